@@ -172,7 +172,7 @@ def capture_in(
 
         return expose(light, str(what), output, job, resume, **request)
     if colour == AUTO:
-        from mitsim.light.memory import first_shadow
+        from mitsim.light.cost_model import first_shadow
 
         with job.planning(str(what), first_shadow(bench, Request(**request).effects)):
             chosen = bench.choose_colour(str(what), **request)

@@ -38,6 +38,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import (
     MOSAIC,
     RUN,
+    AmbientFile,
     ClosingFile,
     ColourManifest,
     MosaicManifest,
@@ -51,9 +52,9 @@ from mitsim.core.runs import AMBIENT, CLOSING, Capture, LineTruth, MosaicCapture
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
+from mitsim.light.cost_model import first_shadow, frame_seconds, frames_cost
 from mitsim.light.light import SampledLight, trace_light, trace_lines
 from mitsim.light.light_file import read_light, write_light
-from mitsim.light.memory import first_shadow, frame_seconds, frames_cost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
@@ -323,6 +324,10 @@ def _run(
         recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposure_s, "seed": request.seed})
     shooting = Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
     shooting.shoot(expected, job)
+    ambient_file = None
+    if ambient:
+        part, noise = shooting.ambient_part, shooting.noise_to_signal
+        ambient_file = AmbientFile(file=AMBIENT, shots=ambient.shots, part=part, noise=noise)
     closing = _close(light, family, expected, request, exposer, recorder)
     total = light.plan.total(totals.noise)
     manifest = RunManifest(
@@ -331,7 +336,7 @@ def _run(
         camera=bench.identity(),
         digital=digital_of(bench.sensor, exposure_s),
         patterns=patterns,
-        ambient_frame=shooting.ambient_file,
+        ambient_frame=ambient_file,
         closing_frame=closing,
         plan=plan.block(),
         mc_error=totals.mc_error,

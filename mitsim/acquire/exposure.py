@@ -4,28 +4,41 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import islice
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
 from mitsim.core.arrays import FloatArray, sum_of_squares
+from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel
 from mitsim.core.job import Job
-from mitsim.core.manifests import MOST_SHOTS, AmbientFile
+from mitsim.core.manifests import MOST_SHOTS
 from mitsim.core.parallel import Behind, in_threads
-from mitsim.core.runs import AMBIENT, Recorder
+from mitsim.core.runs import Recorder
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import Devices
 from mitsim.devices.patterns import PatternFamily, Shot
 from mitsim.devices.sensor import SensorModel
-from mitsim.light.memory import frames_at_once
+from mitsim.devices.session import Drift
+from mitsim.light.cost_model import frames_at_once
 from mitsim.light.settings import Estimate
 from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames, Frame, add_speckle
-from mitsim.sensor.chain import Digital, dn_to_electrons, electrons_from_irradiance, expose, specimen
+from mitsim.scene.window import window_at
+from mitsim.sensor.chain import (
+    Digital,
+    dn_to_electrons,
+    electrons_from_irradiance,
+    expose,
+    ripple_level,
+    ripple_response,
+    specimen,
+)
 from mitsim.sensor.moments import mean_variance, saturated_pixels
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
@@ -45,9 +58,8 @@ class Exposer:
 
     def electrons(self, frame: Frame) -> FloatArray:
         """Return the expected photoelectrons (m, m') of ``frame`` without dark current."""
-        return electrons_from_irradiance(
-            frame.irradiance, self.exposure_s, self.devices.sensor, self.devices.projector.effective_wavelength_nm
-        )
+        wavelength = self.devices.projector.effective_wavelength_nm
+        return electrons_from_irradiance(frame.irradiance, self.exposure_s, self.devices.sensor, wavelength)
 
     def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
         """Return the expected photoelectrons of ``frame`` with its own speckle."""
@@ -65,9 +77,8 @@ class Exposer:
 
     def rendering_noise(self, frame: Frame) -> float:
         """Return the rms Monte Carlo error of ``frame`` [electrons]."""
-        unit = electrons_from_irradiance(
-            1.0, self.exposure_s, self.devices.sensor, self.devices.projector.effective_wavelength_nm
-        )
+        wavelength = self.devices.projector.effective_wavelength_nm
+        unit = electrons_from_irradiance(1.0, self.exposure_s, self.devices.sensor, wavelength)
         return float(np.sqrt(frame.variance) * unit)
 
     def sensor_noise(self, electrons: FloatArray) -> float:
@@ -82,17 +93,19 @@ class Exposer:
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
         """Yield the noisy measurement [electrons/s] of every pattern (i, j), from two frames if signed."""
         positive: FloatArray | None = None
+
+        def measure(item: tuple[Shot, Frame]) -> FloatArray:
+            shot, frame = item
+            return self.rate(self.digital(self.shot_electrons(frame, *shot.names), *shot.names))
+
         for shots in in_chunks(zip(family.shots, expected, strict=True)):
-            rates = in_threads(lambda item: self._measurement(item[1], *item[0].names), shots)
+            rates = in_threads(measure, shots)
             for (shot, _), rate in zip(shots, rates, strict=True):
                 if shot.sign == 1:
                     positive = rate
                     continue
                 yield rate if positive is None else positive - rate, shot.row, shot.column
                 positive = None
-
-    def _measurement(self, frame: Frame, *names: str | int) -> FloatArray:
-        return self.rate(self.digital(self.shot_electrons(frame, *names), *names))
 
 
 def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
@@ -257,9 +270,10 @@ class Totals:
         peak = energy = variance = removed = heaviest = 0.0
         parts = np.zeros((1, 1))
         for chunk in in_chunks((frame,) for frame in expected):
-            for (frame,), (brightest, squares) in zip(chunk, in_threads(_peak_and_energy, chunk), strict=True):
+            squared = in_threads(lambda item: sum_of_squares(item[0].irradiance), chunk)
+            for (frame,), squares in zip(chunk, squared, strict=True):
                 removed = max(removed, frame.removed)
-                peak = max(peak, brightest)
+                peak = max(peak, float(frame.irradiance.max()))
                 energy += squares
                 variance += frame.variance * frame.irradiance.size
                 heaviest += frame.heaviest * frame.variance * frame.irradiance.size
@@ -268,26 +282,19 @@ class Totals:
         return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
 
 
-def _peak_and_energy(item: tuple[Frame]) -> tuple[float, float]:
-    (frame,) = item
-    return float(frame.irradiance.max()), sum_of_squares(frame.irradiance)
+class _Exposed(NamedTuple):
+    """A shot with its noise [electrons]; ``sums`` are squares of noise, light and projector's light, and the light."""
 
-
-@dataclass(frozen=True, eq=False)
-class _Exposed:
-    index: int
+    number: int
     shot: Shot
     electrons: FloatArray
     digital: Digital
     rendering_noise: float
-    sensor_noise: float
+    ratio: float
     saturated: bool
-    light: float
-    energy: float
-    signal: float
+    sums: FloatArray
 
 
-@dataclass(eq=False)
 class Shooting:
     """Exposes expected frames and records them; frames that a resumed run already has are kept.
 
@@ -303,48 +310,42 @@ class Shooting:
         Frames with saturated pixels, and the largest ratio of rendering noise to sensor noise.
     """
 
-    family: PatternFamily
-    recorder: Recorder
-    exposer: Exposer
-    ambient: AmbientFrame | None
-    always: FloatArray
-    saturated: int = 0
-    noise_ratio: float = 0.0
-    _noise_energy: float = 0.0
-    _energy: float = 0.0
-    _signal: float = 0.0
-    _light: float = 0.0
+    def __init__(
+        self,
+        family: PatternFamily,
+        recorder: Recorder,
+        exposer: Exposer,
+        ambient: AmbientFrame | None,
+        always: FloatArray,
+    ) -> None:
+        self.family, self.recorder, self.exposer = family, recorder, exposer
+        self.ambient, self.always = ambient, always
+        self.saturated, self.noise_ratio, self._sums = 0, 0.0, np.zeros(4)
 
     @property
     def sensor_noise(self) -> float:
         """Return the sensor's closed-form relative noise ||noise|| / ||expected|| over all frames."""
-        return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
+        noise, energy = self._sums[:2]
+        return math.sqrt(noise / energy) if energy else 0.0
 
     @property
     def dilution(self) -> float:
         """Return ||frames|| / ||projector's light||: the factor by which lamps dilute a relative error."""
-        return math.sqrt(self._energy / self._signal) if self._signal else 1.0
+        return math.sqrt(self._sums[1] / self._sums[2]) if self._sums[2] else 1.0
 
     @property
     def ambient_part(self) -> float:
         """Return the part of ambient light in the frames."""
-        return float(self.always.sum()) * len(self.family.shots) / self._light if self._light else 0.0
+        return float(self.always.sum()) * len(self.family.shots) / float(self._sums[3]) if self._sums[3] else 0.0
 
     @property
     def noise_to_signal(self) -> float:
         """Return ||noise|| / ||light of the projector|| over all frames less the ambient frame."""
-        own = 0.0
+        own, (noise, _, signal, _) = 0.0, self._sums
         if self.ambient is not None and not self.family.signed:
             own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
             own *= self.always.size * len(self.family.shots)
-        return math.sqrt((self._noise_energy + own) / self._signal) if self._signal else math.inf
-
-    @property
-    def ambient_file(self) -> AmbientFile | None:
-        """Return the manifest's entry of the ambient frame."""
-        if self.ambient is None:
-            return None
-        return AmbientFile(file=AMBIENT, shots=self.ambient.shots, part=self.ambient_part, noise=self.noise_to_signal)
+        return math.sqrt((noise + own) / signal) if signal else math.inf
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
         """Expose and record the ``expected`` frames in chunks, one thread per processor.
@@ -364,51 +365,37 @@ class Shooting:
                 with job.clock.stage("write"):
                     writing.give(exposed)
                 for shot in exposed:
-                    self._count(shot)
+                    self.noise_ratio = max(self.noise_ratio, shot.ratio)
+                    self.saturated += shot.saturated
+                    self._sums += shot.sums
                 job.progress("frames", (chunk[-1][0] + 1) / len(expected))
             with job.clock.stage("write"):
                 writing.wait()
 
-    def _count(self, shot: _Exposed) -> None:
-        if shot.rendering_noise:
-            ratio = shot.rendering_noise / shot.sensor_noise if shot.sensor_noise else np.inf
-            self.noise_ratio = max(self.noise_ratio, ratio)
-        self.saturated += shot.saturated
-        self._noise_energy += shot.sensor_noise**2 * shot.electrons.size
-        self._energy += shot.energy
-        self._signal += shot.signal
-        self._light += shot.light
-
     def _expose(self, item: tuple[int, Shot, Frame]) -> _Exposed:
-        index, shot, frame = item
-        electrons = self.exposer.shot_electrons(frame, *shot.names)
-        digital = self.exposer.digital(electrons, *shot.names)
-        energy = sum_of_squares(electrons)
-        return _Exposed(
-            index=index,
-            shot=shot,
-            electrons=electrons,
-            digital=digital,
-            rendering_noise=self.exposer.rendering_noise(frame),
-            sensor_noise=self.exposer.sensor_noise(electrons),
-            saturated=self.exposer.saturates(digital, electrons),
-            light=float(electrons.sum()),
-            energy=energy,
-            signal=sum_of_squares(electrons - self.always) if self.always.any() else energy,
+        (index, shot, frame), exposer = item, self.exposer
+        electrons = exposer.shot_electrons(frame, *shot.names)
+        digital = exposer.digital(electrons, *shot.names)
+        energy, noise, rendered = (
+            sum_of_squares(electrons),
+            exposer.sensor_noise(electrons),
+            exposer.rendering_noise(frame),
         )
+        signal = sum_of_squares(electrons - self.always) if self.always.any() else energy
+        ratio = 0.0 if not rendered else rendered / noise if noise else math.inf
+        sums = np.array([noise**2 * electrons.size, energy, signal, float(electrons.sum())])
+        saturated = exposer.saturates(digital, electrons)
+        return _Exposed(index, shot, electrons, digital, rendered, ratio, saturated, sums)
 
     def _record(self, exposed: _Exposed) -> None:
-        if self.recorder.keeps(exposed.index):
+        if self.recorder.keeps(exposed.number):
             return
+        shot, exposer = exposed.shot, self.exposer
         metadata: dict[str, str | int | float] = {
-            "row": exposed.shot.row,
-            "column": exposed.shot.column,
-            "sign": exposed.shot.sign,
-            "exposure_s": self.exposer.exposure_s,
-            "rendering_noise_e": exposed.rendering_noise,
-            "seed": self.exposer.seed,
-        }
-        self.recorder.write_frame(exposed.index, frame_channels(exposed.digital, exposed.electrons), metadata)
+            "row": shot.row, "column": shot.column, "sign": shot.sign, "exposure_s": exposer.exposure_s,
+            "rendering_noise_e": exposed.rendering_noise, "seed": exposer.seed,
+        }  # fmt: skip
+        self.recorder.write_frame(exposed.number, frame_channels(exposed.digital, exposed.electrons), metadata)
 
 
 def frame_channels(digital: Digital, electrons: FloatArray) -> dict[str, Channel]:
@@ -417,3 +404,161 @@ def frame_channels(digital: Digital, electrons: FloatArray) -> dict[str, Channel
     whole = digital.dtype == np.uint32
     dn: Channel = digital.astype(np.uint32, copy=False) if whole else digital.astype(np.float32)
     return {"DN": dn, "electrons": electrons.astype(np.float32)}
+
+
+# -------- Drift of a bench and of a camera's exposure
+#
+# Light is traced up to the mask, so that a mask that moved, turned or shakes changes only the optics of traced light
+# (:meth:`mitsim.light.light.SampledLight.behind`). The cells suffice because a moved shadow is averaged over the same
+# cells. The light of a moved projector is traced anew because it reaches other places. Power, lamps, temperature,
+# exposure time and black level are part of the exposure.
+
+_OF_TERMS = ("mask_rotation_mrad", "mask_tilt_rows_mrad", "mask_tilt_columns_mrad", "vibration_um")
+"""Kinds of drift after which other separable terms form the mask's shadow."""
+
+
+def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float = 0.0) -> FloatArray:
+    """Return the (count,) relative light of a source in successive frames; 1 at their begin.
+
+    Parameters
+    ----------
+    seed, name
+        Random stream.
+    count
+        Number of frames; each takes the value at its middle.
+    ramp, flicker
+        Linear change from the begin of the first frame to the end of the last, and normal deviation of each.
+    """
+    changed = 1 + ramp * (np.arange(count) + 0.5) / count
+    if flicker:
+        changed = changed * (1 + flicker * stream(seed, "drift", name).standard_normal(count))
+    return np.asarray(np.maximum(changed, 0.0))
+
+
+def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
+    """Return a ``bench`` whose mask has moved by a ``drift``, for light that was traced before.
+
+    Raises MitsimError for a mask that turns, tilts or shakes before mirrors or is drawn on a raster, for a thick mask
+    that tilts or one that tilts too far, and for one that moves into the sensor or the scene.
+    """
+    row, column, axis = drift.mask_mm
+    camera, kinds = bench.geometry, " and ".join(kind for kind in drift.kinds if kind in _OF_TERMS)
+    changed: dict[str, object] = {
+        "mask_offset_row": camera.mask_offset_row + row,
+        "mask_offset_column": camera.mask_offset_column + column,
+        "mask_distance": camera.mask_distance + axis,
+        "mask_motion": drift.motion,
+        "mask_lean_mrad": drift.tilt_mrad,
+    }
+    moved, fault = camera.model_copy(update=changed), ""
+    if kinds and camera.is_correlated(camera.diffracts):
+        fault = (
+            f"{kinds} would be formed of separable terms, and {camera.mask_words} has none; turn or tilt that mask in "
+            "the camera file's [mask]"
+        )
+    elif kinds and bench.loaded.mirrors:
+        fault = (
+            f"{kinds} would be formed of light in cells, and mirrors bring light in none; take a scene without mirrors"
+        )
+    elif drift.tilt_mrad and camera.mask_thickness:
+        thick = f"{kinds} would tilt a mask of {camera.mask_thickness:g} mm"
+        fault = f"{thick}, and only thin ones are formed tilted; set mask_thickness to 0"
+    elif not camera.mask_distance + axis > 0:
+        fault = f"mask_axis_um moves the mask {-axis:g} mm, to the sensor; it is {camera.mask_distance:g} mm off"
+    elif drift.tilt_mrad and moved.tilt_left_out(moved.diffracts):
+        tilted = f"{kinds} would tilt the mask until its shadow takes more terms than are formed"
+        fault = f"{tilted}; give less, or one of the two alone"
+    if fault:
+        raise MitsimError(f"drift: {fault}")
+    return replace(bench, devices=replace(bench.devices, camera=moved))
+
+
+def drift_projector(bench: Apparatus, drift: Drift) -> Apparatus:
+    """Return a ``bench`` whose projector's picture has moved by a ``drift``; its light must be traced anew."""
+    if not (drift.projector_rows or drift.projector_columns):
+        return bench
+    loaded, grid = bench.loaded, bench.loaded.pixels
+    first_row, first_column = grid.first_row + drift.projector_rows, grid.first_column + drift.projector_columns
+    moved = replace(grid, first_row=first_row, first_column=first_column)
+    windows = window_at(str(loaded.path), loaded.projector, loaded.camera, moved, bench.geometry.scene_distance)
+    placed = replace(moved, row_tan=windows[0], column_tan=windows[1])
+    return replace(bench, loaded=replace(loaded, grid=placed))
+
+
+def warmer(sensor: SensorModel, kelvin: float) -> SensorModel:
+    """Return a ``sensor`` that is ``kelvin`` warmer, or the same if its file states no temperature."""
+    if sensor.dark_current_temperature_c is None or sensor.dark_doubling_c is None or not kelvin:
+        return sensor
+    now = sensor.dark_current_temperature_c if sensor.temperature_c is None else sensor.temperature_c
+    return sensor.model_copy(update={"temperature_c": now + kelvin})
+
+
+@dataclass(frozen=True)
+class DriftedExposer(Exposer):
+    """A camera that has drifted: frames are exposed in its true state and interpreted in its known one.
+
+    Attributes
+    ----------
+    drift
+        The drift.
+    family
+        Patterns in the order of the shots.
+    ambient
+        (m, m') light of lamps [W m^-2] when the ambient frame was taken.
+    """
+
+    drift: Drift = field(default_factory=Drift)
+    family: PatternFamily | None = None
+    ambient: FloatArray | float = 0.0
+
+    def electrons(self, frame: Frame) -> FloatArray:
+        """Return the expected photoelectrons (m, m') of ``frame`` while the shutter is open."""
+        return self._open.electrons(frame)
+
+    def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
+        """Return the expected photoelectrons of ``frame`` with projector and lamps at their level."""
+        rows = len(frame.irradiance)
+        power, lamp = (
+            level * self._ripple(source, rows, *names)
+            for source, level in zip(("power", "lamp"), self.levels[names], strict=True)
+        )
+        light = frame.irradiance + (power - 1) * (frame.irradiance - self.ambient)
+        return super().shot_electrons(replace(frame, irradiance=light + (lamp - 1) * self.ambient), *names)
+
+    def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
+        """Draw noisy digital numbers of expected ``electrons``."""
+        if names[0] == "ambient":
+            level = self.ambient_levels[int(names[1])] * self._ripple("lamp", len(electrons), *names)
+            electrons = level * electrons
+        return self._open.digital(electrons, *names)
+
+    def _ripple(self, source: str, rows: int, *names: str | int) -> FloatArray | float:
+        if source not in self.drift.ripples:
+            return 1.0
+        amplitude, hertz = self.drift.ripples[source]
+        response = ripple_response(self.devices.sensor, self._open.exposure_s, hertz, rows)
+        phase = stream(self.seed, "drift", f"{source} ripple", *names).uniform(0, 2 * np.pi)
+        return ripple_level(response, amplitude, phase)
+
+    @cached_property
+    def _open(self) -> Exposer:
+        sensor, drift = warmer(self.devices.sensor, self.drift.temperature_k), self.drift
+        black = {"black_level_dn": sensor.black_level_dn + drift.black_level_dn}
+        devices = replace(self.devices, sensor=sensor.model_copy(update=black))
+        return Exposer(devices, self.exposure_s * (1 + drift.exposure), self.seed, self.speckle)
+
+    @cached_property
+    def levels(self) -> dict[tuple[str | int, ...], tuple[float, float]]:
+        """Return the relative level of projector and lamps in each shot, by its names."""
+        assert self.family is not None
+        shots, drift = self.family.shots, self.drift
+        power = (1 + drift.power) * levels(self.seed, "power", len(shots), drift.power_ramp, drift.power_flicker)
+        lamp = (1 + drift.lamp) * levels(self.seed, "lamp", len(shots), flicker=drift.lamp_flicker)
+        found = zip(power.tolist(), lamp.tolist(), strict=True)
+        return dict(zip((shot.names for shot in shots), found, strict=True))
+
+    @cached_property
+    def ambient_levels(self) -> FloatArray:
+        """Return the (shots,) relative level of the lamps in each shot of the ambient frame."""
+        assert self.family is not None
+        return levels(self.seed, "ambient", ambient_shots(self.family), flicker=self.drift.lamp_flicker)

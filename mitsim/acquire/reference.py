@@ -22,8 +22,8 @@ from mitsim.core.exr import write_frame
 from mitsim.core.job import Cost, Job
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
+from mitsim.light.cost_model import first_shadow, frames_cost
 from mitsim.light.light import Sampling, trace_light
-from mitsim.light.memory import first_shadow, frames_cost
 from mitsim.optics.frames import monte_carlo_bound
 from mitsim.planner.planner import make_plan, unseen_lamps
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from typing_extensions import Self, Unpack
 
     from mitsim.acquire.capture import Light
-    from mitsim.acquire.choose_colour import Coloured
     from mitsim.acquire.reference import Rendered
+    from mitsim.acquire.spectral import Coloured
     from mitsim.bench.request import ExposureKeys, RequestKeys, SessionKeys
     from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.devices.session import BoardShape
@@ -123,7 +123,7 @@ class Bench(Apparatus):
         """
         from mitsim.acquire.capture import check_plan, request_of, trace_request
         from mitsim.acquire.spectral import SpectralBench, plan_request
-        from mitsim.light.memory import first_shadow
+        from mitsim.light.cost_model import first_shadow
 
         job, asked = job or Job(), request_of(patterns, request)
         if isinstance(patterns, str):
@@ -223,7 +223,7 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`capture_lines` where lines or bands are called for; for a bench in a spectral variant.
         """
-        from mitsim.acquire.choose_colour import choose_colour
+        from mitsim.acquire.spectral import choose_colour
 
         return choose_colour(self, Request(patterns=patterns, **request))
 

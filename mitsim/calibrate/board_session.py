@@ -15,8 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.drifting import levels
-from mitsim.acquire.exposure import camera_warnings
+from mitsim.acquire.exposure import camera_warnings, levels
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
 from mitsim.bench.layout import MOST_LOST, mask_fault
@@ -28,9 +27,17 @@ from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
-from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, in_waves
+from mitsim.light.cost_model import (
+    FIXED,
+    Numbers,
+    first_shadow,
+    forming_seconds,
+    frame_seconds,
+    frames_at_once,
+    in_waves,
+    light_bytes,
+)
 from mitsim.light.light import SampledLight, Sampling, trace_lines
-from mitsim.light.memory import first_shadow, frame_seconds, frames_at_once, light_bytes
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation

@@ -29,8 +29,8 @@ from mitsim.core.files import PARTS, output_folder, plain, read_json, remove_pag
 from mitsim.core.manifests import MANIFEST, Digital, resumable
 from mitsim.devices.framelist import LISTS, DarkFile, FrameList, StripeFile
 from mitsim.devices.session import SIDES, Side
-from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import SampledLight
+from mitsim.light.passes import GRIDS, LightEstimate
 from mitsim.light.plan import Plan
 from mitsim.light.simulation import Simulation
 from mitsim.reconstruct.factors import StripeSums

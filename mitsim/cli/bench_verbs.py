@@ -231,7 +231,7 @@ def plan(
         bench = open_as(scene, opening, job, coloured.colour)
         if place is not None:
             check_apart(place, (*bench.loaded.files, *opening.models))
-        from mitsim.light.memory import first_shadow
+        from mitsim.light.cost_model import first_shadow
 
         starting = running_seconds()
         with job.planning(asked.patterns, first_shadow(bench, asked.effects)):

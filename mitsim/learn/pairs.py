@@ -28,8 +28,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.acquire.capture import trace_request
-from mitsim.acquire.drifting import drift_mask
-from mitsim.acquire.exposure import ambient_shots, camera_warnings, peak_irradiance
+from mitsim.acquire.exposure import ambient_shots, camera_warnings, drift_mask, peak_irradiance
 from mitsim.acquire.spectral import plan_request
 from mitsim.api.bench import Bench
 from mitsim.bench.apparatus import Apparatus
@@ -59,8 +58,8 @@ from mitsim.learn.pair_store import (
     write_shard,
 )
 from mitsim.learn.requests import CALIBRATION, PairsRequest, picture_files
+from mitsim.light.cost_model import first_shadow, frames_cost
 from mitsim.light.light import SampledLight, Sampling, trace_light, traced_again
-from mitsim.light.memory import first_shadow, frames_cost
 from mitsim.light.plan import Plan
 from mitsim.light.simulation import Simulation, emission
 from mitsim.optics.image_formation import FrameOptics

@@ -1,7 +1,7 @@
-"""Settings, what the pilot found and unit costs in; seconds of each stage out, before anything is simulated.
+"""Predicted seconds, memory and disk of a capture, before anything is simulated.
 
-The plan compares its choices at :data:`FIXED` unit costs, not at those of this machine and moment: the same seed must
-mean the same settings. What the pilot measured only scales the prediction that people read.
+Plans compare their choices at the :data:`FIXED` unit costs, not at those of this machine and moment, because the same
+seed must give the same settings. Measured costs only scale the prediction that people read.
 """
 
 from __future__ import annotations
@@ -13,9 +13,15 @@ from typing import cast
 
 import numpy as np
 
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray
-from mitsim.devices.plate import FEW
+from mitsim.core.job import Cost
+from mitsim.core.worker import workers
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.patterns import Lighting
+from mitsim.devices.plate import FEW, MOST_TERMS, Plate
+from mitsim.devices.projector import Spectrum
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import (
     CELLS_OF_COARSE,
@@ -27,44 +33,50 @@ from mitsim.light.settings import (
     SampleCost,
     Settings,
 )
-from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS
+from mitsim.light.simulation import Simulation
+from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS, cells_a_side, cells_per_pixel, points_per_cell
 from mitsim.optics.forming import PROBES
-from mitsim.optics.frames import formed_frames, mixes
+from mitsim.optics.frames import formed_frames, frames_in_memory, mixes
 from mitsim.optics.image_formation import SUMMED_BYTES
-from mitsim.transport.accumulator import MOST_PLACES
+from mitsim.transport.records import MOST_PLACES
 
 ROUNDS, CHECKED_SHOTS = 1.5, 16
-"""Rounds that sampling takes, one or two, of followed light one more; and shots that each looks at to see the error of
-many: shots' errors differ by a few percent, and each costs its look."""
+"""Rounds of sampling, one or two (followed light takes one more), and shots whose error each round checks if there are
+many: their errors differ by a few percent, and each takes time."""
 MOST_CHECKED = 64
-"""Shots that are looked at where light is followed over several surfaces, as heavy paths strike single ones (cookie_bag
-at 1e-3 met its target in eight of 49, and not in all); and classes whose frames tell of all shots, which are formed of
-them: what a look finds of them is used again."""
+"""Checked shots where light is followed over several surfaces, because heavy paths strike single shots (cookie_bag at
+1e-3 met its target in eight of 49, and not in all); also the most classes from whose frames all shots are formed."""
 _CHECK = 0.4
-"""Time of a look at a frame's error in that of forming the frame: 0.36 in corner, 0.44 in cookie_bag, 0.40 in
-gift_card."""
+"""Ratio of the time of checking a frame's error to that of forming it: 0.36 in corner, 0.44 in cookie_bag."""
 MIXING = "black-level"
 """Effect that lights every pixel in every shot, so that shots are no longer single classes."""
 _SPLIT, _EDGES = 2.0, 2.0
-"""Layers, at most, that share the light of one depth; and how many times the cells of a pixel its light lies in, at
-most, where it lies across an edge or at another depth than the cells are aligned at (measured: 1.6)."""
-_GEOMETRIC_ENTRIES = 0.03
-"""An entry of a geometric shadow over one of a wave-optical one: a sum over features against samples of a field."""
+"""Most layers that share the light of one depth, and the factor of a pixel's cells that its light lies in at an edge or
+at another depth than the cells are aligned at (measured: 1.6)."""
+_GEOMETRIC_ENTRIES, _MANY_ENTRIES = 0.03, 1.2
+"""Ratio of an entry of a geometric shadow of few or many terms to one of a wave-optical shadow: a sum over features
+instead of samples of a field."""
+_CELL_S = 5e-8
+"""Time of a cell of a raster on which waves are squared, which is sharpened and searched for its largest terms."""
+_FURTHER_LINE = 0.2
+"""Cost of tracing each further line: 0.15 of a mono capture, 0.3 of one line (three lines of photograph)."""
+_PASSED = 0.4
+"""Ratio of a place of an accumulator, which is emptied and searched, to an entry of light (corner in three lines)."""
+SHARED_COST = 6
+"""Cost of a path of shared indirect light in ordinary paths: corner 5.7, cookie_bag 3.4."""
 
 TRUTH_PART = 1 / 6
-"""Of the error that the frames' own sampling leaves in any image, what the truth may be off by: it then adds at most
-0.12 dB to the error of the best image that a run could give."""
+"""Error of the truth relative to that of the frames' own sampling in any image: it adds at most 0.12 dB."""
 TRUTH_GROUPS = 4
-"""Independent estimates of the truth: their spread is its standard error. An edge's error falls with the samples of one
-estimate, but with the root of the number of estimates: four need 0.7 of the rays of eight."""
+"""Independent estimates of the truth, whose spread is its standard error. An edge's error falls faster with the samples
+of one estimate than with the number of estimates: four need 0.7 of the rays of eight."""
 TRUTH_SAMPLES, BOARD_SAMPLES = 16, 8
-"""Samples a pixel that each of these groups begins with. 64 in all show all but a corner of a hundredth of a pixel,
-which their spread would not tell of; a board has no corners."""
+"""First samples for each pixel and group. 64 in all show all but a corner of a hundredth of a pixel; a board has no
+corners."""
 MOST_RAYS, MOST_SAMPLES = 2**22, 128
-"""Rays of each flux, and samples a pixel where that is more, beyond which it is left as it is: some one and a half
-seconds on two cores. The standard error tells how good it is then."""
+"""Most rays of each flux, or samples for each pixel if that is more: 1.5 s on two cores."""
 _ALLOTTED = 0.5
-"""Part of the rays that the truth takes for its pixels being sampled where that helps most (measured: photograph 0.5,
+"""Part of the rays that the truth takes because its pixels are sampled where that helps most (photograph 0.5,
 gift_card 0.3)."""
 
 
@@ -75,7 +87,7 @@ class UnitCosts:
     Attributes
     ----------
     passes
-        a path, or a connection, of each pass by its name.
+        a path, or a connection, by pass.
     frame, product
         a frame, and a multiplication in forming it.
     entry, accumulated
@@ -83,7 +95,7 @@ class UnitCosts:
     ray
         a ray of the truth.
     pixel
-        a pixel of a shot that is looked through for its brightest and its energy.
+        a pixel of a shot that is searched for its brightest value and its energy.
     """
 
     passes: Mapping[str, float]
@@ -96,35 +108,18 @@ class UnitCosts:
 
 
 FIXED = UnitCosts(
-    passes={name: row.unit_cost for name, row in PASSES.items()},
-    frame=2.2e-3,
-    product=2.1e-11,
-    entry=3.5e-8,
-    accumulated=1e-8,
-    ray=4e-8,
-    pixel=4e-9,
+    {name: row.unit_cost for name, row in PASSES.items()}, 2.2e-3, 2.1e-11, 3.5e-8, 1e-8, ray=4e-8, pixel=4e-9
 )
-"""Chosen near what was measured, as the table's; only their ratios decide."""
-
-
-_MANY_ENTRIES = 1.2
-"""An entry of a geometric shadow of many terms over one of a wave-optical one."""
-_CELL_S = 5e-8
-"""A cell of a raster of light on which waves are squared, beyond these: it is sharpened, and its largest terms are
-looked for (a disc at 512 pixels, 6 to 12 cells a pixel)."""
-_FURTHER_LINE = 0.2
-"""What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
-photograph)."""
-_PASSED = 0.4
-"""A place of an accumulator, which is emptied and looked through, over an entry of light that is accumulated (corner in
-three lines: 4e-9 s)."""
-SHARED_COST = 6
-"""Paths that a path of shared indirect light takes as long as: corner 5.7, cookie_bag 3.4."""
+"""Near the measured costs of two cores; only their ratios decide."""
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """Numbers of settings that cost depends on, of one choice or of (m,) choices; the first six are chosen."""
+    """Numbers of settings that cost depends on, of one choice or of (m,) choices; the first six are chosen.
+
+    ``coarse_layers`` is 1 if coarse light has all layers; ``occluded`` counts pixels with anchors of their own;
+    ``raster_cells`` along a pixel are chosen for frames by correlation, 0 for sums or the fewest cells.
+    """
 
     anchors: Number
     layers: Number
@@ -132,68 +127,53 @@ class Numbers:
     followed_anchors: Number
     occluded_anchors: Number
     coarse_layers: Number
-    """Whether coarse light has all layers, or one."""
     waves: float = 1.0
     indirect: float = 0.0
     mixed: float = 0.0
     occluded: float = 0.0
-    """Pixels of their own anchors."""
     raster_cells: float = 0.0
-    """Along a pixel, where frames are correlations by choice; 0: sums, or as few cells as a raster has."""
 
     @property
     def coarse(self) -> tuple[FloatArray, FloatArray]:
         """Cells a side of a projector pixel, and layers, of coarse light."""
         several = np.asarray(self.coarse_layers) > 0
-        return np.where(several, np.maximum(self.cells // CELLS_OF_COARSE, 1.0), 1.0), np.where(
-            several, self.layers, 1.0
-        )
+        cells = np.where(several, np.maximum(self.cells // CELLS_OF_COARSE, 1.0), 1.0)
+        return cells, np.where(several, self.layers, 1.0)
 
     @property
     def cells_of_followed(self) -> FloatArray:
-        """Cells a side of a projector pixel for what anchors see of followed light, which has one layer."""
+        """Cells a side of a projector pixel for followed light beyond its mean, which has one layer."""
         return self.coarse[0] / FOLLOWED_WIDTH
 
     @classmethod
     def coarsest(cls) -> Numbers:
-        """One of everything, and a wave-optical shadow."""
+        """Return one of everything, and a wave-optical shadow."""
         return cls(*[1.0] * 6)
 
     @classmethod
     def of_counts(
         cls, counts: Sequence[Number], effects: frozenset[str], occluded: int = 0, raster_cells: int = 0
     ) -> Numbers:
-        """Those of the six that are chosen, with ``effects``.
-
-        Parameters
-        ----------
-        counts
-            the first six numbers.
-        effects
-            that are on.
-        occluded, raster_cells
-            as above.
-        """
+        """Return the numbers of the six ``counts`` with ``effects`` on."""
         on = in_waves(effects), "interreflection" in effects, MIXING in effects
         return cls(*counts, *map(float, (*on, occluded, raster_cells)))  # type: ignore[arg-type]
 
     @classmethod
     def of(cls, settings: Settings) -> Numbers:
-        """Those of ``settings``."""
+        """Return the numbers of ``settings``."""
         direct = settings.anchors, len(settings.depths), settings.subdivision
         counts = *direct, settings.followed_anchors, settings.occluded_anchors, settings.coarse_layers
-        return cls.of_counts(
-            [float(count) for count in counts], settings.effects, len(settings.with_own_anchors), settings.raster_cells
-        )
+        occluded, each = len(settings.with_own_anchors), [float(count) for count in counts]
+        return cls.of_counts(each, settings.effects, occluded, settings.raster_cells)
 
 
 def in_waves(effects: frozenset[str]) -> bool:
-    """Whether the mask's shadow is wave-optical with these ``effects``."""
+    """Return True if the mask's shadow is wave-optical with these ``effects``."""
     return bool(effects & names(lambda effect: effect.in_shadow))
 
 
 def sample_costs(pilot_result: PilotResult, effects: frozenset[str]) -> dict[str, SampleCost]:
-    """What each pass that ``effects`` call for takes by the ``pilot_result``; connections to anchors: to one."""
+    """Return the cost of each pass that ``effects`` call for; connections are those to one anchor."""
     found = ((name, pilot_result.sample_costs[name]) for name in PASSES if name in pilot_result.sample_costs)
     return {name: sample_cost for name, sample_cost in found if PASSES[name].called_for(effects)}
 
@@ -201,82 +181,38 @@ def sample_costs(pilot_result: PilotResult, effects: frozenset[str]) -> dict[str
 # -------- Forming frames, and checking their error
 
 
-def _by_fft(forming: Forming, numbers: Numbers) -> bool:
-    """Whether frames are correlations, as they must be or as was chosen."""
-    return bool(numbers.raster_cells) or forming.correlated[bool(numbers.waves)]
-
-
-def _phases(forming: Forming, numbers: Numbers) -> float:
-    """Raster cells that a pixel has, where frames are correlations."""
+def _by_fft(forming: Forming, numbers: Numbers) -> float:
+    """Return the raster cells of a pixel where frames are correlations, as they must be or by choice, else 0."""
+    if not (numbers.raster_cells or forming.correlated[bool(numbers.waves)]):
+        return 0.0
     return numbers.raster_cells**2 or forming.phases
 
 
-def _products(
-    forming: Forming, numbers: Numbers, lit: tuple[Number, Number], cells: Number, layers: Number, anchors: Number
-) -> Number:
-    """Multiplications of one frame, ``lit`` of whose rows and columns of cells hold light, and of the probes that tell
-    its error.
-
-    Parameters
-    ----------
-    forming, numbers
-        what it depends on, and whether the shadow is wave-optical, and on a raster.
-    lit, cells, layers, anchors
-        parts of the rows and of the columns, cells and layers, and anchors.
-    """
-    rows, columns = (part * forming.cells * cells * anchors for part in lit)
-    pixels = forming.pixels
-    # The shorter side is multiplied out first.
-    one_term = layers * (pixels * rows * columns + pixels**2 * np.minimum(rows, columns))
-    of_probes = layers * GROUPS * (PROBES + 1) * (np.minimum(columns, pixels) + pixels) * rows
-    if not _by_fft(forming, numbers):
-        terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
-        return cast(Number, terms * (one_term + of_probes))
-    correlation = CORRELATION_PRODUCTS * _phases(forming, numbers) * layers * np.square(anchors) * pixels**2
-    terms = forming.largest_terms[bool(numbers.waves)]
-    many = np.asarray(terms * 16 * pixels * forming.cells * cells > SUMMED_BYTES)
-    sums, sums_of_probes = (
-        np.where(many, math.inf, count * (terms if math.isfinite(terms) else 0.0)) for count in (one_term, of_probes)
-    )
-    # Frames and what probes see of them each take the cheaper way.
-    return cast(Number, np.minimum(correlation, sums) + np.minimum(GROUPS * correlation, sums_of_probes))
-
-
-def _entries(forming: Forming, numbers: Numbers) -> Number:
-    """Entries of all shadows that are prepared, as many as wave-optical ones take as long."""
-    coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
-    followed = (np.asarray(numbers.followed_anchors) > 1) * numbers.cells_of_followed
-    sides = numbers.cells * numbers.layers + coarse * math.prod(numbers.coarse) + followed
-    if _by_fft(forming, numbers):
-        return cast(Number, 0.0 * sides)
-    many = forming.geometric_terms > FEW
-    geometric = _MANY_ENTRIES * forming.geometric_terms if many else _GEOMETRIC_ENTRIES
-    terms = forming.terms * numbers.waves + geometric * (1 - numbers.waves)
-    return cast(Number, 2 * forming.pixels * forming.cells * sides * terms)
-
-
-def _lit_by_occluded(forming: Forming, numbers: Numbers) -> tuple[Number, Number]:
-    """Parts of the rows and of the columns of cells that hold light of occluded pixels in a frame: each pixel lights
-    its own, and a frame shows as many of them as of all pixels."""
-    most = _EDGES * numbers.occluded * np.square(forming.lit) / forming.cells
-    rows, columns = (np.minimum(forming.lit * part, most) for part in forming.occluded)
-    return rows, columns
-
-
 def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: UnitCosts) -> Number:
-    """Seconds of forming so many ``frames`` of each line.
+    """Return seconds of forming so many ``frames`` of each line, at the ``costs`` of this machine or the fixed ones."""
+    phases, pixels, waves = _by_fft(forming, numbers), forming.pixels, bool(numbers.waves)
 
-    Parameters
-    ----------
-    forming, numbers
-        what it depends on.
-    frames
-        to be formed of a line.
-    costs
-        of this machine, or the fixed ones.
-    """
+    def multiplications(lit: Sequence[Number], cells: Number, layers: Number, anchors: Number) -> Number:
+        """Return those of a frame, whose ``lit`` rows and columns of cells hold light, and of its probes."""
+        rows, columns = (part * forming.cells * cells * anchors for part in lit)
+        # The shorter side is multiplied out first.
+        one_term = layers * (pixels * rows * columns + pixels**2 * np.minimum(rows, columns))
+        of_probes = layers * GROUPS * (PROBES + 1) * (np.minimum(columns, pixels) + pixels) * rows
+        if not phases:
+            terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
+            return cast(Number, terms * (one_term + of_probes))
+        correlation = CORRELATION_PRODUCTS * phases * layers * np.square(anchors) * pixels**2
+        terms = forming.largest_terms[waves]
+        many = np.asarray(terms * 16 * pixels * forming.cells * cells > SUMMED_BYTES)
+        held = terms if math.isfinite(terms) else 0.0
+        sums, sums_of_probes = (np.where(many, math.inf, count * held) for count in (one_term, of_probes))
+        # Frames and what probes see of them each take the cheaper way.
+        return cast(Number, np.minimum(correlation, sums) + np.minimum(GROUPS * correlation, sums_of_probes))
+
     lit, every, coarse = (forming.lit, forming.lit), (1.0, 1.0), numbers.coarse
-    of_occluded = _lit_by_occluded(forming, numbers)
+    # Each occluded pixel lights its own cells, and a frame shows the same part of them as of all pixels.
+    most = _EDGES * numbers.occluded * np.square(forming.lit) / forming.cells
+    of_occluded = [np.minimum(forming.lit * part, most) for part in forming.occluded]
     by_grid = (
         (1.0, lit, numbers.cells, numbers.layers, 1.0),
         (np.asarray(numbers.anchors) > 1, lit, *coarse, numbers.anchors),
@@ -284,62 +220,54 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: U
         (numbers.indirect, every, *coarse, 1.0),
         (np.asarray(numbers.followed_anchors) > 1, every, numbers.cells_of_followed, 1.0, numbers.followed_anchors),
     )
-    products = sum(formed * _products(forming, numbers, *grid) for formed, *grid in by_grid)
-    if mixes(forming.classes, forming.shots, forming.pixels):
-        products = products + numbers.mixed * forming.classes * forming.pixels**2
+    products = sum(formed * multiplications(*grid) for formed, *grid in by_grid)
+    if mixes(forming.classes, forming.shots, pixels):
+        products = products + numbers.mixed * forming.classes * pixels**2
     return cast(Number, forming.lines * frames * (costs.frame + costs.product * products))
 
 
 def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
-    """Seconds of all frames of the family, with the shadows that form them.
-
-    Parameters
-    ----------
-    forming, numbers, costs
-        as for :func:`forming_seconds`.
-    """
-    shadows = costs.entry * _entries(forming, numbers)
-    if _by_fft(forming, numbers):
-        drawing = forming.drawing[bool(numbers.waves)] * costs.product / FIXED.product
-        if not numbers.waves:  # Waves are squared at as many points whatever the cells.
-            drawing *= _phases(forming, numbers) / forming.phases
-        else:
-            drawing += costs.product / FIXED.product * _CELL_S * forming.pixels**2 * _phases(forming, numbers)
-        # What must be drawn the pilot has drawn of one layer in the fewest cells; of several, coarse light is seen at a
-        # depth of its own.
+    """Return seconds of all frames of the family, with the shadows that form them."""
+    phases, waves = _by_fft(forming, numbers), bool(numbers.waves)
+    # Entries of all shadows, in wave-optical ones.
+    coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
+    followed = (np.asarray(numbers.followed_anchors) > 1) * numbers.cells_of_followed
+    sides = numbers.cells * numbers.layers + coarse * math.prod(numbers.coarse) + followed
+    shadows: Number
+    if not phases:
+        many = forming.geometric_terms > FEW
+        geometric = _MANY_ENTRIES * forming.geometric_terms if many else _GEOMETRIC_ENTRIES
+        terms = forming.terms * numbers.waves + geometric * (1 - numbers.waves)
+        shadows = costs.entry * (2 * forming.pixels * forming.cells * sides * terms)
+    else:
+        slower = costs.product / FIXED.product
+        drawing = forming.drawing[waves] * slower
+        if not waves:
+            drawing *= phases / forming.phases
+        else:  # Waves are squared at as many points whatever the cells.
+            drawing += slower * _CELL_S * forming.pixels**2 * phases
+        # The pilot has drawn a shadow of one layer in the fewest cells if there is no other way. Coarse light of
+        # several layers is seen at a depth of its own.
         several = np.asarray(numbers.layers) > 1
-        must = forming.correlated[bool(numbers.waves)] and _phases(forming, numbers) == forming.phases
-        drawn = ~several & must
-        shadows = cast(Number, shadows + drawing * (numbers.layers + several - drawn))
+        drawn = ~several & (forming.correlated[waves] and phases == forming.phases)
+        shadows = cast(Number, drawing * (numbers.layers + several - drawn))
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)
     seen = costs.pixel * forming.shots * forming.pixels**2
     return forming.lines * (shadows + seen) + forming_seconds(forming, numbers, frames, costs)
 
 
 def checking_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
-    """Seconds of seeing how large the Monte Carlo error is, while light is traced.
-
-    Parameters
-    ----------
-    forming, numbers, costs
-        as for :func:`forming_seconds`.
-    """
+    """Return seconds of checking the Monte Carlo error while light is traced."""
     rounds = ROUNDS + numbers.indirect
     if tells_all(forming.classes, forming.shots, forming.pixels):
-        # The last look takes its part of forming the frames over.
+        # What the last check finds is used again when frames are formed.
         return forming_seconds(forming, numbers, _CHECK * (rounds - 1) * forming.classes, costs)
     few, many = (min(shots, forming.shots) for shots in (CHECKED_SHOTS, MOST_CHECKED))
     return forming_seconds(forming, numbers, _CHECK * rounds * (few + numbers.indirect * (many - few)), costs)
 
 
 def tells_all(classes: int, shots: int, pixels: float) -> bool:
-    """Whether looks see all shots, by the frames of their classes.
-
-    Parameters
-    ----------
-    classes, shots, pixels
-        of the family, and a side of the sensor.
-    """
+    """Return True if checks see all shots, by the frames of their classes; ``pixels`` are a side of the sensor."""
     return classes <= MOST_CHECKED and mixes(classes, shots, pixels)
 
 
@@ -347,59 +275,47 @@ def tells_all(classes: int, shots: int, pixels: float) -> bool:
 
 
 def tracing_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
-    """Seconds of tracing the samples in ``settings``, by kind of light.
-
-    Parameters
-    ----------
-    pilot_result
-        paths in a sample.
-    settings
-        the samples.
-    costs
-        as for :func:`forming_seconds`.
-    """
-    return {
-        name: traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
-        * GROUPS
-        * float(PASSES[name].whole(PASSES[name].predicted_samples(settings)))
-        * sample_cost.paths
-        * costs.passes[name]
-        * float(PASSES[name].connections(settings))
-        for name, sample_cost in sample_costs(pilot_result, settings.effects).items()
-    }
+    """Return seconds of tracing the samples in ``settings``, by pass."""
+    found, lines = {}, traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
+    for name, cost in sample_costs(pilot_result, settings.effects).items():
+        row = PASSES[name]
+        samples, connections = float(row.whole(row.predicted_samples(settings))), float(row.connections(settings))
+        found[name] = lines * GROUPS * samples * cost.paths * costs.passes[name] * connections
+    return found
 
 
 def traced_for(lines: int, parted: bool = False) -> float:
-    """Cost of tracing and accumulating so many ``lines``, relative to one line. They share their paths unless glass has
-    ``parted`` them."""
+    """Return the cost of tracing and accumulating so many ``lines``, relative to one line.
+
+    Lines share their paths unless glass has ``parted`` them.
+    """
     return lines if parted else 1 + _FURTHER_LINE * (lines - 1)
 
 
 def predicted_rays(pixels: int, samples: float, rate: float) -> float:
-    """Rays that truth will take for both fluxes (:mod:`mitsim.light.truth`).
+    """Return the rays of the truth for both fluxes (:mod:`mitsim.light.truth`).
 
-    Parameters
-    ----------
-    pixels
-        of the projector.
-    samples, rate
-        that each group of the frames' direct light takes a pixel, and the power of their number that its error falls
-        with.
+    ``samples`` are those of each group of the frames' direct light for a pixel; its error falls with their power
+    ``rate``.
     """
     first = TRUTH_GROUPS * pixels * (TRUTH_SAMPLES + BOARD_SAMPLES)
     wanted = _ALLOTTED * GROUPS * pixels * samples * float(TRUTH_PART ** (-1 / rate))
     return min(first + wanted, max(MOST_RAYS, MOST_SAMPLES * pixels))
 
 
-def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Mapping[str, Number]) -> Number:
-    """Entries of one group's light, at most: a pixel's direct light lies in its own cells, indirect light in all.
+def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> float:
+    """Return seconds of tracing what a perfect image would show."""
+    row, direct = PASSES["direct"], pilot_result.sample_costs["direct"]
+    rate = (pilot_result.spread if settings.anchors > 1 else direct).noise.rate
+    ray = traced_for(pilot_result.forming.lines, pilot_result.forming.parted) * costs.ray
+    return ray * predicted_rays(direct.paths, float(row.whole(row.predicted_samples(settings))), rate)
 
-    Parameters
-    ----------
-    pixels, classes
-        of the projector, and of the family.
-    numbers, samples
-        of the settings; samples by kind of light, or as settings have them.
+
+def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Mapping[str, Number]) -> Number:
+    """Return the most entries of one group's light.
+
+    A projector pixel's direct light lies in its own cells, indirect light in all. ``samples`` are by pass, or those of
+    settings.
     """
 
     def of(name: str) -> Number:
@@ -428,30 +344,138 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
 
 
 def accumulation_seconds(forming: Forming, numbers: Numbers, entries_of_group: Number, costs: UnitCosts) -> Number:
-    """Seconds of accumulating the light of each line.
-
-    Parameters
-    ----------
-    forming, numbers, costs
-        as for :func:`forming_seconds`.
-    entries_of_group
-        of one group's light.
-    """
+    """Return seconds of accumulating the light of each line, of which a group has so many entries."""
     cells, layers = numbers.coarse
     accumulator = forming.classes * np.square(forming.cells * cells) * layers
     passed = numbers.indirect * _PASSED * np.where(accumulator < MOST_PLACES, accumulator, 0.0)
     return cast(Number, forming.lines * GROUPS * costs.accumulated * (entries_of_group + passed))
 
 
-def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> float:
-    """Seconds of tracing what a perfect image would show.
+# -------- Memory and disk of forming, exposing and writing frames
 
-    Parameters
-    ----------
-    pilot_result, settings, costs
-        as for :func:`tracing_seconds`.
+_LAUNCH_BYTES = 220e6
+"""Paths in flight, kernels and LLVM; measured 1.0e8 (photograph) to 2.3e8 (compact_disc)."""
+_FOLLOWED_BYTES = 200e6
+"""Left by the pilot's run of light over several surfaces (cookie_bag 3.8e8, photograph 1.0e8)."""
+_ENTRY_BYTES = 45.0
+"""Entry of a sparse matrix (12), its sum and its part in frames; measured 32 to 45."""
+_PATH_SAMPLE_BYTES = 500.0
+_PATH_BYTES, _PART_BYTES = 200.0, 75.0
+"""Light of a path shared among more cells: two paths (74 each), and each cell's part, sorted (64)."""
+_TERM_BYTES = 3 * 16.0
+_EXPOSED = 7
+_EXPOSING_S, _WRITING_S = 2e-8, 8e-9
+"""Time of a pixel on two processors, and the wait at the end; 49 frames of 512 x 512."""
+_BYTES_PER_PIXEL = 8
+_BYTES_PER_ROW, _HEADER_BYTES = 16, 2000
+FRAMES_AT_ONCE, _BYTES_AT_ONCE = 16, 2**27
+"""Enough frames for eight processors, or so many bytes: 4 frames of 2048 pixels."""
+
+
+def frames_at_once(pixels: int) -> int:
+    return max(1, min(FRAMES_AT_ONCE, _BYTES_AT_ONCE // (8 * pixels)))
+
+
+def frame_seconds(bench: Apparatus, shots: int) -> dict[str, float]:
+    pixels = shots * math.prod(bench.geometry.frame_shape)
+    return {"sensor": pixels * _EXPOSING_S, "write": pixels * _WRITING_S}
+
+
+def frames_bytes(classes: int, shots: int, pixels: float) -> float:
+    formed = frames_in_memory(classes, shots, pixels) * (pixels + GROUPS * (PROBES + 1))
+    return 8.0 * pixels * (formed + _EXPOSED * frames_at_once(round(pixels**2)) * pixels)
+
+
+def frames_cost(
+    bench: Apparatus, settings: Settings, lighting: Lighting, seconds: float = 0.0, on_disk: float = 0.0, lines: int = 1
+) -> Cost:
+    """Return memory, disk and time of a capture.
+
+    Measured runs take a third to all of the memory (tests/hard/test_memory.py). `on_disk` bytes of frames exist
+    already; frames of `lines` are formed one after another.
     """
-    row, direct = PASSES["direct"], pilot_result.sample_costs["direct"]
-    rate = (pilot_result.spread if settings.anchors > 1 else direct).noise.rate
-    ray = traced_for(pilot_result.forming.lines, pilot_result.forming.parted) * costs.ray
-    return ray * predicted_rays(direct.paths, float(row.whole(row.predicted_samples(settings))), rate)
+    (shots, classes), geometry = lighting.weights.shape, bench.geometry
+
+    def file_bytes(rows: int, pixels: int) -> float:
+        return float(_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
+
+    files = shots * file_bytes(geometry.frame_shape[0], math.prod(geometry.frame_shape)) + file_bytes(
+        bench.n, bench.n**2
+    )
+    held = light_bytes(bench, classes, settings, lines) + frames_bytes(classes, shots, geometry.frame_side)
+    return Cost(seconds=seconds, memory_bytes=held, disk_bytes=max(lines * files - on_disk, 0.0))
+
+
+def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int = 1) -> float:
+    """Return the memory of tracing and accumulating light by classes; the light of each of `lines` is held."""
+    held = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
+    paths = Simulation(bench, settings).paths_at_once
+    followed = bool(settings.effects & names(lambda effect: effect.followed))
+    geometry, cells = bench.geometry, bench.n * settings.subdivision * settings.anchors
+    terms = geometry.mask_terms if geometry.mask_terms > FEW else 0
+    factors = _TERM_BYTES * terms * max(geometry.frame_shape) * cells * len(settings.depths)
+    if settings.raster or geometry.is_drawn(geometry.diffracts):
+        drawn = raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells}), bench.waves)
+        # The largest terms of a drawn shadow: of all cells, and of the cells that a shot lights.
+        largest = 2 * min(SUMMED_BYTES, 8.0 * MOST_TERMS * cells * sum(geometry.frame_shape))
+        factors = max(0.0 if settings.raster else factors, drawn) + largest
+    held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * path_sample_bytes(settings)
+    return factors + _LAUNCH_BYTES + _FOLLOWED_BYTES * followed + held
+
+
+def path_sample_bytes(settings: Settings) -> float:
+    parts = min(len(settings.depths), 2) * (4 if settings.sharp else 1)
+    return max(_PATH_SAMPLE_BYTES, _PATH_BYTES + parts * _PART_BYTES)
+
+
+# -------- Drawing a mask's shadow on a raster
+
+_MEANS_S, _TURNED_S = 8e-8, 5e-7
+"""Time of a cell of a shadow without diffraction, of a straight and of a turned mask."""
+_POINT_S, _TERM_S = 9e-9, 8e-11
+_AROUND = 2.0
+_HELD, _AT_WORK, _BLOCK_BYTES = 10, 14, 1.2e8
+_FINER = (4 / 3, 2)
+_MOST_BYTES = 2.0**32
+"""Memory for more cells than the fewest: twice as many for 320 pixels along an axis, 4 / 3 for 512."""
+
+
+def cells_to_choose(geometry: CameraGeometry, spectrum: Spectrum | None) -> tuple[int, ...]:
+    """Return the raster cells for each pixel, fewest first, that a plan may choose."""
+    fewest = cells_per_pixel(geometry)
+
+    def holds(cells: int) -> bool:
+        return raster_bytes(geometry.model_copy(update={"mask_cells": cells}), spectrum) <= _MOST_BYTES
+
+    return fewest, *filter(holds, (math.ceil(by * fewest) for by in _FINER))
+
+
+def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
+    """Return the time of drawing the shadow of one depth; 0 if the mask is never drawn."""
+    mask = geometry.mask_plate
+    waves = spectrum is not None
+    if mask is None or not (geometry.is_drawn(waves) or geometry.may_be_drawn(waves)):
+        return 0.0
+    cells, turned = float(cells_a_side(geometry, spectrum)) ** 2, bool(mask.flaws.turn_deg)
+    if spectrum is None or mask.irradiance:
+        return cells * (_TURNED_S if turned else _MEANS_S)
+    seen = geometry.build_mask()
+    assert isinstance(seen, Plate)
+    step = geometry.pixel_pitch / cells_per_pixel(geometry)
+    points = (points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm)
+    each = _POINT_S + _TERM_S * seen.amplitude.most_terms
+    part = _AROUND if turned else seen.amplitude.uneven_part
+    return cells * part * each * sum(count**2 for count in points)
+
+
+def first_shadow(bench: Apparatus, switches: Mapping[str, bool]) -> Cost:
+    geometry = bench.geometry
+    waves = geometry.diffracts and switches.get("diffraction") is not False
+    if not geometry.is_drawn(waves):
+        return Cost()
+    spectrum = bench.waves if waves else None
+    return Cost(drawing_seconds(geometry, spectrum), raster_bytes(geometry, spectrum))
+
+
+def raster_bytes(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
+    return 8.0 * (_HELD + _AT_WORK) * cells_a_side(geometry, spectrum) ** 2 + _BLOCK_BYTES

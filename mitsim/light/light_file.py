@@ -17,8 +17,8 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import PACKED, FloatArray, checked_hdf5, hdf5_errors, whole_hdf5
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import parse_json
-from mitsim.light.grids import GRIDS, Grid, LightEstimate
 from mitsim.light.light import SampledLight
+from mitsim.light.passes import GRIDS, Grid, LightEstimate
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS
 from mitsim.light.simulation import Simulation

@@ -17,15 +17,13 @@ from scipy import sparse
 from mitsim.bench.effects import Physics
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.devices.patterns import Lighting
-from mitsim.light.grids import GRIDS, LightEstimate
-from mitsim.light.passes import PASSES, Pass, PassTracer, Tracers
+from mitsim.light.passes import GRIDS, PASSES, LightEstimate, Pass, PassTracer, Tracers
 from mitsim.light.settings import PATHS_AT_ONCE
 from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
-from mitsim.transport.accumulator import DeviceAccumulator, DeviceSums
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.records import DIRECT, INDIRECT, Bundle, PathSamples
+from mitsim.transport.records import DIRECT, INDIRECT, Bundle, DeviceAccumulator, DeviceSums, PathSamples
 
 _FEWEST_AT_ONCE = 2**18
 

@@ -52,7 +52,7 @@ _POINTS_PER_FRESNEL_LENGTH = 80
 _MOST_WAVE_POINTS = 1 << 16
 """Largest number of points per side: 4e9 points take a minute per line."""
 _MOST_WAVE_TERMS = 2.0**39
-"""Largest number of points times terms: 40 processor seconds per line, at 8e-11 s each (mitsim.light.memory)."""
+"""Largest number of points times terms: 40 processor seconds per line, at 8e-11 s each (mitsim.light.cost_model)."""
 _LEAST_WAVE_POINTS = 2
 """Least number of points along a cell."""
 _GRID_CELLS = 3

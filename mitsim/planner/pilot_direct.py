@@ -21,8 +21,8 @@ from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.grids import Grid
-from mitsim.light.memory import cells_to_choose, drawing_seconds
+from mitsim.light.cost_model import cells_to_choose, drawing_seconds
+from mitsim.light.passes import Grid
 from mitsim.light.settings import (
     REPLICATES,
     Approximation,
@@ -165,7 +165,7 @@ class Sample:
     def simulation(
         self, bench: Apparatus, settings: Settings, one_line: bool = False, judging_cells: int = 0
     ) -> Simulation:
-        """Make a simulation whose frames are formed at the sample's pixels (:class:`mitsim.light.grids.Grids`)."""
+        """Make a simulation whose frames are formed at the sample's pixels (:class:`mitsim.light.passes.Grids`)."""
         made = Simulation(bench, settings, one_line=one_line, places=self.places, judging_cells=judging_cells)
         made.divides = False
         return made

@@ -30,12 +30,12 @@ from mitsim.light.cost_model import (
     accumulation_seconds,
     checking_seconds,
     entries,
+    frame_seconds,
     in_waves,
     optics_seconds,
     tracing_seconds,
     truth_seconds,
 )
-from mitsim.light.memory import frame_seconds
 from mitsim.light.passes import FOLLOWED
 from mitsim.light.plan import Plan, PlanRow, State
 from mitsim.light.settings import (

@@ -38,11 +38,10 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import PatternFamily, read_name
-from mitsim.light.light import SampledLight, Sampling, Target, trace_light, traced_again
-from mitsim.light.memory import frame_seconds
+from mitsim.light.cost_model import frame_seconds
+from mitsim.light.light import SampledLight, Sampling, Target, first_samples, trace_light, traced_again
 from mitsim.light.passes import PASSES
 from mitsim.light.plan import Plan
-from mitsim.light.sampling import first_samples
 from mitsim.light.settings import (
     COUNTED,
     GROUPS,

@@ -38,19 +38,17 @@ from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.grids import LightEstimate
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.passes import FOLLOWED, PASSES
+from mitsim.light.passes import FOLLOWED, PASSES, LightEstimate
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, TracedPass, expected_of
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.scene.window import straightening
-from mitsim.transport.accumulator import DeviceAccumulator, DeviceSums
 from mitsim.transport.integrator import ANY, FollowingTracer
 from mitsim.transport.plugins.base import rows_columns, turn_and_origin
 from mitsim.transport.projector import CanvasMap
-from mitsim.transport.records import DIRECT, PathSamples
+from mitsim.transport.records import DIRECT, DeviceAccumulator, DeviceSums, PathSamples
 
 FALLOFF, DIFFRACTION, KEYSTONE, DEPTH, OCCLUSION, DETAIL, INTERREFLECTION, MIRRORS = (
     "falloff", "diffraction", "keystone", "depth", "occlusion", "detail", "interreflection", "mirrors",

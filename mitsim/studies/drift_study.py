@@ -23,8 +23,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitsim.acquire.capture import trace_request
-from mitsim.acquire.drifting import DriftedExposer, drift_mask, drift_projector, levels, warmer
-from mitsim.acquire.exposure import ambient_shots, takes_ambient_frame
+from mitsim.acquire.exposure import (
+    DriftedExposer,
+    ambient_shots,
+    drift_mask,
+    drift_projector,
+    levels,
+    takes_ambient_frame,
+    warmer,
+)
 from mitsim.bench.apparatus import Apparatus
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray

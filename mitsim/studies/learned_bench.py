@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsim.acquire.drifting import drift_mask
-from mitsim.acquire.exposure import taken_off
+from mitsim.acquire.exposure import drift_mask, taken_off
 from mitsim.core.arrays import FloatArray, read_npz
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError

@@ -17,11 +17,10 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.devices.projector import Lines
-from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import OpticalSetup, Reception, SensorPoints, landing, sample_wavelengths
 from mitsim.transport.integrator import PATHS_PER_LAUNCH, InFlight, Tracer
 from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, split_by_line, streams
-from mitsim.transport.records import DIRECT, PathSamples, Sightings, check_finite
+from mitsim.transport.records import DIRECT, DeviceAccumulator, PathSamples, Sightings, check_finite
 from mitsim.transport.transmission import Arrival
 
 IntArray = npt.NDArray[np.int64]

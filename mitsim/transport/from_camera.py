@@ -26,7 +26,6 @@ import numpy as np
 
 from mitsim.core.manifests import MOST_LINES
 from mitsim.devices.projector import SPECTRA_NM, Band, Response
-from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Connection, OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
@@ -44,7 +43,7 @@ from mitsim.transport.integrator import (
     tilt,
 )
 from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, streams, x_y
-from mitsim.transport.records import CellAxis, CellGrid, PathSamples, Sightings
+from mitsim.transport.records import CellAxis, CellGrid, DeviceAccumulator, PathSamples, Sightings
 from mitsim.transport.transmission import refracted_way
 
 _SELDOM = 0.125
@@ -179,13 +178,11 @@ class CameraPaths(PathIntegrator[State]):
         Light over mirrors alone belongs to the beams (:mod:`mitsim.transport.specular`); light over one other surface,
         unless seen in a mirror, to the projector's side.
         """
-        hit = self.connector.hit(paths.ray, si.t, paths.rng, self._is_foreign(paths), paths.since)
+        foreign = paths.active & (paths.scattered > dr.select(paths.in_mirror, mi.UInt32(0), mi.UInt32(1)))
+        hit = self.connector.hit(paths.ray, si.t, paths.rng, foreign, paths.since)
         share = dr.select(paths.by_delta, 1, _share(paths.came_pdf, hit.pdf))
         light = self._irradiance(paths, hit.radiance) * share * self._part(paths, paths.kept)
         self._keep_projector(paths, hit.met, light, hit.pixel, paths.scattered)
-
-    def _is_foreign(self, paths: State) -> mi.Bool:
-        return paths.active & (paths.scattered > dr.select(paths.in_mirror, mi.UInt32(0), mi.UInt32(1)))
 
     def _hit_lamp(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
         emitter = si.emitter(self.scene, paths.active)

@@ -23,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
-from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints, Way, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
@@ -36,7 +35,7 @@ from mitsim.transport.integrator import (
     tilt,
 )
 from mitsim.transport.plugins.base import sobol_point, streams
-from mitsim.transport.records import PathSamples, Sightings
+from mitsim.transport.records import DeviceAccumulator, PathSamples, Sightings
 
 _ROOMS = (4**2, 12**2)
 

@@ -22,12 +22,11 @@ from mitsim.core.environment import keep_scenes
 from mitsim.core.job import compiled_kernels
 from mitsim.scene.load import holds_hair
 from mitsim.transport.connect import OpticalSetup, SensorPoints
-from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
+from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, DeviceAccumulator, PathSamples
 
 if TYPE_CHECKING:
     from typing import Self
 
-    from mitsim.transport.accumulator import DeviceAccumulator
     from mitsim.transport.projector import ProjectorOptics
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})

@@ -102,14 +102,12 @@ def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int)
 
     lost, met = (found.where(found.kind == kind) for kind in (INDIRECT, DIRECT))
     # A lens of 1 mm^2; one of half the radius is met a quarter as often, and four times as bright.
-    (mirrors, hits), lobes = (
-        _equal_hits(by_shape(each, each.value), by_shape(each, each.value * each.row)) for each in (lost, met)
-    )
-    return LeftOut(mirrors, hits * math.pi * setup.projector.aperture**2, *lobes)
-
-
-def _equal_hits(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return light, np.divide(np.square(light), moments, out=np.zeros(len(light)), where=light > 0)
+    parts = list[FloatArray]()
+    for each in (lost, met):
+        light, moments = by_shape(each, each.value), by_shape(each, each.value * each.row)
+        parts += light, np.divide(np.square(light), moments, out=np.zeros(len(light)), where=light > 0)
+    parts[1] = parts[1] * math.pi * setup.projector.aperture**2
+    return LeftOut(*parts)
 
 
 @dataclass
@@ -466,7 +464,11 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
         others = _Connections(setup, 1, spread=True).over(least, sharp=False)
         count = max(1, _CONNECTIONS // paths_per_sample)
         rest = float(others.trace(seed, 0, count).value.sum()) / count
-    width = _quantile(found.widths, found.weights, _SHARPEST)
+    width = math.inf
+    if found.widths.size:
+        order = np.argsort(found.widths)
+        sums = np.cumsum(found.weights[order])
+        width = float(found.widths[order][np.searchsorted(sums, _SHARPEST * sums[-1])])
     return SharpLight(total, found.error, hits, found.by_pixel, found.moments, width, rest)
 
 
@@ -481,12 +483,6 @@ def _broad_light(setup: OpticalSetup, least: mi.Float, seed: int, width: float) 
     error = math.sqrt(max(moment - float(np.square(by_pixel).sum()), 0.0) / count)
     hits = total**2 / moment if moment else 0.0
     return SharpLight(total, error, hits, by_pixel, moments, width, float(others.value.sum()) / count)
-
-
-def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
-    order = np.argsort(values)
-    sums = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(sums, part * sums[-1])]) if values.size else math.inf
 
 
 def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:

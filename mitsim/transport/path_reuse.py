@@ -32,12 +32,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Way
 from mitsim.transport.indirect import MEMBERS, SIDE, Emission, IndirectTracer, ProjectorPaths, blocks_of
 from mitsim.transport.integrator import InFlight, camera_part, matt_part, projector_part, shading_correction, tilt
 from mitsim.transport.plugins.base import generator, sobol_point, split_by_line
-from mitsim.transport.records import INDIRECT, PathSamples, Sightings, check_finite
+from mitsim.transport.records import INDIRECT, DeviceAccumulator, PathSamples, Sightings, check_finite
 
 if TYPE_CHECKING:
     ByLine = list[mi.Float]

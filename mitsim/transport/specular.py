@@ -117,19 +117,15 @@ def _search(
     order = np.argsort(place.ravel(), kind="stable")
     corner_of = place.ravel()[order]
     first, last = (np.searchsorted(corner_of, crossings.ray, side=side) for side in ("left", "right"))
-    touched = order[_ranges(first, last)] // 4
-    pairs = np.unique(np.repeat(number, last - first) * len(row) + touched)
+    counts = last - first
+    touched = order[np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts)] // 4
+    pairs = np.unique(np.repeat(number, counts) * len(row) + touched)
     chain, square = np.divmod(pairs, len(row))
     nodes = _nodes(crossings, chains[chain], place[square])
     spread = _spread(nodes, np.full((len(square), 2), np.inf))
     chosen = _near(nodes, spread, geometry)
     square, chain = square[chosen], chain[chosen]
     return _refine(tracer, (chains[chain], row[square], column[square], spread[chosen]), size, n, geometry)
-
-
-def _ranges(first: IntArray, last: IntArray) -> IntArray:
-    counts = last - first
-    return np.asarray(np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts))
 
 
 # -------- Nodes: what is known at points of the lattice
@@ -195,8 +191,9 @@ def _refine(
     pitch, stands_for, turn = min(geometry.pitches), np.ones(len(row), np.int64), 0
     while len(row):
         half = size // 2
-        nodes = _nodes_of(tracer, chain, row, column, half)
-        extent = _extent(nodes)
+        crossings, place = _trace_squares(tracer, row, column, half * np.arange(3))
+        nodes = _nodes(crossings, chain, place)
+        extent = _size(*_box(nodes.valid, nodes.sensor))
         whole = nodes.valid.all(axis=(1, 2))
         smooth = (_departure(nodes.sensor) < _TOLERANCE * pitch) & (extent < geometry.half_width)
         even = _departure(nodes.throughput[..., None]) <= _SHADES * nodes.throughput.max(axis=(1, 2))
@@ -299,11 +296,6 @@ def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGe
     return _Points(Beams(pixel[square], light[square, i, j], sensor, tangent, whole, 0.0), square)
 
 
-def _nodes_of(tracer: SpecularRays, chain: Chains, row: IntArray, column: IntArray, half: int) -> _Nodes:
-    crossings, place = _trace_squares(tracer, row, column, half * np.arange(3))
-    return _nodes(crossings, chain, place)
-
-
 def _box(valid: Mask, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     low, high = (np.where(valid[..., None], values, limit) for limit in (np.inf, -np.inf))
     return low.min(axis=(1, 2)), high.max(axis=(1, 2))
@@ -311,10 +303,6 @@ def _box(valid: Mask, values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _size(low: FloatArray, high: FloatArray) -> FloatArray:
     return np.asarray(np.where(np.isfinite(low), high - low, 0).max(axis=-1))
-
-
-def _extent(nodes: _Nodes) -> FloatArray:
-    return _size(*_box(nodes.valid, nodes.sensor))
 
 
 def _spread(nodes: _Nodes, before: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.transport.plugins.base import channels, device_vectors, host_values, rows_columns, turn_and_origin, vectors
+from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 from mitsim.transport.transmission import CLEAR, flat_panes, transmits
 
@@ -131,7 +131,9 @@ class SpecularRays:
         )
         crossings = []
         for _ in range(self._max_depth + 1):
-            si = self._intersect(rays)
+            ray = mi.Ray3f(mi.Point3f(*device_vectors(rays.start)), mi.Vector3f(*device_vectors(rays.direction)))
+            si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
+            dr.eval(si)
             distance = np.where(host_values(si.is_valid(), len(rays.index)), host_values(si.t, len(rays.index)), np.inf)
             distance = distance + np.linalg.norm(rays.start - rays.origin, axis=1)
             crossing, arrived = self._cross(rays, distance)
@@ -146,12 +148,6 @@ class SpecularRays:
             rays = join(onward)
         return join(crossings)
 
-    def _intersect(self, rays: Rays) -> mi.SurfaceInteraction3f:
-        ray = mi.Ray3f(mi.Point3f(*device_vectors(rays.start)), mi.Vector3f(*device_vectors(rays.direction)))
-        si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
-        dr.eval(si)
-        return si
-
     def _cross(self, rays: Rays, distance: FloatArray) -> tuple[Crossings, Mask]:
         origin = (rays.origin - self.camera_place) @ self._camera_turn
         direction = rays.direction @ self._camera_turn
@@ -163,8 +159,8 @@ class SpecularRays:
         crossing = Crossings(
             rays.index[arrived],
             rays.chain[arrived],
-            _rows_columns(o + d * r),
-            _rows_columns(d / d[:, 2:]),
+            -(o + d * r)[:, 1::-1],  # rows and columns
+            -(d / d[:, 2:])[:, 1::-1],
             rays.spectrum[arrived] @ self.colour,
         )
         return crossing, arrived
@@ -267,10 +263,6 @@ def _redirect(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: Fl
     return np.asarray(np.where((kind & int(mi.BSDFFlags.DeltaReflection))[:, None] != 0, reflected, polished))
 
 
-def _rows_columns(points: FloatArray) -> FloatArray:
-    return np.stack(rows_columns(points[:, 0], points[:, 1]), axis=1)
-
-
 # -------- Curved mirrors in double precision
 #
 # A float32 place at 400 mm is good to 3e-5 mm. On a mirror ball of 1 mm that turns the normal by 3e-5, and the light by
@@ -363,7 +355,8 @@ class _Mesh:
         return cls(*(np.array(values, dtype=np.float64).reshape(-1, 3)[corners] for values in of_vertices))
 
     def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
-        corner, along, across = _edges(self.places[face])
+        corner, *others = np.moveaxis(self.places[face], 1, 0)
+        along, across = (other - corner for other in others)
         geometric = np.cross(along, across)
         scale = (direction * geometric).sum(axis=1)
         offset = origin - corner
@@ -377,10 +370,6 @@ class _Mesh:
         geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
         geometric *= np.sign((geometric * hits.geometric).sum(axis=1))[:, None]
         return Hits(corner + along * b[:, None] + across * c[:, None], geometric, normal)
-
-
-def _edges(triangles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
 
 
 # -------- Balls of glass, whose light comes from close to their rim

@@ -17,7 +17,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from mitsim.api.bench import open_bench
-from mitsim.light.memory import frames_cost
+from mitsim.light.cost_model import frames_cost
 from mitsim.core.configuration import shipped_path
 
 def used():

@@ -22,7 +22,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core import parallel
 from mitsim.core.configuration import shipped_path
 from mitsim.core.exr import read_frame
-from mitsim.light import sampling
+from mitsim.light import light
 from mitsim.light.light import trace_light
 from mitsim.light.settings import GROUPS, REPLICATES, Approximation, ErrorCovariance, Settings
 from mitsim.optics import forming
@@ -226,8 +226,8 @@ def test_light_does_not_depend_on_how_many_paths_are_held_at_once(
     monkeypatch.setattr(
         DirectTracer, "trace", lambda self, seed, first, count: counts.append(count) or trace(self, seed, first, count)
     )
-    for paths_per_sample, at_once in ((sampling.PATHS_AT_ONCE, 16), (sampling.PATHS_AT_ONCE, 16), (3 * bench.n**2, 3)):
-        monkeypatch.setattr(sampling, "PATHS_AT_ONCE", paths_per_sample)
+    for paths_per_sample, at_once in ((light.PATHS_AT_ONCE, 16), (light.PATHS_AT_ONCE, 16), (3 * bench.n**2, 3)):
+        monkeypatch.setattr(light, "PATHS_AT_ONCE", paths_per_sample)
         one = trace_light(bench, plan, lighting, 3)
         found.append(np.stack([frame.irradiance for frame in one.frames(lighting, 3)]))
         assert max(counts) == at_once and sum(counts) == 16 * GROUPS

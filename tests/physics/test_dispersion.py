@@ -22,13 +22,12 @@ from mitsim.acquire.spectral import SpectralBench, line_alone, lit_by_lamps
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import RUN
-from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.direct import DirectTracer, FluxTracer
 from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
-from mitsim.transport.records import Bundle, PathSamples, aligned_grid
+from mitsim.transport.records import Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from mitsim.transport.specular import trace_specular_chains
 from tests.conftest import write_small_scene
 

@@ -24,7 +24,7 @@ from mitsim.devices.mask import Flaws
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
-from mitsim.light.memory import cells_to_choose
+from mitsim.light.cost_model import cells_to_choose
 from mitsim.optics import fft_shadow as rasters
 from mitsim.optics import image_formation
 from mitsim.optics.diffraction import grid_step

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from mitsim.acquire import choose_colour as bands
+from mitsim.acquire import spectral as bands
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError

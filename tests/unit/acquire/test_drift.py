@@ -10,8 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from mitsim.acquire.drifting import DriftedExposer, drift_mask, levels, warmer
-from mitsim.acquire.exposure import AmbientFrame, Exposer, taken_off
+from mitsim.acquire.exposure import AmbientFrame, DriftedExposer, Exposer, drift_mask, levels, taken_off, warmer
 from mitsim.api.bench import Bench
 from mitsim.calibrate.board_session import Session
 from mitsim.core.configuration import load_model, shipped_path

@@ -16,9 +16,9 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
-from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.light_file import write_light
+from mitsim.light.passes import GRIDS, LightEstimate
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings, SharpPixels
 from mitsim.light.simulation import Simulation

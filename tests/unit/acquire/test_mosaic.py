@@ -23,8 +23,8 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import CountedLamps, Response, Spectrum
 from mitsim.devices.sensor import EfficiencyCurve, MosaicCurves
 from mitsim.devices.session import load_recipe
-from mitsim.light.grids import Grid
 from mitsim.light.light import SampledLight
+from mitsim.light.passes import Grid
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.light.truth import Truth

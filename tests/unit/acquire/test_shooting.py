@@ -12,8 +12,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import Recorder
 from mitsim.devices.patterns import parse_patterns
-from mitsim.light import memory
-from mitsim.light.memory import frames_at_once, frames_bytes
+from mitsim.light import cost_model
+from mitsim.light.cost_model import frames_at_once, frames_bytes
 from mitsim.light.settings import GROUPS
 from mitsim.optics import frames as forming
 from tests.unit.acquire.test_exposer import PIXELS, exposer, frame
@@ -39,7 +39,7 @@ def test_shots_are_the_same_however_many_are_exposed_at_a_time(together: int, mo
     files not waited for; its sums left out.)"""
     one, other = Recorder(), Recorder()
     first = shot(one)
-    monkeypatch.setattr(memory, "FRAMES_AT_ONCE", together)
+    monkeypatch.setattr(cost_model, "FRAMES_AT_ONCE", together)
     second = shot(other)
     assert one.files.keys() == other.files.keys() and len(one.files) == 25
     for name, (channels, metadata) in one.files.items():
@@ -53,7 +53,7 @@ def test_shots_are_the_same_however_many_are_exposed_at_a_time(together: int, mo
 
 def test_a_file_that_cannot_be_written_ends_the_shooting(monkeypatch: pytest.MonkeyPatch) -> None:
     """In one line, whichever of the chunks it is in; frames that are not begun are not written either."""
-    monkeypatch.setattr(memory, "FRAMES_AT_ONCE", 4)
+    monkeypatch.setattr(cost_model, "FRAMES_AT_ONCE", 4)
     for bad in ("frame_00000.exr", "frame_00024.exr"):
 
         class Full(Recorder):
@@ -75,7 +75,7 @@ def test_frames_take_as_much_memory_as_is_predicted(mixed: bool, monkeypatch: py
     (Planted: chunks that are kept until all is written; frames formed 36 at a time, where 5 are predicted.)
     """
     pixels, shots = 200, 36
-    for room, count in ((forming, 5), (memory, 4)):
+    for room, count in ((forming, 5), (cost_model, 4)):
         monkeypatch.setattr(room, "_BYTES_AT_ONCE", count * 8 * pixels**2)
     classes, labels = (4, LABELS) if mixed else (12, SPLIT)
     if not mixed:

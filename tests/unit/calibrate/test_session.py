@@ -26,7 +26,7 @@ from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.session import SIDES, SessionRecipe, load_recipe
-from mitsim.light.memory import FRAMES_AT_ONCE, frame_seconds
+from mitsim.light.cost_model import FRAMES_AT_ONCE, frame_seconds
 from mitsim.light.plan import Plan
 from mitsim.light.settings import PATHS_AT_ONCE, Settings
 from mitsim.optics.frames import mixes
@@ -211,7 +211,7 @@ def test_memory_of_large_sensors_stays_below_four_gib(
     (Planted: all shots of a side held.)"""
     assert mixes(128, 128, pixels) == mixed
     large = SimpleNamespace(n=128, geometry=CameraGeometry(pixels=pixels))
-    monkeypatch.setattr("mitsim.light.memory.Simulation", lambda *_: SimpleNamespace(paths_at_once=PATHS_AT_ONCE))
+    monkeypatch.setattr("mitsim.light.cost_model.Simulation", lambda *_: SimpleNamespace(paths_at_once=PATHS_AT_ONCE))
     for n in (128, 512):
         large.n = n
         assert 5e8 < session_cost(large, n, Settings(400.0), 1.0).memory_bytes < 3.6 * 2**30

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.light.grids import LightEstimate
+from mitsim.light.passes import LightEstimate
 from mitsim.light.settings import Settings, SharpPixels
 from mitsim.light.simulation import Simulation
 

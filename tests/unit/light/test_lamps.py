@@ -27,7 +27,7 @@ from mitsim.bench.request import Request
 from mitsim.core.manifests import MOSAIC, RUN
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import SPECTRA_NM, CountedLamps, Response, Spectrum
-from mitsim.light.grids import Grid
+from mitsim.light.passes import Grid
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, expected_of

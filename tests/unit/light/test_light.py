@@ -19,8 +19,8 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.core.arrays import Labels
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting, parse_patterns
+from mitsim.light import cost_model
 from mitsim.light import light as module
-from mitsim.light import memory
 from mitsim.light.cost_model import FIXED
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.plan import Plan
@@ -348,8 +348,8 @@ def test_a_plan_of_several_lines_is_priced_for_all(
     monkeypatch.setattr(planner, "Candidates", Candidates)
     plan = planner.make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False), lines=3)
     assert seen == [3]
-    monkeypatch.setattr(memory, "workers", lambda: 1)  # files one line at a time
-    one, three = (memory.frames_cost(bench, plan.settings, family, lines=count) for count in (1, 3))
+    monkeypatch.setattr(cost_model, "workers", lambda: 1)  # files one line at a time
+    one, three = (cost_model.frames_cost(bench, plan.settings, family, lines=count) for count in (1, 3))
     assert three.disk_bytes == 3 * one.disk_bytes
     assert one.memory_bytes < three.memory_bytes < 2 * one.memory_bytes
 

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 import mitsim
-from mitsim.light.grids import GRIDS
-from mitsim.light.passes import PASSES, table_of
+from mitsim.light.passes import GRIDS, PASSES, table_of
 from mitsim.light.settings import Settings
 from tests.exchanged import frame_of
 
@@ -29,7 +28,7 @@ import mitsim as ms
 from mitsim.light.cost_model import FIXED, tracing_seconds
 from mitsim.light.light import trace_light
 from mitsim.light.light_file import write_light
-from mitsim.light.sampling import next_samples
+from mitsim.light.light import next_samples
 from mitsim.planner import pilot
 assert pathlib.Path(ms.__file__).parents[1] == pathlib.Path.cwd(), ms.__file__
 scene, folder = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.light.cost_model import FIXED, SHARED_COST
+from mitsim.light.light import Group, SampledPass, cheapest_samples, first_samples, next_samples, trace_groups
 from mitsim.light.passes import EVEN, even
-from mitsim.light.sampling import Group, SampledPass, cheapest_samples, first_samples, next_samples, trace_groups
 from mitsim.transport.path_reuse import PathReuseTracer
 
 LIGHTS = (

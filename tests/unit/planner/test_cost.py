@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.light.cost_model import Numbers, entries
-from mitsim.light.memory import light_bytes, path_sample_bytes
-from mitsim.light.sampling import Group, trace_groups
+from mitsim.light.cost_model import Numbers, entries, light_bytes, path_sample_bytes
+from mitsim.light.light import Group, trace_groups
 from mitsim.light.settings import GROUPS, PATHS_AT_ONCE, Settings, SharpPixels
 from mitsim.light.simulation import Simulation
 from mitsim.transport.records import DIRECT, Bundle, CellAxis, CellGrid, PathSamples
@@ -70,7 +69,7 @@ def test_light_of_each_line_is_held(
     shared_scene: Callable[..., Path], variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three lines' entries, at 45 bytes each; one worker accumulates one line after the other. (Planted: of one.)"""
-    monkeypatch.setattr("mitsim.light.memory.workers", lambda: 1)
+    monkeypatch.setattr("mitsim.light.cost_model.workers", lambda: 1)
     bench, settings = open_bench(shared_scene("light"), variant), Settings(depth=400.0, samples={"direct": 9.0})
     one, three = (light_bytes(bench, bench.n**2, settings, lines) for lines in (1, 3))
     held = float(entries(bench.n**2, bench.n**2, Numbers.of(settings), settings))

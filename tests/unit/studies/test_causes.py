@@ -9,8 +9,8 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.arrays import FloatArray
-from mitsim.light.grids import GRIDS
 from mitsim.light.light import SampledLight, traced_again
+from mitsim.light.passes import GRIDS
 from mitsim.light.settings import SharpPixels
 from mitsim.light.simulation import Simulation
 from mitsim.report import IDEALISED

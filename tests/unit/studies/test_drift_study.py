@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from mitsim.acquire.drifting import drift_mask, drift_projector
+from mitsim.acquire.exposure import drift_mask, drift_projector
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe

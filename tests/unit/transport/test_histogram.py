@@ -178,7 +178,7 @@ def test_small_light_beside_great_light_is_counted() -> None:
     """4096 paths of 1 beside one of 2^24, where float32 has steps of 2: what is fetched and accumulated is exact."""
     import mitsuba as mi
 
-    from mitsim.transport.accumulator import DeviceAccumulator
+    from mitsim.transport.records import DeviceAccumulator
 
     light = np.ones(4097, np.float32)
     light[0] = 2.0**24
@@ -205,7 +205,7 @@ def test_accumulators_of_several_lines_are_fetched_together() -> None:
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError
-    from mitsim.transport.accumulator import DeviceAccumulator
+    from mitsim.transport.records import DeviceAccumulator
 
     found, alone = path_samples(inside=False), bundle(anchors=1)
     pixel = np.minimum(found.pixel, PIXELS - 1).astype(np.uint32)

@@ -16,11 +16,10 @@ import pytest
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.manifests import RUN
-from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
-from mitsim.transport.records import DIRECT, INDIRECT, Bundle, PathSamples, aligned_grid
+from mitsim.transport.records import DIRECT, INDIRECT, Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from tests.conftest import write_small_scene
 from tests.unit.transport.test_indirect import CORNER, MIRROR, N
 from tests.unit.transport.test_path_reuse import WALL

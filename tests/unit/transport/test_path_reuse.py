@@ -16,13 +16,12 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport import integrator
-from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
-from mitsim.transport.records import INDIRECT, Bundle, PathSamples, aligned_grid
+from mitsim.transport.records import INDIRECT, Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import seen
 from tests.unit.transport.test_indirect import MATT, MIRROR, SHINY, SPHERE
 
@@ -262,7 +261,7 @@ import hashlib, sys, drjit as dr, numpy as np
 from mitsim.api.bench import open_bench
 from mitsim.transport.records import aligned_grid
 from mitsim.transport.records import Bundle
-from mitsim.transport.accumulator import DeviceAccumulator
+from mitsim.transport.records import DeviceAccumulator
 from tests.unit.transport.test_path_reuse import tracers
 bench = open_bench(sys.argv[1])
 dr.set_thread_count(int(sys.argv[2]))
