@@ -15,16 +15,8 @@ from typing import Annotated, Any, ClassVar, Literal, ParamSpec, TypeVar, get_ar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from mitsim.core.errors import (
-    ArgumentError,
-    MitsimError,
-    check_arguments,
-    cut,
-    is_path,
-    near_name,
-    plain_number,
-    short_text,
-)
+from mitsim.core import errors
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut, near_name, short_text
 from mitsim.core.files import BYTE_ORDER_MARK, read_json, read_text
 
 if sys.version_info >= (3, 11):
@@ -421,7 +413,7 @@ def validated_by(check: Callable[[Any], Any]) -> AfterValidator:
 
 
 def _can_be_path(value: Path | str) -> Path | str:
-    if not is_path(value):
+    if not errors.is_path(value):
         raise ValueError("a path")
     return value
 
@@ -448,7 +440,7 @@ class Options(BaseModel):
 
     def __init__(self, **values: Any) -> None:
         try:
-            super().__init__(**{name: plain_number(value) for name, value in values.items()})
+            super().__init__(**{name: errors.plain_number(value) for name, value in values.items()})
         except ValidationError as error:
             first, *others = self._refusals(error)
             first.others = tuple(others)

@@ -27,18 +27,10 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
+from mitsim.core import files
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, cut, is_path, reason_of
-from mitsim.core.files import (
-    FRAME_LIMITS,
-    MOST_SIDE,
-    check_plain,
-    fits_a_frame,
-    parse_json,
-    resolve,
-    stderr_silenced,
-    whole_file,
-)
+from mitsim.core.files import check_plain, parse_json, resolve, stderr_silenced, whole_file
 
 Value = str | int | float
 Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
@@ -105,8 +97,8 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
     check_plain(path, "frame")
     try:
         header = read_header(path)
-        if not fits_a_frame((header.height, header.width)):
-            raise ValueError(f"claims {header.width}x{header.height} pixels; {FRAME_LIMITS} are read")
+        if not files.fits_a_frame((header.height, header.width)):
+            raise ValueError(f"claims {header.width}x{header.height} pixels; {files.FRAME_LIMITS} are read")
         # OpenEXR prints a warning to stdout for pixels it cannot read, where --json promises JSON alone, and its C++
         # part one to stderr, past Python; it raises later on. The lock keeps two threads from restoring each other's
         # streams.
@@ -275,8 +267,8 @@ def read_header(path: Path) -> ExrHeader:
     window, shown = ([int(edge) for edge in np.ravel(header[name])] for name in ("dataWindow", "displayWindow"))
     left, top, right, bottom = window
     width, height, channels = right - left + 1, bottom - top + 1, header["channels"]
-    if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
-        raise ValueError(f"claims {width}x{height} pixels; 1 to {MOST_SIDE} a side are allowed")
+    if not (0 < width <= files.MOST_SIDE and 0 < height <= files.MOST_SIDE):
+        raise ValueError(f"claims {width}x{height} pixels; 1 to {files.MOST_SIDE} a side are allowed")
     if (left, top) != (0, 0) or window != shown:
         raise ValueError(
             f"has the data window {window} and the display window {shown}; save it with equal ones from 0, 0"

@@ -13,17 +13,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    FailFast,
-    Field,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)  # fmt: skip
+import pydantic
+from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, field_validator, model_validator
 
 from mitsim.core.configuration import LARGEST, NonNegative, Positive, validate
 from mitsim.core.errors import ArgumentError, MitsimError, cut
@@ -59,7 +50,7 @@ FARTHEST = 1e10
 """The largest `scene_distance` [mm]."""
 Distance = Annotated[float, Field(gt=0, le=FARTHEST, allow_inf_nan=False)]
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
-Plain = Annotated[dict[str, Any], BeforeValidator(plain)]
+Plain = Annotated[dict[str, Any], pydantic.BeforeValidator(plain)]
 """A part that others than the solver read, as JSON holds it."""
 
 
@@ -81,7 +72,7 @@ class _Part(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _of_0_3_0(cls, data: Any, info: ValidationInfo) -> Any:
+    def _of_0_3_0(cls, data: Any, info: pydantic.ValidationInfo) -> Any:
         """Where no format was stated, as in version 0.3.0, unknown fields are others' and left alone."""
         if info.context == _UNVERSIONED and isinstance(data, dict):
             return {name: value for name, value in data.items() if name in cls.model_fields}

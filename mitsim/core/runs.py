@@ -16,25 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
+from mitsim.core import manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder, remove_page
 from mitsim.core.images import card, from_above, normalise, span
-from mitsim.core.manifests import (
-    MANIFEST,
-    MOSAIC,
-    ClosingKind,
-    Digital,
-    MosaicManifest,
-    RunHead,
-    RunManifest,
-    read_colours,
-    read_head,
-    read_manifest,
-    write_colours,
-    write_manifest,
-)
+from mitsim.core.manifests import MANIFEST, ClosingKind, Digital, MosaicManifest, RunHead, RunManifest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -359,7 +347,7 @@ class Capture:
 @check_arguments
 def load_run(folder: Path | str) -> Capture:
     """Return the capture in the RUN folder ``folder``. MitsimError when it is not a complete one."""
-    return Capture(read_manifest(Path(folder), RunManifest), Path(folder))
+    return Capture(manifests.read_manifest(Path(folder), RunManifest), Path(folder))
 
 
 def _common_factor(dn: FloatArray) -> int:
@@ -576,7 +564,7 @@ class MosaicCapture:
                 channels = {"reflectance": truth.reflectance, "standard_error": truth.standard_error}
                 single = {key: values.astype(np.float32) for key, values in channels.items()}
                 write_frame(place / TRUTH, single, {"board_reflectance": truth.board})
-        write_colours(folder, self.manifest)
+        manifests.write_colours(folder, self.manifest)
 
     def summary(self) -> dict[str, Any]:
         """What the command line reports: the keys of a capture, and of colour.json."""
@@ -593,7 +581,7 @@ class MosaicCapture:
 def load_mosaic(folder: Path | str) -> MosaicCapture:
     """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
     folder = Path(folder)
-    manifest = cast("MosaicManifest", read_colours(folder, MOSAIC))
+    manifest = cast("MosaicManifest", manifests.read_colours(folder, manifests.MOSAIC))
     truths = {}
     for name in manifest.names:
         if (path := folder / name / TRUTH).is_file():
@@ -686,7 +674,7 @@ class RunFolder(Recorder):
         remove_page(self.folder)
         configuration, digest = self.head.configuration, self.head.configuration_sha256
         head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
-        write_manifest(self.folder, head)
+        manifests.write_manifest(self.folder, head)
 
     def keeps(self, index: int) -> bool:
         """Return True if shot number ``index`` is there already; it then counts as written."""
@@ -719,7 +707,7 @@ class RunFolder(Recorder):
         """Write the ``manifest`` of the finished run, with checksums; return it."""
         checksums = dict(sorted(self._checksums.items()))
         manifest = manifest.model_copy(update={"status": "complete", "checksums": checksums})
-        write_manifest(self.folder, manifest)
+        manifests.write_manifest(self.folder, manifest)
         return manifest
 
     def _note(self, name: str, value: str) -> None:
@@ -757,7 +745,7 @@ def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
     known: Mapping[str, str] = {}
     again = resume and (path / MANIFEST).is_file()
     if again:
-        before = read_head(path)
+        before = manifests.read_head(path)
         if before.configuration_sha256 != head.configuration_sha256:
             changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
             raise MitsimError(
@@ -765,6 +753,6 @@ def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
                 "use the same options, or another folder"
             )
         if before.status == "complete":
-            known = read_manifest(path, RunManifest).checksums
+            known = manifests.read_manifest(path, RunManifest).checksums
     with output_folder(path, overwrite=again) as folder:
         yield RunFolder(folder, head, known)

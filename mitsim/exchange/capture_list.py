@@ -9,36 +9,12 @@ from typing import Any, Literal, TypedDict
 
 from pydantic import Field, model_validator
 
-from mitsim.core.configuration import (
-    CAMERA,
-    LIST,
-    QUALITY,
-    Configuration,
-    FilePath,
-    Options,
-    Positive,
-    locate,
-    option,
-    read_table,
-    shipped_names,
-    validate,
-)
+from mitsim.core import configuration, manifests
+from mitsim.core.configuration import Configuration, FilePath, Options, Positive, option, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import ALL, BARE, CORRECTIONS, Crop, Preparation, Raw, Wanted, check_channel, image_files
-from mitsim.core.manifests import (
-    CALIBRATION,
-    MOST_PIXELS,
-    RUN,
-    CalibrationManifest,
-    ClosingKind,
-    ColourManifest,
-    Digital,
-    check_lines,
-    lines_of_planes,
-    read_colours,
-    read_manifest,
-)
+from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, ColourManifest, Digital
 from mitsim.core.seeds import check_root
 from mitsim.devices.framelist import Identity
 from mitsim.devices.patterns import read_name, takes_seed
@@ -108,8 +84,8 @@ def load_capture_list(name: Path | str) -> CaptureList:
 
     MitsimError when there is none, or it breaks a rule.
     """
-    path = locate(name, "calibration", ".toml", LIST)
-    data = read_table(path, "list")
+    path = configuration.locate(name, "calibration", ".toml", configuration.LIST)
+    data = configuration.read_table(path, "list")
     for name_of_field, kind in _OTHERS.items():
         if name_of_field in data:
             raise MitsimError(f"list {path}: is {kind}")
@@ -195,7 +171,7 @@ class RealCapture:
     def colours(self) -> ColourManifest | None:
         """All planes as lines of a coloured folder; None of a single plane, or a picture that is no mosaic."""
         prepare = self.listed.prepare
-        return lines_of_planes(RUN, prepare.wavelengths_nm) if prepare.channel == ALL else None
+        return manifests.lines_of_planes(manifests.RUN, prepare.wavelengths_nm) if prepare.channel == ALL else None
 
     def electronics(self) -> tuple[Electronics, Preparation]:
         """Return the camera, by its file or the list; and what is done to its numbers, with its mosaic.
@@ -207,7 +183,7 @@ class RealCapture:
         if self.camera is not None:
             if self.exposure_s is None:
                 raise ArgumentError("exposure", "is not given, and frames do not say it; give it")
-            sensor = load_sensor(locate(self.camera, "calibration", ".toml", CAMERA))
+            sensor = load_sensor(configuration.locate(self.camera, "calibration", ".toml", configuration.CAMERA))
             digital, name, largest = digital_of(sensor, check_exposure(self.exposure_s)), sensor.name, sensor.largest_dn
             if prepare.mosaic is None and prepare.channel is not None and sensor.mosaic is not None:
                 prepare = prepare.model_copy(update={"mosaic": sensor.mosaic})
@@ -257,10 +233,10 @@ class RealCapture:
         """Raise MitsimError for a calibration that is none, of other lines, or that keeps means that the list takes."""
         colours = self.colours
         if colours is not None:
-            read_colours(folder, CALIBRATION)
-            check_lines(colours, "channel all", folder)
+            manifests.read_colours(folder, manifests.CALIBRATION)
+            manifests.check_lines(colours, "channel all", folder)
         for line in ("",) if colours is None else colours.names:
-            manifest, asked = read_manifest(folder / line, CalibrationManifest), self.listed.centre
+            manifest, asked = manifests.read_manifest(folder / line, CalibrationManifest), self.listed.centre
             if asked is not None and manifest.centre != asked:
                 raise MitsimError(
                     f"calibration {folder / line}: its centre is {str(manifest.centre).lower()}, and the list's "
@@ -279,7 +255,7 @@ class RealCapture:
 _OF_BARE = ("shape", "bits", "byte_order")
 """Options of files without a header alone."""
 _said = partial(option, None)
-_LISTS, _CAMERAS = (partial(shipped_names, field) for field in (LIST, CAMERA))
+_LISTS, _CAMERAS = (partial(configuration.shipped_names, field) for field in (configuration.LIST, configuration.CAMERA))
 
 
 class FrameFacts(Options):
@@ -325,7 +301,7 @@ class FrameFacts(Options):
     crop: str | tuple[int, ...] | None = _said(
         "of frames: part that is taken in the end", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
     )
-    seed: int | None = _said("root of every random stream", panel=QUALITY)
+    seed: int | None = _said("root of every random stream", panel=configuration.QUALITY)
 
     def of(self, source: Path) -> RealCapture:
         """What is known of the frames at ``source``, checked before any is opened; MitsimError as

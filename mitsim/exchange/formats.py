@@ -13,19 +13,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-from mitsim.core.configuration import (
-    CAMERA,
-    DEVICES,
-    OUTPUT,
-    PROJECTOR,
-    QUALITY,
-    WHAT,
-    FilePath,
-    Options,
-    option,
-    shipped_names,
-    takes,
-)
+from mitsim.core import configuration
+from mitsim.core.configuration import FilePath, Options, option, takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
 from mitsim.core.imagelist import check_channel
@@ -69,21 +58,21 @@ def _function(name: str) -> Callable[..., Any]:
 class Exported(Options):
     """How a run is written."""
 
-    PANEL = OUTPUT
+    PANEL = configuration.OUTPUT
     VERB = "export"
 
     format: str = option(..., "hdf5, mat, torch or png", metavar="FORMAT")
     output: FilePath = option(..., "file to make; of png, a folder", "-o", "--output", metavar="FILE", kind=Path)
     calibration: FilePath | None = option(
-        None, "folder of `mitsim calibrate` that goes with it", metavar="CAL", panel=WHAT, kind=Path
+        None, "folder of `mitsim calibrate` that goes with it", metavar="CAL", panel=configuration.WHAT, kind=Path
     )
     overwrite: bool = option(False, "replace the file")
     projector: str | None = option(
         None,
         "projector: name or TOML file",
         metavar="NAME|FILE",
-        panel=DEVICES,
-        complete=partial(shipped_names, PROJECTOR),
+        panel=configuration.DEVICES,
+        complete=partial(configuration.shipped_names, configuration.PROJECTOR),
     )
 
 
@@ -308,28 +297,28 @@ STRIPES = "stripes"
 class Pictures(Options):
     """A projector that patterns are drawn for, its last picture, and what stripes need beside them."""
 
-    PANEL = DEVICES
+    PANEL = configuration.DEVICES
     VERB = "pattern_pictures"
 
     projector: FilePath = option(
         "mp_cl1",
         "projector of known rows and columns: name or TOML file",
         metavar="NAME|FILE",
-        complete=partial(shipped_names, PROJECTOR),
+        complete=partial(configuration.shipped_names, configuration.PROJECTOR),
     )
     projector_pixels: int = option(128, "projector pixels a side of the patterns", min=1, max=MOST_PIXELS, metavar="N")
-    seed: int | None = option(None, "root of every random stream", panel=QUALITY)
+    seed: int | None = option(None, "root of every random stream", panel=configuration.QUALITY)
     closing_frame: Literal["first", "uniform"] | None = option(
         None,
         "last picture, to check lamp, camera and scene: the first one again, or a uniform one",
         metavar="first|uniform",
-        panel=WHAT,
+        panel=configuration.WHAT,
     )
     camera: FilePath | None = option(
         None,
         "of stripes: camera electronics, name or TOML file",
         metavar="NAME|FILE",
-        complete=partial(shipped_names, CAMERA),
+        complete=partial(configuration.shipped_names, configuration.CAMERA),
     )
     exposure: float | None = option(None, "of stripes: seconds of each frame", metavar="SECONDS")
     signed_capture: Literal["pair", "uniform"] | None = option(

@@ -23,35 +23,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core import manifests
 from mitsim.core.arrays import FloatArray, checked_hdf5, hdf5_errors, is_hdf5, read_variables, write_variables
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
 from mitsim.core.imagelist import ALL, WAVELENGTHS_NM, check_channel
-from mitsim.core.manifests import (
-    CALIBRATION,
-    MOSAIC,
-    RUN,
-    SIDES,
-    CalibrationManifest,
-    Digital,
-    RunManifest,
-    lines_of_planes,
-)
+from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, lines_of_planes
 from mitsim.core.runs import TRUTH
+from mitsim.exchange import packed
 from mitsim.exchange.capture_list import TURNED
-from mitsim.exchange.packed import (
-    FACTORS,
-    Calibration,
-    Content,
-    Loaded,
-    Packed,
-    Run,
-    as_channel,
-    hdf5_item,
-    shots_of,
-    unpack,
-    unpack_colours,
-)
+from mitsim.exchange.packed import FACTORS, Calibration, Content, Loaded, Packed, Run, as_channel, shots_of, unpack
 
 if TYPE_CHECKING:
     import h5py
@@ -149,7 +130,7 @@ def variables_in(path: Path) -> dict[str, Any]:
         for name in file:
             # Groups are structures, sparse matrices, or content of cells.
             if isinstance(file[name], h5py.Dataset) and (known := kind(file[name])) in _CLASSES:
-                values = hdf5_item(file, name, path)[()].T  # MATLAB stores columns first
+                values = packed.hdf5_item(file, name, path)[()].T  # MATLAB stores columns first
                 # Texts are stored as numbers of 16 bits.
                 text = known == "char"
                 found[name] = np.array(["".join(map(chr, values.ravel("F").tolist()))]) if text else values
@@ -303,12 +284,12 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
     file = MatFile(path, variables_in(path))
     if COLOURED in file:
         text = file.text(COLOURED)
-        colours = unpack_colours(text, RUN, path)
+        colours = packed.unpack_colours(text, manifests.RUN, path)
         lines = file.by_line(colours.names)
         run = Content({name: _run_in(own) for name, own in lines.items()}, colours, text)
     elif FILTERED in file:
         shots, text = _run_in(file), file.text(FILTERED)
-        colours = unpack_colours(text, MOSAIC, path, shots.names)
+        colours = packed.unpack_colours(text, manifests.MOSAIC, path, shots.names)
         lines = file.by_line(colours.names)
         truths = {name: _truth_in(own) for name, own in lines.items() if "truth" in own}
         run = Content({"": shots}, colours, text, truths)
@@ -324,7 +305,7 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
         calibration = Content(parts)
     elif run.colours and _CALIBRATED in file:
         text = file.text(_CALIBRATED)
-        colours = unpack_colours(text, CALIBRATION, path)
+        colours = packed.unpack_colours(text, manifests.CALIBRATION, path)
         if {*parts} != {*colours.names}:
             raise MitsimError(f"{path}: has calibrations of {', '.join(parts)}, not of {', '.join(colours.names)}")
         calibration = Content(parts, colours, text)
@@ -441,6 +422,6 @@ def flatcam_calibration(path: Path, channel: str) -> Calibration:
 
     if channel != ALL:
         return Content({"": part(channel)})
-    colours = lines_of_planes(CALIBRATION, WAVELENGTHS_NM)
+    colours = lines_of_planes(manifests.CALIBRATION, WAVELENGTHS_NM)
     text = json.dumps(colours.model_dump(mode="json"))
     return Content({name: part(name) for name in colours.names}, colours, text)

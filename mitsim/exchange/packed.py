@@ -16,38 +16,13 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
+from mitsim.core import files, manifests
 from mitsim.core.arrays import PACKED, checked_hdf5, hdf5_errors, whole_hdf5
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata, Value, checksum, read_frame, verify, write_frame
-from mitsim.core.files import (
-    FRAME_LIMITS,
-    LOCK,
-    MOST_BYTES,
-    fits_a_frame,
-    parse_json,
-    read_text,
-    whole_folder,
-    write_text,
-)
+from mitsim.core.files import MOST_BYTES, parse_json, read_text, whole_folder, write_text
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import (
-    CALIBRATION,
-    COLOUR,
-    MANIFEST,
-    MOSAIC,
-    RUN,
-    SIDES,
-    CalibrationManifest,
-    ColourManifest,
-    MosaicManifest,
-    RunManifest,
-    ShotFile,
-    checked_colours,
-    checked_manifest,
-    open_lines,
-    read_manifest,
-    write_manifest,
-)
+from mitsim.core.manifests import CalibrationManifest, ColourManifest, MosaicManifest, RunManifest, ShotFile
 from mitsim.core.runs import TRUTH, load_run
 from mitsim.version import __version__
 
@@ -55,7 +30,7 @@ if TYPE_CHECKING:
     import h5py
 
 Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
-FACTORS = tuple(f"{name}.exr" for name in SIDES)
+FACTORS = tuple(f"{name}.exr" for name in manifests.SIDES)
 """Names of a CAL folder's files: the left factor's and the right one's."""
 
 # -------- The content of a folder
@@ -107,9 +82,9 @@ class Packed(Generic[Manifest]):
         stated = self.manifest.checksums
         sums = {name: checksum(folder / name) for name in stated if name in self.names}
         if sums == stated and self.text:
-            write_text(folder / MANIFEST, self.text)
+            write_text(folder / manifests.MANIFEST, self.text)
         else:
-            write_manifest(folder, self.manifest.model_copy(update={"checksums": sums}))
+            manifests.write_manifest(folder, self.manifest.model_copy(update={"checksums": sums}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +131,7 @@ class Content(Generic[Manifest]):
             (folder / name).mkdir()
             write_frame(folder / name / TRUTH, *truth)
         if self.colours:
-            write_text(folder / COLOUR, self.text)
+            write_text(folder / manifests.COLOUR, self.text)
 
 
 Run = Content[RunManifest]
@@ -168,12 +143,12 @@ Loaded = tuple[Run | None, Calibration | None, tuple[str, ...]]
 def pack_run(folder: Path) -> Packed[RunManifest]:
     """Return the content of the RUN ``folder``. MitsimError when it is not a complete one."""
     shots = load_run(folder)
-    return Packed(shots.manifest, read_text(folder / MANIFEST, MOST_BYTES), shots.files, shots.read, folder)
+    return Packed(shots.manifest, read_text(folder / manifests.MANIFEST, MOST_BYTES), shots.files, shots.read, folder)
 
 
 def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
     """Return the content of the CAL ``folder``. MitsimError when it is not a complete one."""
-    manifest = read_manifest(folder, CalibrationManifest)
+    manifest = manifests.read_manifest(folder, CalibrationManifest)
 
     def read(name: str) -> tuple[Channels, Metadata]:
         verify(folder, name, manifest.checksums, "calibrate again")
@@ -182,24 +157,24 @@ def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
     for name in FACTORS:
         if "factor" not in (channels := read(name)[0]):
             raise MitsimError(f"{folder / name}: channels are {', '.join(channels)}; factor is needed")
-    return Packed(manifest, read_text(folder / MANIFEST, MOST_BYTES), FACTORS, read, folder)
+    return Packed(manifest, read_text(folder / manifests.MANIFEST, MOST_BYTES), FACTORS, read, folder)
 
 
 def run_content(folder: Path) -> Run:
     """Return the content of the RUN ``folder``, coloured, behind colour filters, or neither. MitsimError when it, or a
     line's folder, is not a complete one."""
-    lines = open_lines(folder, RUN, MOSAIC)
+    lines = manifests.open_lines(folder, manifests.RUN, manifests.MOSAIC)
     files = {name: folder / name / TRUTH for name in (lines.names if lines.filters else ())}
     truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
-    text = read_text(folder / COLOUR, MOST_BYTES) if lines.colours else ""
+    text = read_text(folder / manifests.COLOUR, MOST_BYTES) if lines.colours else ""
     return Content({name: pack_run(part) for name, part in lines.parts.items()}, lines.colours, text, truths)
 
 
 def calibration_content(folder: Path) -> Calibration:
     """Return the content of the CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a
     complete one."""
-    lines = open_lines(folder, CALIBRATION)
-    text = read_text(folder / COLOUR, MOST_BYTES) if lines.colours else ""
+    lines = manifests.open_lines(folder, manifests.CALIBRATION)
+    text = read_text(folder / manifests.COLOUR, MOST_BYTES) if lines.colours else ""
     return Content({name: pack_calibration(part) for name, part in lines.parts.items()}, lines.colours, text)
 
 
@@ -239,16 +214,16 @@ def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
         data = parse_json(text)
     except ValueError as error:
         raise MitsimError(f"{place}: its manifest is not valid JSON ({error}); export it again") from error
-    manifest = checked_manifest(data, model, place)
+    manifest = manifests.checked_manifest(data, model, place)
     run: Any = manifest
     if model is RunManifest:
         for name in (*(shot.file for shot in run.patterns.captures), *run.others.values()):
-            if name in (".", "..", MANIFEST, LOCK, TRUTH) or not name.isprintable():
+            if name in (".", "..", manifests.MANIFEST, files.LOCK, TRUTH) or not name.isprintable():
                 raise MitsimError(f"{place}: a frame is called {cut(name)!r}; give it a name of its own")
     return manifest
 
 
-def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ()) -> ColourManifest:
+def unpack_colours(text: str, kind: str, place: Path, beside: Sequence[str] = ()) -> ColourManifest:
     """Return the lines, and filters, that an exchanged file has.
 
     Parameters
@@ -259,7 +234,7 @@ def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ())
         of folder that this is to be of, one of :data:`mitsim.core.manifests.KINDS`.
     place
         the file, for messages.
-    files
+    beside
         names of what lies beside the lines' folders.
 
     Raises
@@ -270,9 +245,10 @@ def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ())
     try:
         data = parse_json(text)
     except ValueError as error:
-        raise MitsimError(f"{place}: its {COLOUR} is not valid JSON ({error}); export it again") from error
-    colours = checked_colours(data, kind, place)
-    for name in {COLOUR, LOCK, *((MANIFEST, *files) if kind == MOSAIC else ())}.intersection(colours.names):
+        raise MitsimError(f"{place}: its {manifests.COLOUR} is not valid JSON ({error}); export it again") from error
+    colours = manifests.checked_colours(data, kind, place)
+    taken = {manifests.COLOUR, files.LOCK, *((manifests.MANIFEST, *beside) if kind == manifests.MOSAIC else ())}
+    for name in taken.intersection(colours.names):
         raise MitsimError(f"{place}: a line is called {name}; give it a name of its own")
     return colours
 
@@ -293,7 +269,8 @@ def as_channel(values: object, name: str, place: Path) -> Channel:
         for another type or shape.
     """
     array = np.asarray(values)
-    if array.dtype not in (np.float32, np.uint32) or array.ndim != 2 or not array.size or not fits_a_frame(array.shape):
+    fits = array.ndim == 2 and array.size and files.fits_a_frame(array.shape)
+    if array.dtype not in (np.float32, np.uint32) or not fits:
         raise MitsimError(
             f"{place}: {name} is {array.dtype} of shape {array.shape}; float32 or uint32 of rows x columns is needed"
         )
@@ -376,7 +353,7 @@ def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> 
             if calibration is not None:
                 factors, group = calibration.parts[name], place.create_group("calibration", track_order=True)
                 write_text(group, "manifest", factors.text)
-                write_frames(group, {side: factors.read(name) for side, name in zip(SIDES, FACTORS, strict=True)})
+                write_frames(group, {Path(name).stem: factors.read(name) for name in FACTORS})
     return ()
 
 
@@ -397,8 +374,8 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
                 raise MitsimError(
                     f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
                 )
-            kind = RUN if RUN in file else MOSAIC
-            own = {"": _run_in(file, path)} if _LINES not in file or kind == MOSAIC else {}
+            kind = manifests.RUN if manifests.RUN in file else manifests.MOSAIC
+            own = {"": _run_in(file, path)} if _LINES not in file or kind == manifests.MOSAIC else {}
             if _LINES not in file:
                 run, factors = Content(own), _calibration_in(file, path) if "calibration" in file else None
                 calibration = Content({"": factors}) if factors else None
@@ -414,9 +391,9 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
                     {name: _frame_in(line, "truth", path) for name, line in truths.items()},
                 )
                 calibration = None
-                if CALIBRATION in file:
-                    text = _text_in(file, CALIBRATION, path)
-                    colours = unpack_colours(text, CALIBRATION, path)
+                if manifests.CALIBRATION in file:
+                    text = _text_in(file, manifests.CALIBRATION, path)
+                    colours = unpack_colours(text, manifests.CALIBRATION, path)
                     for name in colours.names:
                         if "calibration" not in lines.get(name, ()):
                             raise MitsimError(f"{path}: has no calibration of {name}; export it again")
@@ -506,6 +483,6 @@ def hdf5_item(parent: h5py.Group, name: str, path: Path, kind: str = "Dataset") 
         raise MitsimError(f"{path}: {parent.name.rstrip('/')}/{name} {what}; export it again")
     if kind == "Dataset" and item.shape is None:
         raise MitsimError(f"{path}: {item.name} is empty; export it again")
-    if kind == "Dataset" and not fits_a_frame(item.shape[1:]):
-        raise MitsimError(f"{path}: {item.name} claims {item.shape}; {FRAME_LIMITS} are allowed")
+    if kind == "Dataset" and not files.fits_a_frame(item.shape[1:]):
+        raise MitsimError(f"{path}: {item.name} claims {item.shape}; {files.FRAME_LIMITS} are allowed")
     return item
