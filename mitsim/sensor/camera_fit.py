@@ -29,33 +29,26 @@ _STEPS = np.array([1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0, 1e-2])
 """Relative and least steps of the numerical derivatives."""
 _LEAST_STEPS = np.array([1e-15, 1e-3, 1e-2, 1e-4, 1e-15, 1e-3, 1e-3, 1e-5])
 _STARTS = (1.0, 0.9, 0.8, 0.65, 0.5)
-"""Rounding of little noise raises variances up to twice."""
-_TRIED, _SOLVED = 10, 25
-"""Evaluations of a trial and of a solution."""
+"""Fractions of the gain from which the fit starts, because rounding of little noise raises variances up to twice."""
 _DITHERED = 0.44
 """Variance [DN^2] below which rounding moves means."""
-_HALF = 0.5
 _NODES = 9
 _AT_END = 1e-4
 """Fraction of numbers at the ADC's end from which a set is not below saturation."""
-_STEADY = 1e-5
-_CHANCE = 1e-3
+_STEADY, _CHANCE = 1e-5, 1e-3
 _FITS = 2.0
 """Reduced chi-square from which other starts of the fit are tried."""
 _TELLS = 9.0
 """Difference of chi-square that decides between a bent camera and a drifting lamp: three standard errors."""
 _SATURATED, _FALLEN = 0.05, 0.5
-_DEAD = 0.5
-_HOT = 8.0
+_DEAD, _HOT, _FILLED = 0.5, 8.0, 0.9
+"""Limits of bad pixels: response, dark current in standard deviations, and dark reading as a part of saturation."""
 _SURE = 4.0
 """Standard errors from which an effect enters the camera."""
 _UNEVEN, _MOST_UNEVEN = 0.01, 0.25
 """Differences of the light over the frame from which a surface is divided out, and from which frames are refused."""
-_ROBUST = 1.4826
-_ROUNDED = 12**-0.5
 _CUT = 1e-3
 """Fraction of dark readings at 0 from which lit frames determine the black level."""
-_FILLED = 0.9
 _HIDES = 2.0
 """Ratio of the fitted to the observed error of offsets from which offsets count as hidden."""
 _MOST_RESPONSE = 0.1
@@ -258,12 +251,8 @@ class _Problem:
         """Fit a linear camera, from several starts if several cameras may explain few codes."""
         found, hidden = [self.solve(self.start)], self.measured[1].min() < HIDDEN
         for part in _STARTS if self.measured[1].min() < LEAST_DARK else ():
-            best = min(found, key=lambda each: each.chi_square)
-            if best.worse <= _FITS and not hidden:
-                break
-            found.append(self.solve(self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0, 1.0], most=_TRIED))
-            if found[-1].chi_square < best.chi_square:
-                found.append(self.solve(found[-1].values))
+            if hidden or min(found, key=lambda each: each.chi_square).worse > _FITS:
+                found.append(self.solve(self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0, 1.0]))
         best = min(found, key=lambda each: each.chi_square)
         others = [each.values - best.values for each in found if each.chi_square < best.chi_square + _TELLS]
         off = max(others, key=lambda other: abs(float(other[0])))
@@ -277,7 +266,7 @@ class _Problem:
             found = self.solve(self.start, found.bent, max(found.scatter, 1.5 * found.lamp))
         return found
 
-    def solve(self, start: FloatArray, bend: bool = False, lamp: float | None = None, most: int = _SOLVED) -> Transfer:
+    def solve(self, start: FloatArray, bend: bool = False, lamp: float | None = None) -> Transfer:
         """Fit means and variances by least squares if the light of sets scatters by a fraction `lamp`.
 
         The light of a set moves its mean and variance together. Its best deviation follows from the residuals of both.
@@ -302,11 +291,11 @@ class _Problem:
             return np.stack([(rest(x + step) - here) / step.sum() for step in np.diag(steps)], axis=1)
 
         solved = scipy.optimize.least_squares(
-            rest, values[free], slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=most
+            rest, values[free], slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=35
         )
         values[free] = solved.x
         # Dark readings are known to half a code, and pixels are alike to half a code, even if few codes hide it.
-        span, code = float(np.ptp(self.time[~lit])), max(_HALF, abs(values[1]))
+        span, code = float(np.ptp(self.time[~lit])), max(0.5, abs(values[1]))
         known = np.diag([0.0, 1 / code, 1 / code, 0.0, 0.0, 1.0, 1.0, code**-2])
         known[0, [0, _DARK]] = np.array([values[_DARK], values[0]]) * span / code
         normal = solved.jac.T @ solved.jac + known[:, free].T @ known[:, free]
@@ -390,7 +379,7 @@ class Pixels:
         self.long = max(unlit, key=lambda index: (taken[index].exposure_s, taken[index].count))
         self.least = min(unlit, key=lambda index: (taken[index].exposure_s, -taken[index].count))
         self.short = max(unlit, key=lambda index: (taken[index].count, -taken[index].exposure_s))
-        self.taken, self.dark, self.notes = taken, dark, list[str]()
+        self.taken, self.notes = taken, list[str]()
         offset, longest = images(self.short), images(self.long)
         contrast = images(self.bright) - (offset if dark == self.short else images(dark))
         middle, noise = float(np.median(contrast)), math.sqrt(self._noise(self.bright, dark))
@@ -402,10 +391,10 @@ class Pixels:
             excess = longest - (offset if self.least == self.short else images(self.least))
             middle = float(np.median(excess))
             # With few codes most readings are one number, and the noise is the rest.
-            wide = math.sqrt(self._noise(self.long, self.least))
-            wide = max(wide, _ROBUST * float(np.median(np.abs(excess - middle))), 1e-9)
+            wide = 1.4826 * float(np.median(np.abs(excess - middle)))
+            wide = max(math.sqrt(self._noise(self.long, self.least)), wide, 1e-9)
             if taken[self.least].variance < LEAST_DARK:
-                wide = max(wide, _ROUNDED)
+                wide = max(wide, 12**-0.5)
             hot = excess > middle + _HOT * wide
             self.beyond = float(excess[hot].mean() - excess[~hot].mean()) if hot.any() else 0.0
         dead = (dead | filled) & ~hot  # pixels that are full at every exposure show no light
@@ -425,8 +414,7 @@ class Pixels:
             contrast = contrast / surface
             self.surface = np.roll(_spatial_parts(surface, 0.0, 0.0)[0], -1)
         self.excess, self.shape, self.size = excess, contrast.shape, contrast.size
-        said = self.taken[self.short]
-        self.offsets = _spatial_parts(offset, self._noise(self.short), float(said.pair.rows) / said.count)
+        self.offsets = _spatial_parts(offset, self._noise(self.short), self._shared(self.short))
         square = float(contrast.mean()) ** 2
         noise, rows = self._noise(self.bright, dark), self._shared(self.bright, dark)
         self.responses = _spatial_parts(contrast / math.sqrt(square), noise / square, rows / square)
@@ -436,6 +424,7 @@ class Pixels:
         return sum(self.taken[index].variance / self.taken[index].count for index in sets)
 
     def _shared(self, *sets: int) -> float:
+        """Return the part of :meth:`_noise` that rows share."""
         return sum(float(self.taken[index].pair.rows) / self.taken[index].count for index in sets)
 
     def _mean_variance(self, parts: FloatArray) -> float:
@@ -455,11 +444,20 @@ class Pixels:
             )
         least = 1e-12 if stated.bits is None else 1 / self.size  # one pixel may have another code
         spatial = float(self.offsets[0].sum()), max(math.hypot(*self.offsets[1]), least)
-        self.transfer = transfer = fit(self.taken, stated.bits, self.short, spatial)
-        self.gain, error = transfer["gain"], transfer.error("gain")
-        self.gain_error = error / self.gain
-        found = {"gain_dn_per_e": (self.gain, self.gain * self.gain_error), **self._read(), **self._dark()}
-        found |= self._offsets(spatial, found["dark_current_spread_e_per_s"][0]) | self._responses()
+        transfer = fit(self.taken, stated.bits, self.short, spatial)
+        gain, gain_error, bends = transfer["gain"], transfer.error("gain"), (transfer["bend"], transfer["bend_2"])
+        found = {"gain_dn_per_e": (gain, gain_error), **self._read(transfer), **self._dark(transfer)}
+        found |= self._offsets(transfer, spatial, found["dark_current_spread_e_per_s"][0])
+        found["dead_pixels"] = self.dead, math.sqrt(max(self.dead, 1 / self.size) / self.size)
+        top = None if stated.bits is None else 2.0**stated.bits - 1
+        if any(bends):  # relative responses are steeper or flatter on a bent curve
+            well = max(((transfer.saturation_dn or math.inf) - transfer["black"]) / gain / (1 + sum(bends)), 1.0)
+            x = transfer["response"] * self.taken[self.bright].light / well
+            bent = (1 + 2 * bends[0] * x + 3 * bends[1] * x**2) / (1 + bends[0] * x + bends[1] * x**2)
+        else:
+            bent = 1.0
+        for name, value, error in zip(("pixel", "row", "column"), *self.responses, strict=True):
+            found[f"prnu_{name}"] = _root(value / bent**2, error / bent**2)
         if stated.photons:
             still = self._mean_variance(np.maximum(self.responses[0], 0))  # of a specimen's pixels
             value, error = transfer["response"], transfer.error("response")
@@ -469,18 +467,36 @@ class Pixels:
                     f"photons_per_s: light makes {value:.3g} electrons a photon; at most 1 is possible, "
                     "so correct photons_per_s (photons on one pixel in a second), or leave it out"
                 )
-        found |= self._end(stated)
+        end = transfer.saturation_dn if transfer.saturates else top
+        if transfer.saturation_dn is None:
+            what = "is taken as what the ADC's end needs" if top else "is taken as infinite"
+            self.notes.append(f"full well: no frame is saturated, so it {what}; take brighter frames")
+        elif not transfer.saturates:
+            self.notes.append("full well: the ADC's end is reached first, so it may be larger")
+        full, error = math.inf, 0.0
+        if end is not None:
+            height, sum_ = end - transfer["black"], 1 + sum(bends)
+            full = height / gain / sum_
+            if transfer.saturation_dn is not None:  # an assumed number has no error
+                # The errors of gain, black level and both bends (`NAMES`) are not independent.
+                slopes = np.array([1 / gain, 0, 1 / height, 0, 0, 1 / sum_, 1 / sum_, 0])
+                error = full * math.sqrt(slopes @ transfer.covariance @ slopes)
+        found["full_well_e"] = full, error
         fields: dict[str, Any] = {name: float(f"{value:.7g}") for name, (value, _) in found.items()}
         errors = {name: error for name, (_, error) in found.items()}
-        if any(bend := (transfer["bend"], transfer["bend_2"])):
-            fields["linearity"] = tuple(float(f"{value:.7g}") for value in bend)
+        if any(bends):
+            fields["linearity"] = tuple(float(f"{value:.7g}") for value in bends)
             errors["linearity"] = transfer.error("bend")
         fields |= {name: getattr(stated, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
         sensor = validate(SensorModel, fields, "camera found")
         return FoundCamera(sensor, errors, transfer, self, tuple(self.notes))
 
-    def _read(self) -> dict[str, Known]:
-        transfer, gain, dark = self.transfer, self.gain, [each for each in self.taken if not each.light]
+    def _read(self, transfer: Transfer) -> dict[str, Known]:
+        gain, gain_error, dark = (
+            transfer["gain"],
+            transfer.error("gain"),
+            [each for each in self.taken if not each.light],
+        )
         read, error = transfer["read"], transfer.error("read")
         if min(each.variance for each in dark) < LEAST_DARK:
             error = max(error, math.sqrt(LEAST_DARK - 1 / 12) - read)  # few codes hide the noise: an upper limit
@@ -492,7 +508,7 @@ class Pixels:
         row_error = float(weight.sum() ** -0.5 / share)
         shared, shared_error = _root(float((values * weight).sum() / weight.sum() / share), row_error)
         own = math.sqrt(max(read**2 - shared**2, 0.0))
-        own_error = math.hypot(error, own * self.gain_error, row_error / max(2 * own, 1e-9) if shared else 0.0)
+        own_error = math.hypot(error, own * gain_error / gain, row_error / max(2 * own, 1e-9) if shared else 0.0)
         black = transfer["black"]
         black_error = math.hypot(transfer.error("black"), math.sqrt(self._mean_variance(self.offsets[0])))
         if black < -_SURE * black_error and max(each.cut[0] for each in dark) > _CUT:
@@ -507,16 +523,16 @@ class Pixels:
             "black_level_dn": (max(black, 0.0), black_error),
         }
 
-    def _dark(self) -> dict[str, Known]:
-        mean, error = self.transfer["dark"], self.transfer.error("dark")
+    def _dark(self, transfer: Transfer) -> dict[str, Known]:
+        mean, error = transfer["dark"], transfer.error("dark")
         names = "dark_current_e_per_s", "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s"
         if self.excess is None:
             self.notes.append(
                 "dark current is not told by dark frames of one exposure, and taken as 0; take two or more"
             )
             return dict.fromkeys(names, (0.0, 0.0))
-        both = self.taken[self.long], self.taken[self.least]
-        unit, count, (m, n) = self.gain * (both[0].exposure_s - both[1].exposure_s), self.size, self.shape
+        gain, both = transfer["gain"], (self.taken[self.long], self.taken[self.least])
+        unit, count, (m, n) = gain * (both[0].exposure_s - both[1].exposure_s), self.size, self.shape
         if not error:
             error = 0.5 / unit
             self.notes.append(f"dark current is hidden by rounding, and taken as 0; it is below {error:.2g} e-/s")
@@ -527,7 +543,7 @@ class Pixels:
         variance = float(np.square(even).mean()) * n / (n - 1)
         spread, spread_error = (variance - noise) / unit**2, math.sqrt(2 / count) * variance / unit**2
         wide, wide_error = _root(spread if mean > 0 else 0.0, spread_error)
-        counted = sum(self.gain**2 * beyond * each.exposure_s / each.count for each in both)
+        counted = sum(gain**2 * beyond * each.exposure_s / each.count for each in both)
         hot_error = math.sqrt((variance + counted) / max(self.hot * count, 1) + rows / m) / unit
         found = (
             (max(mean, 0.0), math.hypot(error, wide / math.sqrt(count))), (wide, wide_error),
@@ -535,57 +551,26 @@ class Pixels:
         )  # fmt: skip
         return dict(zip(names, found, strict=True))
 
-    def _offsets(self, seen: Known, spread: float) -> dict[str, Known]:
+    def _offsets(self, transfer: Transfer, seen: Known, spread: float) -> dict[str, Known]:
         """Return offsets [e-]; the fit gives their spread, because rounding changes the spread of mean readings."""
-        true, error = self.transfer["spatial"], self.transfer.error("spatial")
+        true, error = transfer["spatial"], transfer.error("spatial")
+        gain, gain_error = transfer["gain"], transfer.error("gain")
         sure = seen[0] > _SURE * seen[1] and true > _SURE * error
         values = self.offsets[0] * (true / seen[0] if sure else 0.0)
         own = math.sqrt(max(error**2 - seen[1] ** 2, 0.0)) / max(true, 1e-300) if sure else 0.0
         hidden = not sure and error > _HIDES * seen[1]
         errors = np.full(3, error) if hidden else self.offsets[1] * (true / seen[0] if sure else 1.0)
-        values[0] -= (self.gain * spread * self.taken[self.short].exposure_s) ** 2
+        values[0] -= (gain * spread * self.taken[self.short].exposure_s) ** 2
         found = {}
         for name, value, each in zip(("pixel", "row", "column"), values, errors, strict=True):
-            kept, kept_error = _root(value / self.gain**2, math.hypot(each, value * own) / self.gain**2)
-            found[f"dsnu_{name}_e"] = kept, math.hypot(kept_error, kept * self.gain_error)
+            kept, kept_error = _root(value / gain**2, math.hypot(each, value * own) / gain**2)
+            found[f"dsnu_{name}_e"] = kept, math.hypot(kept_error, kept * gain_error / gain)
         if hidden:
             self.notes.append(
                 "dsnu_*_e are hidden by rounding or by the ADC's end, and taken as 0; dsnu_pixel_e is below "
                 f"{found['dsnu_pixel_e'][1]:.2g} e-"
             )
         return found
-
-    def _responses(self) -> dict[str, Known]:
-        transfer, full = self.transfer, 1.0
-        if any(transfer.values[5:7]):
-            b1, b2 = transfer.values[5:7]
-            end = transfer.saturation_dn or math.inf
-            well = max((end - transfer["black"]) / self.gain / (1 + b1 + b2), 1.0)
-            x = transfer["response"] * self.taken[self.bright].light / well
-            full = (1 + 2 * b1 * x + 3 * b2 * x**2) / (1 + b1 * x + b2 * x**2)
-        return {"dead_pixels": (self.dead, math.sqrt(max(self.dead, 1 / self.size) / self.size))} | {
-            f"prnu_{name}": _root(value / full**2, error / full**2)
-            for name, value, error in zip(("pixel", "row", "column"), *self.responses, strict=True)
-        }
-
-    def _end(self, stated: Stated) -> dict[str, Known]:
-        transfer = self.transfer
-        top = None if stated.bits is None else 2.0**stated.bits - 1
-        end = transfer.saturation_dn if transfer.saturates else top
-        bent = 1 + transfer["bend"] + transfer["bend_2"]
-        if transfer.saturation_dn is None:
-            what = "is taken as what the ADC's end needs" if top else "is taken as infinite"
-            self.notes.append(f"full well: no frame is saturated, so it {what}; take brighter frames")
-        elif not transfer.saturates:
-            self.notes.append("full well: the ADC's end is reached first, so it may be larger")
-        if end is None:
-            return {"full_well_e": (math.inf, 0.0)}
-        full = (end - transfer["black"]) / self.gain / bent
-        if transfer.saturation_dn is None:
-            return {"full_well_e": (full, 0.0)}  # an assumed number has no error
-        # The errors of gain, black level and both bends (`NAMES`) are not independent.
-        slopes = np.array([1 / self.gain, 0, 1 / (end - transfer["black"]), 0, 0, 1 / bent, 1 / bent, 0])
-        return {"full_well_e": (full, full * math.sqrt(slopes @ transfer.covariance @ slopes))}
 
 
 def _spatial_parts(image: FloatArray, noise: float, rows: float) -> tuple[FloatArray, FloatArray]:

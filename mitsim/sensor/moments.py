@@ -24,7 +24,6 @@ from mitsim.sensor.chain import (
     reading_offset,
 )
 
-_FEW = 64.0
 _SOME = 1e4
 _CAN_SATURATE = 1e-3
 _DITHERED = 0.8
@@ -238,47 +237,30 @@ def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArr
     clipped, variance = clipped_moments(expected, model.superpixel_full_well_e)
     read, gain = model.superpixel_reading_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
     mean, noise = np.asarray(amplify(clipped, model)), np.asarray(variance * gain**2 + read**2)
-    dim, some = expected < _FEW, (expected >= _FEW) & (expected < _SOME)
+    few = expected < _SOME
     if model.linearity:
-        return _sum_counts(expected, (dim, some), np.ones(expected.shape, bool), (mean, noise), model)
+        return _sum_counts(expected, np.ones(expected.shape, bool), (mean, noise), model)
     if model.largest_dn is None:
         return mean, noise
     room, deviation = np.minimum(mean, model.largest_dn - mean), np.sqrt(noise)
     # Counts are a lattice that only read noise blurs, as long as they are few; and so is what fills the full well.
     full = model.superpixel_full_well_e - expected < 8 * np.sqrt(expected)
-    hard = (room < 8 * deviation) | (np.where(dim | some | full, read, deviation) < _DITHERED)
+    hard = (room < 8 * deviation) | (np.where(few | full, read, deviation) < _DITHERED)
     total = np.asarray(noise + 1 / 12)
     gone = room < -10 * deviation
     mean[gone], total[gone] = np.clip(mean[gone], 0, model.largest_dn), 0.0
-    return _sum_counts(expected, (dim, some), hard & ~gone, (mean, total), model)
+    return _sum_counts(expected, hard & ~gone, (mean, total), model)
 
 
 def _sum_counts(
-    expected: FloatArray,
-    few: tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]],
-    hard: npt.NDArray[np.bool_],
-    moments: tuple[FloatArray, FloatArray],
-    model: SensorModel,
+    expected: FloatArray, hard: npt.NDArray[np.bool_], moments: tuple[FloatArray, FloatArray], model: SensorModel
 ) -> tuple[FloatArray, FloatArray]:
-    (dim, some), (mean, total) = few, moments
-    for part, found in ((dim, _sum_over_counts), (some, _sum_about_mean), (~dim & ~some, _average_counts)):
-        part = hard & part
+    """Replace the moments of hard pixels: by sums over counts as long as these are few, and by a quadrature beyond."""
+    mean, total = moments
+    for part, found in ((hard & (expected < _SOME), _sum_about_mean), (hard & (expected >= _SOME), _average_counts)):
         if part.any():
             mean[part], total[part] = found(expected[part], model)
     return mean, total
-
-
-def _sum_over_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    most = float(expected.max())
-    counts = np.arange(int(most + 12 * math.sqrt(most)) + 20, dtype=np.float64)
-    levels, variances = _read_out(counts, model)
-    weight = np.exp(-expected)
-    first, second = np.zeros_like(expected), np.zeros_like(expected)
-    for count, rise, variance in zip(counts, levels - levels[0], variances, strict=True):
-        first += weight * rise
-        second += weight * (rise**2 + variance)
-        weight = weight * (expected / (count + 1))
-    return levels[0] + first, np.maximum(second - first**2, 0.0)
 
 
 def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
@@ -291,8 +273,8 @@ def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
     mean, variance = np.empty_like(nodes), np.empty_like(nodes)
     for index, node in enumerate(nodes):
         near = slice(first[index] - first.min(), last[index] - first.min() + 1)
-        weights = np.exp(counts[near] * math.log(node) - node - logarithms[near])
-        middle = levels[near][len(weights) // 2]
+        weights = np.exp(scipy.special.xlogy(counts[near], node) - node - logarithms[near])
+        middle = levels[near][int(node) - first[index]]
         rise = (weights * (levels[near] - middle)).sum()
         mean[index] = middle + rise
         variance[index] = (weights * (np.square(levels[near] - middle - rise) + variances[near])).sum()
@@ -319,7 +301,7 @@ def _grid(expected: FloatArray) -> FloatArray:
     """
     roots = np.sqrt(expected)
     count = int(np.ptp(roots) * 20) + 2
-    return expected if count >= expected.size else np.square(np.linspace(roots.min(), roots.max(), count))
+    return expected if count >= expected.size else np.square(np.linspace(roots.min(), roots.max() + 1e-6, count))
 
 
 def _between(
@@ -327,8 +309,8 @@ def _between(
 ) -> tuple[FloatArray, FloatArray]:
     if nodes is expected:
         return mean, variance
-    roots, places = np.sqrt(expected), np.sqrt(nodes)
-    return np.interp(roots, places, mean), np.interp(roots, places, variance)
+    curves = scipy.interpolate.CubicSpline(np.sqrt(nodes), np.stack([mean, variance], axis=1))(np.sqrt(expected))
+    return curves[:, 0], np.maximum(curves[:, 1], 0.0)
 
 
 def _read_out(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:

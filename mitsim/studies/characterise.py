@@ -11,11 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
@@ -24,11 +22,11 @@ from mitsim.core.files import write_json, write_text
 from mitsim.core.job import Job
 from mitsim.devices.framelist import FlatFrames, capacity_of
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.pages import round_to_error, typeset, written_figure
-from mitsim.report.plots import BLACK, BLUE, COLUMN, FONT, GREY, ORANGE, TITLE_LETTERS, VERMILION, figure_of, label_axes
+from mitsim.report.pages import Mean, round_to_error, typeset, written_figure
+from mitsim.report.plots import curves, grouped_bars
 from mitsim.sensor.camera_fit import FoundCamera, Stated, find_camera
 from mitsim.sensor.chain import mean_dark_current
-from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, MOST_FITTED, QUANTISATION, SPLIT, Alike, Session, figures
+from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, QUANTISATION, SPLIT, Alike, Session, figures
 from mitsim.studies.camera_frames import Frames, draw_sessions, mean_image, read_again, read_sets, remarks
 from mitsim.studies.emva_options import Procedure
 from mitsim.studies.framework.page import Part, build_findings, text_table
@@ -317,21 +315,21 @@ class Characterisation:
 
 def figures_of(done: Characterisation) -> Mapping[str, Figure]:
     """Draw the plots by file name; plots of figures that the frames do not show are left out."""
-    rows, saturates = {row.name: row for row in done.rows}, done.session.saturates
+    rows, what = {row.name: row for row in done.rows}, "camera found" if done.real else "closed form"
+    gain, black = rows["system_gain"].found, done.frames.sensor.superpixel_black_level_dn
 
-    def text(row: Row) -> str:
-        found, error = (round_to_error(each, row.standard_error) for each in (row.found, row.standard_error))
-        unit = row.unit.replace("e-", "e\N{SUPERSCRIPT MINUS}")
-        return typeset(f"{found} +- {error} {unit}, {'camera found' if done.real else 'set'} {row.set:.5g}")
+    def found(name: str) -> str:
+        row = rows[name]
+        value, error = (round_to_error(each, row.standard_error) for each in (row.found, row.standard_error))
+        given = f"{'camera found' if done.real else 'set'} {row.set:.5g}"
+        return typeset(f"{value} +- {error} {row.unit}, {given}".replace("e-", "e\N{SUPERSCRIPT MINUS}"))
 
-    def chart(points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str) -> Axes:
-        axes = figure_of(3.3, COLUMN)[1]
-        label = "camera found" if done.real else "closed form"
-        axes.plot(*points(done.expected), color=GREY, lw=1.5, label=label)
-        axes.plot(*points(done.session), color=BLUE, lw=0, marker="o", ms=5, label="pairs of frames")
-        axes.set_title(fill(title, TITLE_LETTERS), fontsize=FONT)
-        label_axes(axes, x, y)
-        return axes
+    def chart(points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str) -> Figure:
+        lines = {
+            name: {place: Mean(value, math.nan, 1) for place, value in zip(*points(session), strict=True)}
+            for name, session in ((what, done.expected), ("pairs of frames", done.session))
+        }
+        return curves({"": lines}, x, y, ticks=False, title=title)
 
     def straightness(session: Session) -> tuple[FloatArray, FloatArray]:
         photons, signal, noise = session.transfer()
@@ -340,54 +338,32 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
         slope, start = np.polyfit(photons[used], signal[used], 1, w=1 / signal[used])
         return photons[used], 100 * (signal[used] / (start + slope * photons[used]) - 1)
 
-    def darkness(session: Session) -> tuple[FloatArray, FloatArray]:
-        signal = session.pairs.mean[session.unlit] - done.frames.sensor.superpixel_black_level_dn
-        return session.exposure_s[session.unlit], signal / rows["system_gain"].found
-
-    title = f"Photon transfer: EMVA 1288 finds a gain of {text(rows['system_gain'])}"
-    axes = chart(
-        lambda session: session.transfer()[1:],
-        title,
-        "signal less dark signal [DN]",
-        "variance less dark variance [DN$^2$]",
+    off = {row.name.replace("_", " "): {"": Mean(row.deviations or 0.0, math.nan, 1)} for row in done.rows}
+    far = sum(abs(row.deviations or 0.0) > MOST_OFF for row in done.rows)
+    title = (
+        f"{far or 'None'} of {len(off)} figures {'are' if far > 1 else 'is'} more than {MOST_OFF:g} standard errors off"
     )
-    _, signal, noise = done.session.transfer()
-    full = float(signal[int(noise.argmax())]) if saturates else float(signal.max())
-    line = np.array([0.0, MOST_FITTED * full if saturates else full])
-    label = "fit to 70 %" if saturates else "fit"
-    axes.plot(line, rows["system_gain"].found * line, color=VERMILION, lw=2, ls="--", label=label)
-    if saturates:
-        axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="saturation")
-        axes.set_xlim(right=1.1 * float(signal.max()))
-    charts = {"photon_transfer.png": axes}
+    given = "the camera's" if done.real else "set"
+    charts = {
+        "deviations.png": grouped_bars(off, f"found less {given} or expected [standard errors]", title),
+        "photon_transfer.png": chart(
+            lambda session: session.transfer()[1:], f"EMVA 1288 finds a gain of {found('system_gain')}",
+            "signal less dark signal [DN]", "variance less dark variance [DN$^2$]",
+        ),
+    }  # fmt: skip
     if "linearity_min" in rows:
         light = "photons on a pixel [1]" if done.frames.sensor.states_efficiency else "light on a pixel [a.u.]"
-        least, most = rows["linearity_min"].found, rows["linearity_max"].found
-        title = f"Linearity: {typeset(f'{least:.2g}')} to {typeset(f'{most:+.2g}')} % off a line"
-        charts["linearity.png"] = chart(straightness, title, light, "deviation from a line [%]")
-        charts["linearity.png"].axhline(0, color=BLACK, lw=1)
+        title = f"Linearity: {rows['linearity_min'].found:.2g} to {rows['linearity_max'].found:+.2g} % off a line"
+        charts["linearity.png"] = chart(straightness, typeset(title), light, "deviation from a line [%]")
     if "dark_current" in rows:
-        title = f"EMVA 1288 finds a dark current of {text(rows['dark_current'])}"
-        y = "dark signal less black level [e$^-$]"
-        charts["dark_current.png"] = chart(darkness, title, "exposure time [s]", y)
-    for name, axes in charts.items():
-        axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left" if name == "photon_transfer.png" else "best")
-
-    figure, axes = figure_of(0.9 + 0.26 * len(done.rows), COLUMN)
-    off = np.clip([row.deviations for row in done.rows], -2 * MOST_OFF, 2 * MOST_OFF)
-    place = np.arange(len(off))[::-1]
-    axes.axvspan(-MOST_OFF, MOST_OFF, color="#eef2f7", zorder=0)
-    axes.axvline(0, color=BLACK, lw=1)
-    axes.plot(off, place, "o", color=BLUE, ms=7)
-    names = [row.name.replace("_", " ").replace("dsnu", "DSNU").replace("prnu", "PRNU") for row in done.rows]
-    axes.set_yticks(place, names, fontsize=FONT - 1)
-    far = int(np.count_nonzero(np.abs(off) > MOST_OFF))
-    verdict = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
-    axes.set_title(f"{verdict}\nmore than {MOST_OFF:g} standard errors off", fontsize=FONT)
-    axes.set_xlim(-1.2 * max(MOST_OFF, float(np.abs(off).max())), 1.2 * max(MOST_OFF, float(np.abs(off).max())))
-    of = "the camera's" if done.real else "set"
-    label_axes(axes, f"found less {of} or expected\n[standard errors]; shaded: within {MOST_OFF:g}", "", grid="x")
-    return {"deviations.png": figure, **{name: each.figure for name, each in charts.items()}}
+        charts["dark_current.png"] = chart(
+            lambda session: (
+                session.exposure_s[session.unlit], (session.pairs.mean[session.unlit] - black) / gain
+            ),
+            f"EMVA 1288 finds a dark current of {found('dark_current')}", "exposure time [s]",
+            "dark signal less black level [e$^-$]",
+        )  # fmt: skip
+    return charts
 
 
 # ---- characterisation ------------------------------------------------------------------------------------------------
