@@ -27,6 +27,11 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 
 Digital = FloatArray | npt.NDArray[np.uint32]
+_NUMBERS = (
+    "superpixel_full_well_e", "linearity", "superpixel_read_noise_e", "gain_dn_per_e", "superpixel_black_level_dn",
+    "largest_dn",
+)  # fmt: skip
+"""Numbers of a model that all pixels share."""
 _MANY = 64.0
 """Mean electrons from which counts are quantiles of normal deviates."""
 
@@ -77,7 +82,8 @@ def expose(
     dark = dark.reshape(-1) if isinstance(dark, np.ndarray) else dark
     arrays = light, dark, _few(light, dark, shot_rng), offset
     dtype = np.float64 if model.largest_dn is None else np.uint32
-    return by_pixel(_read_out, _numbers_of(model), arrays, (shot_rng, read_rng), dtype).reshape(shape)
+    numbers = {name: getattr(model, name) for name in _NUMBERS}
+    return by_pixel(_read_out, numbers, arrays, (shot_rng, read_rng), dtype).reshape(shape)
 
 
 def _read_out(model: Any, light: Any, dark: Any, few: Any, offset: Any, shot: Any, read: Any) -> Any:
@@ -85,17 +91,6 @@ def _read_out(model: Any, light: Any, dark: Any, few: Any, offset: Any, shot: An
     if offset is not None:
         electrons = electrons + offset
     return quantise(amplify(add_read_noise(electrons, model, read), model), model)
-
-
-def _numbers_of(model: SensorModel) -> dict[str, float | tuple[float, ...] | None]:
-    return {
-        "superpixel_full_well_e": model.superpixel_full_well_e,
-        "linearity": tuple(model.linearity),
-        "superpixel_read_noise_e": model.superpixel_read_noise_e,
-        "gain_dn_per_e": model.gain_dn_per_e,
-        "superpixel_black_level_dn": model.superpixel_black_level_dn,
-        "largest_dn": model.largest_dn,
-    }
 
 
 def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> FloatArray:
@@ -106,7 +101,6 @@ def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> FloatArray:
 # -------- One specimen of a camera
 
 Map = npt.NDArray[np.float32]
-_MOST_MAPS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,17 +118,48 @@ class Specimen:
     dead: int = 0
 
 
-@lru_cache(maxsize=_MOST_MAPS)
+@lru_cache(maxsize=2)
 def specimen(model: SensorModel, shape: tuple[int, int]) -> Specimen:
     """Return the specimen that ``model.pattern_seed`` names (EMVA 1288 4.0, "spatial nonuniformity")."""
-    hot, dead = (_defects(model, shape, kind) for kind in ("hot", "dead"))
-    return Specimen(
-        offset_e=_parts(model, shape, "offset", model.offset_parts),
-        response=_response(model, shape, dead),
-        dark_e_per_s=_dark_current(model, shape, hot),
-        hot=0 if hot is None else int(np.count_nonzero(hot)),
-        dead=0 if dead is None else int(np.count_nonzero(dead)),
-    )
+    count, pixels = math.prod(shape), math.prod(shape) * model.binning**2
+
+    def draw(name: str, parts: tuple[float, float, float]) -> Map | None:
+        """Draw normal deviations of pixels, rows and columns."""
+        if not any(parts):
+            return None
+        total, sizes = np.zeros(shape, dtype=np.float32), (shape, (shape[0], 1), (1, shape[1]))
+        for deviation, kind, size in zip(parts, ("pixel", "row", "column"), sizes, strict=True):
+            if deviation:
+                total += deviation * stream(model.pattern_seed, name, kind).standard_normal(size, dtype=np.float32)
+        return total
+
+    def choose(kind: str, part: float) -> Map | None:
+        """Count the defects of a kind in each superpixel."""
+        if not part:
+            return None
+        chosen = stream(model.pattern_seed, kind).choice(pixels, round(part * pixels), replace=False)
+        return np.bincount(chosen % count, minlength=count).reshape(shape).astype(np.float32)
+
+    hot, dead = choose("hot", model.hot_pixels), choose("dead", model.dead_pixels)
+    response = draw("response", model.response_parts)
+    if response is not None:
+        response = np.maximum(1 + response, np.float32(0))
+    if dead is not None:
+        alive = np.ones(shape, dtype=np.float32) if response is None else response
+        response = np.asarray(alive * (1 - dead / model.binning**2), dtype=np.float32)
+    mean, spread, dark = model.dark_current_e_per_s, model.dark_current_spread_e_per_s, None
+    if spread or hot is not None:
+        current = np.full(shape, mean * model.binning**2)
+        if spread:  # a gamma law, which is never negative and whose sums over binned pixels are gamma, too
+            drawn = stream(model.pattern_seed, "dark current").standard_gamma(
+                (mean * model.binning / spread) ** 2, shape
+            )
+            current = (spread**2 / mean) * drawn
+        if hot is not None:
+            current += model.hot_dark_current_e_per_s * hot
+        dark = np.asarray(model.dark_factor * current, dtype=np.float32)
+    hot_count, dead_count = (0 if each is None else int(np.count_nonzero(each)) for each in (hot, dead))
+    return Specimen(draw("offset", model.offset_parts), response, dark, hot_count, dead_count)
 
 
 def response_variance(model: SensorModel) -> float:
@@ -157,50 +182,6 @@ def mean_dark_current(model: SensorModel) -> float:
     """Return the mean dark current of superpixels, including hot pixels [electrons/s]."""
     hot = model.hot_pixels * model.hot_dark_current_e_per_s * model.binning**2 * model.dark_factor
     return model.superpixel_dark_current_e_per_s + hot
-
-
-def _parts(model: SensorModel, shape: tuple[int, int], name: str, parts: tuple[float, float, float]) -> Map | None:
-    if not any(parts):
-        return None
-    total = np.zeros(shape, dtype=np.float32)
-    sizes = shape, (shape[0], 1), (1, shape[1])
-    for deviation, kind, size in zip(parts, ("pixel", "row", "column"), sizes, strict=True):
-        if deviation:
-            total += deviation * stream(model.pattern_seed, name, kind).standard_normal(size, dtype=np.float32)
-    return total
-
-
-def _response(model: SensorModel, shape: tuple[int, int], dead: Map | None) -> Map | None:
-    spread = _parts(model, shape, "response", model.response_parts)
-    if spread is None and dead is None:
-        return None
-    response = np.ones(shape, dtype=np.float32) if spread is None else np.maximum(1 + spread, np.float32(0))
-    return response if dead is None else np.asarray(response * (1 - dead / model.binning**2), dtype=np.float32)
-
-
-def _dark_current(model: SensorModel, shape: tuple[int, int], hot: Map | None) -> Map | None:
-    """Draw from a gamma law, which is never negative and whose sums over binned pixels are gamma, too."""
-    if not model.dark_current_spread_e_per_s and hot is None:
-        return None
-    mean, spread = model.dark_current_e_per_s, model.dark_current_spread_e_per_s
-    if spread:
-        drawn = stream(model.pattern_seed, "dark current").standard_gamma((mean * model.binning / spread) ** 2, shape)
-        dark = (spread**2 / mean) * drawn
-    else:
-        dark = np.full(shape, mean * model.binning**2)
-    if hot is not None:
-        dark += model.hot_dark_current_e_per_s * hot
-    return np.asarray(model.dark_factor * dark, dtype=np.float32)
-
-
-def _defects(model: SensorModel, shape: tuple[int, int], kind: str) -> Map | None:
-    part = model.hot_pixels if kind == "hot" else model.dead_pixels
-    if not part:
-        return None
-    count = math.prod(shape)
-    pixels = count * model.binning**2
-    chosen = stream(model.pattern_seed, kind).choice(pixels, round(part * pixels), replace=False)
-    return np.bincount(chosen % count, minlength=count).reshape(shape).astype(np.float32)
 
 
 def neighbours(light: FloatArray, part: float) -> FloatArray:
