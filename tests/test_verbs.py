@@ -340,3 +340,18 @@ def test_the_doctor_tells_its_checks(monkeypatch: pytest.MonkeyPatch) -> None:
         assert [each.name for each in ms.doctor(warm=True)] == ["python", "kernels"][: 1 + ok]
     with pytest.raises(ms.ArgumentError, match="variant 'x': use llvm_ad_mono"):
         ms.doctor(variant="x")
+
+
+def test_every_option_of_the_command_line_has_a_help_text() -> None:
+    import typer
+
+    from mitsim.cli import app
+
+    verbs = typer.main.get_command(app).commands
+    silent = [
+        f"{verb} {parameter.name}"
+        for verb, command in verbs.items()
+        for parameter in command.params
+        if parameter.name != "help" and not getattr(parameter, "help", "")
+    ]
+    assert not silent, silent
