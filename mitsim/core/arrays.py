@@ -100,8 +100,12 @@ class Npy:
 
     @classmethod
     def of(cls, file: BinaryIO, size: int) -> Npy:
-        """The header at the beginning of ``file``, of ``size`` bytes. ValueError where it is none, of Python objects,
-        or claims other than the file has."""
+        """Read the header at the beginning of ``file``, of ``size`` bytes.
+
+        ValueError where it is none, of Python objects, or claims other than the file has.
+
+        ValueError where it is none, of Python objects, or claims other than the file has.
+        """
         read = _HEADERS.get(np.lib.format.read_magic(file))
         if read is None:
             raise ValueError("it is no array of numbers")
@@ -122,7 +126,10 @@ class Npy:
         return math.prod(self.shape) * self.dtype.itemsize
 
     def part(self, file: BinaryIO, index: int | None = None) -> npt.NDArray[Any]:
-        """The numbers in ``file``, or those of one ``index`` of the first axis. ValueError where it ends before."""
+        """Return the numbers in ``file``, or those of one ``index`` of the first axis.
+
+        ValueError where it ends before.
+        """
         several = index is not None and not self.fortran
         shape = self.shape[1:] if several else self.shape
         count = math.prod(shape)
@@ -135,7 +142,7 @@ class Npy:
 
 
 def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of an NPZ ``file``.
+    """Return the arrays of an NPZ ``file``.
 
     Parameters
     ----------
@@ -179,7 +186,7 @@ _MOST_ITEMS, _DEEPEST = 100_000, 16
 
 @contextmanager
 def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
-    """An HDF5 file that takes the place of ``path`` on leaving; after an error nothing of it is left.
+    """Open an HDF5 file that takes the place of ``path`` on leaving; after an error nothing of it is left.
 
     MitsimError when it cannot be written, as on a full disk.
     """
@@ -265,7 +272,7 @@ def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] 
 
 @contextmanager
 def hdf5_errors(path: Path) -> Iterator[None]:
-    """What h5py finds wrong with the file ``path``, in one line."""
+    """Raise h5py's errors on the file ``path`` as one line."""
     try:
         yield
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
@@ -356,8 +363,10 @@ def write_variables(path: Path, variables: Mapping[str, Any]) -> None:
 
 
 def is_hdf5(path: Path) -> bool:
-    """Whether the file ``path`` is HDF5, as MATLAB files of version 7.3 are behind their head; MitsimError where it is
-    no plain file."""
+    """Return True if the file ``path`` is HDF5, as MATLAB files of version 7.3 are behind their head.
+
+    MitsimError where it is no plain file.
+    """
     check_plain(path)
     with open(path, "rb") as file:
         head = file.read(_USER_BLOCK + len(_HDF5_MARK))
@@ -365,8 +374,9 @@ def is_hdf5(path: Path) -> bool:
 
 
 def read_variables(path: Path) -> dict[str, Any]:
-    """The arrays of real numbers and the texts of the MATLAB file ``path``, by name; cells, structures and objects,
-    which files of `mitsim export` and FlatCam have none of, are not looked into.
+    """Return the arrays of real numbers and the texts of the MATLAB file ``path``, by name.
+
+    Cells, structures and objects are not read, because files of `mitsim export` and FlatCam have none.
 
     MitsimError for a file that is missing, damaged, of version 7.3 or 4, or that takes more memory than is free.
     """

@@ -206,8 +206,11 @@ def _model_at(model: type[BaseModel] | None, place: Place) -> type[BaseModel] | 
 
 
 def shipped_path(*parts: str) -> Path:
-    """Return the path of a file or folder that comes with mitsim, for example ``shipped_path("calibration",
-    "imx249.toml")``. A wheel carries them inside the package, a source tree beside it."""
+    """Return the path of a file or folder that comes with mitsim.
+
+    For example ``shipped_path("calibration", "imx249.toml")``. A wheel carries them inside the package, a source tree
+    beside it.
+    """
     package = Path(__file__).resolve().parents[1]
     inside = package / "_shipped"
     path = (inside if inside.is_dir() else package.parent).joinpath(*parts)
@@ -333,8 +336,10 @@ _OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)--
 
 
 def opening_words(path: Path) -> tuple[str, str]:
-    """Return the first sentence of the comment that opens the scene or TOML file ``path``, and what follows "Serves:"
-    in that comment."""
+    """Return the first sentence of the comment that opens a file, and the words after "Serves:" in that comment.
+
+    The file ``path`` is a scene or TOML.
+    """
     opening = _OPENING.match(path.read_text(encoding="utf-8"))
     if opening is None:
         return "", ""

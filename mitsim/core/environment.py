@@ -1,4 +1,4 @@
-"""This machine: a variant's name in, Mitsuba ready to use out; and the checks behind `mitsim doctor`."""
+"""The machine: a variant's name in, Mitsuba ready to use out; and the checks behind `mitsim doctor`."""
 
 from __future__ import annotations
 
@@ -305,7 +305,7 @@ class Probe:
 
 
 def install_command() -> str:
-    """The one command that installs a fitting LLVM on this machine."""
+    """Return the one command that installs a fitting LLVM on this machine."""
     if platform.system() == "Darwin":
         return "brew install llvm"
     sudo = "" if os.geteuid() == 0 else "sudo "

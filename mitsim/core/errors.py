@@ -1,5 +1,7 @@
-"""The one exception for what a user can cause and mend; arguments of public functions that are of another kind than
-their annotation says, which are refused by it in a line."""
+"""The exception for what a user can cause and mend, and the check of arguments of public functions.
+
+Arguments of another kind than their annotation says are refused by it in a line.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +49,10 @@ class ArgumentError(MitsimError):
 
 
 def printable(text: str) -> str:
-    """A ``text`` without what a terminal would obey: control characters and those that turn its direction are spaces,
-    line ends stay."""
+    """Return a ``text`` without characters that a terminal would obey.
+
+    Control characters and those that turn its direction become spaces; line ends stay.
+    """
     return "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
 
 
@@ -59,12 +63,12 @@ def cut(text: str, length: int = 60) -> str:
 
 
 def reason_of(error: BaseException) -> str:
-    """What an ``error`` of a library says, on one line; its name where it says nothing."""
+    """Return the words of a library's ``error`` on one line; its name where it has none."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def near_name(text: str, known: Iterable[str]) -> str:
-    """ "did you mean NAME? " for the ``known`` name that a mistyped ``text`` is nearest to; empty without one."""
+    """Return "did you mean NAME? " for the ``known`` name that is nearest to ``text``; empty without one."""
     near = difflib.get_close_matches(text, [*known], 1)
     return f"did you mean {near[0]}? " if near else ""
 
@@ -134,7 +138,7 @@ def plain_number(value: object) -> object:
 
 
 def checked_fields(made: C) -> C:
-    """The class ``made``, which refuses such arguments when it is called: see :func:`checked`."""
+    """Make a class refuse arguments when it is called as :func:`check_arguments` does."""
     made.__init__ = check_arguments(vars(made)["__init__"])  # type: ignore[misc]
     return made
 
@@ -183,7 +187,9 @@ def _is_number(value: object) -> bool:
 
 def _is_real_array(value: object) -> bool:
     """Return True if a ``value`` is an array of bits, whole or real numbers as NumPy has them, which is not imported.
-    A masked array is none, because work would go on with the numbers under its mask."""
+
+    A masked array is none, because work would go on with the numbers under its mask.
+    """
     real = getattr(getattr(value, "dtype", None), "kind", "") in tuple("biuf")
     return real and not is_masked(value) and getattr(value, "ndim", 0) > 0
 
@@ -202,8 +208,10 @@ def short_text(value: object, length: int = 60) -> str:
 
 
 def is_path(value: object) -> bool:
-    """Return True if a ``value``, text or an object that stands for some, can be a path: an empty one would be the
-    working folder, and of a longer one the operating system has an error of its own."""
+    """Return True if a ``value``, text or an object that has some, can be a path.
+
+    An empty one would be the working folder, and for a longer one the operating system has an error of its own.
+    """
     try:
         text = os.fspath(value)  # type: ignore[call-overload]
         data = os.fsencode(text) if isinstance(text, str) else b""

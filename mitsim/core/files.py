@@ -34,7 +34,7 @@ PAIRS, SHARDS = "pairs.json", "pairs_*.h5"
 
 @contextmanager
 def whole_file(path: Path | str) -> Iterator[Path]:
-    """A name beside ``path`` to write to; on leaving it takes the place of ``path``, and after an error it is removed.
+    """Yield a name beside ``path`` to write to, which takes its place on leaving, and is removed after an error.
 
     MitsimError when the file cannot be written, or is no plain file; a link stays, and its file is replaced.
     """
@@ -181,8 +181,9 @@ def check_output(path: Path | str, overwrite: bool = False, kind: Literal["folde
 
 @contextmanager
 def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """The folder ``path`` for the time of a work, in which no other process may claim it; ``overwrite`` allows one that
-    holds files. If the work fails before writing, a new folder is removed.
+    """Hold the folder ``path`` for the time of a work, in which no other process may claim it.
+
+    ``overwrite`` allows one that holds files. If the work fails before writing, a new folder is removed.
 
     MitsimError as for :func:`prepare_output`, and when another process holds the folder.
     """
@@ -202,8 +203,9 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """The file ``path`` for the time of a work, in which no other process may claim it; ``overwrite`` allows one that
-    exists.
+    """Hold the file ``path`` for the time of a work, in which no other process may claim it.
+
+    ``overwrite`` allows one that exists.
 
     MitsimError as for :func:`prepare_output`, and when another process holds the file.
     """
@@ -240,8 +242,9 @@ def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
 
 @contextmanager
 def whole_folder(path: Path | str) -> Iterator[Path]:
-    """The new or empty folder ``path``, for files that appear together: after an error none of them is left, and what
-    a killed process left is removed by the next.
+    """Hold the new or empty folder ``path`` for files that appear together.
+
+    After an error none of them is left, and the next process removes those of a killed one.
 
     MitsimError as for :func:`output_folder`.
     """
@@ -265,7 +268,7 @@ def _empty(folder: Path) -> None:
 
 
 def _beside(path: Path, ending: str) -> Path:
-    """A hidden name in the folder of ``path`` that begins as its own."""
+    """Return a hidden name in the folder of ``path`` that begins as its own."""
     name = path.name.encode()[:_NAME_BYTES].decode(errors="ignore")
     return path.with_name(f".{name}{ending}")
 
@@ -320,8 +323,11 @@ MOST_BYTES = 32 << 20
 
 
 def plain(value: Any) -> Any:
-    """``value`` as JSON can hold it: arrays become lists, paths text, pydantic models dictionaries, NaN and
-    infinities null (JSON has no such numbers). TypeError for anything else."""
+    """Return ``value`` as JSON can hold it.
+
+    Arrays become lists, paths text, pydantic models dictionaries, NaN and infinities null (JSON has no such numbers).
+    TypeError for anything else.
+    """
     if hasattr(value, "model_dump"):
         value = value.model_dump()
     if hasattr(value, "tolist"):  # arrays and numbers of numpy, which plain data can do without
@@ -350,7 +356,7 @@ def write_json(path: Path | str, obj: Any) -> None:
 
 
 def parse_json(text: str) -> Any:
-    """The object in a JSON ``text``. ValueError when it is not JSON, has a key twice, or is nested too deep."""
+    """Return the object in a JSON ``text``. ValueError when it is none, has a key twice, or is nested too deep."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         unique: dict[str, Any] = {}
@@ -371,8 +377,12 @@ BYTE_ORDER_MARK = "\ufeff"
 
 
 def read_json(path: Path | str) -> Any:
-    """The object in the JSON file ``path`` of at most 32 MiB. MitsimError when it cannot be read, is not JSON, or has a
-    key twice."""
+    """Return the object in the JSON file ``path`` of at most 32 MiB.
+
+    MitsimError when it cannot be read, is not JSON, or has a key twice.
+
+    MitsimError when it cannot be read, is not JSON, or has a key twice.
+    """
     try:
         return parse_json(read_text(path, MOST_BYTES).removeprefix(BYTE_ORDER_MARK))
     except ValueError as error:
@@ -398,8 +408,12 @@ def fits_a_frame(shape: Sequence[int]) -> bool:
 
 
 def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
-    """The status of the plain file ``path``, called ``what`` in errors. MitsimError when it cannot be looked at, or is
-    a folder, pipe or device, from which reading may never end."""
+    """Return the status of the plain file ``path``, called ``what`` in errors.
+
+    MitsimError when it cannot be looked at, or is a folder, pipe or device, from which reading may never end.
+
+    MitsimError when it cannot be looked at, or is a folder, pipe or device, from which reading may never end.
+    """
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -412,15 +426,21 @@ def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
 
 
 def resolve(path: Path | str) -> Path:
-    """Where ``path`` leads, links followed as far as they lead: ``Path.resolve`` raises RuntimeError for one that leads
-    to itself, before Python 3.13."""
+    """Return the place that ``path`` leads to, links followed as far as they lead.
+
+    ``Path.resolve`` raises RuntimeError for a link that leads to itself, before Python 3.13.
+    """
     return Path(os.path.realpath(path))
 
 
 @contextmanager
 def stderr_silenced() -> Iterator[None]:
-    """What native code writes to stderr of a damaged file, past Python, goes nowhere: it raises too. One thread at a
-    time, so that two do not restore each other's stream."""
+    """Drop what native code writes to stderr about a damaged file, past Python, because it raises too.
+
+    One thread at a time, so that two do not restore each other's stream.
+
+    One thread at a time, so that two do not restore each other's stream.
+    """
     with _silence:
         stderr = os.dup(2)
         try:
@@ -433,8 +453,12 @@ def stderr_silenced() -> Iterator[None]:
 
 
 def read_text(path: Path | str, most: int) -> str:
-    """The UTF-8 text of the plain file ``path``. MitsimError as ``check_plain``, and for over ``most`` bytes;
-    ValueError when it is no UTF-8."""
+    """Return the UTF-8 text of the plain file ``path``.
+
+    MitsimError as ``check_plain``, and for over ``most`` bytes; ValueError when it is no UTF-8.
+
+    MitsimError as ``check_plain``, and for over ``most`` bytes; ValueError when it is no UTF-8.
+    """
     size = check_plain(path).st_size
     if size > most:
         raise MitsimError(f"file {path}: has {size} bytes; at most {most} are allowed")

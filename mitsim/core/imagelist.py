@@ -1,5 +1,6 @@
-"""What a list or a command line says of pictures: which are read, how, and what is done to their numbers before they
-are frames. A folder in, its files in the order of their numbers out.
+"""A list's or command line's words on pictures in: which are read, how, and how they become frames; file names out.
+
+Files of a folder are in the order of their numbers.
 
 None is opened here, and numpy is not imported, so that a mistake is told at once. `mitsim.core.images` reads numbers,
 `mitsim.core.prepare` makes frames of them.
@@ -162,7 +163,7 @@ def planes_of(mosaic: str) -> dict[str, tuple[int, int]]:
 
 
 def check_channel(name: str) -> str:
-    """The ``name``, where a plane is called so, or all are; ArgumentError otherwise."""
+    """Return the ``name`` if a plane is called so, or all are; ArgumentError otherwise."""
     if name not in (*PLANES, ALL):
         raise ArgumentError("channel", f"{name!r}: use {', '.join(PLANES)} or {ALL}")
     return name
@@ -204,7 +205,7 @@ class Wanted:
         return cls(raw=raw, orientation=how.orientation, mosaic=how.mosaic)
 
     def refusal(self, path: Path, reason: str) -> MitsimError:
-        """A line that says for what ``reason`` the file ``path`` is not read."""
+        """Return a line that states for what ``reason`` the file ``path`` is not read."""
         return MitsimError(f"{self.what} {path}: {reason}")
 
 
@@ -239,6 +240,6 @@ def image_files(source: Path, wanted: Wanted = FRAME) -> tuple[Path, ...]:
 
 
 def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """A key by which shot 10 comes after shot 9."""
+    """Return a key by which shot 10 comes after shot 9."""
     parts = re.split(r"([0-9]+)", path.name)
     return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts], path.name

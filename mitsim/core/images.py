@@ -1,5 +1,6 @@
-"""Pictures: of other programs (PNG, TIFF, NPY, OpenEXR, bare numbers), a path in, size or numbers as stored out; and
-for people, numbers in, PNG bytes and the text that shows them in a notebook out.
+"""Pictures of other programs in, their numbers out; and numbers in, pictures for people out.
+
+PNG, TIFF, NPY, OpenEXR, DNG and bare numbers are read. People get PNG bytes and the text that shows them in a notebook.
 
 Nothing is scaled, inverted or made grey, and turned only where that is asked for: a file whose numbers its reader would
 change is refused. What a header
@@ -165,8 +166,10 @@ def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
 
 
 def own_end(values: Numbers) -> float | None:
-    """Return the largest number that a file of such ``values`` can hold: 255 or 65535; None where cameras seldom reach
-    it."""
+    """Return the largest number that a file of such ``values`` can hold: 255 or 65535.
+
+    None where cameras seldom reach it.
+    """
     return float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" and values.dtype.itemsize < 4 else None
 
 
@@ -217,8 +220,10 @@ def _png(path: Path, wanted: Wanted) -> _Reader:
 
 
 def _upright(path: Path, values: Numbers, stated: Any, wanted: Wanted) -> Numbers:
-    """Return the numbers of a picture as they are ``wanted`` of a file that states its orientation; MitsimError where
-    nobody says whether the stored or the shown picture is meant."""
+    """Return the numbers of a picture as they are ``wanted`` of a file that states its orientation.
+
+    MitsimError where nobody says whether the stored or the shown picture is meant.
+    """
     if wanted.orientation is None and stated != _UPRIGHT:
         raise wanted.refusal(
             path,
@@ -269,8 +274,10 @@ def _tiff(path: Path, wanted: Wanted) -> _Reader:
 
 
 def _pages_of(path: Path) -> tuple[int, dict[int, tuple[int, int, bytes]]]:
-    """Return the number of pages of a TIFF, one more than :data:`_MOST_PAGES` at most, and the orientation of each page
-    that is not upright: its value, its place in the file, and the bytes of an upright one.
+    """Return the number of pages of a TIFF, and the orientation of each page that is not upright.
+
+    There may be one page more than :data:`_MOST_PAGES`. An orientation is its value, its place in the file, and the
+    bytes of an upright one.
 
     Pillow takes a millisecond for each page, and turns a picture as it loads it: of files that are packed and of others
     in different ways, which change with its version. It is given upright ones.
@@ -484,7 +491,7 @@ _SHOWN_HEIGHT = 144
 
 
 def png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
-    """A PNG of reflectances, or of linear sRGB, shown as :func:`lightness`.
+    """Encode reflectances, or linear sRGB, as a PNG that is shown as :func:`lightness`.
 
     Parameters
     ----------
@@ -503,13 +510,13 @@ def lightness(reflectance: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def linear_light(shade: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """The reflectance 0..1 that :func:`lightness` encodes as a ``shade``."""
+    """Return the reflectance 0..1 that :func:`lightness` encodes as a ``shade``."""
     encoded = np.clip(np.asarray(shade, dtype=np.float64), 0, 1)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
-    """A PNG of ``values`` as they are.
+    """Encode ``values`` as they are as a PNG.
 
     Parameters
     ----------
@@ -535,7 +542,7 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
 
 
 def from_above(module: str, name: str) -> Callable[..., Any]:
-    """A function that draws or labels results of rooms below its own, for the methods by which they offer it.
+    """Return a function that draws or labels results of rooms below its own, for methods by which they offer it.
 
     These are the only calls up the house; who never draws imports nothing for it.
 
@@ -549,13 +556,15 @@ def from_above(module: str, name: str) -> Callable[..., Any]:
 
 
 def data_uri(picture: bytes, kind: str = "png") -> str:
-    """A ``picture``, a PNG or of another ``kind``, as the address that holds it, for a page that refers to nothing
-    outside itself."""
+    """Return a ``picture``, a PNG or of another ``kind``, as the address that holds it.
+
+    A page with it refers to nothing outside itself.
+    """
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
 
 
 def span(values: npt.ArrayLike, unit: str) -> str:
-    """The range of numbers ``values``, with their ``unit``, for the caption of a picture of them :func:`scaled`."""
+    """Return the range of ``values`` with their ``unit``, for the caption of a picture of them."""
     ends = np.min(values), np.max(values)
     low, high = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in ends)
     return f"{low} to {high} {unit}"

@@ -1,5 +1,7 @@
-"""What goes with long work besides its inputs: where its time goes, who is told how far it is, what it may take of what
-this machine has left, and the refusal of what would take more."""
+"""What goes with long work besides its inputs: a clock, progress, limits, and what this machine has left.
+
+Work that would take more than that is refused.
+"""
 
 from __future__ import annotations
 
@@ -70,16 +72,16 @@ class Watch:
     """Who is told what work is at, as the rows on a terminal are. This one ignores it all."""
 
     def begin(self, stage: str) -> None:
-        """The ``stage`` goes on from here."""
+        """Note that the ``stage`` goes on from here."""
 
     def end(self, stage: str, seconds: float) -> None:
-        """The ``stage`` is over, or waits for its next turn; ``seconds`` all in all so far."""
+        """Note that the ``stage`` is over, or waits for its next turn; ``seconds`` all in all so far."""
 
     def predict(self, seconds: Mapping[str, float]) -> None:
-        """What stages to come are predicted to take, ``seconds`` by name."""
+        """Note the ``seconds`` that stages to come are predicted to take, by name."""
 
     def report(self, stage: str, fraction: float) -> None:
-        """The finished ``fraction``, 0 to 1, of a ``stage``, or of a loop over several: a :data:`Progress`."""
+        """Note the finished ``fraction``, 0 to 1, of a ``stage``, or of a loop over several: a :data:`Progress`."""
 
 
 @checked_fields
@@ -105,7 +107,7 @@ class Clock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Adds the time spent inside the context to ``name``."""
+        """Add the time spent inside the context to ``name``."""
         started = time.perf_counter()
         self._watch.begin(self._prefix + name)
         try:
@@ -119,7 +121,7 @@ class Clock:
         self._watch.predict({self._prefix + name: own for name, own in stages.items() if name not in self._stages})
 
     def apart(self, prefix: str) -> Clock:
-        """A clock of its own for a part of the work, watched by the same with ``prefix`` before its stages' names."""
+        """Return a clock for a part of the work, watched by the same with ``prefix`` before its stages' names."""
         return Clock(0.0, self._watch, self._prefix + prefix)
 
     @check_arguments
@@ -138,8 +140,10 @@ class Clock:
         return {**self._stages, "total": time.perf_counter() - self._started}
 
     def kernels(self) -> dict[str, float]:
-        """``number`` of kernels that were compiled since the clock was made, and ``seconds`` that it took: later runs
-        find them in Dr.Jit's cache, and are the faster by so much."""
+        """Return the ``number`` of kernels compiled since the clock was made, and the ``seconds`` that it took.
+
+        Later runs find them in Dr.Jit's cache, and are the faster by so much.
+        """
         return asdict(compiled_kernels().since(self._compiled))
 
     def _add(self, name: str, seconds: float) -> None:
@@ -235,14 +239,14 @@ class Job:
     command: str | None = None
 
     def apart(self, prefix: str) -> Job:
-        """The same for a part of the work whose seconds are its own, ``prefix`` before its stages' names."""
+        """Return a job for a part of the work whose seconds are its own, ``prefix`` before its stages' names."""
         return replace(
             self, clock=self.clock.apart(prefix), progress=lambda stage, part: self.progress(prefix + stage, part)
         )
 
     @contextmanager
     def planning(self, what: str, least: Cost | None = None) -> Iterator[None]:
-        """The stage "plan" of the clock, refused once the whole work has taken all the seconds that its limits allow.
+        """Enter the stage "plan", which is refused once the work has taken all seconds that its limits allow.
 
         Parameters
         ----------
@@ -388,7 +392,7 @@ def free_disk(path: Path) -> float:
 
 
 def size_text(count: float) -> str:
-    """A ``count`` of bytes for people."""
+    """Return a ``count`` of bytes for people."""
     return f"{count / 2**30:.3g} GiB" if count >= 1000 * 2**20 else f"{count / 2**20:.3g} MiB"
 
 
@@ -407,8 +411,9 @@ _BAR = 24
 @check_arguments
 @contextmanager
 def progress(limits: Limits | None = None, hidden: bool = False, start: float = 0.0) -> Iterator[Job]:
-    """Make a job that shows how far it is while the context lasts: rows on a terminal and in a notebook, else a line a
-    minute on standard error.
+    """Make a job that shows how far it is while the context lasts.
+
+    It shows rows on a terminal and in a notebook, else a line a minute on standard error.
 
     Parameters
     ----------
@@ -461,8 +466,11 @@ class _Log(Watch):
 
 @dataclass
 class _Row:
-    """One stage on a terminal: its name or last report, the seconds of earlier turns, the begin of the present turn,
-    the seconds and the part that its rate counts from, and its seconds at its end by its rate or by the plan."""
+    """One stage on a terminal.
+
+    It has its name or last report, the seconds of earlier turns, the begin of the present turn, the seconds and the
+    part that its rate counts from, and its seconds at its end by its rate or by the plan.
+    """
 
     words: str
     spent: float = 0.0
@@ -566,8 +574,10 @@ class _Rows(Watch):
 
 
 class _Cell(_Rows):
-    """The same rows below a cell of a notebook, written anew at most :data:`_REFRESHES` times a second; the last ones
-    stay."""
+    """The same rows below a cell of a notebook.
+
+    They are written anew at most :data:`_REFRESHES` times a second; the last ones stay.
+    """
 
     _handle: Any = None
     _written = 0.0

@@ -117,8 +117,9 @@ class Digital(_Part):
         return rate
 
     def variance(self, light: FloatArray | float, shots: int = 1) -> FloatArray:
-        """Noise variance [(electrons / s)^2] of a sum or difference of shots, after EMVA 1288: shot noise of light and
-        dark current, read noise, rounding; what is not stated counts as 0.
+        """Return the noise variance [(electrons / s)^2] of a sum or difference of shots, after EMVA 1288.
+
+        It counts shot noise of light and dark current, read noise and rounding; what is not stated counts as 0.
 
         Parameters
         ----------
@@ -280,7 +281,7 @@ class RunHead(_Head):
 
     @classmethod
     def of(cls, configuration: Mapping[str, Any]) -> RunHead:
-        """The head of an unfinished run of that ``configuration``."""
+        """Return the head of an unfinished run of that ``configuration``."""
         digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
         return cls(status="incomplete", configuration=dict(configuration), configuration_sha256=digest)
 
@@ -369,8 +370,11 @@ Edges = Annotated[tuple[Coordinate, ...], Field(strict=False, min_length=2, max_
 
 
 class Parallax(_Part):
-    """How a calibration's factors move with depth: the projector's window, seen from the middle of the frames on a
-    plane at distance z, has its edges at tan-angles window + parallax (1/z - 1/depth), in index coordinates."""
+    """How a calibration's factors move with depth.
+
+    The projector's window, seen from the middle of the frames on a plane at distance z, has its edges at tan-angles
+    window + parallax (1/z - 1/depth), in index coordinates.
+    """
 
     depth_mm: Distance
     """Sensor to the board [mm]."""

@@ -67,8 +67,10 @@ def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:
 
 @cache
 def _libraries(*_: bool) -> tuple[Any, ...]:
-    """Libraries of BLAS in this process, which has imported these of :data:`_BRING_BLAS`. Looking for them takes a
-    millisecond, so it is done once, and again after such an import."""
+    """Libraries of BLAS in this process, which has imported these of :data:`_BRING_BLAS`.
+
+    Looking for them takes a millisecond, so it is done once, and again after such an import.
+    """
     # Imported here: threadpoolctl sets an environment variable when it is imported, and importing mitsim sets none.
     from threadpoolctl import ThreadpoolController
 
@@ -76,7 +78,7 @@ def _libraries(*_: bool) -> tuple[Any, ...]:
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """``function`` of each of the ``items``, in order, one thread a processor; it should spend its time in numpy.
+    """Return ``function`` of each of the ``items``, in order, one thread a processor; its time should be numpy's.
 
     The threads are kept. One item, and items of an item, are worked on where they are asked for. After an error, or
     Control-C, items that nobody has begun are left out, and those that somebody has are finished.

@@ -1,5 +1,6 @@
-"""Numbers as a file holds them in; a frame out: without common factor, dark signal and uneven response, one plane of a
-mosaic, turned and cropped.
+"""A file's numbers in, a frame out.
+
+The frame has no common factor, dark signal or uneven response, and is one plane of a mosaic, turned and cropped.
 
 What is saturated in a file stays so: such pixels, and those that turning makes of them, have the end of the scale that
 :attr:`Preparer.digital` states.
@@ -118,15 +119,17 @@ class Preparer:
         return self.dark is None and self.response is None and not self.how.turn_deg
 
     def plane(self, values: Numbers) -> Numbers:
-        """The part of ``values`` (rows, columns) that is of the channel."""
+        """Return the part of ``values`` (rows, columns) that is of the channel."""
         if self.how.channel is None:
             return values
         row, column = planes_of(self.how.mosaic or BGGR)[self.how.channel]
         return values[row::2, column::2]
 
     def mean(self, source: Path, wanted: Wanted) -> FloatArray:
-        """Mean of all frames in ``source``, a file or folder read as ``wanted``, as they are stored but for the common
-        factor. MitsimError where one cannot be read, or is of another size."""
+        """Return the mean of all frames in ``source``, a file or folder, as they are stored but for the common factor.
+
+        They are read as ``wanted``. MitsimError where one cannot be read, or is of another size.
+        """
         total, count = np.zeros(()), 0
         for path in image_files(source, wanted):
             for values in read_images(path, wanted):
@@ -136,8 +139,9 @@ class Preparer:
         return np.asarray(total / count, dtype=np.float64)
 
     def frame(self, path: Path, values: Numbers, mean: bool = False) -> Numbers:
-        """The frame of a file's ``values`` (rows, columns): of their type, or of single precision where they are
-        corrected or turned.
+        """Return the frame of a file's ``values`` (rows, columns).
+
+        It is of their type, or of single precision where they are corrected or turned.
 
         Parameters
         ----------
@@ -250,13 +254,15 @@ class CommonFactor:
             self.factor = int(np.gcd.reduce(np.append(row.astype(np.int64), self.factor)))
 
     def shift(self, end: float | None) -> int:
-        """What the numbers of a camera that counts to ``end`` are multiplied by in the high bits of these files, where
-        these are multiples of it; else 1."""
+        """Return the factor of numbers in the high bits of these files, where these are multiples of it; else 1.
+
+        The camera counts to ``end``.
+        """
         shift = 1 if end is None else 1 << max(self._bits - int(end).bit_length(), 0)
         return shift if self.factor % shift == 0 else 1
 
     def choose(self, end: float | None) -> tuple[int, int]:
-        """What to divide by, and what to divide by if the numbers were shifted or scaled all the same.
+        """Return the factor to divide by, and the one to divide by if the numbers were shifted or scaled all the same.
 
         Parameters
         ----------

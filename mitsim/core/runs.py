@@ -159,9 +159,11 @@ class Capture:
             yield each.frame, each.row, each.column
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """Yield the measurement of every pattern, read one at a time; the halves of a signed one come as their
-        difference, others without the ambient frame, if one was taken. MitsimError for a frame that is missing,
-        damaged, not finite or of another ``shape`` than is asked for."""
+        """Yield the measurement of every pattern, read one at a time.
+
+        The halves of a signed one come as their difference, others without the ambient frame, if one was taken.
+        MitsimError for a frame that is missing, damaged, not finite or of another ``shape`` than is asked for.
+        """
         digital = self.manifest.digital
         waiting: dict[tuple[int, int], Measurement] = {}
         for shot in self.manifest.patterns.captures:
@@ -200,15 +202,19 @@ class Capture:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the capture's files: its shots', and those of ambient frame, closing frame and truth, if it has
-        them."""
+        """Names of the capture's files.
+
+        They are its shots', and those of ambient frame, closing frame and truth, if it has them.
+        """
         names = [*(shot.file for shot in self.manifest.patterns.captures), *self.manifest.others.values()]
         return (*names, TRUTH) if self._has_truth else tuple(names)
 
     @check_arguments
     def read(self, name: str) -> tuple[Channels, Metadata]:
-        """Return channels and metadata of one of the :attr:`files`, by its ``name``. MitsimError for one that is
-        missing or damaged."""
+        """Return channels and metadata of one of the :attr:`files`, by its ``name``.
+
+        MitsimError for one that is missing or damaged.
+        """
         if name not in self._memory if self.folder is None else Path(name).name != name or "\0" in name:
             raise ArgumentError("name", f"{cut(repr(name))}: is no file of this capture; see files")
         if self.folder is None:
@@ -218,8 +224,10 @@ class Capture:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 that captures of the same frames share: of mitsim's in memory or on disk, of a real camera's in the
-        same place."""
+        """SHA-256 that captures of the same frames share.
+
+        mitsim's share it in memory and on disk, a real camera's in the same place.
+        """
         manifest = self.manifest
         # What is not stated is left out: folders of 0.4.0 keep their fingerprints.
         digest = hashlib.sha256(manifest.digital.model_dump_json(exclude_defaults=True).encode())
@@ -301,8 +309,10 @@ class Capture:
         return from_above("report.plots", "draw_shot")(self, shot, quantity, ax)
 
     def to_xarray(self) -> Dataset:
-        """Frames, and where known expected electrons and truth, as an ``xarray.Dataset`` with units and coordinates;
-        MitsimError where xarray, an extra, is not installed."""
+        """Return frames, expected electrons and truth where known, as an ``xarray.Dataset`` with coordinates.
+
+        MitsimError where xarray, an extra, is not installed.
+        """
         return from_above("exchange.labelled", "label_capture")(self)
 
     def __repr__(self) -> str:
@@ -567,7 +577,7 @@ class MosaicCapture:
         manifests.write_colours(folder, self.manifest)
 
     def summary(self) -> dict[str, Any]:
-        """What the command line reports: the keys of a capture, and of colour.json."""
+        """Return the facts that the command line reports: the keys of a capture, and of colour.json."""
         return {**self.manifest.model_dump(), **self.shots.summary()}
 
     def __repr__(self) -> str:
@@ -579,7 +589,7 @@ class MosaicCapture:
 
 @check_arguments
 def load_mosaic(folder: Path | str) -> MosaicCapture:
-    """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
+    """Return the run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
     folder = Path(folder)
     manifest = cast("MosaicManifest", manifests.read_colours(folder, manifests.MOSAIC))
     truths = {}
@@ -626,8 +636,10 @@ class Recorder:
         return False
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        """Write a file of the run by its ``name``, whole or not at all: its ``channels``, (rows, columns) each, and
-        ``metadata``."""
+        """Write a file of the run by its ``name``, whole or not at all.
+
+        It has ``channels``, (rows, columns) each, and ``metadata``.
+        """
         self.files[name] = channels, metadata
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
@@ -663,8 +675,10 @@ class RunFolder(Recorder):
     folder: Path
 
     def __init__(self, folder: Path, head: RunHead, known: Mapping[str, str]) -> None:
-        """Make a run of the configuration in ``head``, in its ``folder``; checksums of an earlier, finished run by file
-        name are ``known``."""
+        """Make a run of the configuration in ``head``, in its ``folder``.
+
+        Checksums of an earlier, finished run by file name are ``known``.
+        """
         super().__init__()
         self.folder, self.head = folder, head
         self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
@@ -715,8 +729,10 @@ class RunFolder(Recorder):
             self._checksums[name] = value
 
     def _identity(self, index: int, channels: Channels) -> Metadata:
-        """Return what tells a frame from one of another run, another place in this one, or one that was damaged: in an
-        interrupted run no manifest holds checksums of files yet."""
+        """Return what tells a frame from one of another run, another place in this one, or one that was damaged.
+
+        In an interrupted run no manifest holds checksums of files yet.
+        """
         digest = hashlib.sha256()
         for name, values in sorted(channels.items()):
             digest.update(name.encode())

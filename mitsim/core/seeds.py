@@ -19,23 +19,27 @@ _LARGEST_ROOT = 2**64
 
 
 def check_root(root: int) -> int:
-    """The seed ``root`` of all streams, or MitsimError when it is out of range."""
+    """Return the seed ``root`` of all streams; MitsimError when it is out of range."""
     if not 0 <= root < _LARGEST_ROOT:
         raise MitsimError(f"seed: got {root}; allowed are whole numbers from 0 to 2^64 - 1")
     return root
 
 
 def stream(root: int, *names: str | int) -> np.random.Generator:
-    """A generator of its own for ``names`` under the seed ``root`` (0 <= root < 2^64), for example
-    ``stream(seed, "shot", frame)``. MitsimError for a root out of range."""
+    """Return a generator of its own for ``names`` under the seed ``root`` (0 <= root < 2^64).
+
+    For example ``stream(seed, "shot", frame)``. MitsimError for a root out of range.
+    """
     import numpy as np
 
     return np.random.Generator(np.random.PCG64(_sequence(root, "stream", names)))
 
 
 def integer(root: int, *names: str | int) -> int:
-    """A child seed in [0, 2^32) for ``names`` under the seed ``root``, for libraries that want an integer; unrelated to
-    :func:`stream` of that name. MitsimError for a root out of range."""
+    """Return a child seed in [0, 2^32) for ``names`` under the seed ``root``, for libraries that want an integer.
+
+    It is unrelated to the :func:`stream` of that name. MitsimError for a root out of range.
+    """
     import numpy as np
 
     return int(_sequence(root, "integer", names).generate_state(1, np.uint32)[0])

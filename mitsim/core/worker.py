@@ -50,8 +50,10 @@ _WHOLE = "\r\x1b[J\x1b[?25h"
 
 
 class OutOfTime(BaseException):
-    """Raised in work whose time is over (:mod:`mitsim.core.job`); no Exception, so that nothing in it takes it for
-    a failure that it may go on from."""
+    """Raised in work whose time is over (:mod:`mitsim.core.job`).
+
+    It is no Exception, so that nothing in the work takes it for a failure that it may go on from.
+    """
 
 
 _stopped_by: int | None = None
@@ -123,8 +125,11 @@ def enter_worker() -> None:
 
 
 def end_with(status: object) -> None:
-    """Note the exit ``status`` of a worker that is about to end: once threads have ended, what was registered for the
-    exit is done and output is written, it ends at once. To take interpreter and native libraries apart takes 0.2 s."""
+    """Note the exit ``status`` of a worker that is about to end.
+
+    Once threads have ended, functions that are registered for the exit are done and output is written, it ends at once.
+    To take interpreter and native libraries apart takes 0.2 s.
+    """
     global _status
     _status = status if isinstance(status, int) else None
 
@@ -148,9 +153,12 @@ def advise(text: str) -> None:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Signals that stop this process wait until the block ends: native code that is being imported turns what they
-    raise into errors of its own, or ends the process. Threads that begin in it leave them to the main one for good;
-    those that were there, as of a library for linear algebra, may still take one, which is kept for the end."""
+    """Make signals that stop this process wait until the block ends.
+
+    Native code that is being imported turns what they raise into errors of its own, or ends the process. Threads that
+    begin in it leave them to the main one for good; those that were there, as of a library for linear algebra, may
+    still take one, which is kept for the end.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -173,8 +181,11 @@ def held_back() -> Iterator[None]:
 
 @contextmanager
 def pause_collector() -> Iterator[None]:
-    """Python's collector waits while modules are imported: it would go through what they make again and again, for 0.06
-    to 0.1 s of a capture. What a worker has by then, it goes past from there on."""
+    """Make Python's collector wait while modules are imported.
+
+    It would go through what they make again and again, for 0.06 to 0.1 s of a capture. What a worker has by then, it
+    goes past from there on.
+    """
     collecting, known = gc.isenabled(), len(sys.modules)
     gc.disable()
     try:
@@ -205,9 +216,11 @@ def end_stopped() -> NoReturn:
 
 
 def end_uncaught(error: BaseException) -> NoReturn:
-    """Say in one line what nobody caught, with the file that has its traceback, and exit with 2: 1 would say that there
-    is a result. Of an ``error`` that an interrupt became on its way, as of a module that was being imported, the
-    interrupt is said."""
+    """Report in one line an ``error`` that nobody caught, with the file of its traceback, and exit with 2.
+
+    1 would mean that there is a result. If an interrupt became that error on its way, as in a module that was being
+    imported, the interrupt is reported.
+    """
     if is_stopped():
         end_stopped()
     import tempfile
@@ -263,8 +276,14 @@ def _stop(number: int, _: FrameType | None) -> None:
 
 
 def _insist_on_signals() -> None:
-    """A signal comes again until its handler has run. Python's own C handler only notes it and writes a byte; where
-    that happens just before Python waits for something, nothing ends the wait."""
+    """Repeat a signal until its handler has run.
+
+    Python's own C handler only notes it and writes a byte; where that happens just before Python waits for something,
+    nothing ends the wait.
+
+    Python's own C handler only notes it and writes a byte; where that happens just before Python waits for something,
+    nothing ends the wait.
+    """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
@@ -285,9 +304,11 @@ def _again(_: int, __: FrameType | None) -> None:
 
 
 def _unraisable(lost: sys.UnraisableHookArgs) -> None:
-    """An interrupt that fell into a callback or a destructor, where Python drops it with a traceback, comes again; what
-    else goes wrong while the process is stopped is not told, as that a second signal came too late. Alarms of
-    :mod:`mitsim.core.job` come again of themselves."""
+    """Repeat an interrupt that fell into a callback or a destructor, where Python drops it with a traceback.
+
+    Other errors of a stopped process are not reported, such as a second signal that came too late. Alarms of
+    :mod:`mitsim.core.job` come again of themselves.
+    """
     if lost.exc_type is OutOfTime:
         return
     if not is_stopped():

@@ -30,8 +30,10 @@ TURNED = "turn_deg"
 
 
 class CaptureList(Configuration):
-    """What a real capture is of, and how its files become frames. Options of `mitsim import` take the place of what it
-    says."""
+    """What a real capture is of, and how its files become frames.
+
+    Options of `mitsim import` take the place of what it says.
+    """
 
     camera: Identity | None = None
     """Identity that a calibration must share: a name, or anything as a run's manifest has it; none: by --camera or
@@ -80,7 +82,7 @@ class CaptureList(Configuration):
 
 
 def load_capture_list(name: Path | str) -> CaptureList:
-    """The list of a ``name``, shipped, or in a TOML or JSON file; its paths begin where the command runs.
+    """Load the list of a ``name``, shipped, or in a TOML or JSON file; its paths begin where the command runs.
 
     MitsimError when there is none, or it breaks a rule.
     """
@@ -304,8 +306,10 @@ class FrameFacts(Options):
     seed: int | None = _said("root of every random stream", panel=configuration.QUALITY)
 
     def of(self, source: Path) -> RealCapture:
-        """What is known of the frames at ``source``, checked before any is opened; MitsimError as
-        :meth:`RealCapture.check`, and for what has no effect."""
+        """Return what is known of the frames at ``source``, checked before any is opened.
+
+        MitsimError as :meth:`RealCapture.check`, and for options without effect.
+        """
         listed = CaptureList() if self.list is None else load_capture_list(self.list)
         bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
         if self.shape is None or not bare:
@@ -338,7 +342,7 @@ class FrameFacts(Options):
         return known
 
     def _preparation(self, listed: Preparation) -> Preparation:
-        """What is done to numbers by a list's ``listed``, and what is said here in the place of it."""
+        """Return the preparation of a list, ``listed``, with the options in the place of it."""
         paths = {"dark": self.dark_frame, "flat": self.flat_frame, "flat_dark": self.flat_dark_frame}
         stated = {"channel": self.channel, "mosaic": self.mosaic, "divide_by": self.divide, "turn_deg": self.turn}
         given: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}

@@ -1,5 +1,6 @@
-"""RUN and CAL folders in, a file or folder of a format that other programs read out; such a file, or a real camera's
-frames, back to folders; and patterns in, pictures for a real projector out.
+"""RUN and CAL folders in, a file or folder of a format that other programs read out; and back.
+
+A real camera's frames become folders, too, and patterns become pictures for a real projector.
 
 Each format is a row of :data:`FORMATS`. Its module is imported when it is used: what a request says is checked before.
 """

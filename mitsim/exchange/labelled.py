@@ -1,5 +1,6 @@
-"""Runs and factors in, a file of PyTorch's tensors out; captures, factors and images in, xarray Datasets out, with
-axes, units and coordinates by the CF conventions.
+"""Runs and factors in, a file of PyTorch's tensors out; captures, factors and images in, xarray Datasets out.
+
+Datasets have axes, units and coordinates by the CF conventions.
 
 PyTorch and xarray are extras (`pip install mitsim[torch,xarray]`), imported when they are used.
 """
@@ -96,8 +97,10 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
 
 
 def measurements(shots: Capture) -> FloatArray:
-    """Return (K K', rows, columns) electrons a second of every pattern of ``shots``, row-major over (i, j): differences
-    of signed pairs, others less the ambient frame. MitsimError for a frame that cannot be read."""
+    """Return (K K', rows, columns) electrons a second of every pattern of ``shots``, row-major over (i, j).
+
+    They are differences of signed pairs, others less the ambient frame. MitsimError for a frame that cannot be read.
+    """
     columns = shots.patterns[1].shape[1]
     frames = {each.row * columns + each.column: each.frame for each in shots.pattern_measurements()}
     return np.stack([frames[index] for index in sorted(frames)])

@@ -110,8 +110,9 @@ _CLASSES = {"char", "single", "double", *(f"{sign}int{bits}" for sign in ("", "u
 
 
 def variables_in(path: Path) -> dict[str, Any]:
-    """Return the arrays of real numbers and the texts of the MATLAB file ``path``, of version 5 or 7.3, by name; cells,
-    structures and sparse matrices are not looked into.
+    """Return the arrays of real numbers and the texts of the MATLAB file ``path``, of version 5 or 7.3, by name.
+
+    Cells, structures and sparse matrices are not read.
 
     MitsimError for a file that is missing, damaged, of version 4, or that takes more memory than is free.
     """
@@ -231,8 +232,10 @@ def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple
 
 
 def _run_variables(run: Packed[RunManifest]) -> dict[str, Any]:
-    """Return manifest, patterns, other frames, and `data_coded`, `measBg` and, of signed pairs, `data_negative`:
-    (rows, columns, K, K') each, or (rows, columns)."""
+    """Return manifest, patterns, other frames, and the frames of a run by name.
+
+    `data_coded` and, of signed pairs, `data_negative` are (rows, columns, K, K'), `measBg` is (rows, columns).
+    """
     manifest, digital = run.manifest, run.manifest.digital
     signs = {abs(shot.sign) for shot in manifest.patterns.captures}
     if len(signs) != 1:
@@ -365,8 +368,10 @@ def _truth_in(own: MatFile) -> tuple[Channels, Metadata]:
 
 
 def _calibration_in(own: MatFile, digital: Digital) -> Packed[CalibrationManifest]:
-    """Return the calibration of the variables ``own``, of a run whose frames are read as ``digital`` says: its unit is
-    that of `phi_left` and `phi_right`."""
+    """Return the calibration of the variables ``own``, of a run whose frames are read as ``digital`` says.
+
+    Its unit is that of `phi_left` and `phi_right`.
+    """
     text = own.text("calibration_manifest")
     manifest = unpack(text, CalibrationManifest, own.path)
     metadata: Metadata = {"unit": "sqrt(e-/s)"}
@@ -381,7 +386,7 @@ def _calibration_in(own: MatFile, digital: Digital) -> Packed[CalibrationManifes
 
 
 def flatcam_calibration(path: Path, channel: str) -> Calibration:
-    """The factors of one plane of a real FlatCam, or of all, from its calibration file.
+    """Return the factors of one plane of a real FlatCam, or of all, from its calibration file.
 
     Parameters
     ----------

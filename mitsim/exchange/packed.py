@@ -61,8 +61,10 @@ class Packed(Generic[Manifest]):
     place: Path
 
     def save(self, folder: Path | str) -> Path:
-        """Write the ``folder``, new or empty, whole or not at all; return it. MitsimError where that cannot be
-        written, or a file cannot be read."""
+        """Write the ``folder``, new or empty, whole or not at all; return it.
+
+        MitsimError where that cannot be written, or a file cannot be read.
+        """
         with whole_folder(folder) as place:
             self.fill(place)
         return Path(folder)
@@ -161,8 +163,10 @@ def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
 
 
 def run_content(folder: Path) -> Run:
-    """Return the content of the RUN ``folder``, coloured, behind colour filters, or neither. MitsimError when it, or a
-    line's folder, is not a complete one."""
+    """Return the content of the RUN ``folder``, coloured, behind colour filters, or neither.
+
+    MitsimError when it, or a line's folder, is not a complete one.
+    """
     lines = manifests.open_lines(folder, manifests.RUN, manifests.MOSAIC)
     files = {name: folder / name / TRUTH for name in (lines.names if lines.filters else ())}
     truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
@@ -171,8 +175,10 @@ def run_content(folder: Path) -> Run:
 
 
 def calibration_content(folder: Path) -> Calibration:
-    """Return the content of the CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a
-    complete one."""
+    """Return the content of the CAL ``folder``, coloured or not.
+
+    MitsimError when it, or a line's folder, is not a complete one.
+    """
     lines = manifests.open_lines(folder, manifests.CALIBRATION)
     text = read_text(folder / manifests.COLOUR, MOST_BYTES) if lines.colours else ""
     return Content({name: pack_calibration(part) for name, part in lines.parts.items()}, lines.colours, text)
@@ -475,8 +481,10 @@ def _metadata_in(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Valu
 
 
 def hdf5_item(parent: h5py.Group, name: str, path: Path, kind: str = "Dataset") -> Any:
-    """Return the item ``name`` of a group of the file ``path``. MitsimError where it is not of that ``kind``, or is an
-    array that no frames fit."""
+    """Return the item ``name`` of a group of the file ``path``.
+
+    MitsimError where it is not of that ``kind``, or is an array that no frames fit.
+    """
     item = parent.get(name)
     if type(item).__name__ != kind:
         what = "is missing" if item is None else f"is no {kind.lower()}"

@@ -119,8 +119,9 @@ def draw_family(
 
 
 def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, Any]:
-    """Draw every shot of a calibration session to a new folder, whole or not at all, in the order in which
-    `mitsim calibrate --frames` counts frames.
+    """Draw every shot of a calibration session to a new folder, whole or not at all.
+
+    The order is that in which `mitsim calibrate --frames` counts frames.
 
     Parameters
     ----------

@@ -1,5 +1,6 @@
-"""Frames of a real camera and what is known of it in; a RUN folder that `mitsim reconstruct` takes out, of all planes
-of a mosaic a coloured one.
+"""A real camera's frames and what is known of them in; a RUN folder that `mitsim reconstruct` takes out.
+
+All planes of a mosaic make a coloured one.
 
 What a real capture lacks - truth, scene, expected electrons, predicted error - is left out.
 """
@@ -152,8 +153,10 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
 
 
 def _range_check(path: Path, frame: Numbers, camera: Electronics) -> Callable[[int, bool], None]:
-    """Return a function that raises MitsimError if the numbers of a ``frame`` in a file, divided by a factor, are none
-    that the ``camera`` gives. Those of a mean frame need not be whole."""
+    """Return a function that raises MitsimError if a frame's numbers, over a factor, are beyond the ``camera``.
+
+    Those of a mean frame need not be whole.
+    """
     largest, low, high, kind = camera.largest, float(frame.min()), float(frame.max()), frame.dtype
     whole = kind.kind != "f" or np.array_equal(frame, np.rint(frame))
     cause = "they were scaled, or the camera is another; save them as they are, or give the right camera file"
@@ -300,8 +303,10 @@ class _Plane:
         return Packed(manifest, "", names, read, source), shape, preparer.unlit
 
     def _part(self, path: Path, frame: Numbers, how: Preparation) -> Numbers:
-        """Return the part of a ``frame`` that the calibration is of: all of it, or the middle of a plane without a
-        stated crop. MitsimError for another size."""
+        """Return the part of a ``frame`` that the calibration is of.
+
+        It is all of it, or the middle of a plane without a stated crop. MitsimError for another size.
+        """
         if self.shape is not None and how.channel is not None and how.crop is None:
             row, column = ((side - wanted) // 2 for side, wanted in zip(frame.shape, self.shape, strict=True))
             if min(row, column) >= 0:  # as FlatCam's loader cuts it
