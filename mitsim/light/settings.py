@@ -1,4 +1,4 @@
-"""What is simulated, and how finely; and what the pilot measured, by which that is chosen."""
+"""Settings of a simulation, and the pilot's measurements by which they are chosen."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from mitsim.core.parallel import in_threads
 
 Number = float | FloatArray
 Count = Annotated[int, Field(ge=1, le=4096)]
-"""Of a plan's file: anchors, cells or pixels a side; the largest projector has as many pixels."""
+"""Anchors, cells or pixels along an axis in a plan's file; the largest projector has as many pixels."""
 Index = Annotated[int, Field(ge=0, lt=4096**2)]
-"""The same of its pixels."""
+"""Number of a projector pixel in a plan's file."""
 GROUPS = 4
-"""Independent estimates of the light, whose spread is the Monte Carlo error: of light of many paths, whose noise is of
-many kinds, four tell it as well as more (docs/physics.md), and each takes its own accumulating, forming and probing."""
+"""Independent estimates of the light, whose spread is the Monte Carlo error. Four measure it as well as more do
+(docs/physics.md), and each must be accumulated, formed and probed."""
 PATHS_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 FOLLOWED_WIDTH = 4
-"""Projector pixels a side of a cell for what several anchors see of followed light beyond its mean: little light, of
-many anchors. Where coarse light has finer cells, so has this."""
+"""Projector pixels along a cell for followed light beyond its mean, which is little light of many anchors. If coarse
+light has finer cells, so has this."""
 CELLS_OF_COARSE = 4
-"""Fine cells a side of a cell of coarse light, where it has all layers: at accuracies of 1e-3 and above it then lies in
-one cell a projector pixel, at 3e-4 in two a side."""
+"""Fine cells along a cell of coarse light with all layers: at accuracies of 1e-3 and above there is then one cell a
+projector pixel, at 3e-4 two along an axis."""
 MOST_PATHS = 2**32
-"""Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
+"""Paths at which sampling stops and is flagged: half an hour on two cores."""
 
 
 class Estimate(NamedTuple):
-    """A relative error: the best ``value`` for it, and the ``bound`` that it stays below at 95 %."""
+    """A relative error: its best ``value``, and the ``bound`` that it stays below at 95 %."""
 
     value: float
     bound: float
 
 
-# -------- What is simulated, and how finely
+# -------- Settings
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class SharpPixels:
     Attributes
     ----------
     pixels
-        their numbers, increasing.
+        Numbers of the pixels, increasing.
     anchors
-        points a side of the sensor that their light is connected to.
+        Points along an axis of the sensor that their light is connected to.
     window
-        first and last tan-angle of their light along rows, then along columns.
+        First and last tan-angle of their light along rows, then along columns.
     left
-        error that interpolation between these points leaves, relative to all light.
+        Error of interpolation between these points, relative to all light.
     """
 
     pixels: tuple[Index, ...]
@@ -69,45 +69,45 @@ class SharpPixels:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is simulated, and how finely.
+    """Effects that are simulated, and the numbers of anchors, layers, cells and samples.
 
     Attributes
     ----------
     depth
-        where the light is seen, 1 / mean(1/z) [mm]; the cells are aligned with the projector's pixels there.
+        Mean depth of the light, 1 / mean(1/z) [mm], at which cells are aligned with the projector's pixels.
     anchors
-        points a side of the sensor from which radiance is evaluated.
+        Points along an axis of the sensor at which radiance is evaluated.
     layers
-        depths [mm], far to near, between which light is split; one for a flat scene.
+        Depths [mm], far to near, between which light is split; one for a flat scene.
     subdivision
-        cells a side of a projector pixel.
+        Cells along a projector pixel.
     effects
-        names of those that are simulated (:mod:`mitsim.bench.effects`).
+        Names of the simulated effects (:mod:`mitsim.bench.effects`).
     samples
-        that each group is predicted to need, by the name of the pass (:mod:`mitsim.light.passes`): of a projector
-        pixel, or of a cell of what is followed from the camera. Below 1, one is traced; so it is where nothing is said.
+        Predicted samples of each group by pass (:mod:`mitsim.light.passes`), for each projector pixel, or for each cell
+        of light followed from the camera. One is traced if the number is below 1 or missing.
     followed_anchors
-        points a side of the sensor that light over several surfaces, or in mirrors, is followed to.
+        Points along an axis of the sensor to which light over several surfaces, or in mirrors, is followed.
     coarse_layers
-        whether coarse light has all layers and finer cells: indirect light, and what anchors see of direct light beyond
-        its mean.
+        True if coarse light has all layers and finer cells: indirect light, and direct light beyond its mean over the
+        anchors.
     shared
-        whether neighbouring pixels share the second points of indirect light (:mod:`mitsim.transport.path_reuse`).
+        True if neighbouring pixels share the second points of indirect light (:mod:`mitsim.transport.path_reuse`).
     repeats
-        (blocks^2,) paths that each block of pixels takes in a sample of indirect light
-        (:mod:`mitsim.transport.indirect`); none: one of each pixel.
+        (blocks^2,) paths of each block of pixels in a sample of indirect light (:mod:`mitsim.transport.indirect`);
+        empty for one path of each pixel.
     reach
-        largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None: no more
-        than of light at ``depth``.
+        Largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None for that of
+        light at ``depth``.
     sharp
-        pixels whose direct light is traced apart.
+        Pixels whose direct light is traced apart.
     occluded, occluded_anchors
-        projector pixels whose light is hidden from part of the sensor, increasing, and points a side from which what
-        the sensor sees of them beyond the mean is evaluated. With one point they are pixels like the others.
+        Projector pixels whose light is hidden from part of the sensor, increasing, and points along an axis at which
+        their light beyond the mean is evaluated. With one point they are treated like other pixels.
     raster
-        whether frames are correlations with a mask's shadow on a raster, by FFT, and not sums of separable terms.
+        True if frames are correlations with a mask's shadow on a raster, by FFT, instead of sums of separable terms.
     raster_cells
-        cells of that raster along a pixel; 0: as few as a raster has.
+        Cells of that raster along a pixel; 0 for the fewest.
     """
 
     depth: Positive
@@ -129,49 +129,51 @@ class Settings:
 
     @property
     def depths(self) -> tuple[float, ...]:
-        """Depth of each layer [mm]; the one depth of a flat scene."""
+        """Return the depth of each layer [mm]."""
         return self.layers or (self.depth,)
 
     @property
     def coarse_cells(self) -> int:
-        """Cells a side of a projector pixel for coarse light."""
+        """Return the cells along a projector pixel for coarse light."""
         return max(self.subdivision // CELLS_OF_COARSE, 1) if self.coarse_layers else 1
 
     @property
     def followed_width(self) -> int:
-        """Projector pixels a side of a cell for what anchors of followed light see beyond its mean, in one layer."""
+        """Return the projector pixels along a cell for followed light beyond its mean, which has one layer."""
         return max(FOLLOWED_WIDTH // self.coarse_cells, 1) if self.followed_anchors > 1 else 1
 
     @property
     def with_own_anchors(self) -> tuple[int, ...]:
-        """Occluded pixels, where they have anchors of their own."""
+        """Return the occluded pixels, if they have anchors of their own."""
         return self.occluded if self.occluded_anchors > 1 else ()
 
 
-# -------- What the pilot measured, by which a plan is made
+# -------- Measurements of the pilot
 
 COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors")
 """Numbers that a plan chooses: points of the sensor a side for direct light, depths, cells a side of a projector pixel,
 points a side for light that is followed over several surfaces or from the camera, and for occluded pixels."""
 _FEWEST_SAMPLES = 1e-3
-"""Samples of light without noise: next to none, and above 0 because costs are ratios."""
+"""Samples of light without noise, above 0 because costs are ratios."""
 _AT_ONCE = 2**13
-"""Entries of frames that are multiplied at a time: some megabytes, where all of them are a hundred."""
+"""Entries of frames that are multiplied at a time: some megabytes instead of a hundred."""
 REPLICATES = 4
-"""Independent replicates of the pilot, the fewest whose spread tells a standard error worth its name."""
+"""Independent replicates of the pilot, the fewest whose spread is a usable standard error."""
 SURE = 2.35
 """Standard errors from an estimate to its 95 % bound: Student's distribution with ``REPLICATES`` - 1 degrees of
 freedom."""
 RASTER_RATE = 1.5
-"""Power of a raster's cells along a pixel that its error falls with: from 6 to 12 cells, in frames of dots, 1.4 (a
+"""Power of the cells along a pixel with which a raster's error falls: from 6 to 12 cells, in frames of dots, 1.4 (a
 picture of light) to 2.9 (a mask turned by 0.3 degrees)."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate; ``spread`` is the
-    relative variance of its square among estimates, 0 where many paths make it; ``heavy`` the number of equal paths
-    that would make it as unevenly, infinite where nobody counted them."""
+    """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate.
+
+    ``spread`` is the relative variance of its square among estimates, 0 if many paths cause it; ``heavy`` is the number
+    of equal paths that would cause it as unevenly, infinite if not counted.
+    """
 
     error: float
     samples: float
@@ -181,18 +183,18 @@ class Noise:
 
     @classmethod
     def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
-        """Of one of several replicates, by random paths of which few may be heavy.
+        """Measure the noise of one of several replicates, by random paths of which few may be heavy.
 
         Parameters
         ----------
         seen
             (replicates, ...) frames.
         light
-            norm of the frames of all light, which the error is relative to.
+            Norm of the frames of all light, which the error is relative to.
         samples
-            of a replicate.
+            Samples of a replicate.
         paths
-            light that each path of all replicates brought.
+            Light of each path of all replicates.
         """
         energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
         mean = float(energies.mean())
@@ -202,20 +204,19 @@ class Noise:
         return cls(math.sqrt(float(energies.sum()) / (len(seen) - 1)) / light, samples, 0.5, spread, heavy)
 
     def samples_for(self, target: Number) -> Number:
-        """Samples a cell at which the error is ``target``."""
+        """Return the samples a cell at which the error is ``target``."""
         if self.error <= 0:
             return _FEWEST_SAMPLES + 0 * target
         return self.samples * (self.error / target) ** (1 / self.rate)
 
     def error_left(self, samples: Number) -> Number:
-        """The error at so many ``samples`` a cell."""
+        """Return the error at so many ``samples`` a cell."""
         return self.error * (samples / self.samples) ** -self.rate
 
 
 @dataclass(frozen=True)
 class SampleCost:
-    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds to trace and
-    accumulate a path, 0 where nobody has timed it."""
+    """Cost of one kind of light: noise relative to all light, paths in a sample, and seconds a path (0: not timed)."""
 
     noise: Noise
     paths: int
@@ -223,53 +224,49 @@ class SampleCost:
 
     @classmethod
     def none(cls) -> SampleCost:
-        """Of light that there is none of."""
+        """Return the cost of absent light."""
         return cls(Noise(0.0, 1, 0.5), 0)
 
     @classmethod
     def relative(cls, error: float, light: float, samples: int, paths: int, rate: float = 0.5) -> SampleCost:
-        """Of replicates of so many ``samples`` that are off by an ``error``, where frames of all light have the norm
-        ``light``.
+        """Return the cost of light whose replicates of so many ``samples`` have an ``error``.
 
-        Parameters
-        ----------
-        error, light, samples
-            as above; nothing is known to be noisy where there is no light.
-        paths, rate
-            of a sample, and the power of the samples that the error falls with.
+        ``light`` is the norm of the frames of all light; ``rate`` is the power of the samples with which the error
+        falls.
         """
         return cls(Noise(error / light if light else 0.0, samples, rate), paths)
 
     @property
     def variance(self) -> float:
-        """Relative variance of one sample, where the error falls with the square root of their number."""
+        """Return the relative variance of one sample, if the error falls with the square root of their number."""
         return self.noise.samples * self.noise.error**2
 
 
 @dataclass(frozen=True, order=True)
 class Approximation:
-    """What a plan may leave out (an effect; ``count`` 0), or a number that it may choose (anchors, layers, cells)."""
+    """An omitted effect (``count`` 0), or a chosen number of anchors, layers or cells."""
 
     name: str
     count: int = 0
 
 
 WIDE = Approximation("followed_width", FOLLOWED_WIDTH)
-"""Cells of several projector pixels, in one layer, for what anchors see of followed light."""
+"""Cells of several projector pixels, in one layer, for followed light beyond its mean."""
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorCovariance:
-    """What each part changes in the frames, as inner products between independent replicates: the sum of any of them,
-    with its signs, without the replicates' noise.
+    """Changes of the frames by approximations, as inner products between independent replicates.
+
+    They give the change by any sum of approximations, with signs and without the replicates' noise.
 
     Attributes
     ----------
     parts
-        what was changed.
+        Approximations.
     products
         (replicates, replicates, parts, parts) inner products of the changes, relative to the squared norm of all light;
-        those of a replicate with itself hold its noise, and are not used.
+        those of a replicate with itself contain its noise and are not used.
     """
 
     parts: tuple[Approximation, ...]
@@ -277,7 +274,7 @@ class ErrorCovariance:
 
     @classmethod
     def between(cls, seen: Mapping[Approximation, FloatArray], energy: float) -> ErrorCovariance:
-        """Of changes (replicates, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
+        """Multiply changes (replicates, ...) of frames whose squared norm is ``energy``."""
         flat = [change.reshape(REPLICATES, -1) for change in seen.values()]
 
         def multiply(first: int) -> FloatArray:
@@ -291,9 +288,9 @@ class ErrorCovariance:
         return cls(tuple(seen), products / energy if energy > 0 else products)
 
     def squared_errors(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(m,) squared changes by m sums of parts and their standard errors, from ``chosen`` (m, parts) weights.
+        """Return (m,) squared changes by m sums of parts, with standard errors, from ``chosen`` (m, parts) weights.
 
-        The mean product of two different replicates, and its jackknife over replicates.
+        These are the mean product of two different replicates, and its jackknife over replicates.
         """
         replicates, places = len(self.products), np.arange(len(self.products))
         others = [self.products[place, places != place].sum(axis=0) for place in places]
@@ -305,7 +302,7 @@ class ErrorCovariance:
         return total / kept, spread
 
     def estimate(self, parts: Collection[Approximation]) -> Estimate:
-        """Relative change of the frames by all ``parts`` together; parts that were not measured change nothing."""
+        """Return the relative change by all ``parts`` together; parts that were not measured change nothing."""
         chosen = np.array([[part in parts for part in self.parts]], dtype=np.float64)
         squared, spread = (float(values[0]) for values in self.squared_errors(chosen))
         least = max(squared, 0.0)
@@ -314,36 +311,36 @@ class ErrorCovariance:
 
 @dataclass(frozen=True)
 class Forming:
-    """What forming frames depends on besides settings.
+    """Quantities that determine the cost of forming frames, besides settings.
+
+    Pairs are without diffraction and with it.
 
     Attributes
     ----------
     pixels, cells
-        a side of the sensor, and of the grid with one cell a projector pixel.
+        Along an axis of the sensor, and of the grid with one cell a projector pixel.
     lit
-        part of the rows of cells that hold light in a frame.
+        Part of the rows of cells that have light in a frame.
     terms, geometric_terms
-        of the wave-optical shadow, and of the geometric one.
+        Terms of the wave-optical shadow, and of the geometric one.
     shots, classes
-        of the family.
+        Shots and classes of the family.
     product
-        seconds of a multiplication in a large product of matrices, on all processors; 0 where nobody has timed it.
+        Seconds of a multiplication in a large product of matrices, on all processors; 0 if not timed.
     correlated
-        whether frames without diffraction, and with it, are always correlations with a shadow on a raster, and never
-        sums of separable terms.
+        True if frames are always correlations with a shadow on a raster, and never sums of separable terms.
     phases
-        raster cells that a pixel has at least, where a shadow is drawn on one.
+        Fewest raster cells of a pixel.
     largest_terms
-        terms that hold a shadow that must be drawn on a raster, without diffraction and with it; infinite where they
-        are too many, and where it need not.
+        Terms of a shadow that must be drawn on a raster; infinite if there are too many, or it need not be drawn.
     drawing
-        seconds of drawing a shadow on as few, without diffraction and with it, for each layer.
+        Seconds of drawing a shadow on the coarsest raster, for each layer.
     lines
-        each with frames of its own.
+        Lines, each with frames of its own.
     parted
-        whether glass sends each line its own way, so that they share no paths.
+        True if glass sends each line its own way, so that lines share no paths.
     occluded
-        parts of the projector's rows and of its columns that occluded pixels lie in.
+        Parts of the projector's rows and columns that contain occluded pixels.
     """
 
     pixels: float
@@ -365,55 +362,57 @@ class Forming:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A mask's shadow on a raster: what that leaves of the frames, None where it is none to choose, whether there is no
-    other way, and numbers of raster cells along a pixel, of which the first leaves that."""
+    """A mask's shadow on a raster.
+
+    ``error`` is that of the frames with the first number of ``cells`` along a pixel, None if a raster cannot be chosen;
+    ``needed`` is True if there is no other way.
+    """
 
     error: Estimate | None = None
     needed: bool = False
     cells: tuple[int, ...] = (4,)
 
     def error_left(self, cells: int) -> Estimate | None:
-        """What a raster of so many ``cells`` a pixel leaves; 0: the fewest."""
+        """Return the error of a raster of so many ``cells`` along a pixel (0: the fewest)."""
         finer = (cells or self.cells[0]) / self.cells[0]
         return self.error and Estimate(*(error * finer**-RASTER_RATE for error in self.error))
 
 
 @dataclass(frozen=True)
 class PilotResult:
-    """What a short replicate at the scene measured (:mod:`mitsim.planner.pilot`); all errors are relative.
+    """Measurements of short runs of a scene (:mod:`mitsim.planner.pilot`); all errors are relative.
 
     Attributes
     ----------
     depth, layers
-        depth of the light [mm]; candidates for the layers' depths, by their number.
+        Depth of the light [mm]; candidates for the layers' depths, by their number.
     changes
-        of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
-        cells that was tried, and by one coarse cell a pixel, or one layer, for light that lies in coarse cells.
+        Changes of the frames by omitting each effect, by each number of anchors, layers and cells that was tried, and
+        by one coarse cell a pixel, or one layer, for light in coarse cells.
     sample_costs
-        what each pass takes, by its name (:mod:`mitsim.light.passes`); of light at anchors: paths to one of them.
+        Cost of each pass by name (:mod:`mitsim.light.passes`); that of light at anchors counts paths to one of them.
     spread
-        what direct light takes that goes to random points of the sensor, and not to its centre.
+        Cost of direct light to random points of the sensor instead of its centre.
     forming
-        how frames are formed.
+        Quantities that determine the cost of frames.
     apart
-        effects that are no part of the expected frames, with the independent error of leaving each out.
+        Error of omitting each effect that is drawn with the sensor's noise.
     unresolved
-        part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.missed`).
+        Part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.missed`).
     shared, repeats
-        as in :class:`mitsim.light.settings.Settings`, where that takes less for as little noise: what indirect light
-        takes is then of that.
+        As in :class:`Settings`, if they reduce the work for the same noise; the cost of indirect light includes them.
     left_out
-        light that no tracer finds, over that and what is found (:mod:`mitsim.transport.missed`).
+        Part of all light that no tracer finds (:mod:`mitsim.transport.missed`).
     unresolved_specular
-        light over mirrors alone whose place on the sensor is not known, over all light.
+        Part of all light that comes over mirrors alone and whose place on the sensor is unknown.
     mirror
-        place, among the scene's shapes, of what most of that comes over.
+        Number, among the scene's shapes, of the one that most of the light left out comes over.
     reach, sharp, occluded
-        as in :class:`mitsim.light.settings.Settings`.
+        As in :class:`Settings`.
     raster
-        what a shadow on a raster leaves of the frames, without diffraction and with it (:class:`Drawn`).
+        Error of a shadow on a raster, without diffraction and with it.
     hits
-        rays that bring all direct light if each projector pixel sends one, where these are few; else infinite.
+        Rays that bring all direct light if each projector pixel sends one, if these are few; else infinite.
     """
 
     depth: float
@@ -436,31 +435,31 @@ class PilotResult:
     hits: float = math.inf
 
     def with_sample_costs(self, found: Mapping[str, SampleCost]) -> PilotResult:
-        """The same, where some passes take what was ``found``."""
+        """Return a copy in which some passes have the costs ``found``."""
         return replace(self, sample_costs={**self.sample_costs, **found})
 
     def forms(self, waves: bool) -> tuple[int, ...]:
-        """Raster cells along a pixel that frames may be formed of, 0 for a sum of terms; with ``waves`` or not."""
+        """Return the raster cells along a pixel that frames may be formed with, 0 for a sum of terms."""
         drawn = self.raster[waves]
         if drawn.error is None:
             return (drawn.cells[0] if drawn.needed else 0,)
         return drawn.cells if drawn.needed else (0, *drawn.cells)
 
     def error(self, *parts: Approximation) -> Estimate:
-        """Relative change of the frames by all ``parts`` together."""
+        """Return the relative change of the frames by all ``parts`` together."""
         apart = sum(self.apart.get(part.name, 0.0) ** 2 for part in parts)
         value, bound = self.changes.estimate(parts)
         return Estimate(math.hypot(value, math.sqrt(apart)), math.hypot(bound, math.sqrt(apart)))
 
     @cached_property
     def effects(self) -> dict[str, Estimate]:
-        """Error of leaving out each effect that the bench has."""
+        """Return the error of omitting each effect of the bench."""
         measured = [part.name for part in self.changes.parts if part.count == 0]
         return {name: self.error(Approximation(name)) for name in (*measured, *self.apart)}
 
     @cached_property
     def ladders(self) -> dict[str, dict[int, Estimate]]:
-        """Error of each number of anchors, layers and cells that was tried, fewest first."""
+        """Return the error of each number of anchors, layers and cells that was tried, fewest first."""
         found: dict[str, dict[int, Estimate]] = {name: {} for name in COUNTED}
         for part in sorted(part for part in self.changes.parts if part.name in COUNTED):
             found[part.name][part.count] = self.error(part)
