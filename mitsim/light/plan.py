@@ -1,4 +1,4 @@
-"""The effect plan: what was chosen and predicted in; what people, the command line and files read of it out."""
+"""The plan of a capture, as an object, as JSON for the command line, and in a file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _REPORTED = (
     "effects", "accuracy", "predicted_seconds", "predicted", "settings", "warnings", "predicted_range",
     "sampling_target", "systematic_error", "systematic_bound", "asked_seconds", "colour", "notes",
 )  # fmt: skip
-"""What the command line says of a plan, besides bytes."""
+"""Keys of the command line's JSON, besides bytes."""
 FORMAT = 1
 """Version of a plan's file."""
 
@@ -43,11 +43,11 @@ class PlanRow:
     Attributes
     ----------
     name, state, reason
-        of an effect or discretisation; a sentence.
+        Effect or number, its state, and a sentence; the sentence may be empty.
     error_if_off
-        relative change of the frames without it; None where no prediction was made.
+        Relative change of the frames without the effect, or with one of it; None if not predicted.
     seconds
-        what it adds.
+        Time that it adds.
     """
 
     name: str
@@ -66,10 +66,10 @@ class ColourCandidate:
     name
         ``mono``, ``bands:K`` or ``lines``.
     error
-        what it leaves of the light's lines in direct light: relative rms error of the noise-free frames in electrons,
-        of the worst band; None where that was not looked for.
+        Relative rms error of the noise-free frames in electrons, of direct light in the worst band; None if not
+        measured.
     seconds
-        predicted, from start to finish.
+        Predicted time from start to finish.
     """
 
     name: str
@@ -79,31 +79,23 @@ class ColourCandidate:
 
 @dataclass(frozen=True)
 class ColourChoice:
-    """Which of several ways is taken.
-
-    Attributes
-    ----------
-    chosen
-        its name.
-    candidates
-        all of them, the cheapest first.
-    """
+    """The ``chosen`` way to simulate colours, by name, and all ``candidates``, the cheapest first."""
 
     chosen: str
     candidates: tuple[ColourCandidate, ...]
 
     @property
     def taken(self) -> ColourCandidate:
-        """The one that is chosen."""
+        """Return the chosen candidate."""
         return next(each for each in self.candidates if each.name == self.chosen)
 
     def later(self, seconds: float) -> ColourChoice:
-        """The same, every way by so many ``seconds`` longer."""
+        """Return a copy in which every way takes so many ``seconds`` longer."""
         return replace(self, candidates=tuple(replace(e, seconds=e.seconds + seconds) for e in self.candidates))
 
     @property
     def words(self) -> str:
-        """What is said of it in one line."""
+        """Return the choice in one line."""
         errors = ", ".join(
             f"{each.name} {'not known' if each.error is None else f'{each.error:.1e}' if each.error else '0'}"
             for each in self.candidates
@@ -118,35 +110,34 @@ class Plan:
     Attributes
     ----------
     accuracy
-        relative error that is to be kept.
+        Relative error that is to be kept.
     effects
-        a row for each effect and discretisation.
+        A row for each effect and each number.
     predicted_seconds
-        from start to finish, the sum of ``predicted``.
+        Time from start to finish, the sum of ``predicted``.
     settings
-        what is simulated, and how finely.
+        Effects that are simulated, and numbers of anchors, layers, cells and samples.
     sampling_target
-        relative Monte Carlo error at which sampling stops.
+        Relative Monte Carlo error at which sampling stops.
     systematic_error, systematic_bound
-        what everything left out or made coarse is predicted to leave, with its signs, relative; at most, at 95 %.
+        Predicted relative error of all that is left out or made coarse, with signs, and its 95 % bound.
     warnings
-        why a result will be flagged.
+        Reasons why a result will be flagged.
     predicted
-        seconds by stage.
+        Seconds by stage.
     predicted_range
-        between which nine of ten runs end, where few heavy paths bring most of the noise, so that their samples are not
-        known; None where ``predicted_seconds`` tells it.
+        Seconds between which nine of ten runs end, if few heavy paths bring most of the noise; else None.
     request, cost
-        what it is for, and what that takes; None where it was decided without them.
+        Request that the plan is for, and its predicted cost; None if it was made without them.
     made_of
-        what it hangs on of the bench, by name, as :attr:`mitsim.bench.apparatus.Apparatus.deciding` has it; None where
-        it was decided without a request.
+        Properties of the bench that the plan depends on (:attr:`mitsim.bench.apparatus.Apparatus.deciding`); None if it
+        was made without a request.
     asked_seconds
-        for the whole run, of which the accuracy is the finest that they buy; None where the accuracy was asked for.
+        Time of the whole run, for which the accuracy is the best possible; None if the accuracy was asked for.
     colour
-        what was weighed for the light's colours; None where that was not asked for.
+        Choice of colours; None if it was not asked for.
     notes
-        what was chosen without looking as closely as it could be, and why.
+        Choices that were made safely instead of measured more closely, with reasons.
     """
 
     accuracy: float
@@ -168,20 +159,20 @@ class Plan:
 
     @check_arguments
     def row(self, name: str) -> PlanRow:
-        """What is said of the effect or discretisation called ``name``; MitsimError when there is none."""
+        """Return the row of the effect or number ``name``; raise MitsimError if there is none."""
         rows = {row.name: row for row in self.effects}
         if name not in rows:
             raise MitsimError(f"plan: no row {name!r}; there are {', '.join(rows)}")
         return rows[name]
 
     def total(self, noise: Estimate) -> Estimate:
-        """Error of frames with this Monte Carlo error, ``noise``, all in all."""
+        """Return the total error of frames with the Monte Carlo error ``noise``."""
         systematic = self.systematic_error, self.systematic_bound
         return Estimate(*(math.hypot(*both) for both in zip(systematic, noise, strict=True)))
 
     @check_arguments
     def taking(self, **seconds: float) -> Plan:
-        """The same plan, with the ``seconds`` of more stages in its prediction."""
+        """Return a copy with the ``seconds`` of more stages in its prediction."""
         stages = {**self.predicted, **seconds}
         more = sum(stages.values()) - sum(self.predicted.values())
         colour = self.colour and self.colour.later(more)
@@ -192,7 +183,7 @@ class Plan:
         )
 
     def block(self) -> dict[str, Any]:
-        """The plan as JSON holds it."""
+        """Return the plan as JSON."""
         from mitsim.light.passes import PASSES  # with what traces them: a plan that is read needs no renderer
 
         samples = {row.samples_key: row.predicted_samples(self.settings) for row in PASSES.values()}
@@ -206,9 +197,9 @@ class Plan:
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the plan to the JSON file ``path``, which is replaced, whole or not at all; returns it.
+        """Write the plan to the JSON file ``path``, which is replaced as a whole, and return it.
 
-        MitsimError for a plan that was decided without a request, and where the file cannot be written.
+        Raises MitsimError for a plan that was made without a request, or if the file cannot be written.
         """
         text = self.as_text()
         if len(text) > MOST_BYTES:
@@ -219,15 +210,15 @@ class Plan:
     @staticmethod
     @check_arguments
     def load(path: Path | str) -> Plan:
-        """The plan in the file ``path`` that :meth:`save` or ``mitsim plan -o`` wrote.
+        """Load the plan in the file ``path`` that :meth:`save` or ``mitsim plan -o`` wrote.
 
-        MitsimError for a file that cannot be read, is none of a plan or of another version of mitsim, breaks a rule of
-        the format, or was changed since.
+        Raises MitsimError for a file that cannot be read, contains no plan, was written by another version of mitsim,
+        breaks a rule of the format, or was changed.
         """
         return Plan.of_data(read_json(path), f"plan {path}")
 
     def as_text(self) -> str:
-        """The plan as its file has it; ArgumentError for one that was decided without a request."""
+        """Return the text of the plan's file; raise ArgumentError for a plan that was made without a request."""
         known = self.known_request
         asked = {name: getattr(known, name) for name in ("patterns", "seconds", "seed", "effects")}
         asked |= known.model_dump(mode="json", exclude_unset=True)
@@ -237,12 +228,14 @@ class Plan:
 
     @staticmethod
     def of_data(data: Any, where: str) -> Plan:
-        """The plan of a file's JSON ``data``, which is found ``where``, for messages; MitsimError as :meth:`load`."""
+        """Return the plan of a file's JSON ``data``; messages name the file as ``where``."""
         if not isinstance(data, dict) or data.get("kind") != "plan":
             raise MitsimError(f"{where}: is no file of a plan; give one that `mitsim plan -o` wrote")
-        writer = _writer(data)
+        writer: Any = data
+        for name in ("plan", "made_of", "version", "mitsim"):
+            writer = writer.get(name) if isinstance(writer, dict) else None
         if writer != __version__:
-            raise MitsimError(f"{where}: was made by mitsim {writer}, and this is {__version__}; plan anew")
+            raise MitsimError(f"{where}: was made by mitsim {cut(str(writer))}, and this is {__version__}; plan anew")
         try:
             file = PlanFile.model_validate_json(json.dumps(data))
         except pydantic.ValidationError as error:
@@ -260,24 +253,16 @@ class Plan:
 
     @property
     def known_request(self) -> Request:
-        """What it is for; ArgumentError for a plan that was decided without a request."""
+        """Return the request; raise ArgumentError for a plan that was made without one."""
         if self.request is None:
             raise ArgumentError("plan", "was decided without a request; make it by bench.plan")
         return self.request
 
     @check_arguments
     def request_with(self, changes: Mapping[str, Any]) -> Request:
-        """What it is for with other values of some fields; those that the plan hangs on may only be said again.
+        """Return the request with other values of some fields of :class:`mitsim.bench.request.Request`.
 
-        Parameters
-        ----------
-        changes
-            values by field of :class:`mitsim.bench.request.Request`.
-
-        Raises
-        ------
-        MitsimError
-            for a value that a field cannot have, or that needs another plan.
+        Raises MitsimError for an invalid value, or one that needs another plan.
         """
         planned = self.known_request
         request = planned.with_values(**changes)
@@ -290,24 +275,14 @@ class Plan:
         return request
 
     def made_for(self, name: str) -> str:
-        """That another value of a field ``name`` of the request needs another plan."""
+        """Return a message that another value of the request's field ``name`` needs another plan."""
         return f"the plan was made for {_words(getattr(self.known_request, name))}; plan anew"
 
     @check_arguments
     def check_made_of(self, deciding: Mapping[str, Any], argument: str = "plan") -> None:
-        """Refuse a plan of another bench.
+        """Refuse a plan of another bench than the one with these ``deciding`` properties.
 
-        Parameters
-        ----------
-        deciding
-            of this bench (:attr:`mitsim.bench.apparatus.Apparatus.deciding`).
-        argument
-            that brought the plan.
-
-        Raises
-        ------
-        ArgumentError
-            with what differs.
+        Raises ArgumentError for the ``argument`` that brought the plan, with the difference.
         """
         if self.made_of is None:
             raise ArgumentError(argument, "was decided without a bench; make it by bench.plan")
@@ -325,7 +300,7 @@ class Plan:
                 )
 
     def payload(self) -> dict[str, Any]:
-        """What the command line reports."""
+        """Return the JSON of the command line."""
         block = {**self.block(), "warnings": self.warnings}
         cost = {"memory": self.cost.memory_bytes, "disk": self.cost.disk_bytes} if self.cost else {}
         return {
@@ -335,7 +310,7 @@ class Plan:
 
     @property
     def range_words(self) -> str:
-        """What is said of the range of seconds in one line; nothing where there is none."""
+        """Return the range of seconds in one line, or an empty text."""
         if self.predicted_range is None:
             return ""
         least, most = self.predicted_range
@@ -346,7 +321,7 @@ class Plan:
 
     @property
     def _uncoloured(self) -> ColourChoice | None:
-        """Monochrome frames, where nothing else was asked for; None of light of some lines."""
+        """Return the choice of monochrome frames if no colours were asked for; None for light of some lines."""
         row = next((row for row in self.effects if row.name == "spectrum"), None)
         if row is None or row.state != "off":
             return None
@@ -354,15 +329,14 @@ class Plan:
 
     @check_arguments
     def plot(self, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
-        """Draw what each effect would leave in the frames if it were off, or the seconds of each stage; returns the
-        axes.
+        """Draw the error of omitting each effect, or the seconds of each stage, and return the axes.
 
         Parameters
         ----------
         quantity
-            which of both.
+            ``error`` or ``seconds``.
         ax
-            matplotlib's axes to draw on; None: those of a new figure.
+            Matplotlib axes; None for a new figure.
         """
         return from_above("report.plots", "draw_plan")(self, quantity, ax)
 
@@ -396,32 +370,24 @@ class Plan:
 
 
 class PlanFile(Configuration, defer_build=True):
-    """A plan as JSON keeps it."""
+    """File of a plan."""
 
     kind: Literal["plan"]
-    """What the file is."""
+    """Kind of file."""
     format: int = pydantic.Field(ge=1, le=FORMAT)
     """Version of this format."""
     sha256: str
-    """Of `plan` as JSON with sorted keys; a file that was changed is refused."""
+    """Checksum of `plan` as JSON with sorted keys; a file that was changed is refused."""
     plan: Plan
-    """Fields of `mitsim.Plan`: those above, what it is for, and what it was made of."""
-
-
-def _writer(data: Any) -> str:
-    """Version of mitsim that wrote the JSON ``data`` of a file, as far as it says so."""
-    for name in ("plan", "made_of", "version", "mitsim"):
-        data = data.get(name) if isinstance(data, dict) else None
-    return cut(str(data))
+    """Fields of `mitsim.Plan`, with its request and the bench's properties."""
 
 
 def _digest(own: Any) -> str:
-    """SHA-256 of JSON data."""
     return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
 
 
 def _difference(one: Any, other: Any, place: str = "") -> tuple[str, Any, Any] | None:
-    """Where JSON data first differs: the place, and what either has there; None for equal data."""
+    """Return where JSON data first differs, with both values there; None for equal data."""
     if isinstance(one, dict) and isinstance(other, dict):
         each = (_difference(one.get(name), other.get(name), f"{name} ") for name in dict.fromkeys([*one, *other]))
         return next(filter(None, each), None)
@@ -429,12 +395,10 @@ def _difference(one: Any, other: Any, place: str = "") -> tuple[str, Any, Any] |
 
 
 def _words(value: Any) -> str:
-    """A value of a request's field in a message."""
     if isinstance(value, dict):
         return ",".join(f"{'+' if on else '-'}{name}" for name, on in value.items()) or "none"
     return repr(value)
 
 
 def _value_text(value: Any) -> str:
-    """A value of JSON in a message."""
     return "none" if value is None else cut(value if isinstance(value, str) else json.dumps(value), 40)
