@@ -561,7 +561,7 @@ SIZES = {
     "devices": (10, 2394),
     "exchange": (8, 1677),
     "learn": (8, 1650),
-    "light": (9, 1912),
+    "light": (9, 1910),
     "metrics": (1, 81),
     "mitsim": (1, 102),
     "optics": (10, 1985),
