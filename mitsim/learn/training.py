@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -121,12 +121,21 @@ def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, La
 
 @dataclass(eq=False)
 class Trainer:
-    """Network in training."""
+    """Network in training.
+
+    Attributes
+    ----------
+    taken, curve, best
+        Steps, judgements (step, PSNR) of the pairs that choose, and the weights after the best step.
+    """
 
     request: Training
     prepared: Prepared
     sums: Sums
     network: Method
+    taken: int = 0
+    curve: list[tuple[int, float]] = field(default_factory=list)
+    best: dict[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.optimiser = torch.optim.AdamW(self.network.parameters(), betas=_BETAS, weight_decay=_DECAY)
@@ -136,6 +145,52 @@ class Trainer:
         self.critic = Critic(self.request, self._like) if weighted else None
         photographs = np.arange(len(self.sums.truths)) if self.sums.photographs is None else self.sums.photographs
         self.teaching, self.choosing, self.judging = part_photographs(photographs, self.request.seed)
+
+    def is_over(self) -> bool:
+        """Return True if all steps are taken, or if the last judgements show no gain."""
+        psnr = [value for _, value in self.curve]
+        gone = max(psnr[:-_PATIENCE], default=-math.inf) > max(psnr[-_PATIENCE:]) - _GAIN_DB
+        return self.taken >= self.request.steps or gone
+
+    def go_on(self, job: Job) -> None:
+        """Take the steps up to the next judgement; raise MitsimError if the loss is not finite."""
+        steps = self.request.steps
+        for number in range(self.taken, min(self.taken + max(steps // _LOOKS, 1), steps)):
+            if not math.isfinite(self.step(number)):
+                raise MitsimError(f"training: its numbers ran away at step {number}; give a smaller rate")
+            self.taken = number + 1
+            job.progress("train", self.taken / steps)
+        self.choose()
+        job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.taken / steps)
+
+    def choose(self) -> None:
+        """Judge the network by the pairs that choose, and keep its weights if it is the best so far."""
+        self.curve.append((self.taken, self.judge(self.choosing)))
+        if self.curve[-1][1] >= max(value for _, value in self.curve):
+            self.best = weights_of(self.network)
+
+    def save(self, path: Path, digest: str) -> None:
+        """Write the state after a judgement, from which an interrupted training continues."""
+        state = {"step": self.taken, "curve": self.curve, "best": self.best, "network": weights_of(self.network)}
+        critic = self.critic.state() if self.critic else {}
+        write_tensors(path, {"digest": digest, **state, "optimiser": self.optimiser.state_dict(), "critic": critic})
+
+    def load(self, path: Path, digest: str) -> None:
+        """Continue from a state; raise MitsimError if it cannot be read or belongs to another training."""
+        try:
+            held = torch.load(path, map_location="cpu", weights_only=True)
+            own, self.taken, self.curve, self.best = (held[name] for name in ("digest", "step", "curve", "best"))
+        except Exception as error:  # torch.load raises errors of many classes
+            raise MitsimError(f"{path}: cannot be read ({cut(reason_of(error), 200)}); remove it") from error
+        if own != digest:
+            raise MitsimError(
+                f"{path}: is of a training of other pairs, factors or options, or of numbers of other precision "
+                "on another processor; give those, or remove it"
+            )
+        self.network.load_state_dict(held["network"])
+        self.optimiser.load_state_dict(held["optimiser"])
+        if self.critic:
+            self.critic.restore(held["critic"])
 
     def rate(self, number: int) -> float:
         part, rising = (number + 0.5) / self.request.steps, _RISING
@@ -218,73 +273,8 @@ class Trainer:
 # -------- A training
 
 
-@dataclass(eq=False)
-class State:
-    """State of a training, which a file keeps between judgements; `best` has the weights after the best step."""
-
-    step: int
-    curve: list[tuple[int, float]]
-    best: dict[str, Tensor]
-    network: dict[str, Tensor]
-    optimiser: dict[str, Any]
-    critic: dict[str, Any]
-
-    @classmethod
-    def first(cls, trainer: Trainer) -> State:
-        state = cls(0, [], {}, {}, {}, {})
-        state._judge(trainer)
-        return state
-
-    def restore(self, trainer: Trainer) -> None:
-        trainer.network.load_state_dict(self.network)
-        trainer.optimiser.load_state_dict(self.optimiser)
-        if trainer.critic:
-            trainer.critic.restore(self.critic)
-
-    def is_over(self, steps: int) -> bool:
-        """Return True if all steps are taken, or if the last judgements show no gain."""
-        psnr = [value for _, value in self.curve]
-        return self.step >= steps or max(psnr[:-_PATIENCE], default=-math.inf) > max(psnr[-_PATIENCE:]) - _GAIN_DB
-
-    def go_on(self, trainer: Trainer, job: Job) -> None:
-        """Take the steps up to the next judgement; raise MitsimError if the loss is not finite."""
-        steps = trainer.request.steps
-        for number in range(self.step, min(self.step + max(steps // _LOOKS, 1), steps)):
-            if not math.isfinite(trainer.step(number)):
-                raise MitsimError(f"training: its numbers ran away at step {number}; give a smaller rate")
-            self.step = number + 1
-            job.progress("train", self.step / steps)
-        self._judge(trainer)
-        job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.step / steps)
-
-    def _judge(self, trainer: Trainer) -> None:
-        self.curve.append((self.step, trainer.judge(trainer.choosing)))
-        self.network, self.optimiser = _copy(trainer.network), trainer.optimiser.state_dict()
-        self.critic = trainer.critic.state() if trainer.critic else {}
-        if self.curve[-1][1] >= max(value for _, value in self.curve):
-            self.best = self.network
-
-    def write(self, path: Path, digest: str) -> None:
-        write_tensors(path, {"digest": digest, **vars(self)})
-
-    @classmethod
-    def read(cls, path: Path, digest: str) -> State:
-        """Read a state; raise MitsimError if it cannot be read or belongs to another training."""
-        try:
-            held = torch.load(path, map_location="cpu", weights_only=True)
-            own = held.pop("digest")
-            state = cls(**held)
-        except Exception as error:  # torch.load raises errors of many classes
-            raise MitsimError(f"{path}: cannot be read ({cut(reason_of(error), 200)}); remove it") from error
-        if own != digest:
-            raise MitsimError(
-                f"{path}: is of a training of other pairs, factors or options, or of numbers of other precision "
-                "on another processor; give those, or remove it"
-            )
-        return state
-
-
-def _copy(network: Method) -> dict[str, Tensor]:
+def weights_of(network: Method) -> dict[str, Tensor]:
+    """Return a copy of the weights."""
     return {name: values.detach().cpu().clone() for name, values in network.state_dict().items()}
 
 
@@ -362,25 +352,27 @@ def train_network(
         memory += _BASE_BYTES + 4.0 * len(store) * (2 * math.prod(shape) + bins)
         Cost(memory_bytes=memory).check(f"{store.folder}: training {request.method}", job.limits)
         sums = sums or Sums.of(store, prepared, job, network.reads_frames)
-    trainer, first = Trainer(request, prepared, sums, network), _copy(network)
+    trainer, first = Trainer(request, prepared, sums, network), weights_of(network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
     parts = request.model_dump(), factors.fingerprint, about, half
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
     unfinished = Path(f"{output}{_UNFINISHED}")
-    state = State.read(unfinished, digest) if resume and unfinished.is_file() else State.first(trainer)
-    state.restore(trainer)
+    if resume and unfinished.is_file():
+        trainer.load(unfinished, digest)
+    else:
+        trainer.choose()
     with job.clock.stage("train"):
-        predicted = time.perf_counter() - started + trainer.seconds_a_step() * (request.steps - state.step)
+        predicted = time.perf_counter() - started + trainer.seconds_a_step() * (request.steps - trainer.taken)
         Cost(predicted).check(f"{store.folder}: training {request.method}", job.limits)
         job.clock.predict({"train": predicted})
-        while not state.is_over(request.steps):
-            state.go_on(trainer, job)
-            state.write(unfinished, digest)
+        while not trainer.is_over():
+            trainer.go_on(job)
+            trainer.save(unfinished, digest)
     network.load_state_dict(first)
     before = trainer.judge(trainer.judging)
-    network.load_state_dict(state.best)
+    network.load_state_dict(trainer.best)
     after = trainer.judge(trainer.judging)
-    how = {**request.model_dump(), "half_precision": half, "curve": state.curve, "psnr_db": after}
+    how = {**request.model_dump(), "half_precision": half, "curve": trainer.curve, "psnr_db": after}
     manifest = ModelManifest(
         method=request.method, camera=factors.manifest.camera, factors=factors.fingerprint,
         patterns=store.manifest.patterns, exposure_s=store.manifest.exposure_s, noise=sums.noise, pairs=about,
@@ -389,7 +381,7 @@ def train_network(
     model = LearnedSolver(manifest, network.eval(), factors.sides, store.patterns)
     model.save(output)
     unfinished.unlink(missing_ok=True)
-    return Trained(model, tuple(state.curve), before, after, predicted, str(output))
+    return Trained(model, tuple(trainer.curve), before, after, predicted, str(output))
 
 
 def first_network(request: Training, shape: tuple[int, int]) -> Method:

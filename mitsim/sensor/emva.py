@@ -191,9 +191,14 @@ def alike(
     # Spread over the pixels' variances, which noise that rows share moves together (`mitsim.studies.camera_frames`).
     spread = float(own.var()) + (4 * max(variance - rows, 0.0) * rows + 2 * rows**2 * n) / (count - 1)
     drift = float(np.var(means, ddof=1)) - (variance - rows) / (m * n) - rows / m
+    difference = difference - difference.mean(axis=1, keepdims=True)
+    difference -= difference.mean(axis=0)
+    power = float(np.square(difference).mean()) or math.inf
+    beside, below = (difference[:, 1:] * difference[:, :-1]).mean(), (difference[1:] * difference[:-1]).mean()
     return Alike(
         count, (m, n), pair, Stack(pair.mean, *left), math.sqrt(spread / (m * n)),
-        (ends[0] / count / m / n, ends[1] / count / m / n), math.sqrt(max(drift, 0.0)), _neighbours(difference),
+        (ends[0] / count / m / n, ends[1] / count / m / n), math.sqrt(max(drift, 0.0)),
+        (float(beside) / power, float(below) / power),
         _comb(codes, noise) if math.isfinite(largest) else (0.0, 1.0), tuple(digests), light, exposure_s,
     )  # fmt: skip
 
@@ -209,15 +214,6 @@ def _comb(codes: FloatArray, noise: float) -> tuple[float, float]:
     waves = np.abs(np.fft.rfft(codes))[first:] / codes.sum()
     strongest = int(np.argmax(waves > 0.9999 * waves.max()))
     return float(waves[strongest]), len(codes) / (first + strongest)
-
-
-def _neighbours(noise: FloatArray) -> tuple[float, float]:
-    noise = noise - noise.mean(axis=1, keepdims=True)
-    noise -= noise.mean(axis=0)
-    power = float(np.square(noise).mean())
-    if not power:
-        return 0.0, 0.0
-    return float((noise[:, 1:] * noise[:, :-1]).mean()) / power, float((noise[1:] * noise[:-1]).mean()) / power
 
 
 def pairs_of(pairs: Sequence[Pair]) -> Pair:

@@ -153,16 +153,16 @@ def teach(method: str, prepared: Prepared, sums: Sums, budget: Budget, seed: int
     job
         is told how far it is.
     """
-    from mitsim.learn.training import State, Trainer, first_network
+    from mitsim.learn.training import Trainer, first_network
 
     started, request = time.process_time(), Training(method=method, steps=budget.steps, batch=budget.batch, seed=seed)
     shape = prepared.left.scene_size, prepared.right.scene_size
     trainer = Trainer(request, prepared, sums, first_network(request, shape))
-    state = State.first(trainer)
-    while not state.is_over(budget.steps):
-        state.go_on(trainer, job)
-    trainer.network.load_state_dict(state.best)
-    return Taught(trainer.network.eval(), state.curve, time.process_time() - started)
+    trainer.choose()
+    while not trainer.is_over():
+        trainer.go_on(job)
+    trainer.network.load_state_dict(trainer.best)
+    return Taught(trainer.network.eval(), trainer.curve, time.process_time() - started)
 
 
 def image(camera: Camera, frame: FloatArray, method: str, taught: dict[str, Taught]) -> tuple[FloatArray, float]:
