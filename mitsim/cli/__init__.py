@@ -17,9 +17,8 @@ import typer
 import mitsim
 from mitsim.cli.bench_verbs import capture, demo, doctor, pairs, plan, render, run_, study, transport, view
 from mitsim.cli.calibrate_verb import calibrate
-from mitsim.cli.commands import message_of
+from mitsim.cli.commands import Program, Verb, message_of, parts_of
 from mitsim.cli.frame_verbs import characterise, export, import_, patterns, reconstruct, report, sense, train
-from mitsim.cli.screen import Program, Verb, parts_of
 from mitsim.cli.shelf_verbs import list_, new
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.worker import INTERRUPTED, end_stopped, end_uncaught, is_stopped, say_note

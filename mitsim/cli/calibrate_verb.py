@@ -9,27 +9,20 @@ import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.request import NO, Exposure, FixedColour, Opening, Request, SessionRequest, Task
-from mitsim.cli.commands import Common, LimitedPictured, Resumed, check_work, complete_scene, option_name, verb
-from mitsim.cli.screen import finish, finish_folder, memory_line, payload_of_lines, total_of_lines
+from mitsim.cli.bench_verbs import check_work, memory_line, payload_of_lines, total_of_lines
+from mitsim.cli.commands import LimitedPictured, Resumed, command, option_name, scene_named, to_make
 from mitsim.core.configuration import OUTPUT, WHAT, option
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import CALIBRATION
 from mitsim.core.worker import RESUME, advise
+from mitsim.devices.session import load_recipe
 from mitsim.verbs import calibrate_in, open_as
 
 if TYPE_CHECKING:
-    from mitsim.devices.session import Modelling
     from mitsim.reconstruct.factors import Factors
-
-_OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet", "verbose", "no_pictures"}
-"""Options of `mitsim calibrate` that go with --frames."""
-_OF_KNOWN = {"known", "aged", "output", "as_json", "quiet", "verbose", "no_pictures"}
-"""Those that go with --known."""
 
 
 class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed):
@@ -37,14 +30,8 @@ class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed
 
     PANEL = WHAT
 
-    output: Path | None = option(
-        None,
-        "calibration folder to make; of --plan, recipe to write",
-        "-o",
-        "--output",
-        metavar="CAL",
-        panel=OUTPUT,
-    )
+    scene: str | None = scene_named(None, "scene XML, or the name of a shipped scene; none with --frames")
+    output: Path | None = to_make(None, "calibration folder to make; of --plan, recipe to write", "CAL")
     frames: Path | None = option(None, "folder with the frames of a real session, instead of a scene", metavar="DIR")
     known: Path | None = option(None, "list of captures of known pictures, instead of a scene", metavar="LIST.toml")
     aged: Path | None = option(
@@ -72,34 +59,15 @@ class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed
             raise MitsimError("Missing option '-o' / '--output': give the calibration folder to make")
         return self.output
 
-    def modelling(self, accuracy: float) -> Modelling:
-        """Return the fit of --model, of light of an ``accuracy``; MitsimError for words that it does not have."""
-        from mitsim.devices.session import FITTED, Modelling
-
-        names = FITTED if self.fit is None else tuple(name.strip() for name in self.fit.split(","))
-        model: Any = self.model  # checked there
-        frames = {} if self.frames_used is None else {"frames": self.frames_used}
-        return Modelling(model, **frames, fitted=names, accuracy=accuracy)
-
-    def refuse_others(self, scene: str | None, allowed: set[str], reason: str) -> None:
-        """Refuse, for a ``reason``, a ``scene`` and the first option that is given and not ``allowed``."""
-        given = {*self.given, *(() if scene is None else ("scene",))}
-        if others := sorted(given - allowed):
+    def allow(self, names: str, reason: str) -> None:
+        """Refuse, for a ``reason``, all options that are given but for these ``names`` and those of how it is said."""
+        allowed = {*names.split(), "output", "as_json", "quiet", "verbose", "no_pictures"}
+        if others := sorted({*self.given} - allowed):
             raise MitsimError(f"{reason}; leave out {option_name(others[0])}")
 
 
-@verb
-def calibrate(
-    asked: Calibrating,
-    scene: Annotated[
-        str | None,
-        typer.Argument(
-            help="scene XML, or the name of a shipped scene; none with --frames",
-            metavar="[SCENE]",
-            autocompletion=complete_scene,
-        ),
-    ] = None,
-) -> int:
+@command
+def calibrate(asked: Calibrating) -> int:
     """Estimate the camera's two factors, simulated or real.
 
     Renders a Hadamard session on a white board, or reads the frames of a real one (--frames) or of known pictures
@@ -110,151 +78,130 @@ def calibrate(
     $ mitsim calibrate --frames session -o cal --camera imx249
     """
     if asked.known is not None:
-        asked.refuse_others(scene, _OF_KNOWN, f"--known {asked.known}: runs and their list decide")
+        asked.allow("known aged", f"--known {asked.known}: runs and their list decide")
         return _calibrate_known(asked.known, asked)
     if asked.aged is not None:
         raise MitsimError(f"--from {asked.aged}: is mended by captures of known pictures; give --known LIST too")
     if asked.model is not None and not asked.planning:
-        return _fit(scene, asked)
+        return _fit(asked)
     for name in ("frames_used", "fit", "model"):
         if (value := getattr(asked, name)) is not None:
             raise MitsimError(f"{option_name(name)} {value}: is for --model without --plan; leave it out")
     if asked.frames is not None:
-        asked.refuse_others(scene, _OF_FRAMES, f"--frames {asked.frames}: frames and their list decide")
+        asked.allow("frames camera", f"--frames {asked.frames}: frames and their list decide")
         return _calibrate_frames(asked.frames, asked)
-    if scene is None:
+    if asked.scene is None:
         raise MitsimError(
             "calibrate: give a scene, --frames DIR with the frames of a real session, or --known LIST of known pictures"
         )
-    if asked.planning:
-        return _plan(scene, asked)
-    return _calibrate(scene, asked)
+    return (_plan if asked.planning else _calibrate)(asked.scene, asked)
 
 
-# ---- a simulated session ---------------------------------------------------------------------------------------------
+def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memory: float) -> int:
+    """Print what the terminal shows of calibrations by the name of their folder in ``folder``, or of one without a
+    name; return the exit status."""
+    results = {
+        name: {
+            **each.manifest.result,
+            "memory_bytes": memory,
+            "warnings": each.warnings,
+            "output": str(folder / name),
+        }
+        for name, each in found.items()
+    }
+    lines = []
+    for result in results.values():
+        # JSON has null for infinite numbers.
+        names = "separability_residual", "noise_free_residual", "phi_error", "predicted_phi_error", "condition"
+        numbers = (result.get(name) for name in names)
+        residual, clean, error, predicted, condition = (math.inf if each is None else each for each in numbers)
+        simulated, shadow = "shadow_residual" in result, result.get("shadow_residual")
+        divisor = result.get("divided_by", 1)
+        lines += [
+            f"{result['frames']} frames of {result['n']} stripes in {result['seconds']['total']:.1f} s: "
+            f"{result['output']}",
+            f"Factor error {error:.1e}, separability residual {residual:.2%} ({clean:.1e} without noise)"
+            if simulated
+            else f"Factor error {predicted:.1e} by its noise, separability residual {residual:.2%}",
+            *asked.details(
+                f"Condition {condition:.2e}",
+                *([] if shadow is None else [f"Of single pixels' shadows the factors lack {shadow:.1e}"]),
+                memory_line(result),
+            ),
+            *([] if divisor == 1 else [f"Numbers are divided by {divisor}, which all have"]),
+            *(f"Not known: {text}" for text in result.get("not_known", ())),
+        ]
+    warnings = [text for each in found.values() for text in each.warnings]
+    payload = results[""] if [*results] == [""] else {"depths": [*results.values()], "output": str(folder)}
+    return asked.finish_folder(folder, {**payload, "warnings": warnings}, lines, warnings)
+
+
+def _finish_lines(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memory: float) -> int:
+    """Print what the terminal shows of a coloured calibration; return the exit status."""
+    results = {
+        name: {**each.manifest.result, "warnings": each.warnings, "output": str(folder / name)}
+        for name, each in found.items()
+    }
+    payload, lines = {**payload_of_lines(CALIBRATION, results, folder), "memory_bytes": memory}, []
+    for part in payload["channels"]:
+        residual = part["separability_residual"]
+        error = part["predicted_phi_error"] if part["phi_error"] is None else part["phi_error"]
+        lines.append(
+            f"{part['name']}: {part['frames']} frames of {part['n']} stripes, separability residual "
+            f"{'unknown' if residual is None else f'{residual:.2%}'}, factor error {error:.1e}"
+        )
+    return asked.finish_folder(folder, payload, [total_of_lines(payload), *lines], payload["warnings"])
 
 
 def _calibrate(scene: str, asked: Calibrating) -> int:
+    """Calibrate by a simulated session."""
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.devices.session import load_recipe
 
-    recipe, folder, colour = asked.recipe or load_recipe(), asked.folder, asked.colour
-    if asked.write_frames is not None or colour != NO:
+    recipe, folder, colour, kept = asked.recipe or load_recipe(), asked.folder, asked.colour, asked.write_frames
+    if kept is not None or colour != NO:
         recipe.of_one_depth()
-    if asked.write_frames is not None:
-        if asked.resume:
-            raise MitsimError(
-                "--write-frames: a resumed session shows its finished patterns no more; leave out --resume"
-            )
-        if colour != NO:
-            raise MitsimError(
-                f"--write-frames {asked.write_frames}: frames are kept of light that is not told apart; leave one out"
-            )
+    if kept is not None and asked.resume:
+        raise MitsimError("--write-frames: a resumed session shows its finished patterns no more; leave out --resume")
+    if kept is not None and colour != NO:
+        raise MitsimError(f"--write-frames {kept}: frames are kept of light that is not told apart; leave one out")
     check_work(folder, asked.resume, "calibration", several=colour != NO or bool(recipe.depths))
-    if asked.write_frames is not None:
-        check_output(asked.write_frames)
+    if kept is not None:
+        check_output(kept)
     asked.check(scene, None, Exposure(None, recipe.exposure_fraction), colour)
     advise(RESUME)
     session = asked.part(SessionRequest)
     with asked.job() as job:
         bench = open_as(scene, asked, job, colour)
         held = memory_from_here()
-        if asked.write_frames is not None:
-            found: Mapping[str, Factors] = {"": bench.write_session(asked.write_frames, folder, job, **session.given)}
+        if kept is not None:
+            found: Mapping[str, Factors] = {"": bench.write_session(kept, folder, job, **session.given)}
         else:
             found = calibrate_in(bench, colour, session, Task(folder, asked.resume, job))
-    taken = memory_since(held)
-    if colour != NO:
-        payload, lines = _of_lines(found, folder)
-        payload["memory_bytes"] = taken
-        return finish_folder(asked, folder, payload, lines, payload["warnings"])
-    payloads = [
-        {**factors.manifest.result, "memory_bytes": taken, "output": str(folder / name)}
-        for name, factors in found.items()
-    ]
-    lines = [line for payload in payloads for line in _session_lines(payload, asked)]
-    warnings = [text for factors in found.values() for text in factors.warnings]
-    if not recipe.depths:
-        return finish_folder(asked, folder, payloads[0], lines, warnings)
-    whole = {"depths": payloads, "output": str(folder), "warnings": warnings}
-    return finish_folder(asked, folder, whole, lines, warnings)
+    finish = _finish if colour == NO else _finish_lines
+    return finish(found, folder, asked, memory_since(held))
 
 
-def _session_lines(payload: dict[str, Any], common: Common) -> list[str]:
-    names = "separability_residual", "noise_free_residual", "phi_error", "condition"
-    residual, clean, error, condition = _finite(payload, *names)
-    shadow = payload["shadow_residual"]
-    return [
-        f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: "
-        f"{payload['output']}",
-        f"Factor error {error:.1e}, separability residual {residual:.2%} ({clean:.1e} without noise)",
-        *common.details(
-            f"Condition {condition:.2e}",
-            *([] if shadow is None else [f"Of single pixels' shadows the factors lack {shadow:.1e}"]),
-            memory_line(payload),
-        ),
-    ]
-
-
-def _of_lines(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, Any], list[str]]:
-    """Return the JSON and the lines of text of a coloured calibration, by its ``factors``."""
-    results = {
-        name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
-        for name, each in factors.items()
-    }
-    payload = payload_of_lines(CALIBRATION, results, output)
-    lines = [
-        f"{part['name']}: {part['frames']} frames of {part['n']} stripes, separability residual "
-        f"{_percent(part['separability_residual'])}, factor error "
-        f"{part['predicted_phi_error'] if part['phi_error'] is None else part['phi_error']:.1e}"
-        for part in payload["channels"]
-    ]
-    return payload, [total_of_lines(payload), *lines]
-
-
-def _percent(part: float | None) -> str:
-    return "unknown" if part is None else f"{part:.2%}"
-
-
-def _finite(payload: Mapping[str, Any], *names: str) -> list[float]:
-    """Return numbers of a ``payload``, where JSON has null for infinite ones."""
-    return [math.inf if payload[name] is None else payload[name] for name in names]
-
-
-# ---- frames of a real session ----------------------------------------------------------------------------------------
-
-
-def _calibrate_frames(folder: Path, asked: Calibrating) -> int:
+def _calibrate_frames(frames: Path, asked: Calibrating) -> int:
+    """Calibrate by the frames of a real session."""
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.framelist import load_frames
 
-    session, output = load_frames(folder), asked.folder  # refused before the estimator is imported
+    session, output = load_frames(frames), asked.folder  # refused before the estimator is imported
     from mitsim.reconstruct.captured_session import calibrate_frames, calibrate_planes
 
     held = memory_from_here()
     with asked.job() as job:
         if session.planes != ("",):
-            payload, lines = _of_lines(calibrate_planes(session, output, job, asked.camera), output)
-            payload["memory_bytes"] = memory_since(held)
-            return finish_folder(asked, output, payload, lines, payload["warnings"])
-        factors = calibrate_frames(session, output, job, asked.camera)
-    payload = {**factors.manifest.result, "memory_bytes": memory_since(held), "output": str(output)}
-    residual, error, condition = _finite(payload, "separability_residual", "predicted_phi_error", "condition")
-    lines = [
-        f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
-        f"Factor error {error:.1e} by its noise, separability residual {residual:.2%}",
-        *asked.details(f"Condition {condition:.2e}", memory_line(payload)),
-        *([] if payload["divided_by"] == 1 else [f"Numbers are divided by {payload['divided_by']}, which all have"]),
-        *(f"Not known: {text}" for text in payload["not_known"]),
-    ]
-    return finish_folder(asked, output, payload, lines, factors.warnings)
-
-
-# ---- captures of known pictures --------------------------------------------------------------------------------------
+            found: Mapping[str, Factors] = calibrate_planes(session, output, job, asked.camera)
+        else:
+            found = {"": calibrate_frames(session, output, job, asked.camera)}
+    finish = _finish if [*found] == [""] else _finish_lines
+    return finish(found, output, asked, memory_since(held))
 
 
 def _calibrate_known(listed: Path, asked: Calibrating) -> int:
+    """Calibrate by captures of known pictures."""
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.framelist import load_known
@@ -276,12 +223,16 @@ def _calibrate_known(listed: Path, asked: Calibrating) -> int:
     if captures.lines is not None:
         payload["planes"] = results
     pictures = f"{first['pictures']} picture" + "s" * (first["pictures"] > 1)
-    said = f"{first['frames']} frames of {pictures} in {first['seconds']['total']:.1f} s: {output}"
+    lines = [f"{first['frames']} frames of {pictures} in {first['seconds']['total']:.1f} s: {output}"]
     if aged is not None:
-        left = f"Left over beyond noise {first['unexplained_residual']:.2%}, before {first['unexplained_before']:.2%}"
-        moved = f"Moved: {moved_in_words(first['moved'])}"
-        return finish_folder(asked, output, payload, [said, moved, left], warnings)
+        left, before = first["unexplained_residual"], first["unexplained_before"]
+        lines += [f"Moved: {moved_in_words(first['moved'])}", f"Left over beyond noise {left:.2%}, before {before:.2%}"]
+        return asked.finish_folder(output, payload, lines, warnings)
     rows, columns = first["scale"]
+    lines.append(
+        f"Pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
+        "columns of pixels"
+    )
     planes = dict[str, list[str]]()
     for name, each in results.items():
         text = (
@@ -290,22 +241,15 @@ def _calibrate_known(listed: Path, asked: Calibrating) -> int:
             f"{each['predicted_frame_error']:.1e} in frames of such pictures"
         )
         planes.setdefault(text, []).append(name)
-    lines = [
-        said,
-        f"Pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
-        "columns of pixels",
-        *(f"{', '.join(names)}: {text}" if any(names) else text for text, names in planes.items()),
-    ]
-    return finish_folder(asked, output, payload, lines, warnings)
-
-
-# ---- `mitsim calibrate --plan` ---------------------------------------------------------------------------------------
+    lines += [f"{', '.join(names)}: {text}" if any(names) else text for text, names in planes.items()]
+    return asked.finish_folder(output, payload, lines, warnings)
 
 
 def _plan(scene: str, asked: Calibrating) -> int:
+    """Plan a session that an image of a given PSNR needs."""
     from mitsim.bench.request import check_psnr
     from mitsim.core.files import output_file, prepare_output, write_text
-    from mitsim.devices.session import load_recipe, recipe_text
+    from mitsim.devices.session import recipe_text
 
     recipe, output, colour = asked.recipe or load_recipe(), asked.output, asked.colour
     recipe.of_one_depth()
@@ -333,20 +277,20 @@ def _plan(scene: str, asked: Calibrating) -> int:
             if output is not None:
                 write_text(output, recipe_text(found.recipe))
                 lines.append(f"Recipe: {output}")
-    payload = {**found.payload(), "output": None if output is None else str(output)}
-    return finish(asked.as_json, payload, lines, found.warnings)
+    return asked.finish({**found.payload(), "output": None if output is None else str(output)}, lines, found.warnings)
 
 
-# ---- `mitsim calibrate --model` --------------------------------------------------------------------------------------
-
-
-def _fit(scene: str | None, asked: Calibrating) -> int:
+def _fit(asked: Calibrating) -> int:
+    """Model the factors, with devices that are fitted to a few frames."""
     from mitsim.core.files import check_output
     from mitsim.devices.framelist import load_frames
-    from mitsim.devices.session import load_recipe
+    from mitsim.devices.session import FITTED, Modelling
 
-    modelling, folder = asked.modelling(asked.accuracy), asked.folder
-    if scene is None:
+    fitted = FITTED if asked.fit is None else tuple(name.strip() for name in asked.fit.split(","))
+    count = {} if asked.frames_used is None else {"frames": asked.frames_used}
+    model: Any = asked.model  # checked there
+    modelling, folder = Modelling(model, **count, fitted=fitted, accuracy=asked.accuracy), asked.folder
+    if asked.scene is None:
         raise MitsimError("--model: give the scene too, which states the camera and projector as they were to be built")
     of_frames_alone = ("recipe", "seed", "accuracy") if asked.frames else ()
     for name in ("resume", "write_frames", "colour", *of_frames_alone):
@@ -356,26 +300,22 @@ def _fit(scene: str | None, asked: Calibrating) -> int:
     recipe, frames = asked.recipe or load_recipe(), asked.frames and load_frames(asked.frames)
     check_output(folder)
     if frames is None:
-        asked.check(scene, None, Exposure(None, recipe.exposure_fraction))
+        asked.check(asked.scene, None, Exposure(None, recipe.exposure_fraction))
     with asked.job() as job:
-        bench = open_as(scene, asked, job)
+        bench = open_as(asked.scene, asked, job)
         from mitsim.calibrate.model import calibrate_model
 
         factors = calibrate_model(bench, modelling, frames, recipe, asked.seed, folder, job)
     result = factors.manifest.result
-    lines = _model_lines(result, folder)
-    return finish_folder(asked, folder, {**result, "output": str(folder)}, lines, factors.warnings)
-
-
-def _model_lines(result: Mapping[str, Any], output: Path) -> list[str]:
     numbers = [
         f"{name.replace('_', ' ')} {number['value']:.6g} +-{number['standard_error']:.2g} {number['unit']}"
         for name, number in result["parameters"].items()
         if number["standard_error"] is not None
     ]
-    return [
-        f"{result['model']} model fitted to {result['frames']} frames in {result['seconds']['total']:.1f} s: {output}",
+    lines = [
+        f"{result['model']} model fitted to {result['frames']} frames in {result['seconds']['total']:.1f} s: {folder}",
         *numbers,
         f"Unexplained {result['unexplained_residual']:.2%}, chi-square {result['chi_square']:.3g} a datum, condition "
         f"{result['condition']:.2e}",
     ]
+    return asked.finish_folder(folder, {**result, "output": str(folder)}, lines, factors.warnings)

@@ -1,217 +1,114 @@
-"""Command lines from models of options: models become parameters of typer, and what is given becomes models again.
+"""Commands from models of options, and what a terminal shows of them: pages of help, results, warnings and progress.
 
+A verb is a function of one model, which declares all that its command line takes; :func:`command` makes the command.
 Errors of the library speak of arguments; :func:`message_of` writes them as options.
+
+Help is plain text, on a terminal or not: rich's panels take half as long again to show, leave a sentence 22 of 80
+characters, and take `mitsim[learn]` for markup.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
+import json
+import os
 import re
 import shlex
+import shutil
+import signal
 import sys
+import textwrap
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from mitsim.bench.request import Variant
-from mitsim.core.configuration import LIMITS, OUTPUT, WHAT, Options, option, shipped_files
+from mitsim.core.configuration import LIMITS, OUTPUT, PANELS, WHAT, Options, option, shipped_files
 from mitsim.core.errors import ArgumentError, MitsimError, printable
+from mitsim.core.files import PICTURES
 from mitsim.core.job import Limits, progress, running_seconds
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from mitsim.core.job import Job
     from mitsim.light.plan import Plan
 
-_SPELLED = {"scene": "SCENE"}
-"""Options that are not called like their parameter; models add theirs."""
-_METAVARS: Mapping[type, str] = {float: "NUMBER", int: "N", str: "TEXT", Path: "PATH"}
+M = TypeVar("M", bound=Options)
+
+# ---- Options that several verbs have ---------------------------------------------------------------------------------
 
 
-def completing(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Return what completes a word in a shell: the ``names`` that begin with it."""
-
-    def complete(incomplete: str) -> list[str]:
-        return [name for name in names() if name.startswith(incomplete)]
-
-    return complete
+def argument(default: Any, help: str, metavar: str, **shown: Any) -> Any:
+    """Declare a field that the command line takes without a name; see :func:`mitsim.core.configuration.option`."""
+    return option(default, help, metavar=metavar, positional=True, **shown)
 
 
-complete_scene = completing(lambda: shipped_files("scenes", "scene.xml"))
-Scene = Annotated[
-    str,
-    typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE", autocompletion=complete_scene),
-]
+def to_make(default: Any, help: str, metavar: str, **shown: Any) -> Any:
+    """Declare the file or folder that a verb makes."""
+    return option(default, help, "-o", "--output", metavar=metavar, kind=Path, panel=OUTPUT, **shown)
 
 
-# ---- from models to a command line -----------------------------------------------------------------------------------
+def scene_named(
+    default: Any, help: str = "scene XML, or the name of a shipped scene", metavar: str = "[SCENE]", **shown: Any
+) -> Any:
+    """Declare the scene of a verb."""
+    return argument(default, help, metavar, complete=lambda: shipped_files("scenes", "scene.xml"), **shown)
 
 
-@dataclass(frozen=True)
-class Shown:
-    """How a verb shows a model: the fields ``only``, in this order (all if empty), with ``changes`` of some of them."""
-
-    only: tuple[str, ...] = ()
-    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-
-def show(only: str = "", **changes: Mapping[str, Any]) -> Shown:
-    """Return how a verb shows a model, as an annotation of it; names of fields have spaces between."""
-    return Shown(tuple(only.split()), changes)
-
-
-def verb(function: Callable[..., int]) -> Callable[..., int]:
-    """Make a function whose arguments are models of options, or typer's own, a command of typer.
-
-    A model is made of the options that the command line gives, so that ``model_fields_set`` names them; an argument
-    ``given`` gets the names of all options that are given.
-    """
-    parameters: dict[str, inspect.Parameter] = {}
-    groups: dict[str, tuple[type[Options], Sequence[str], Mapping[str, Any]]] = {}
-    hints = get_type_hints(function, include_extras=True)
-    for name, each in inspect.signature(function).parameters.items():
-        kind, *marks = (
-            (hints[name].__origin__, *hints[name].__metadata__)
-            if hasattr(hints[name], "__metadata__")
-            else (hints[name],)
-        )
-        if not (isinstance(kind, type) and issubclass(kind, Options)):
-            if name != "given":
-                parameters[name] = inspect.Parameter(
-                    name, inspect.Parameter.KEYWORD_ONLY, default=each.default, annotation=_own_hint(kind, marks)
-                )
-            continue
-        how = next((mark for mark in marks if isinstance(mark, Shown)), Shown())
-        declared = {n: kind for base in kind.__mro__ for n in inspect.get_annotations(base)}
-        fields = [n for n in how.only or declared if n in kind.model_fields and _extra(kind, n)["kind"] is not False]
-        readers = {}
-        for one in fields:
-            extra = {**_extra(kind, one), **how.changes.get(one, {})}
-            readers[one] = _reader(kind, one, extra)
-            parameters.setdefault(one, _parameter(kind, one, extra))
-        groups[name] = kind, fields, readers
-
-    @functools.wraps(function)
-    def call(context: typer.Context, **values: Any) -> int:
-        given = {name for name in values if _is_given(context, name)}
-        made = {
-            name: kind(**{one: readers[one](values[one]) for one in fields if one in given})
-            for name, (kind, fields, readers) in groups.items()
-        }
-        taken = {one for _, fields, _ in groups.values() for one in fields}
-        own = {name: value for name, value in values.items() if name not in taken}
-        if "given" in hints:
-            own["given"] = given
-        return function(**own, **made)
-
-    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-    call.__signature__ = inspect.Signature([context, *parameters.values()])  # type: ignore[attr-defined]
-    call.__annotations__ = {name: each.annotation for name, each in parameters.items()} | {"context": typer.Context}
-    return call
-
-
-def _is_given(context: typer.Context, name: str) -> bool:
-    source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
-
-
-def _own_hint(kind: Any, marks: Sequence[Any]) -> Any:
-    """Return the annotation of an argument that is no model, with a word for its value."""
-    for mark in marks:
-        mark.metavar = mark.metavar or _metavar(kind)
-    return Annotated[(kind, *marks)] if marks else kind
-
-
-def _extra(model: type[Options], name: str) -> Mapping[str, Any]:
-    extra: Any = model.model_fields[name].json_schema_extra
-    return extra  # type: ignore[no-any-return]
-
-
-def _kinds(annotation: Any) -> Iterator[Any]:
-    """Iterate over the alternatives of an ``annotation``, without None; of a Literal over its words."""
-    if get_origin(annotation) in (Union, UnionType, Literal):
-        for each in get_args(annotation):
-            yield from _kinds(each)
-    elif get_origin(annotation) is Annotated:
-        yield from _kinds(get_args(annotation)[0])
-    elif annotation is not NoneType:
-        yield annotation
-
-
-def _metavar(kind: Any) -> str | None:
-    return next((_METAVARS[each] for each in _kinds(kind) if each in _METAVARS), None)
-
-
-def _parameter(model: type[Options], name: str, extra: Mapping[str, Any]) -> inspect.Parameter:
-    """Return typer's parameter of a field of a ``model``, which is shown as ``extra`` states."""
-    declared = model.model_fields[name]
-    kinds = [*_kinds(declared.annotation)]
-    kind = extra["kind"] or (kinds[0] if len(kinds) == 1 and kinds[0] in (bool, int, float, str, Path) else str)
-    names = extra["names"] or ((f"--{name.replace('_', '-')}",) if kind is bool else ())
-    if names and f"--{name.replace('_', '-')}" not in names:
-        _SPELLED[name] = names[0]
-    shown = typer.Option(
-        *names,
-        help=extra.get("help", declared.description),
-        metavar=extra.get("metavar") or _metavar(kind),
-        rich_help_panel=extra.get("panel", _panel(model, name)) or None,
-        show_default=extra.get("show_default", True),
-        min=extra.get("min"),
-        max=extra.get("max"),
-        autocompletion=completing(extra["complete"]) if "complete" in extra else None,
-    )
-    default = inspect.Parameter.empty if declared.is_required() else extra.get("default", declared.default)
-    if isinstance(default, (dict, tuple)):
-        default = "" if kind is str else None
-    hint = kind if default is not None else kind | None
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, shown])
-
-
-def _panel(model: type[Options], name: str) -> str:
-    """Return the heading of a field: that of the class that declares it."""
-    declaring = next(base for base in model.__mro__ if name in inspect.get_annotations(base))
-    return str(getattr(declaring, "PANEL", WHAT))
-
-
-def _reader(model: type[Options], name: str, extra: Mapping[str, Any]) -> Callable[[Any], Any]:
-    """Return the function that makes the value of a field of a ``model`` of the word on the command line."""
-    kinds, read = [*_kinds(model.model_fields[name].annotation)], extra.get("read")
-    words = [kind for kind in kinds if isinstance(kind, str)]
-    if read or not (float in kinds and words):
-        return read or (lambda value: value)
-    return lambda text: read_number(name, text, words)
-
-
-def read_number(argument: str, text: str, words: Sequence[str]) -> float | str:
-    """Return the number in a ``text``, or the text if it is one of the ``words``; ArgumentError otherwise."""
-    if text in words:
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise ArgumentError(argument, f"{text!r}: give a number or {' or '.join(words)}") from None
-
-
-# ---- options of all verbs --------------------------------------------------------------------------------------------
+def shown(**changes: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+    """Return how a verb shows some fields, by their names, as arguments of :func:`option`."""
+    return changes
 
 
 class Common(Variant):
-    """Options that every verb has."""
+    """Options of every verb.
+
+    Of the fields of a verb's model those of ``FIRST`` are listed first, those of ``HIDDEN`` belong to Python alone, and
+    ``CHANGES`` shows some otherwise than the models that it derives from; names have spaces between.
+    """
 
     PANEL = OUTPUT
+    FIRST: ClassVar[str] = ""
+    HIDDEN: ClassVar[str] = ""
+    CHANGES: ClassVar[Mapping[str, Mapping[str, Any]]] = shown()
 
     as_json: bool = option(False, "one JSON object on stdout, nothing else there", "--json")
     quiet: bool = option(False, "no progress")
     verbose: bool = option(False, "say all that was found, not the result alone")
 
+    def given_of(self, model: type[Options]) -> dict[str, Any]:
+        """Return the options that were given of those that a ``model`` has."""
+        return {name: value for name, value in self.given.items() if name in model.model_fields}
+
     def details(self, *lines: str) -> Sequence[str]:
-        """Return those ``lines`` that are printed with --verbose alone."""
+        """Return the ``lines``, which are printed with --verbose alone."""
         return lines if self.verbose else ()
+
+    @property
+    def limits(self) -> Limits:
+        """Longest time and most memory of the job."""
+        return Limits()
 
     @contextmanager
     def job(self) -> Iterator[Job]:
@@ -219,10 +116,15 @@ class Common(Variant):
         with progress(self.limits, self.quiet or self.as_json, running_seconds()) as job:
             yield replace(job, command=command_line())
 
-    @property
-    def limits(self) -> Limits:
-        """Longest time and most memory of the job."""
-        return Limits()
+    def call(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> int:
+        """Print the result of a ``function`` of the Python face, which takes a job; return the exit status."""
+        with self.job() as job:
+            result = function(*arguments, job=job, **named)
+        return self.finish(result.payload(), result.lines(), result.warnings)
+
+    def finish(self, payload: Any, lines: Sequence[str], warnings: Sequence[str] = ()) -> int:
+        """Print a result, as JSON or as lines; return exit status 1 if there are ``warnings``, which go to stderr."""
+        return print_result(self.as_json, payload, lines, warnings)
 
 
 class Limited(Common):
@@ -237,16 +139,58 @@ class Limited(Common):
 
     @property
     def limits(self) -> Limits:
-        """Those that are asked for."""
         return Limits(self.max_seconds, None if self.max_memory is None else self.max_memory * 2**30)
 
 
 class Pictured(Common):
     """Options of verbs whose work has pictures."""
 
-    PANEL = ""
+    PANEL = OUTPUT
 
     no_pictures: bool = option(False, "leave out pictures and the page report.html")
+
+    def finish_folder(
+        self, folder: Path, payload: Mapping[str, Any], lines: Sequence[str], warnings: Sequence[str]
+    ) -> int:
+        """Make the pictures and the page of a finished ``folder``, which JSON names as ``report``; print the result."""
+        made, failed = self._attempt(lambda: page_of(folder), f"`mitsim report {folder}` makes them later")
+        said = [] if made is None else [page_line(made)]
+        return self.finish({**payload, "report": made}, [*lines, *said], [*warnings, *failed])
+
+    def finish_frame(
+        self,
+        frame: tuple[Path, npt.NDArray[Any], str],
+        payload: Mapping[str, Any],
+        lines: Sequence[str],
+        warnings: Sequence[str],
+    ) -> int:
+        """Make a picture next to a file of one frame, which JSON names as ``picture``; print the result.
+
+        ``frame`` is the file, its numbers (rows, columns) or (rows, columns, 3), and their unit.
+        """
+
+        def make() -> dict[str, Any]:
+            from mitsim.report.pages import write_beside
+
+            started = time.perf_counter()
+            file, words = write_beside(*frame)
+            return {"file": str(file), "shows": words, "seconds": time.perf_counter() - started}
+
+        made, failed = self._attempt(make, "the frame is kept")
+        said = [] if made is None else [f"picture {made['file']}: {made['shows']}"]
+        return self.finish({**payload, "picture": made}, [*lines, *said], [*warnings, *failed])
+
+    def _attempt(self, make: Callable[[], dict[str, Any]], kept: str) -> tuple[dict[str, Any] | None, list[str]]:
+        """Return what ``make`` makes, unless pictures are not wanted. Work is not lost if they cannot be made: then
+        return None, and a warning that states what is ``kept``."""
+        if self.no_pictures:
+            return None, []
+        try:
+            return make(), []
+        except MitsimError as error:
+            return None, [f"pictures: {message_of(error)}; {kept}"]
+        except (OSError, MemoryError) as error:
+            return None, [f"pictures: {getattr(error, 'strerror', None) or 'out of memory'}; {kept}"]
 
 
 class LimitedPictured(Limited, Pictured):
@@ -288,28 +232,109 @@ class KnownPlan(Options):
         return found
 
 
-def check_work(output: Path, resume: bool, kind: str, several: bool = False) -> None:
-    """Refuse, before the renderer is imported, a RUN or CAL folder that cannot be written.
+def page_of(folder: Path) -> dict[str, Any]:
+    """Make the page and the pictures of a ``folder``, and return their JSON."""
+    started = time.perf_counter()
+    from mitsim.report.folder_page import report_folder
 
-    Parameters
-    ----------
-    output, resume
-        Folder, and whether work in it is to go on.
-    kind
-        "capture" or "calibration".
-    several
-        Whether the folder is to hold several such folders.
+    page = report_folder(folder)
+    pictures = sorted(map(str, (folder / PICTURES).glob("*.png")))
+    return {"page": str(page), "pictures": pictures, "seconds": time.perf_counter() - started}
+
+
+def page_line(made: Mapping[str, Any]) -> str:
+    return f"Page: {made['page']} (pictures in {made['seconds']:.1f} s)"
+
+
+# ---- From models to a command line -----------------------------------------------------------------------------------
+
+_METAVARS: Mapping[type, str] = {float: "NUMBER", int: "N", str: "TEXT", Path: "PATH"}
+_SPELLED = {"scene": "SCENE"}
+"""Options that are not called like their field; commands add theirs."""
+
+
+def command(function: Callable[[M], int]) -> Callable[..., int]:
+    """Make a ``function`` of one model of options a command of typer.
+
+    The model is made of what the command line gives, so that ``model_fields_set`` names it.
     """
-    from mitsim.core.files import check_output
-    from mitsim.core.manifests import MANIFEST, resumable
+    model: type[Options] = next(kind for name, kind in get_type_hints(function).items() if name != "return")
+    first, hidden = (getattr(model, name, "").split() for name in ("FIRST", "HIDDEN"))
+    declared = {name: base for base in reversed(model.__mro__) for name in inspect.get_annotations(base)}
+    listed = [name for base in model.__mro__ for name in inspect.get_annotations(base) if declared[name] is base]
+    names = [name for name in dict.fromkeys([*first, *listed]) if name in model.model_fields and name not in hidden]
+    readers, parameters = {}, [inspect.Parameter("context", _NAMED, annotation=typer.Context)]
+    for name in names:
+        described: Any = model.model_fields[name].json_schema_extra
+        extra = {"panel": getattr(declared[name], "PANEL", WHAT), **described}
+        extra |= getattr(model, "CHANGES", {}).get(name, {})
+        if extra["kind"] is not False:
+            readers[name] = _reader(model, name, extra.get("read"))
+            parameters.append(_parameter(model, name, extra))
 
-    begun = (output / MANIFEST).is_file()
-    if resume and begun and not several:
-        resumable(output, kind)
-    check_output(output, overwrite=resume and begun != several)
+    @functools.wraps(function)
+    def call(context: typer.Context, **values: Any) -> int:
+        sources = {name: context.get_parameter_source(name) for name in values}
+        given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        return function(model(**{name: readers[name](values[name]) for name in given}))  # type: ignore[arg-type]
+
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    call.__annotations__ = {each.name: each.annotation for each in parameters}
+    return call
 
 
-# ---- words of a command line in messages -----------------------------------------------------------------------------
+_NAMED = inspect.Parameter.KEYWORD_ONLY
+
+
+def _parameter(model: type[Options], name: str, extra: Mapping[str, Any]) -> inspect.Parameter:
+    """Return typer's parameter of a field of a ``model``, which is shown as ``extra`` states."""
+    declared = model.model_fields[name]
+    kinds, words = _kinds(declared.annotation), extra.get("complete")
+    kind = extra["kind"] or (kinds[0] if len(kinds) == 1 and kinds[0] in (bool, int, float, str, Path) else str)
+    shown: dict[str, Any] = {
+        "help": extra.get("help", declared.description),
+        "metavar": extra.get("metavar") or next((_METAVARS[each] for each in _kinds(kind) if each in _METAVARS), None),
+        "autocompletion": words and (lambda incomplete: [word for word in words() if word.startswith(incomplete)]),
+        **{key: extra[key] for key in ("show_default", "min", "max") if key in extra},
+    }
+    if extra.get("positional"):
+        mark = typer.Argument(**shown)
+    else:
+        spelled = f"--{name.replace('_', '-')}"
+        names = extra["names"] or ((spelled,) if kind is bool else ())
+        if names and spelled not in names:
+            _SPELLED[name] = names[0]
+        mark = typer.Option(*names, rich_help_panel=extra["panel"] or None, **shown)
+    default = inspect.Parameter.empty if declared.is_required() else extra.get("default", declared.default)
+    if isinstance(default, (dict, tuple)):
+        default = "" if kind is str else None
+    hint = kind if default is not None else kind | None
+    return inspect.Parameter(name, _NAMED, default=default, annotation=Annotated[hint, mark])
+
+
+def _kinds(annotation: Any) -> list[Any]:
+    """Return the alternatives of an ``annotation``, without None; of a Literal its words."""
+    if get_origin(annotation) in (Union, UnionType, Literal):
+        return [kind for each in get_args(annotation) for kind in _kinds(each)]
+    if get_origin(annotation) is Annotated:
+        return _kinds(get_args(annotation)[0])
+    return [] if annotation is NoneType else [annotation]
+
+
+def _reader(model: type[Options], name: str, read: Callable[[Any], Any] | None) -> Callable[[Any], Any]:
+    """Return the function that makes the value of a field of the word on the command line: ``read``, if it is given."""
+    kinds = _kinds(model.model_fields[name].annotation)
+    words = [kind for kind in kinds if isinstance(kind, str)]
+    if read or not (float in kinds and words):
+        return read or (lambda value: value)
+
+    def number(text: str) -> float | str:
+        try:
+            return text if text in words else float(text)
+        except ValueError:
+            raise ArgumentError(name, f"{text!r}: give a number or {' or '.join(words)}") from None
+
+    return number
 
 
 def command_line() -> str | None:
@@ -321,7 +346,7 @@ def command_line() -> str | None:
 
 
 def option_name(name: str) -> str:
-    """Return the option of the parameter ``name``."""
+    """Return the option of the field or argument ``name``."""
     return _SPELLED.get(name, f"--{name.replace('_', '-')}")
 
 
@@ -334,3 +359,151 @@ def message_of(error: MitsimError) -> str:
     return re.sub(
         r"(?<!-)\b(\w+(?==True)|max_seconds|max_memory)(=True)?", lambda m: "--" + m[1].replace("_", "-"), text
     )
+
+
+# ---- Pages of help ---------------------------------------------------------------------------------------------------
+
+_NARROWEST = 30
+"""Columns that a page has at least: an option and a word beside it."""
+_FIRST_COLUMN = 3 / 8
+"""Part of the width that names of options have at most, so that twelve words of 80 columns, and five of 40, fit beside
+them."""
+
+
+def parts_of(text: str | None) -> tuple[str, str, tuple[str, ...]]:
+    """Split the ``text`` of a docstring into its first line, its other prose, and its commands, the lines after a $."""
+    prose, *examples = re.split(r"\n\s*\$ ", (text or "").rstrip())
+    summary, _, more = prose.partition("\n")
+    return summary, more.strip(), tuple(examples)
+
+
+class _Page:
+    """A page of help, of a verb or of the program."""
+
+    help: str | None
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the page; click alone makes none narrower than 50 columns."""
+        formatter.width = min(formatter.width, max(shutil.get_terminal_size().columns - 2, _NARROWEST))
+        self.format_usage(ctx, formatter)  # type: ignore[attr-defined]
+        summary, more, examples = parts_of(self.help)
+        for text in filter(None, (summary, more)):
+            formatter.write_paragraph()
+            with formatter.indentation():
+                formatter.write_text(text)
+        self.format_options(ctx, formatter)  # type: ignore[attr-defined]
+        if examples:
+            with formatter.section(typer.style("Examples", bold=True)):
+                for line in examples:
+                    formatter.write(f"  {line}\n")
+
+
+class Verb(_Page, TyperCommand):
+    """A verb, whose page has a heading for each panel of its options, and examples in the end."""
+
+    def format_usage(self, ctx: Any, formatter: Any) -> None:
+        """Write the line of what must be given."""
+        words = [
+            f"{each.opts[0]} {each.metavar}" if _is_option(each) else str(each.metavar)
+            for each in self.params
+            if each.required or not _is_option(each)
+        ]
+        formatter.write_usage(ctx.command_path, " ".join([*words, "[OPTIONS]"]))
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write all that may be given, by panels."""
+        panels: dict[str, list[tuple[str, str]]] = {name: [] for name in ("Arguments", *PANELS)}
+        for each in self.get_params(ctx):
+            name = (getattr(each, "rich_help_panel", None) or OUTPUT) if _is_option(each) else "Arguments"
+            panels[name].append(_row(each))
+        _write_panels(panels, formatter)
+
+
+class Program(_Page, TyperGroup):
+    """The program, whose page has its verbs by panels, a whole line for each."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write verbs and options."""
+        panels = groupby(self.commands.values(), lambda verb: verb.rich_help_panel)  # type: ignore[attr-defined]
+        named = {name: [(str(verb.name), parts_of(verb.help)[0]) for verb in verbs] for name, verbs in panels}
+        _write_panels(named, formatter)
+        _write_panels({"Options": [_row(each) for each in self.get_params(ctx)]}, formatter)
+
+
+def _write_panels(panels: Mapping[str, Sequence[tuple[str, str]]], formatter: Any) -> None:
+    """Write rows of names and meanings under their headings, with the same columns for all headings."""
+    most = int(_FIRST_COLUMN * formatter.width)
+    width = max((len(name) for rows in panels.values() for name, _ in rows if len(name) <= most), default=0)
+    for heading, rows in panels.items():
+        if rows:
+            with formatter.section(typer.style(heading, bold=True)):  # which is left out where nobody would see it
+                formatter.write_dl([(name.ljust(width), meaning) for name, meaning in rows], col_max=width)
+
+
+def _is_option(parameter: Any) -> bool:
+    return bool(parameter.param_type_name == "option")
+
+
+def _row(parameter: Any) -> tuple[str, str]:
+    """Return what a user types for a ``parameter``, its shortest name first, and what it means, may be and is."""
+    if _is_option(parameter):
+        names = ", ".join(sorted(parameter.opts, key=len))
+        name = names if parameter.is_flag or not parameter.metavar else f"{names} {parameter.metavar}"
+        needed = "required" if parameter.required else ""
+    else:
+        name, needed = str(parameter.metavar), ""
+    least, most = (getattr(parameter, end, None) for end in ("min", "max"))
+    allowed = f"{least} to {most}" if most is not None else f"at least {least}" if least is not None else ""
+    shown, value = parameter.show_default, parameter.default
+    if isinstance(shown, str):
+        default = f"default {shown}"
+    elif not shown or value in (None, "", ()) or isinstance(value, bool):
+        default = ""
+    else:
+        default = f"default {value:g}" if isinstance(value, float) else f"default {value}"
+    return name, "; ".join(filter(None, [parameter.help, allowed, default, needed]))
+
+
+# ---- Results ---------------------------------------------------------------------------------------------------------
+
+COLUMNS, LINES = 80, 24
+"""Size of the usual terminal, and of what is no terminal."""
+
+
+def wrap_text(text: str, indent: str = "") -> list[str]:
+    """Wrap a ``text`` to the width of the terminal. Further lines follow an ``indent``; names and paths stay whole."""
+    width = shutil.get_terminal_size((COLUMNS, LINES)).columns
+    indent = indent or text[: len(text) - len(text.lstrip())] or "  "
+    lines = textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return lines or [""]
+
+
+def print_result(as_json: bool, payload: Any, lines: Iterable[str], warnings: Sequence[str]) -> int:
+    """Print a result as one JSON object, the ``payload``, or as ``lines`` of text; return exit status 1 if there are
+    ``warnings``, which go to stderr in either case."""
+    with write_at_end():
+        if as_json:
+            from mitsim.core.files import plain
+
+            print(json.dumps(plain(payload), allow_nan=False))
+        for line in () if as_json else lines:
+            for part in printable(line).split("\n"):
+                # Columns of a table stay one below the other.
+                print(*([part] if "  " in part.strip() else wrap_text(part)), sep="\n")
+    for warning in warnings:
+        print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
+    return 1 if warnings else 0
+
+
+@contextmanager
+def write_at_end() -> Iterator[None]:
+    """Write what is printed in this context at its end. If nobody reads standard output any more, end the program
+    quietly as SIGPIPE does; raise MitsimError if it cannot be written for another reason, such as a full disk."""
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError as error:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - what the exit writes has to go somewhere
+        if isinstance(error, BrokenPipeError):
+            sys.exit(128 + signal.SIGPIPE)
+        raise MitsimError(f"standard output: cannot be written ({error.strerror}); give it another place") from None

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 import mitsim
 from mitsim.bench.request import Irradiance
-from mitsim.cli.commands import Common, Limited, Overwritten, Pictured, Resumed, completing, option_name, show, verb
-from mitsim.cli.screen import finish, finish_folder, finish_frame, page_line, page_of
-from mitsim.core.configuration import CAMERA, DEVICES, WHAT, option, shipped_names
+from mitsim.cli.commands import (
+    Common,
+    Limited,
+    Pictured,
+    Resumed,
+    argument,
+    command,
+    option_name,
+    page_line,
+    page_of,
+    shown,
+    to_make,
+)
+from mitsim.core.configuration import CAMERA, DEVICES, OUTPUT, WHAT, option, shipped_names
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import JOINT, MOSAIC, RUN, SpectralFolder, check_way, is_coloured, open_lines
 from mitsim.core.worker import RESUME, advise
@@ -26,14 +35,27 @@ if TYPE_CHECKING:
     from mitsim.report.colour_image import ColourImage
     from mitsim.report.reconstruct_run import Judged
 
-# ---- images of frames ------------------------------------------------------------------------------------------------
+# ---- Images of frames ------------------------------------------------------------------------------------------------
 
 
-class ImageInputs(Overwritten):
-    """What an image is made of."""
+def _method(name: str) -> Any:
+    """Return a method's name, or the network in a file."""
+    if not name.endswith(MODEL):
+        return name
+    from mitsim.learn.verbs import load_network
+
+    return load_network(name)
+
+
+class Reconstructing(ImageRequest, Pictured):
+    """What an image is made of, how, and where it goes."""
 
     PANEL = WHAT
+    FIRST = "run output calibration"
+    CHANGES = shown(method={"read": _method})
 
+    run: Path = argument(..., "folder of `mitsim capture`", "RUN")
+    output: Path | None = to_make(None, "folder for the image; RUN/reconstruction if not given", "DIR")
     calibration: Path | None = option(None, "folder of `mitsim calibrate`; needed without --psf", metavar="CAL")
     psf: Path | None = option(
         None, "in place of a calibration: picture of the light of a scene point, of the frames' pixels", metavar="FILE"
@@ -50,29 +72,42 @@ class ImageInputs(Overwritten):
         metavar="joint|half|demosaic",
         show_default="joint",
     )
+    overwrite: bool = option(False, "replace an earlier image in the folder", panel=OUTPUT)
+
+    def check_inputs(self, lines: SpectralFolder) -> None:
+        """Refuse options that have no effect on a run of these ``lines``, and inputs that are missing."""
+        run = lines.folder
+        if self.psf is not None:
+            self.refuse(["calibration", "chart", "mosaic"], "with --psf")
+            if lines.colours:
+                raise MitsimError(f"--psf {self.psf}: {run} is coloured; reconstruct one of its lines, {run}/NAME")
+            self.check_point_spread(self.reduce)
+            if not self.psf.is_file():
+                raise MitsimError(f"--psf {self.psf}: is no file; give a picture of the light of a scene point")
+            return
+        if self.reduce != 1:
+            self.refuse(["reduce"], "without --psf")
+        if self.calibration is None:
+            raise MitsimError("--calibration: is missing; give the folder of `mitsim calibrate`, or --psf FILE")
+        if not lines.colours:
+            self.refuse(["chart", "mosaic"], f"on {run}, which is not coloured")
+        elif not lines.filters:
+            self.refuse(["mosaic"], f"on {run}, which has a run for each line")
+        else:
+            from mitsim.reconstruct.request import check_joint
+
+            check_way(self.mosaic or JOINT)
+            check_joint(self.lam)
+            for name, value in self.given_of(ImageRequest).items():
+                if name != "lam" and value != ImageRequest.model_fields[name].default:
+                    raise MitsimError(
+                        f"{option_name(name)} {value}: runs behind colour filters are solved by tikhonov at the "
+                        "calibrated depth; leave it out"
+                    )
 
 
-def _method(name: str) -> Any:
-    """Return a method's name, or the network in a file."""
-    if not name.endswith(MODEL):
-        return name
-    from mitsim.learn.verbs import load_network
-
-    return load_network(name)
-
-
-@verb
-def reconstruct(
-    run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given", metavar="DIR"),
-    ] = None,
-    *,
-    asked: Annotated[ImageRequest, show(method={"read": _method})],
-    inputs: Annotated[ImageInputs, show(overwrite={"help": "replace an earlier image in the folder", "panel": ""})],
-    common: Pictured,
-) -> int:
+@command
+def reconstruct(asked: Reconstructing) -> int:
     """Recover the image from frames and a calibration alone.
 
     Of coloured folders, an image of each line, and one in colour.
@@ -87,83 +122,55 @@ def reconstruct(
     from mitsim.reconstruct.request import check_parallax, holds_image
 
     # All of it is refused before the solver is imported, which takes half a second.
-    output, lines, chart = output or run / "reconstruction", open_lines(run, RUN, MOSAIC), None
-    _check_inputs(lines, asked, inputs)
+    run, output, lines = asked.run, asked.output or asked.run / "reconstruction", open_lines(asked.run, RUN, MOSAIC)
+    calibration: Any = asked.calibration
+    chart = None
+    asked.check_inputs(lines)
     for part in lines.parts.values():
         read_manifest(part, RunManifest)
-    if inputs.calibration is not None:
-        for name, part in lines.check_calibration(inputs.calibration).parts.items():
+    if calibration is not None:
+        for name, part in lines.check_calibration(calibration).parts.items():
             manifest = read_manifest(part, CalibrationManifest)
             if asked.focus is not None or asked.margin:
-                check_parallax(manifest.parallax, str(inputs.calibration / name))
-    if inputs.chart is not None:
+                check_parallax(manifest.parallax, str(calibration / name))
+    if asked.chart is not None:
         from mitsim.devices.framelist import load_chart
 
-        chart = load_chart(inputs.chart)
+        chart = load_chart(asked.chart)
     # An image of the same inputs may be replaced, and which inputs a folder has is looked into later.
     check_output(output, overwrite=is_coloured(output) if lines.colours else holds_image(output))
     from mitsim.report import reconstruct_run
 
     held = memory_from_here()
-    with common.job() as job:
-        options = {"lam": asked.lam, "way": inputs.mosaic or JOINT} if lines.filters else asked.given
-        where: Any = {"output": output, "overwrite": inputs.overwrite, "job": job, **options}
+    with asked.job() as job:
+        options = asked.given_of(ImageRequest)
+        if lines.filters:
+            options = {"lam": asked.lam, "way": asked.mosaic or JOINT}
+        where: Any = {"output": output, "overwrite": asked.overwrite, "job": job, **options}
         found: Any
-        calibration: Any = inputs.calibration
-        if inputs.psf is not None:
-            found = reconstruct_run.reconstruct_psf(run, inputs.psf, reduce=inputs.reduce, **where)
+        if asked.psf is not None:
+            found = reconstruct_run.reconstruct_psf(run, asked.psf, reduce=asked.reduce, **where)
         elif lines.colours:
             found = reconstruct_run.reconstruct_colours(run, calibration, chart=chart, page=False, **where)
         else:
             found = reconstruct_run.reconstruct(run, calibration, **where)
     payload = {**found.summary(), "memory_bytes": memory_since(held)}
-    shown = _colours_lines(found, common) if lines.colours else _image_lines(found, payload, common)
-    return finish_folder(common, output, payload, shown, payload["warnings"])
-
-
-def _check_inputs(lines: SpectralFolder, asked: ImageRequest, inputs: ImageInputs) -> None:
-    """Refuse options that have no effect on a run of these ``lines``, and inputs that are missing."""
-    run = lines.folder
-    if inputs.psf is not None:
-        inputs.refuse(["calibration", "chart", "mosaic"], "with --psf")
-        if lines.colours:
-            raise MitsimError(f"--psf {inputs.psf}: {run} is coloured; reconstruct one of its lines, {run}/NAME")
-        asked.check_point_spread(inputs.reduce)
-        if not inputs.psf.is_file():
-            raise MitsimError(f"--psf {inputs.psf}: is no file; give a picture of the light of a scene point")
-        return
-    if inputs.reduce != 1:
-        inputs.refuse(["reduce"], "without --psf")
-    if inputs.calibration is None:
-        raise MitsimError("--calibration: is missing; give the folder of `mitsim calibrate`, or --psf FILE")
-    if not lines.colours:
-        inputs.refuse(["chart", "mosaic"], f"on {run}, which is not coloured")
-    elif not lines.filters:
-        inputs.refuse(["mosaic"], f"on {run}, which has a run for each line")
-    else:
-        from mitsim.reconstruct.request import check_joint
-
-        check_way(inputs.mosaic or JOINT)
-        check_joint(asked.lam)
-        for name, value in asked.without("lam").items():
-            if value != ImageRequest.model_fields[name].default:
-                raise MitsimError(
-                    f"{option_name(name)} {value}: runs behind colour filters are solved by tikhonov at the calibrated "
-                    "depth; leave it out"
-                )
+    shown = _colours_lines(found, asked) if lines.colours else _image_lines(found, payload, asked)
+    return asked.finish_folder(output, payload, shown, payload["warnings"])
 
 
 def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> list[str]:
     """Return what the terminal shows of an image, by its ``payload``."""
     image, rank = result.reconstruction, payload["rank"]
     inherits = image.status.verdict.good and not image.ok
-    verdict = "Flagged" if inherits else image.status.verdict.value.capitalize()
+    if result.quality is not None:
+        verdict = f"{'Flagged' if inherits else image.status.verdict.value.capitalize()}: {result.quality}"
+    else:
+        verdict = f"Flagged: {image.status.flags[0]}" if inherits else f"{image.status.sentence}."
     rank_words = "" if rank is None else f", rank {rank}, condition {payload['condition_whole']:.3g}"
     trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit, image.fit) if known)
     return [
-        f"{f'Flagged: {image.status.flags[0]}' if inherits else f'{image.status.sentence}.'}"
-        if result.quality is None
-        else f"{verdict}: {result.quality}",
+        verdict,
         f"Image: {payload['output']}",
         *([] if payload["white"] == 1 else [f"image.png shows {payload['white']:.3g} electrons/s as white"]),
         *([] if image.focus is None else [str(image.focus)]),
@@ -177,7 +184,7 @@ def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> l
     ]
 
 
-def _colours_lines(found: ColourImage, common: Common) -> list[str]:
+def _colours_lines(found: ColourImage, common: Pictured) -> list[str]:
     """Return what the terminal shows of an image in colour."""
     verdict = "Solved" if found.ok else "Flagged"
     quality = f"PSNR {found.psnr_db:.2f} dB over all lines" if found.psnr_db is not None else "an image of every line"
@@ -190,11 +197,14 @@ def _colours_lines(found: ColourImage, common: Common) -> list[str]:
     ]
 
 
-@verb
-def report(
-    folder: Annotated[Path, typer.Argument(help="of capture, calibrate, reconstruct or import", metavar="FOLDER")],
-    common: Common,
-) -> int:
+class Reporting(Common):
+    """Options of `mitsim report`."""
+
+    folder: Path = argument(..., "of capture, calibrate, reconstruct or import", "FOLDER")
+
+
+@command
+def report(asked: Reporting) -> int:
     """Make the pictures and the page of a folder again.
 
     From its files alone: a run, a calibration or an image.
@@ -202,39 +212,31 @@ def report(
     $ mitsim report run
     $ mitsim report cal
     """
-    made = page_of(folder)
-    return finish(common.as_json, {**made, "output": str(folder)}, [page_line(made)], ())
+    made = page_of(asked.folder)
+    return asked.finish({**made, "output": str(asked.folder)}, [page_line(made)])
 
 
-# ---- a camera's sensor alone -----------------------------------------------------------------------------------------
+# ---- A camera's sensor alone -----------------------------------------------------------------------------------------
 
-_CAMERA_HELP = "camera electronics: name or TOML file"
-_complete_camera = completing(lambda: shipped_names(CAMERA))
+_CAMERA: dict[str, Any] = {"help": "camera electronics: name or TOML file", "complete": lambda: shipped_names(CAMERA)}
 
 
-@verb
-def characterise(
-    camera: Annotated[
-        str | None,
-        typer.Argument(help=_CAMERA_HELP, metavar="[CAMERA]", show_default=False, autocompletion=_complete_camera),
-    ] = None,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="folder of page, plots, JSON and camera.toml", metavar="DIR")
-    ] = Path("characterise-output"),
-    frames: Annotated[
-        str,
-        typer.Option(
-            help="frames of each stack; without CAMERA: folder of a real camera's frames under even light and in the "
-            "dark",
-            metavar="N|DIR",
-            rich_help_panel=WHAT,
-        ),
-    ] = "100",
-    *,
-    asked: Procedure,
-    common: Common,
-    given: set[str],
-) -> int:
+class Characterising(Procedure, Common):
+    """Options of `mitsim characterise`."""
+
+    camera: str | None = argument(None, metavar="[CAMERA]", show_default=False, **_CAMERA)
+    output: Path = to_make(Path("characterise-output"), "folder of page, plots, JSON and camera.toml", "DIR")
+    stacks: str = option(
+        "100",
+        "frames of each stack; without CAMERA: folder of a real camera's frames under even light and in the dark",
+        "--frames",
+        metavar="N|DIR",
+        panel=WHAT,
+    )
+
+
+@command
+def characterise(asked: Characterising) -> int:
     """Measure a camera after EMVA 1288, simulated or real.
 
     On simulated frames, beside what the camera's file sets, or on real frames (--frames DIR).
@@ -242,25 +244,25 @@ def characterise(
     $ mitsim characterise imx249 -o figures
     $ mitsim characterise --frames flats -o mine
     """
-    if camera is None and "frames" not in given:
+    if asked.camera is None and "stacks" not in asked.given:
         raise MitsimError("characterise: got no CAMERA; give one to simulate, or --frames DIR of a real one")
-    stacks = int(frames) if frames.isdecimal() and camera is not None else Path(frames)
-    with common.job() as job:
-        done = mitsim.characterise(camera, output, stacks, job, **asked.given)
-    return finish(common.as_json, done.payload(), done.lines(), done.warnings)
+    simulated = asked.stacks.isdecimal() and asked.camera is not None
+    stacks = int(asked.stacks) if simulated else Path(asked.stacks)
+    return asked.call(mitsim.characterise, asked.camera, asked.output, stacks, **asked.given_of(Procedure))
 
 
-@verb
-def sense(
-    image: Annotated[Path, typer.Argument(help="irradiance [W/m^2], OpenEXR or NPY", metavar="IMAGE.exr")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.png|exr|npy")],
-    camera: Annotated[
-        str,
-        typer.Option(help=_CAMERA_HELP, metavar="NAME|FILE", rich_help_panel=DEVICES, autocompletion=_complete_camera),
-    ],
-    asked: Irradiance,
-    common: Pictured,
-) -> int:
+class Sensing(Irradiance, Pictured):
+    """Options of `mitsim sense`."""
+
+    FIRST = "image output camera exposure exposure_fraction"
+
+    image: Path = argument(..., "irradiance [W/m^2], OpenEXR or NPY", "IMAGE.exr")
+    output: Path = to_make(..., "frame to write", "FRAME.png|exr|npy")
+    camera: str = option(..., metavar="NAME|FILE", panel=DEVICES, **_CAMERA)
+
+
+@command
+def sense(asked: Sensing) -> int:
     """Put an image of any renderer behind a camera's sensor.
 
     Out come digital numbers, with the sensor's noise.
@@ -274,55 +276,59 @@ def sense(
     from mitsim.devices.sensor import load_sensor
 
     asked.refuse_idle()
-    sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
-    check_ending(output, sensor)
-    check_image(image)
-    check_apart(output, [image])
-    with output_file(output, overwrite=True) as place:
-        frame = mitsim.sense(image, camera, **asked.given)
+    sensor = load_sensor(locate(asked.camera, "calibration", ".toml", CAMERA))
+    check_ending(asked.output, sensor)
+    check_image(asked.image)
+    check_apart(asked.output, [asked.image])
+    with output_file(asked.output, overwrite=True) as place:
+        frame = mitsim.sense(asked.image, asked.camera, **asked.given_of(Irradiance))
         payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{sensor.name}: {payload['shape'][0]}x{payload['shape'][1]} pixels, exposure {frame.exposure_s:.3g} s, "
         f"mean {payload['mean_dn']:.5g} DN, largest {payload['largest_dn']:.5g}: {payload['output']}",
         *frame.notes,
     ]
-    return finish_frame(common, (output, frame.digital, "DN"), payload, lines, frame.warnings)
+    return asked.finish_frame((asked.output, frame.digital, "DN"), payload, lines, frame.warnings)
 
 
-# ---- exchange --------------------------------------------------------------------------------------------------------
+# ---- Exchange --------------------------------------------------------------------------------------------------------
 
 
-@verb
-def export(
-    run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
-    exported: Exported,
-    common: Common,
-) -> int:
+class Exporting(Exported, Common):
+    """Options of `mitsim export`."""
+
+    run: Path = argument(..., "folder of `mitsim capture`", "RUN")
+
+
+@command
+def export(asked: Exporting) -> int:
     """Write a run in a format that other programs read.
 
     $ mitsim export run --format hdf5 -o run.h5
     $ mitsim export run --format mat -o run.mat --calibration cal
     """
-    if exported.format == "png":
-        exported.refuse(["overwrite"], "on a folder of pictures, which takes the place of none")
-    payload = mitsim.export(run, **exported.given)
+    if asked.format == "png":
+        asked.refuse(["overwrite"], "on a folder of pictures, which takes the place of none")
+    payload = mitsim.export(asked.run, **asked.given_of(Exported))
     with_it = f" with {payload['calibration']}" if payload["calibration"] else ""
-    lines = [f"{payload['frames']} frames{with_it} as {exported.format}: {payload['output']}", *payload["notes"]]
-    return finish(common.as_json, payload, lines, ())
+    lines = [f"{payload['frames']} frames{with_it} as {asked.format}: {payload['output']}", *payload["notes"]]
+    return asked.finish(payload, lines)
 
 
-@verb
-def import_(
-    source: Annotated[
-        Path, typer.Argument(help="file of `mitsim export`, or frames: a folder of them, or one file", metavar="SOURCE")
-    ],
-    facts: Annotated[FrameFacts, show(seed={"default": 0}, byte_order={"default": "little"})],
-    pictured: Pictured,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")] = None,
-    calibration_output: Annotated[
-        Path | None, typer.Option(help="folder to make of the file's calibration", metavar="CAL")
-    ] = None,
-) -> int:
+class Importing(FrameFacts, Pictured):
+    """Options of `mitsim import`."""
+
+    CHANGES = shown(seed={"default": 0}, byte_order={"default": "little"})
+
+    source: Path = argument(..., "file of `mitsim export`, or frames: a folder of them, or one file", "SOURCE")
+    output: Path | None = to_make(None, "run folder to make", "RUN")
+    calibration_output: Path | None = option(
+        None, "folder to make of the file's calibration", metavar="CAL", panel=OUTPUT
+    )
+
+
+@command
+def import_(asked: Importing) -> int:
     """Make a run of a real camera's frames, or of an exported file.
 
     $ mitsim import frames -o run --list mine.toml --calibration cal
@@ -331,16 +337,24 @@ def import_(
     """
     from mitsim.exchange.formats import READERS
 
-    if output is None and calibration_output is None:
+    source, output, calibration, facts = (
+        asked.source,
+        asked.output,
+        asked.calibration_output,
+        asked.given_of(FrameFacts),
+    )
+    if output is None and calibration is None:
         raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
     if source.suffix.lower() in READERS:
-        facts.refuse(facts.without("channel"), f"on {source}, which says itself what its frames are")
-        payload = mitsim.import_file(source, output, calibration_output, facts.channel)
-    elif output is None or calibration_output is not None:
+        asked.refuse(
+            [name for name in facts if name != "channel"], f"on {source}, which says itself what its frames are"
+        )
+        payload = mitsim.import_file(source, output, calibration, asked.channel)
+    elif output is None or calibration is not None:
         raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
     else:
-        with pictured.job() as job:
-            payload = mitsim.import_frames(source, output, job, **facts.given)
+        with asked.job() as job:
+            payload = mitsim.import_frames(source, output, job, **facts)
     lines = []
     if payload["output"]:
         lines.append(f"{payload['frames']} frame{'s' if payload['frames'] != 1 else ''}: {payload['output']}")
@@ -352,19 +366,21 @@ def import_(
     if payload["left_out"]:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
     if payload["output"]:
-        return finish_folder(pictured, Path(payload["output"]), payload, lines, payload["warnings"])
-    return finish(pictured.as_json, {**payload, "report": None}, lines, payload["warnings"])
+        return asked.finish_folder(Path(payload["output"]), payload, lines, payload["warnings"])
+    return asked.finish({**payload, "report": None}, lines, payload["warnings"])
 
 
-@verb
-def patterns(
-    family: Annotated[
-        str, typer.Argument(help=f"{pattern_names()}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="folder to make", metavar="DIR")],
-    asked: Annotated[Pictures, show(seed={"default": 0}, signed_capture={"default": "pair"})],
-    common: Common,
-) -> int:
+class Drawing(Pictures, Common):
+    """Options of `mitsim patterns`."""
+
+    CHANGES = shown(seed={"default": 0}, signed_capture={"default": "pair"})
+
+    family: str = argument(..., f"{pattern_names()}; or stripes, those of a calibration", "PATTERNS|stripes")
+    output: Path = to_make(..., "folder to make", "DIR")
+
+
+@command
+def patterns(asked: Drawing) -> int:
     """Draw patterns as pictures for a real projector.
 
     Or a calibration's stripes, with the list that its frames need.
@@ -372,56 +388,43 @@ def patterns(
     $ mitsim patterns dots:7 -o pictures
     $ mitsim patterns stripes -o stripes --camera imx249 --exposure 0.02
     """
-    payload, last = mitsim.pattern_pictures(family, output, **asked.given), asked.closing_frame
-    if payload["session"]:
-        after = (
-            f"Copy {payload['session']} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
-        )
-    else:
-        after = (
-            f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} --camera NAME "
-            f"--exposure SECONDS --calibration CAL -o RUN{f' --closing-frame {last}' if last else ''}"
-        )
+    payload = mitsim.pattern_pictures(asked.family, asked.output, **asked.given_of(Pictures))
+    last = f" --closing-frame {asked.closing_frame}" if asked.closing_frame else ""
+    after = (
+        f"Their frames are read by: mitsim import FRAMES --patterns {asked.output / 'patterns.json'} --camera NAME "
+        f"--exposure SECONDS --calibration CAL -o RUN{last}"
+    )
+    if session := payload["session"]:
+        after = f"Copy {session} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
     from mitsim.exchange.png_files import describe_cells
 
     where = payload["projector"]
     lines = [
         f"{payload['pictures']} pictures of {where['rows']}x{where['columns']}, {payload['n']}x{payload['n']} cells of "
-        f"{describe_cells(where)}: {output}",
+        f"{describe_cells(where)}: {asked.output}",
         after,
     ]
-    return finish(common.as_json, payload, lines, ())
+    return asked.finish(payload, lines)
 
 
-# ---- learning --------------------------------------------------------------------------------------------------------
+# ---- Learning --------------------------------------------------------------------------------------------------------
 
 
-@verb
-def train(
-    method: Annotated[
-        str,
-        typer.Argument(
-            help=f"{', '.join(METHODS[:-1])} or {METHODS[-1]}",
-            metavar="METHOD",
-            autocompletion=completing(lambda: METHODS),
-        ),
-    ],
-    pairs: Annotated[Path, typer.Argument(help="folder of `mitsim pairs`", metavar="PAIRS")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="file to make", metavar="MODEL.pt")],
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            help="folder of `mitsim calibrate`",
-            metavar="CAL",
-            show_default="PAIRS/calibration",
-            rich_help_panel=WHAT,
-        ),
-    ] = None,
-    *,
-    schedule: Schedule,
-    resumed: Resumed,
-    limited: Limited,
-) -> int:
+class Learning(Schedule, Resumed, Limited):
+    """Options of `mitsim train`."""
+
+    FIRST = "method pairs output calibration"
+
+    method: str = argument(..., f"{', '.join(METHODS[:-1])} or {METHODS[-1]}", "METHOD", complete=lambda: METHODS)
+    pairs: Path = argument(..., "folder of `mitsim pairs`", "PAIRS")
+    output: Path = to_make(..., "file to make", "MODEL.pt")
+    calibration: Path | None = option(
+        None, "folder of `mitsim calibrate`", metavar="CAL", show_default="PAIRS/calibration", panel=WHAT
+    )
+
+
+@command
+def train(asked: Learning) -> int:
     """Train a network that makes images of frames.
 
     For reconstruct --method MODEL.pt. Needs torch: mitsim[learn].
@@ -431,16 +434,17 @@ def train(
     """
     from mitsim.learn.verbs import train as train_model
 
+    output, schedule = asked.output, asked.given_of(Schedule)
     if output.suffix != MODEL:
         raise MitsimError(f"--output {output}: a trained network is a file that ends in {MODEL}; give such a name")
-    Training(method=method, **schedule.given)  # refused before anything is imported for it
+    Training(method=asked.method, **schedule)  # refused before anything is imported for it
     advise(RESUME)
-    with limited.job() as job:
-        made = train_model(method, pairs, output, calibration, resumed.resume, job, **schedule.given)
+    with asked.job() as job:
+        made = train_model(asked.method, asked.pairs, output, asked.calibration, asked.resume, job, **schedule)
         payload = {**made.summary(), "seconds": job.clock.seconds()}
     lines = [
-        f"{payload['model']}: {payload['weights']} weights, {made.curve[-1][0]} of {schedule.steps} steps in "
+        f"{payload['model']}: {payload['weights']} weights, {made.curve[-1][0]} of {asked.steps} steps in "
         f"{payload['seconds']['total']:.0f} s (predicted {made.predicted_seconds:.0f}): {output}",
         f"PSNR of photographs held out: {made.psnr_before_db:.2f} dB before, {made.psnr_db:.2f} dB after",
     ]
-    return finish(limited.as_json, payload, lines, ())
+    return asked.finish(payload, lines)

@@ -12,24 +12,21 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Any, get_args
 
-import typer
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from mitsim.cli.commands import Common, completing, verb
-from mitsim.cli.screen import finish
+from mitsim.cli.commands import Common, argument, command, to_make
 from mitsim.core.configuration import (
     CAMERA,
     DEFAULT_CAMERA,
     PROJECTOR,
     RECIPE,
-    WHAT,
     load_model,
     opening_words,
+    option,
     read_toml,
-    refuse_unused,
     shipped_files,
     toml_value,
 )
@@ -40,27 +37,11 @@ from mitsim.core.errors import MitsimError, near_name
 
 @dataclass(frozen=True)
 class Entry:
-    """One thing that a command line may name.
-
-    Attributes
-    ----------
-    name
-        as it is typed.
-    serves
-        what it is for, in a line.
-    what
-        it is, where that is another line.
-    """
+    """One thing that a command line may name, what it ``serves``, and ``what`` it is where that is another line."""
 
     name: str
     serves: str
     what: str = ""
-
-
-def _scenes() -> Iterator[Entry]:
-    for name, path in shipped_files("scenes", "scene.xml").items():
-        what, serves = opening_words(path)
-        yield Entry(name, serves, what)
 
 
 def _cameras() -> Iterator[Entry]:
@@ -74,15 +55,10 @@ def _cameras() -> Iterator[Entry]:
         yield Entry(name, verbs, f"{sensor.name}, pixels of {sensor.superpixel_pitch_um:g} um")
 
 
-def _projectors() -> Iterator[Entry]:
-    for name, path in shipped_files("calibration", ".toml", PROJECTOR).items():
-        yield Entry(name, opening_words(path)[1], read_toml(path)["name"])
-
-
 def _masks() -> Iterator[Entry]:
     from mitsim.devices.mask_profile import KINDS as MASKS
 
-    yield from (Entry(name, what) for name, what in MASKS.items())
+    return (Entry(name, what) for name, what in MASKS.items())
 
 
 def _studies() -> Iterator[Entry]:
@@ -101,8 +77,8 @@ def _studies() -> Iterator[Entry]:
 def _effects() -> Iterator[Entry]:
     from mitsim.bench.effects import DISCRETISED, EFFECTS
 
-    yield from (Entry(name, what) for name, what in DISCRETISED.items())
-    yield from (Entry(name, effect.what) for name, effect in EFFECTS.items())
+    known = {**DISCRETISED, **{name: effect.what for name, effect in EFFECTS.items()}}
+    return (Entry(name, what) for name, what in known.items())
 
 
 def _methods() -> Iterator[Entry]:
@@ -121,21 +97,25 @@ def _methods() -> Iterator[Entry]:
 def _patterns() -> Iterator[Entry]:
     from mitsim.devices.patterns import FAMILIES
 
-    for family in FAMILIES.values():
-        yield Entry(", ".join(family.forms), _clause(str(family.factor.__doc__)))
+    return (Entry(", ".join(each.forms), _clause(str(each.factor.__doc__))) for each in FAMILIES.values())
 
 
 KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
-    "scenes": _scenes,
+    "scenes": lambda: (
+        Entry(name, *opening_words(path)[::-1]) for name, path in shipped_files("scenes", "scene.xml").items()
+    ),
     "cameras": _cameras,
-    "projectors": _projectors,
+    "projectors": lambda: (
+        Entry(name, opening_words(path)[1], read_toml(path)["name"])
+        for name, path in shipped_files("calibration", ".toml", PROJECTOR).items()
+    ),
     "masks": _masks,
     "studies": _studies,
     "effects": _effects,
     "methods": _methods,
     "patterns": _patterns,
 }
-"""What `mitsim list` knows: of each kind all that there is, as the files and modules say that have it."""
+"""Entries of each kind that `mitsim list` knows, as the files and modules state them."""
 
 
 def _source(module: str) -> ast.Module:
@@ -154,47 +134,37 @@ def _clause(text: str) -> str:
     return first[0].lower() + first[1:] if first[1:2].islower() or first[1:2] == " " else first
 
 
-@verb
-def list_(
-    *,
-    kind: Annotated[
-        str | None,
-        typer.Argument(
-            help=f"{', '.join(KINDS)}; all if not given", metavar="[KIND]", autocompletion=completing(lambda: KINDS)
-        ),
-    ] = None,
-    common: Common,
-) -> int:
+class Listing(Common):
+    """Options of `mitsim list`."""
+
+    kind: str | None = argument(None, f"{', '.join(KINDS)}; all if not given", "[KIND]", complete=lambda: KINDS)
+
+
+@command
+def list_(asked: Listing) -> int:
     """Scenes, devices, studies, effects, methods: what each is for.
 
     $ mitsim list scenes
     $ mitsim list cameras --json
     """
+    kind, lines = asked.kind, list[str]()
     if kind is not None and kind not in KINDS:
         raise MitsimError(f"list {kind}: no such kind; {near_name(kind, KINDS)}use {', '.join(KINDS)}")
     found = {name: [*entries()] for name, entries in KINDS.items() if kind in (None, name)}
-    lines: list[str] = []
     for name, entries in found.items():
         lines += [] if kind else [*([""] if lines else []), f"{name}:"]
-        lines += _rows(entries, 0 if kind else 2)
-    return finish(
-        common.as_json, {name: [asdict(each) for each in entries] for name, entries in found.items()}, lines, ()
-    )
-
-
-def _rows(entries: list[Entry], indent: int) -> Iterator[str]:
-    """Iterate over the lines of ``entries``: names, and what each is for, wrapped to the terminal."""
-    first = max(len(each.name) for each in entries) + indent + 2
-    width = max(shutil.get_terminal_size().columns, first + 20)
-    for each in entries:
-        text = each.serves if not each.what or each.what.endswith(".") else f"{each.what}: {each.serves}"
-        name = f"{'':{indent}}{each.name}".ljust(first)
-        yield from textwrap.wrap(name + text, width, subsequent_indent=" " * first, break_on_hyphens=False)
+        indent = 0 if kind else 2
+        first = max(len(each.name) for each in entries) + indent + 2
+        width = max(shutil.get_terminal_size().columns, first + 20)
+        for each in entries:
+            text = each.serves if not each.what or each.what.endswith(".") else f"{each.what}: {each.serves}"
+            line = f"{'':{indent}}{each.name}".ljust(first) + text
+            lines += textwrap.wrap(line, width, subsequent_indent=" " * first, break_on_hyphens=False)
+    return asked.finish({name: [asdict(each) for each in entries] for name, entries in found.items()}, lines)
 
 
 # ---- Files to begin with ---------------------------------------------------------------------------------------------
 
-_NAME = re.compile(r"[A-Za-z][\w-]*")
 _MASKS: dict[str, dict[str, Any]] = {
     "separable": {"order": 9},
     "flatcam": {"order": 9},
@@ -204,139 +174,97 @@ _MASKS: dict[str, dict[str, Any]] = {
     "drawing": {"file": "mask.png"},
     "psf": {"file": "psf.png", "psf_distance_mm": 400.0, "aperture_mm2": 1.0},
 }
-"""What masks of each kind begin with: features as fine and about as many as those of the shipped scenes, or a picture
-beside the file."""
+"""Fields that masks of each kind begin with: features as fine and about as many as those of the shipped scenes, or a
+picture beside the file."""
 _FEATURE_MM = 0.06
 """Side of a feature of the shipped scenes' mask."""
 _HEAD = "# To set a field after a #, take the # away, and that of its table; what it says is its default.", ""
-_LIST = {"patterns": "dots:7", "n": 128}
-"""What `mitsim import` needs beside a camera and an exposure."""
+_CAPTURE = "mitsim capture photograph -o run --patterns dots:7 --camera {}"
 
 
 @dataclass(frozen=True)
 class _Starter:
-    """What a kind begins with.
+    """A kind of file to begin with.
 
-    Attributes
-    ----------
-    use
-        command that takes the file {}.
-    lines
-        of the file, from its name and the path of the shipped one that it is like; None: a folder, a copy.
-    like
-        name of that one, unless another is asked for; empty: there is none.
-    field
-        by which shipped files of the kind are known, on the shelf that they share.
+    ``use`` is the command that takes the file {}, ``like`` the shipped file that it begins as unless another is asked
+    for (empty: none), and ``field`` what such shipped files are known by.
     """
 
     use: str
-    lines: Callable[[str, Path], Iterator[str]] | None
     like: str = ""
     field: str = ""
 
-    def files(self) -> Mapping[str, Path]:
-        """Files that one may be like, by name."""
-        if self.field:
-            return shipped_files("calibration", ".toml", self.field)
-        return shipped_files("scenes", "scene.xml") if self.lines is None else shipped_files("sessions", ".toml")
 
-
-def _camera(name: str, like: Path) -> Iterator[str]:
-    from mitsim.devices.sensor import SensorModel, load_sensor
-
-    return starter(SensorModel, _begun_as(like, load_sensor(like), name=name))
-
-
-def _mask(name: str, like: Path, kind: str = "separable") -> Iterator[str]:
-    from mitsim.devices.mask_profile import MaskProfile
-
-    yield from _camera(name, like)
-    yield ""
-    yield from starter(MaskProfile, {"kind": kind, "feature_mm": _FEATURE_MM, **_MASKS[kind]}, "mask")
-
-
-def _projector(name: str, like: Path) -> Iterator[str]:
-    from mitsim.devices.projector import ProjectorModel
-
-    return starter(ProjectorModel, _begun_as(like, load_model(like, ProjectorModel), name=name))
-
-
-def _session(_: str, like: Path) -> Iterator[str]:
-    yield from like.read_text(encoding="utf-8").splitlines()[1:]
-
-
-def _recipe(_: str, like: Path) -> Iterator[str]:
-    from mitsim.devices.session import SessionRecipe, load_recipe
-
-    return starter(SessionRecipe, _begun_as(like, load_recipe(like)))
-
-
-def _list(_: str, __: Path) -> Iterator[str]:
-    from mitsim.exchange.capture_list import CaptureList
-
-    return starter(CaptureList, _LIST)
-
-
-def _study(name: str, _: Path) -> Iterator[str]:
-    found = importlib.util.find_spec("mitsim.studies.starter_study")
-    assert found is not None and found.origin is not None
-    yield Path(found.origin).read_text(encoding="utf-8").replace('"starter"', f'"{name}"').rstrip()
-
-
-def _begun_as(like: Path, model: BaseModel, **more: str) -> dict[str, Any]:
-    """Return the fields that the file ``like`` of a ``model`` sets, and ``more``."""
-    return {**model.model_dump(exclude_unset=True), **more, "source": f"as the shipped {like.stem}, to be replaced"}
-
-
-def _captures(like: Path) -> bool:
-    """Return True if the camera of the file ``like`` states its quantum efficiency."""
-    from mitsim.devices.sensor import load_sensor
-
-    return load_sensor(like).states_efficiency
-
-
-_CAPTURE = "mitsim capture photograph -o run --patterns dots:7 --camera {}"
 _STARTERS = {
-    "camera": _Starter(_CAPTURE, _camera, DEFAULT_CAMERA, CAMERA),
-    "projector": _Starter("mitsim plan photograph --projector {}", _projector, "mp_cl1", PROJECTOR),
-    "scene": _Starter("mitsim plan {}/scene.xml", None, "photograph"),
-    "mask": _Starter(_CAPTURE, _mask, DEFAULT_CAMERA, CAMERA),
-    "recipe": _Starter("mitsim calibrate photograph -o cal --recipe {}", _recipe, "session", RECIPE),
-    "session": _Starter("mitsim run {} -o session-output", _session, "demo"),
-    "study": _Starter("mitsim study {} -o study --quick", _study),
-    "list": _Starter("mitsim import FRAMES -o run --list {} --camera NAME --exposure SECONDS", _list),
+    "camera": _Starter(_CAPTURE, DEFAULT_CAMERA, CAMERA),
+    "projector": _Starter("mitsim plan photograph --projector {}", "mp_cl1", PROJECTOR),
+    "scene": _Starter("mitsim plan {}/scene.xml", "photograph"),
+    "mask": _Starter(_CAPTURE, DEFAULT_CAMERA, CAMERA),
+    "recipe": _Starter("mitsim calibrate photograph -o cal --recipe {}", "session", RECIPE),
+    "session": _Starter("mitsim run {} -o session-output", "demo"),
+    "study": _Starter("mitsim study {} -o study --quick"),
+    "list": _Starter("mitsim import FRAMES -o run --list {} --camera NAME --exposure SECONDS"),
 }
 
 
-@verb
-def new(
-    *,
-    kind: Annotated[
-        str,
-        typer.Argument(help=", ".join(_STARTERS), metavar="KIND", autocompletion=completing(lambda: _STARTERS)),
-    ],
-    name: Annotated[str, typer.Argument(help="letters, digits, - and _, a letter first", metavar="NAME")],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", help="file to make, of a scene a folder; named after NAME if not given", metavar="PATH"
+def _shipped(kind: str) -> Mapping[str, Path]:
+    """Return the files that one of a ``kind`` may be like, by name."""
+    if field := _STARTERS[kind].field:
+        return shipped_files("calibration", ".toml", field)
+    return shipped_files("scenes", "scene.xml") if kind == "scene" else shipped_files("sessions", ".toml")
+
+
+def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
+    """Iterate over the lines of a file of a ``kind``, as the shipped file ``like``; a mask is of the kind ``mask``."""
+    from mitsim.devices.mask_profile import MaskProfile
+    from mitsim.devices.projector import ProjectorModel
+    from mitsim.devices.sensor import load_sensor
+    from mitsim.devices.session import load_recipe
+    from mitsim.exchange.capture_list import CaptureList
+
+    def begun(model: BaseModel, **more: str) -> Iterator[str]:
+        source = f"as the shipped {like.stem}, to be replaced"
+        return starter(type(model), {**model.model_dump(exclude_unset=True), **more, "source": source})
+
+    if kind in ("camera", "mask"):
+        yield from begun(load_sensor(like), name=name)
+    if kind == "mask":
+        yield ""
+        yield from starter(MaskProfile, {"kind": mask, "feature_mm": _FEATURE_MM, **_MASKS[mask]}, "mask")
+    elif kind == "projector":
+        yield from begun(load_model(like, ProjectorModel), name=name)
+    elif kind == "recipe":
+        yield from begun(load_recipe(like))
+    elif kind == "session":
+        yield from like.read_text(encoding="utf-8").splitlines()[1:]
+    elif kind == "list":  # what `mitsim import` needs beside a camera and an exposure
+        yield from starter(CaptureList, {"patterns": "dots:7", "n": 128})
+    elif kind == "study":
+        found = importlib.util.find_spec("mitsim.studies.starter_study")
+        assert found is not None and found.origin is not None
+        yield Path(found.origin).read_text(encoding="utf-8").replace('"starter"', f'"{name}"').rstrip()
+
+
+class Beginning(Common):
+    """Options of `mitsim new`."""
+
+    kind: str = argument(..., ", ".join(_STARTERS), "KIND", complete=lambda: _STARTERS)
+    name: str = argument(..., "letters, digits, - and _, a letter first", "NAME")
+    output: Path | None = to_make(None, "file to make, of a scene a folder; named after NAME if not given", "PATH")
+    like: str | None = option(
+        None,
+        "shipped one that it begins as; of a mask also its kind",
+        metavar="NAME",
+        show_default="imx249, mp_cl1, photograph, session, demo",
+        panel="What",
+        complete=lambda: dict.fromkeys(
+            name for kind, each in _STARTERS.items() if each.like for name in [*_shipped(kind), *_MASKS]
         ),
-    ] = None,
-    like: Annotated[
-        str | None,
-        typer.Option(
-            help="shipped one that it begins as; of a mask also its kind",
-            metavar="NAME",
-            show_default="imx249, mp_cl1, photograph, session, demo",
-            rich_help_panel=WHAT,
-            autocompletion=completing(
-                lambda: {name: None for each in _STARTERS.values() if each.like for name in [*each.files(), *_MASKS]}
-            ),
-        ),
-    ] = None,
-    common: Common,
-    given: set[str],
-) -> int:
+    )
+
+
+@command
+def new(asked: Beginning) -> int:
     """A file to begin with: commented, whole, valid as it is.
 
     Each field says what it is and what it may be. A mask is a camera file with a table [mask], a recipe is of
@@ -348,49 +276,47 @@ def new(
     $ mitsim new study tilt -o studies/tilt.py
     """
     from mitsim.core.files import output_file, whole_folder, write_text
+    from mitsim.devices.sensor import load_sensor
 
+    kind, name, like = asked.kind, asked.name, asked.like
     if kind not in _STARTERS:
         raise MitsimError(f"new {kind}: no such kind; {near_name(kind, _STARTERS)}use {', '.join(_STARTERS)}")
-    if not _NAME.fullmatch(name):
+    if not re.fullmatch(r"[A-Za-z][\w-]*", name):
         raise MitsimError(f"new {kind} {name!r}: give a name of letters, digits, - and _ that begins with a letter")
     begin = _STARTERS[kind]
     if not begin.like:
-        refuse_unused(given, ["like"], f"on a {kind}, of which there is one to begin with")
-    ending = ".py" if kind == "study" else "" if begin.lines is None else ".toml"
-    output = output or Path(f"{name}{ending}")
+        asked.refuse(["like"], f"on a {kind}, of which there is one to begin with")
+    ending = {"study": ".py", "scene": ""}.get(kind, ".toml")
+    output = asked.output or Path(f"{name}{ending}")
     if output.suffix != ending and ending:
         raise MitsimError(f"--output {output}: a {kind} is a file that ends in {ending}; give such a name")
-    known = begin.files() if begin.like else {"": Path()}
+    known = _shipped(kind) if begin.like else {"": Path()}
     masks = _MASKS if kind == "mask" else ()
     source = known.get(begin.like if like is None or like in masks else like)
     if source is None:
         names = [*masks, *known]
         raise MitsimError(f"--like {like}: is no shipped {kind}; {near_name(str(like), names)}give {', '.join(names)}")
     use = begin.use.format(output)
-    if begin.field == CAMERA and not _captures(source):
+    if begin.field == CAMERA and not load_sensor(source).states_efficiency:
         use = f"mitsim characterise {output} -o figures"
-    if begin.lines is None:
+    if kind == "scene":
         with whole_folder(output) as folder:
             shutil.copytree(source.parent, folder, dirs_exist_ok=True)
     else:
-        head = (
-            [f"# {kind.capitalize()} {name}, for: {use}", *([] if kind == "session" else _HEAD)]
-            if ending == ".toml"
-            else []
-        )
-        lines = _mask(name, source, like) if like is not None and like in masks else begin.lines(name, source)
-        text = "\n".join([*head, *lines]) + "\n"
+        head = [f"# {kind.capitalize()} {name}, for: {use}", *([] if kind == "session" else _HEAD)]
+        lines = _lines(kind, name, source, like if like is not None and like in masks else "separable")
+        text = "\n".join([*(head if ending == ".toml" else []), *lines]) + "\n"
         with output_file(output) as place:
             write_text(place, text)
     payload = {"kind": kind, "name": name, "output": str(output), "use": use}
-    return finish(common.as_json, payload, [f"{kind.capitalize()} {name}: {output}", f"Try: {use}"], ())
+    return asked.finish(payload, [f"{kind.capitalize()} {name}: {output}", f"Try: {use}"])
 
 
-# ---- what fields of a file are ---------------------------------------------------------------------------------------
+# ---- Fields of a file, explained -------------------------------------------------------------------------------------
 
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 _WIDTH = 100
-"""Columns of a comment: chosen, so that a file fits beside its neighbour on a screen."""
+"""Columns of a comment, so that a file fits beside its neighbour on a screen."""
 
 
 def meanings(model: type[BaseModel]) -> dict[str, str]:
@@ -402,8 +328,7 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
             (written,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
         except (OSError, TypeError, SyntaxError):
             continue
-        body = getattr(written, "body", [])
-        for field, below in itertools.pairwise(body):
+        for field, below in itertools.pairwise(getattr(written, "body", [])):
             text = getattr(getattr(below, "value", None), "value", None)
             if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(text, str):
                 text = " ".join(text.split("\n\n")[0].split()).removesuffix(".")
@@ -456,11 +381,21 @@ def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") 
     model
         of the file.
     values
-        fields that are set; they make the file whole.
+        Fields that are set; they make the file whole.
     table
-        name of the table that the fields are in; empty: of none.
+        Name of the table that the fields are in; empty for none.
     """
-    parts = {name: _model_of(field.annotation) for name, field in model.model_fields.items()}
+
+    def comment(text: str) -> list[str]:
+        text = text[0].upper() + text[1:] if text[1].islower() or text[1] == " " else text
+        return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False)
+
+    def model_of(kind: Any) -> type[BaseModel] | None:
+        """Return the model of a table; None for other fields and for lists of tables."""
+        kinds = (each for each in (kind, *get_args(kind)) if isinstance(each, type))
+        return next((each for each in kinds if issubclass(each, BaseModel)), None)
+
+    parts = {name: model_of(field.annotation) for name, field in model.model_fields.items()}
     schema, known = model.model_json_schema()["properties"], meanings(model)
     if table:
         yield f"{'' if values else '#'}[{table}]"
@@ -468,27 +403,15 @@ def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") 
     given = [name for name in plain if name in values]
     for name in (*given, *(name for name in plain if name not in values)):
         if given and name not in values:
-            yield from ("", *_comment("Further fields."))
+            yield from ("", *comment("Further fields."))
             given = []
         allowed = allowed_text(schema[name]).replace("`", "").removesuffix(", null")
         default = model.model_fields[name].default
         lacks = default is PydanticUndefined or default_text(default) in ("none", "infinite")
-        yield from _comment(f"{known[name]}. Allowed: {allowed}.")
+        yield from comment(f"{known[name]}. Allowed: {allowed}.")
         shown = "..." if lacks else toml_value(default)
         yield f"{name} = {toml_value(values[name])}" if name in values else f"#{name} = {shown}"
     for name, part in parts.items():
         if part is not None:
-            yield from ("", *_comment(f"{known[name]}."))
+            yield from ("", *comment(f"{known[name]}."))
             yield from starter(part, values.get(name) or {}, f"{table}.{name}".removeprefix("."))
-
-
-def _comment(text: str) -> list[str]:
-    text = text[0].upper() + text[1:] if text[1].islower() or text[1] == " " else text
-    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False)
-
-
-def _model_of(kind: Any) -> type[BaseModel] | None:
-    """Return the model of a table, if a field of a ``kind`` is one; None for other fields and for lists of tables."""
-    kinds = [kind, *get_args(kind)]
-    found = (each for each in kinds if isinstance(each, type) and issubclass(each, BaseModel))
-    return next(found, None)

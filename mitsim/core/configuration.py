@@ -169,7 +169,12 @@ def _mistakes_in(model: type[BaseModel], error: ValidationError, data: object) -
             hint = near or (f"known fields: {', '.join(known)}" if known else "remove it")
             text = f"{field}: got {value}, no such field; {hint}"
         else:
-            text = f"{field or 'contents'}: got {value}; {rule_of(one['msg'])}"
+            rule, named = rule_of(one["msg"]), [part for part in one["loc"] if isinstance(part, str)]
+            if kind.startswith(("greater", "less")) and named:  # pydantic states the end that is crossed alone
+                of = getattr(_model_at(model, one["loc"][: one["loc"].index(named[-1])]), "model_fields", {})
+                limits = limits_of(of[named[-1]]) if named[-1] in of else ""
+                rule = f"give a number {limits}" if limits.startswith("from") or ", " in limits else rule
+            text = f"{field or 'contents'}: got {value}; {rule}"
         found.setdefault(place, (line, text))
     return [*found.values()]
 
@@ -508,8 +513,11 @@ def refuse_unused(given: Iterable[str], names: Iterable[str], where: str) -> Non
 
 def limits_of(field: FieldInfo) -> str:
     """Return the range of a number that a ``field`` states, in words; empty without one."""
-    names = "ge", "gt", "le", "lt"
-    found = {name: getattr(mark, name) for mark in field.metadata for name in names if hasattr(mark, name)}
+    names, marks, kinds = ("ge", "gt", "le", "lt"), [*field.metadata], [field.annotation]
+    for kind in kinds:  # grows, because a number may be optional, or one of several
+        kinds += get_args(kind)
+        marks += kind.metadata if isinstance(kind, FieldInfo) else []
+    found = {name: getattr(mark, name) for mark in marks for name in names if hasattr(mark, name)}
     ends = {name: f"{end:g}" if isinstance(end, float) else str(end) for name, end in found.items()}
     if {"ge", "le"} <= ends.keys():
         return f"from {ends['ge']} to {ends['le']}"

@@ -29,12 +29,10 @@ class ColourImage:
     ----------
     images : (n, n', lines) array
         Reflectances, 1 = the calibration's board, whose own reflectance is ``board``.
-    model
-        Conversion of reflectances at the lines to colours.
     truth : (n, n', lines) array
         What perfect images would show, relative to the board; None for a real camera.
     chart
-        Place of a colour chart in the image, where it is known.
+        Place of a colour chart in the image, on which colours are then fitted; MitsimError if it lies outside.
     facts
         How the images were found, in words, for the page.
     solution, of_lines
@@ -46,7 +44,6 @@ class ColourImage:
     lines: ColourManifest
     images: FloatArray
     board: float
-    model: ColourModel
     truth: FloatArray | None = None
     chart: ChartPlace | None = None
     qualities: Mapping[str, Quality | None] = field(default_factory=dict)
@@ -58,19 +55,16 @@ class ColourImage:
     of_lines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     inputs: Mapping[str, str | float] = field(default_factory=dict)
 
-    @classmethod
-    def of(
-        cls, lines: ColourManifest, images: FloatArray, board: float | None, chart: ChartPlace | None, **more: Any
-    ) -> ColourImage:
-        """Convert images to colours, by a matrix fitted on the chart where its place is known, else by the fixed one.
+    def __post_init__(self) -> None:
+        self.model  # noqa: B018 - refuses a chart outside the image
 
-        A ``board`` of None is taken for 1. MitsimError where the chart lies outside the image.
-        """
-        model, board = ColourModel.of_lines(lines.wavelengths_nm), board or 1.0
-        if chart is not None:
-            means = board * chart.means(images)
-            model = ColourModel.fit(lines.wavelengths_nm, means, "the chart in this image")
-        return cls(lines=lines, images=images, board=board, model=model, chart=chart, **more)
+    @cached_property
+    def model(self) -> ColourModel:
+        """Conversion of reflectances at the lines to colours."""
+        waves = self.lines.wavelengths_nm
+        if self.chart is None:
+            return ColourModel.of_lines(waves)
+        return ColourModel.fit(waves, self.board * self.chart.means(self.images), "the chart in this image")
 
     @property
     def reflectances(self) -> FloatArray:
@@ -179,11 +173,11 @@ class ColourImage:
 
     def write(self, folder: Path, **origin: Any) -> None:
         """Write image.exr, image.png, and colour.json last, with the entries ``origin``; an earlier page is removed."""
-        remove_page(folder)
         rgb = linear_srgb(self.xyz)
         named = dict(zip("RGBXYZ", np.moveaxis(np.concatenate([rgb, self.xyz], axis=-1), -1, 0), strict=True))
         channels = {name: values.astype(np.float32) for name, values in named.items()}
         units = {"rgb": "linear sRGB", "xyz": "CIE 1931 under D65, perfect reflector Y = 1"}
+        remove_page(folder)
         checksums = {
             IMAGE_FILE: write_frame(folder / IMAGE_FILE, channels, units),
             PICTURE_FILE: write_bytes(folder / PICTURE_FILE, png(rgb)),
@@ -191,17 +185,9 @@ class ColourImage:
         of_lines = (f"{name}/{IMAGE_FILE}" for name in self.lines.names)
         checksums |= {name: checksum(folder / name) for name in of_lines if (folder / name).is_file()}
         more = {key: value for key, value in self.summary().items() if key != "channels"}
-        write_colours(
-            folder,
-            ColourManifest(kind="colour-image", channels=self.lines.channels),
-            **({"inputs": self.inputs} if self.inputs else {}),
-            **origin,
-            **more,
-            facts={**self.facts, **self.table},
-            board_reflectance=self.board,
-            chart=self.chart,
-            checksums=checksums,
-        )
+        more |= {"inputs": self.inputs} if self.inputs else {}
+        more |= {**origin, "facts": {**self.facts, **self.table}, "board_reflectance": self.board, "chart": self.chart}
+        state_image(folder, self.lines, checksums=checksums, **more)
 
     def _repr_html_(self) -> str:
         pictures = {"in colour\nsRGB under D65": linear_srgb(self.xyz)}
@@ -212,10 +198,11 @@ class ColourImage:
         return card("Image in colour", pictures, self.sentences)
 
 
-def begin_image(folder: Path, lines: ColourManifest, **inputs: Any) -> None:
-    """State in colour.json that an image of ``lines`` is being made, so that the same work can replace a killed one."""
+def state_image(folder: Path, lines: ColourManifest, **more: Any) -> None:
+    """Write colour.json; with ``status="incomplete"`` before an image is made, so that the same work can replace a
+    killed one."""
     remove_page(folder)
-    write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), status="incomplete", **inputs)
+    write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), **more)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

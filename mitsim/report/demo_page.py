@@ -224,14 +224,17 @@ def render_html(report: ReportData) -> str:
         best[row] = max(psnr, key=lambda name: psnr[name]) if psnr else ""
     curves = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
     both = {
-        f.label: (Mean(f.idealised.quality.psnr_db, math.nan, 1), Mean(f.rendered.quality.psnr_db, math.nan, 1))
+        f.label: {
+            "idealised model, ideal factors": Mean(f.idealised.quality.psnr_db, math.nan, 1),
+            "rendered light, calibrated factors": Mean(f.rendered.quality.psnr_db, math.nan, 1),
+        }
         for f in report.families
         if f.idealised is not None and f.rendered is not None
     }
     positive = {row.name: row.value for row in report.budget if row.value}
     figures = {
         "singular_values": plots.singular_values(curves) if curves else None,
-        "quality": plots.quality_bars(both) if both else None,
+        "quality": plots.grouped_bars(both, "PSNR [dB]") if both else None,
         "budget": plots.error_bars(positive, report.accuracy) if positive else None,
     }
     trust = next((f.rendered.trust for f in report.families if f.rendered and f.name == report.main), None)

@@ -5,7 +5,7 @@ The truth of an image is read from its run, as long as the run is where it was.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -58,9 +58,10 @@ from mitsim.report.pages import (
 _ELSEWHERE = {
     *("kind", "format", "status", "configuration", "configuration_sha256", "checksums", "patterns", "plan"),
     *("seconds", "warnings", "versions", "command", "kernels", "result", "estimate", "verdict", "camera"),
-    "opened",
+    *("opened", "inputs", MADE_OF),
 }
-"""Keys of a manifest outside the table of numbers: the page shows them elsewhere, or only programs need them."""
+"""Keys of a manifest or result outside the table of numbers: the page shows them elsewhere, or only programs need
+them."""
 _TRUTH = "what a perfect image shows: of each projector pixel what it lights, black where that is not seen"
 _MISFIT = 2.0
 """Least chi-square a datum that is white: chance alone, some hundredths about 1, would fill any smaller scale."""
@@ -72,8 +73,8 @@ _SHOWN_PERCENT = 99.0
 class Shown:
     """Content of a folder's page.
 
-    ``kernels`` are number and seconds of compiled kernels; numbers, camera, configuration and versions are lines of
-    tables by name; ``parts`` are the pages of the folders in it; ``facts`` say how an image in colour was found.
+    ``kernels`` are number and seconds of compiled kernels; ``tables`` are lines by the titles of tables; ``parts`` are
+    the pages of the folders in it; ``facts`` say how an image in colour was found.
     """
 
     kind: str
@@ -85,10 +86,7 @@ class Shown:
     plan: PlanChart | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     kernels: Mapping[str, float] = field(default_factory=dict)
-    numbers: Mapping[str, str] = field(default_factory=dict)
-    camera: Mapping[str, str] = field(default_factory=dict)
-    configuration: Mapping[str, str] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)
+    tables: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     parts: Mapping[str, Shown] = field(default_factory=dict)
     colours: ColourImage | None = None
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -117,6 +115,11 @@ def report_folder(folder: Path | str) -> Path:
 
 def _write(folder: Path, shown: Shown) -> None:
     """Write pictures and pages, last of all the folder's own page, because it says that everything is there."""
+
+    def named(xyz: FloatArray) -> str:
+        """Return the colour of (3,) ``xyz`` as a page names it."""
+        return f"#{bytes(np.rint(255 * lightness(linear_srgb(xyz))).astype(np.uint8)).hex()}"
+
     for name, part in shown.parts.items():
         _write(folder / name, part)
     with output_folder(folder, overwrite=True):
@@ -124,13 +127,13 @@ def _write(folder: Path, shown: Shown) -> None:
         images = [path.name for path in sorted(folder.iterdir()) if (path / IMAGE_FILE).is_file()]
         text = render_page(
             "folder.html",
-            {"hex": _hex},
             page=shown,
             folder=folder.absolute(),
             images=[name for name in images if (folder / name / PAGE).is_file() and name not in shown.parts],
             stages=stages_of(shown.seconds),
             total=total_of(shown.seconds),
             chart=chart() if shown.colours and shown.colours.chart else None,
+            hex=named,
         )
         try:
             if shown.pictures:
@@ -141,11 +144,6 @@ def _write(folder: Path, shown: Shown) -> None:
         except BaseException:
             remove_page(folder)
             raise
-
-
-def _hex(xyz: FloatArray) -> str:
-    """Return the colour of (3,) ``xyz`` as a page names it."""
-    return f"#{bytes(np.rint(255 * lightness(linear_srgb(xyz))).astype(np.uint8)).hex()}"
 
 
 def _content(folder: Path) -> Shown:
@@ -177,14 +175,14 @@ def _content(folder: Path) -> Shown:
 def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> Shown:
     """Show a folder of several, one for each value of an ``axis`` in a ``unit``."""
     parts = {name: _content(folder / name) for name in names}
-    first = next(iter(parts.values()))
+    first, *_, last = *parts.values(), *parts.values()
     return Shown(
         kind=f"{first.kind} by {axis}",
         verdict=f"{len(parts)} {axis}{'s' if len(parts) > 1 else ''}: {', '.join(parts)}{unit}",
         warnings=[f"{name}: {text}" for name, part in parts.items() for text in part.warnings],
         command=first.command,
-        seconds=next(reversed(parts.values())).seconds,
-        versions=first.versions,
+        seconds=last.seconds,
+        tables={"Versions": first.tables["Versions"]},
         parts=parts,
     )
 
@@ -193,6 +191,7 @@ def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> 
 
 
 def _of_run(lines: SpectralFolder) -> Shown:
+    """Show the frames of a run, on one scale from the black level, and its truth."""
     shots = load_run(lines.folder)
     manifest, taken, black = shots.manifest, shots.manifest.patterns, np.float64(shots.manifest.digital.black_level_dn)
     accuracy = (manifest.plan or {}).get("accuracy")
@@ -203,16 +202,13 @@ def _of_run(lines: SpectralFolder) -> Shown:
         """Read a frame less the black level [DN]."""
         return np.asarray(shots.read(name)[0]["DN"] - black)
 
-    def picture(name: str, title: str, values: FloatArray, about: str = "") -> Picture:
-        return Picture.of(name, title, values, Scale.of(values, "DN above the black level", 0.0), about)
-
-    first = frame(taken.captures[0].file)
-    columns = max(count // shots.patterns[0].shape[1], 1)
-    pictures = [contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape, columns)]
-    if count > 1:
-        pictures.append(picture("frame", f"One of them, {taken.captures[0].file}", first))
+    first, columns = frame(taken.captures[0].file), max(count // shots.patterns[0].shape[1], 1)
+    single = {"frame": (f"One of them, {taken.captures[0].file}", first, "")} if count > 1 else {}
     titles = {"ambient": "Projector off: what is taken off", "closing": "Closing frame: no part of the image"}
-    pictures += [picture(kind, titles[kind], frame(name), name) for kind, name in manifest.others.items()]
+    single |= {kind: (titles[kind], frame(name), name) for kind, name in manifest.others.items()}
+    pictures = [contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape, columns)]
+    for name, (title, values, about) in single.items():
+        pictures.append(Picture.of(name, title, values, Scale.of(values, "DN above the black level", 0.0), about))
     if shots.truth is not None:
         pictures.append(Picture.of("truth", "The truth", shots.truth, REFLECTANCE, _TRUTH))
     for name in lines.names if lines.filters else ():
@@ -220,65 +216,62 @@ def _of_run(lines: SpectralFolder) -> Shown:
             truth = finite_channel(read_frame(path)[0], "reflectance", path)
             pictures.append(Picture.of(f"truth_{name}", f"The truth at {name}", truth, REFLECTANCE))
     asked = "" if error is None or accuracy is None else f"accuracy {accuracy:g} asked for, "
-    known = {"patterns": {"family": taken.family, "n": taken.n, "frames": count}}
     return Shown(
         kind="Capture",
         verdict=f"{count} frame{'s' if count > 1 else ''}{'' if error is None else f', error at most {error:.1e}'}",
         detail=f"{first.shape[0]} x {first.shape[1]} pixels, patterns {taken.family or 'from elsewhere'}, {asked}"
         f"exposure {shots.exposure_s:.3g} s a frame",
+        warnings=manifest.warnings,
+        command=manifest.command,
         pictures=pictures,
         plan=PlanChart.of(rows, accuracy) if rows else None,
         seconds=manifest.seconds,
         kernels=manifest.kernels,
-        **_of_manifest(manifest, lines.folder, known),
+        tables=_tables(manifest, lines.folder, {"patterns": {"family": taken.family, "n": taken.n, "frames": count}}),
     )
 
 
 def _of_calibration(folder: Path) -> Shown:
+    """Show both factors of a calibration."""
     factors = load_calibration(folder)
     manifest, result = factors.manifest, factors.manifest.result
     errors = (result.get(name) for name in ("phi_error", "predicted_phi_error"))
     error = next((value for value in errors if isinstance(value, float)), None)
     verdict = (manifest.verdict or "a calibration").capitalize()
     verdict = f"Flagged. {verdict}" if manifest.warnings else verdict
-    pictures = [
-        Picture.of(
-            name,
-            f"The {name} factor, of {axis}",
-            side.T,
-            Scale.of(side, "sqrt(electrons/s)"),
-            f"{side.shape[1]} projector {axis} (down) x {side.shape[0]} sensor {axis} (across)",
-            wide=True,
-        )
-        for name, side, axis in (("left", factors.left, "rows"), ("right", factors.right, "columns"))
-    ]
+    pictures = []
+    for name, side, axis in (("left", factors.left, "rows"), ("right", factors.right, "columns")):
+        about = f"{side.shape[1]} projector {axis} (down) x {side.shape[0]} sensor {axis} (across)"
+        scale = Scale.of(side, "sqrt(electrons/s)")
+        pictures.append(Picture.of(name, f"The {name} factor, of {axis}", side.T, scale, about, wide=True))
+    known = {key: value for key, value in result.items() if key not in _ELSEWHERE}
     return Shown(
         kind="Calibration",
         verdict=verdict if error is None else f"{verdict}, factor error {error:.1e}",
         detail="" if manifest.estimate in manifest.warnings else manifest.estimate or "",
+        warnings=manifest.warnings,
+        command=manifest.command,
         pictures=pictures,
-        seconds=_by_stage(result.get("seconds")),
-        kernels=_by_stage(result.get("kernels")),
-        **_of_manifest(manifest, folder, {key: value for key, value in result.items() if key not in _ELSEWHERE}),
+        seconds=_numbers(result.get("seconds")),
+        kernels=_numbers(result.get("kernels")),
+        tables=_tables(manifest, folder, known),
     )
 
 
-def _of_manifest(manifest: Any, folder: Path, known: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what pages of runs and calibrations show of a manifest; ``known`` are its first numbers."""
+def _tables(manifest: Any, folder: Path, known: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
+    """Return the tables on the pages of runs and calibrations; ``known`` are the first numbers."""
     files = [path for path in folder.iterdir() if path.is_file() and path.name != PAGE]
     sizes = f"{len(files)}, {size_text(sum(path.stat().st_size for path in files))}"
     numbers = {key: value for key, value in manifest.model_dump().items() if key not in _ELSEWHERE}
     return {
-        "warnings": manifest.warnings,
-        "command": manifest.command,
-        "numbers": {**lines_of(known), **lines_of(numbers), "files": sizes},
-        "camera": lines_of(manifest.camera),
-        "configuration": lines_of(manifest.configuration),
-        "versions": manifest.versions,
+        "Numbers": {**lines_of(known), **lines_of(numbers), "files": sizes},
+        "Camera": lines_of(manifest.camera),
+        "Configuration": lines_of(manifest.configuration),
+        "Versions": manifest.versions,
     }
 
 
-def _by_stage(data: Any) -> dict[str, float]:
+def _numbers(data: Any) -> dict[str, float]:
     """Return the numbers of some ``data`` by name, because other programs may have written it."""
     listed = data.items() if isinstance(data, Mapping) else ()
     return {name: value for name, value in listed if isinstance(value, (int, float))}
@@ -288,52 +281,51 @@ def _by_stage(data: Any) -> dict[str, float]:
 
 
 def _of_image(folder: Path) -> Shown:
+    """Show an image and what is known of it: truth, error, uncertainty, depth and misfit."""
     result = read_result(folder)
     image = finite_channel(read_frame(folder / IMAGE_FILE)[0], "reflectance", folder / IMAGE_FILE)
     quality, similar, warnings = result.get("psnr"), result.get("ssim"), result.get("warnings") or ()
     known = [f"PSNR {quality:.1f} dB"] if isinstance(quality, float) else ["An image, and no truth to judge it by"]
     known += [f"SSIM {similar:.3f}"] if isinstance(similar, float) else []
     inputs = result.get("inputs") if isinstance(result.get("inputs"), dict) else {}
-    numbers = {key: value for key, value in result.items() if key not in {*_ELSEWHERE, "inputs", MADE_OF}}
+    white, truth, size = result.get("white"), _truth_of(result), f"{image.shape[0]} x {image.shape[1]} projector pixels"
+    by_spread = POINT_SPREAD in (inputs or {}) and isinstance(white, float)
+    scale = Scale(0.0, white, "electrons/s") if by_spread and isinstance(white, float) else REFLECTANCE
+    pictures = [Picture.of("image", "The image", image, scale, size)]
+    if truth is not None and truth.shape == image.shape:
+        pictures.append(Picture.of("truth", "The truth", truth, REFLECTANCE, _TRUTH))
+        pictures.append(_error_picture(np.abs(image - truth), REFLECTANCE.unit, "|image \N{MINUS SIGN} truth|"))
+    trust = "How far to trust it", "standard uncertainty that the image states of each pixel"
+    for file, channel, unit, (title, about) in (
+        (UNCERTAINTY_FILE, "uncertainty", REFLECTANCE.unit, trust),
+        (DEPTH_FILE, "depth_mm", "mm", ("Depth of each pixel", "")),
+        (DEPTH_FILE, "confidence", "(1: certain)", ("How sure the depth is", "")),
+    ):
+        if (path := folder / file).is_file():
+            values = finite_channel(read_frame(path)[0], channel, path)
+            scale = Scale.of(values, unit, None if channel == "depth_mm" else 0.0)
+            scale = Scale(0.0, 1.0, unit) if channel == "confidence" else scale
+            pictures.append(Picture.of(channel.removesuffix("_mm"), title, values, scale, about))
+    misfit = result.get("misfit")
+    tiles = np.array(misfit.get("map", []) if isinstance(misfit, dict) else [], dtype=np.float64)
+    if tiles.ndim == 2 and tiles.size > 1 and np.isfinite(tiles).all():
+        about = "chi-square a datum by place on the sensor, 1 where only noise is left"
+        scale = Scale(0.0, max(float(tiles.max()), _MISFIT), "a datum")
+        pictures.append(Picture.of("misfit", "Where the frames do not fit", tiles, scale, about))
     return Shown(
         kind="Image",
         verdict=("Flagged. " if warnings else "") + ", ".join(known),
         detail="" if warnings else str(result.get("status", "")),
         warnings=[*map(str, warnings)],
         command=result.get("command"),
-        pictures=[*_image_pictures(folder, result, image)],
-        seconds=_by_stage(result.get("seconds")),
-        numbers=lines_of(numbers),
-        configuration=lines_of({"inputs": inputs, MADE_OF: result.get(MADE_OF) or {}}),
+        pictures=pictures,
+        seconds=_numbers(result.get("seconds")),
+        tables={
+            "Numbers": lines_of({key: value for key, value in result.items() if key not in _ELSEWHERE}),
+            "Configuration": lines_of({"inputs": inputs, MADE_OF: result.get(MADE_OF) or {}}),
+            "Versions": {},
+        },
     )
-
-
-def _image_pictures(folder: Path, result: Mapping[str, Any], image: FloatArray) -> Iterator[Picture]:
-    """Draw an ``image`` and what is known of it: truth, error, uncertainty, depth and misfit."""
-    by_spread, white = POINT_SPREAD in (result.get("inputs") or {}), result.get("white")
-    scale = Scale(0.0, white, "electrons/s") if by_spread and isinstance(white, float) else REFLECTANCE
-    yield Picture.of("image", "The image", image, scale, f"{image.shape[0]} x {image.shape[1]} projector pixels")
-    truth = _truth_of(result)
-    if truth is not None and truth.shape == image.shape:
-        yield Picture.of("truth", "The truth", truth, REFLECTANCE, _TRUTH)
-        yield _error_picture(np.abs(image - truth), REFLECTANCE.unit, "|image \N{MINUS SIGN} truth|")
-    for file, name, channel, title, unit, about in (
-        (UNCERTAINTY_FILE, "uncertainty", "uncertainty", "How far to trust it", REFLECTANCE.unit,
-         "standard uncertainty that the image states of each pixel"),
-        (DEPTH_FILE, "depth", "depth_mm", "Depth of each pixel", "mm", ""),
-        (DEPTH_FILE, "confidence", "confidence", "How sure the depth is", "(1: certain)", ""),
-    ):  # fmt: skip
-        if (path := folder / file).is_file():
-            values = finite_channel(read_frame(path)[0], channel, path)
-            scale = Scale.of(values, unit, None if name == "depth" else 0.0)
-            scale = Scale(0.0, 1.0, unit) if name == "confidence" else scale
-            yield Picture.of(name, title, values, scale, about)
-    misfit = result.get("misfit")
-    tiles = np.array(misfit.get("map", []) if isinstance(misfit, dict) else [], dtype=np.float64)
-    if tiles.ndim == 2 and tiles.size > 1 and np.isfinite(tiles).all():
-        about = "chi-square a datum by place on the sensor, 1 where only noise is left"
-        scale = Scale(0.0, max(float(tiles.max()), _MISFIT), "a datum")
-        yield Picture.of("misfit", "Where the frames do not fit", tiles, scale, about)
 
 
 def _error_picture(error: FloatArray, unit: str, about: str, least: float = 0.0) -> Picture:
@@ -361,33 +353,35 @@ def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
         return None
 
 
-# -------- Images in colour
-
-
 def _of_colours(lines: SpectralFolder) -> Shown:
     """Show an image in colour; lines that were solved one by one have pages of their own."""
-    folder, colours = lines.folder, lines.colours
+    folder, colours, names = lines.folder, lines.colours, lines.names
     assert colours is not None
     data = read_json(folder / COLOUR)
     if data.get("status") == "incomplete":
         raise MitsimError(f"{folder / COLOUR}: holds no result of a finished image; reconstruct it again")
     verify_files(folder, data.get("checksums"), "reconstruct it again")
-    parts = {name: _of_image(folder / name) for name in lines.names if (folder / name / RESULT_FILE).is_file()}
-    files = [folder / name / IMAGE_FILE for name in lines.names]
+    parts = {name: _of_image(folder / name) for name in names if (folder / name / RESULT_FILE).is_file()}
+    files = [folder / name / IMAGE_FILE for name in names]
     images = np.stack([finite_channel(read_frame(file)[0], "reflectance", file) for file in files], axis=-1)
     if parts:
         truths = [_truth_of(read_json(folder / name / RESULT_FILE)) for name in parts]
         known = [each for each in truths if each is not None and each.shape == images.shape[:2]]
-        truth = np.stack(known, axis=-1) if len(known) == len(lines.names) else None
+        truth = np.stack(known, axis=-1) if len(known) == len(names) else None
     else:
         truth = _truth_of(data)
         truth = truth if truth is not None and truth.shape == images.shape else None
-    place = None if data.get("chart") is None else validate(ChartPlace, data["chart"], f"{folder / COLOUR}: chart")
-    qualities = {
-        name: None if truth is None else Quality.of(images[..., number], truth[..., number])
-        for number, name in enumerate(lines.names)
-    }
-    image = ColourImage.of(colours, images, data.get("board_reflectance"), place, truth=truth, qualities=qualities)
+    image = ColourImage(
+        lines=colours,
+        images=images,
+        board=data.get("board_reflectance") or 1.0,
+        chart=None if data.get("chart") is None else validate(ChartPlace, data["chart"], f"{folder / COLOUR}: chart"),
+        truth=truth,
+        qualities={
+            name: None if truth is None else Quality.of(images[..., number], truth[..., number])
+            for number, name in enumerate(names)
+        },
+    )
     verdict, detail = f"An image from {len(files)} spectral lines", "No truth to compare it with."
     quality = "" if image.psnr_db is None else f"PSNR of the {len(files)} lines: {image.psnr_db:.1f} dB. "
     if image.patches:
@@ -397,32 +391,29 @@ def _of_colours(lines: SpectralFolder) -> Shown:
     elif image.delta_e is not None:
         verdict = f"Mean Delta E 2000 to the truth: {image.delta_e.mean():.2f}"
         detail = f"{quality}Mean over all pixels."
+    size = f"in sRGB under D65, {images.shape[0]} x {images.shape[1]} projector pixels"
+    ideal, pictures = "what a perfect image of the same lines would show, by the same matrix", list[Picture]()
+    for name, xyz, about in (("image", image.xyz, size), ("truth", image.truth_xyz, ideal)):
+        if xyz is not None:
+            caption = f"{about}; white is a perfect reflector, and what lies beyond the screen's colours is cut"
+            pictures.append(Picture(name, f"The {name}", caption, png(linear_srgb(xyz), LARGEST, SMALLEST)))
+    if image.delta_e is not None:
+        about = "1 is about the least difference that an eye sees side by side"
+        pictures.append(_error_picture(image.delta_e, "Delta E 2000", about, 1.0))
+    for number, line in enumerate(colours.channels):
+        title = f"{line.wavelength_nm:g} nm"
+        pictures.append(Picture.of(f"image_{line.name}", title, images[..., number], REFLECTANCE))
+        if truth is not None:
+            pictures.append(Picture.of(f"truth_{line.name}", f"{title}, truth", truth[..., number], REFLECTANCE))
     return Shown(
         kind="Image in colour",
         verdict=verdict,
         detail=detail,
         warnings=data.get("warnings") or (),
         command=data.get("command"),
-        pictures=[*_colour_pictures(image)],
-        versions=versions(),
+        pictures=pictures,
+        tables={"Versions": versions()},
         parts=parts,
         colours=image,
         facts=data.get("facts") or {},
     )
-
-
-def _colour_pictures(image: ColourImage) -> Iterator[Picture]:
-    size = f"in sRGB under D65, {image.images.shape[0]} x {image.images.shape[1]} projector pixels"
-    ideal = "what a perfect image of the same lines would show, by the same matrix"
-    for name, xyz, about in (("image", image.xyz, size), ("truth", image.truth_xyz, ideal)):
-        if xyz is not None:
-            caption = f"{about}; white is a perfect reflector, and what lies beyond the screen's colours is cut"
-            yield Picture(name, f"The {name}", caption, png(linear_srgb(xyz), LARGEST, SMALLEST))
-    if image.delta_e is not None:
-        about = "1 is about the least difference that an eye sees side by side"
-        yield _error_picture(image.delta_e, "Delta E 2000", about, 1.0)
-    for number, line in enumerate(image.lines.channels):
-        title = f"{line.wavelength_nm:g} nm"
-        yield Picture.of(f"image_{line.name}", title, image.images[..., number], REFLECTANCE)
-        if image.truth is not None:
-            yield Picture.of(f"truth_{line.name}", f"{title}, truth", image.truth[..., number], REFLECTANCE)

@@ -98,18 +98,30 @@ def curves(
     ticks
         True for a tick at every x that was measured, as far as there is room.
     """
+
+    def points(curve: Curve) -> FloatArray:
+        """Return (points, 3) numbers, finite means and standard errors of a ``curve``, sorted."""
+        found = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
+        rows = np.array(found, dtype=np.float64).reshape(-1, 3)
+        return rows[np.isfinite(rows[:, :2]).all(axis=1)]
+
+    def column(shown: Mapping[str, FloatArray], number: int) -> set[float]:
+        return {float(value) for rows in shown.values() for value in rows[:, number]}
+
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
-    found = {panel: {name: _points(curve) for name, curve in shown.items()} for panel, shown in panels.items()}
-    told = {panel: shown for panel, shown in found.items() if len(_column(shown, 0)) > 1}
+    found = {panel: {name: points(curve) for name, curve in shown.items()} for panel, shown in panels.items()}
+    told = {panel: shown for panel, shown in found.items() if len(column(shown, 0)) > 1}
     if not told:
         return Figure()
     figure, places = panels_of(len(told), 1, _PANEL * len(told) + 0.9, COLUMN, sharex=True, sharey=True)
-    measured = sorted({number for shown in told.values() for number in _column(shown, 0)})
-    levels = [level for shown in told.values() for level in _column(shown, 1)]
+    measured = sorted({number for shown in told.values() for number in column(shown, 0)})
+    levels = [level for shown in told.values() for level in column(shown, 1)]
+    shown_by_name: dict[str, Any] = {}
     for axes, (panel, shown) in zip(places[:, 0], told.items(), strict=True):
-        for name, points in ((name, points) for name, points in shown.items() if len(points)):
+        for name, rows in ((name, rows) for name, rows in shown.items() if len(rows)):
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
-            axes.errorbar(points[:, 0], points[:, 1], _bar_errors(points[:, 2]), label=name, **style)
+            drawn = axes.errorbar(rows[:, 0], rows[:, 1], _bar_errors(rows[:, 2]), label=name, **style)
+            shown_by_name[name] = drawn  # a panel may lack curves that another has
         axes.set_title(panel, fontsize=FONT)
         label_axes(axes, fill(x, TITLE_LETTERS) if axes is places[-1, 0] else "", fill(y, _UPRIGHT_LETTERS))
         if log or spans_decades(measured):
@@ -118,27 +130,11 @@ def curves(
             axes.set_yscale("log")
     if ticks:
         _tick_at(places[-1, 0], measured)
-    shown_by_name: dict[str, Any] = {}
-    for axes in places[:, 0]:  # a panel may lack curves that another has
-        shown_by_name |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     labels = [name for name in names if name and name in shown_by_name]
-    if labels:
-        legend_below(figure, [shown_by_name[name] for name in labels], labels)
+    legend_below(figure, [shown_by_name[name] for name in labels], labels)
     if title:
         figure.suptitle(fill(title, TITLE_LETTERS), fontsize=FONT + 1)
     return figure
-
-
-def _points(curve: Curve) -> FloatArray:
-    """Return (points, 3) numbers, finite means and standard errors of a ``curve``, sorted."""
-    points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
-    found = np.array(points, dtype=np.float64).reshape(-1, 3)
-    return found[np.isfinite(found[:, :2]).all(axis=1)]
-
-
-def _column(shown: Mapping[str, FloatArray], column: int) -> set[float]:
-    """Return the different values of a ``column`` of all curves."""
-    return {float(value) for points in shown.values() for value in points[:, column]}
 
 
 def spans_decades(values: Iterable[float]) -> bool:
@@ -188,62 +184,37 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
     return figure
 
 
-def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: str) -> Figure:
-    """Draw two means for each name, the first as a bar, the second as a dot, the largest on top."""
-    ordered = sorted(values.items(), key=lambda item: item[1][0].value)
-    figure, axes = figure_of(0.9 + _rows_height(name for name, _ in ordered), _BARS)
-    rows = np.arange(len(ordered))
-    first, second = (
-        np.array([(pair[index].value, pair[index].error) for _, pair in ordered]).reshape(-1, 2).T for index in (0, 1)
-    )
-    axes.barh(rows, first[0], 0.66, xerr=_bar_errors(first[1]), color=PALE, capsize=3, label=labels[0])
-    style: dict[str, Any] = {"color": VERMILION, "ms": 5.5, "capsize": 3, "lw": 0, "elinewidth": 1.5}
-    axes.errorbar(second[0], rows, xerr=_bar_errors(second[1]), fmt="D", label=labels[1], **style)
-    _name_rows(axes, [name for name, _ in ordered])
-    label_axes(axes, x, "", grid="x")
-    return figure
-
-
-def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
-    """Draw a bar with its error for each value by name, for at most two kinds, the largest on top."""
-    values = [(mean, name, kind) for kind, means in kinds.items() for name, mean in means.items()]
-    ordered = sorted(values, key=lambda value: value[0].value)
-    figure, axes = figure_of(1.2 + _rows_height(name for _, name, _ in ordered), _BARS)
-    for colour, kind in zip((BLUE, PALE), kinds, strict=False):
-        own = [(row, mean) for row, (mean, _, of) in enumerate(ordered) if of == kind]
-        if own:
-            rows, means = zip(*own, strict=True)
-            errors = [mean.error for mean in means]
-            axes.barh(rows, [mean.value for mean in means], 0.66, xerr=errors, color=colour, capsize=3, label=kind)
-    most = max(mean.value + mean.error for mean, _, _ in ordered)
-    least = min([0.0, *(1.1 * (mean.value - mean.error) for mean, _, _ in ordered if mean.value < 0)])
-    axes.set_xlim(least, 1.1 * most or 1.0)
-    _name_rows(axes, [name for _, name, _ in ordered])
-    label_axes(axes, x, "", grid="x")
-    return figure
-
-
-def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = "") -> Figure:
+def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = "", ordered: bool = False) -> Figure:
     """Draw horizontal bars with one standard error: a group for each name, a bar for each kind, its number behind it.
 
     Parameters
     ----------
     groups
-        means by kind, by the groups' names, the first on top; a group may lack kinds.
+        Means by kind, by the groups' names, the first on top; a group may lack kinds.
     x, title
-        name of the axis with its unit, and title.
+        Name of the axis with its unit, and title.
+    ordered
+        True to put the group with the largest first mean on top.
     """
     kinds = list(dict.fromkeys(kind for bars in groups.values() for kind in bars))
-    figure, axes = figure_of(0.9 + max(0.75 * len(kinds), 1.0) * _rows_height(groups), _BARS)
-    height, places = 0.8 / len(kinds), np.arange(len(groups))[::-1]
+    if ordered:
+        groups = dict(sorted(groups.items(), key=lambda item: -next(iter(item[1].values())).value))
+    slots = len(kinds) if max(map(len, groups.values())) > 1 else 1
+    figure, axes = figure_of(0.9 + max(0.75 * slots, 1.0) * _rows_height(groups), _BARS)
+    height, places = 0.8 / slots, np.arange(len(groups))[::-1]
     for index, kind in enumerate(kinds):
         own = [(place, bars[kind]) for place, bars in zip(places, groups.values(), strict=True) if kind in bars]
-        rows = np.array([place + (len(kinds) / 2 - 0.5 - index) * height for place, _ in own])
+        shift = (slots / 2 - 0.5 - index) * height if slots > 1 else 0.0
         values, errors = (np.array([getattr(mean, part) for _, mean in own]) for part in ("value", "error"))
         colour = (PALE, BLUE, ORANGE, GREEN)[index % 4] if len(kinds) > 1 else BLUE
-        drawn = axes.barh(rows, values, 0.92 * height, xerr=_bar_errors(errors), color=colour, capsize=3, label=kind)
+        style = {"xerr": _bar_errors(errors), "color": colour, "capsize": 3, "label": kind}
+        drawn = axes.barh([place + shift for place, _ in own], values, 0.92 * height, **style)
         axes.bar_label(drawn, [scientific(float(value)) for value in values], fontsize=FONT - 2, padding=3)
-    _name_rows(axes, list(groups)[::-1])
+    axes.set_yticks(places, [fill(typeset(name), _NAME_LETTERS) for name in groups])
+    axes.tick_params(axis="y", length=0)
+    axes.set_ylim(-0.6, len(groups) - 0.4)
+    if len(kinds) > 1:
+        axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     if title:
         figure.suptitle(fill(title, TITLE_LETTERS + 10), fontsize=FONT)
     axes.margins(x=0.14)
@@ -302,24 +273,6 @@ def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
     bar = figure.colorbar(drawn, ax=axes, extend="both")
     bar.set_label("error [predicted deviations]", fontsize=FONT - 1)
     bar.ax.tick_params(labelsize=FONT - 2)
-    return figure
-
-
-def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> Figure:
-    """Draw the PSNR [dB] by family in the idealised model and with rendered light, with one standard error."""
-    figure, axes = figure_of(0.36 * WIDTH)
-    place = np.arange(len(quality), dtype=np.float64)
-    looks = (-0.2, PALE, "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
-    for means, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
-        values, errors = (np.array([getattr(mean, part) for mean in means]) for part in ("value", "error"))
-        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label, yerr=_bar_errors(errors), capsize=3)
-        axes.bar_label(bars, fmt="%.1f", fontsize=FONT - 1, padding=2)
-    if title:
-        figure.suptitle(title, fontsize=FONT)
-    axes.set_xticks(place, list(quality), fontsize=FONT)
-    axes.margins(y=0.14)
-    label_axes(axes, "", "PSNR [dB]", grid="y")
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", ncols=2, bbox_to_anchor=(0, 1.16))
     return figure
 
 
@@ -408,7 +361,11 @@ def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str,
         (shown["best for its time"],) = axes.plot(*front.T, "o", color=GREY, **ring)
         axes.set(xscale="log", yscale="log", xmargin=0.2)
         axes.set_title(title, fontsize=FONT)
-        log_ticks(axes)
+        low, high = axes.get_xlim()
+        if high < _SHORT_AXIS * low:
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
         label_axes(axes, "wall time [s]" if axes is places[-1, 0] else "", fill(error, _UPRIGHT_LETTERS))
     for text, level in (levels or {}).items():
         where: Any = places[0, 0].get_yaxis_transform()
@@ -431,15 +388,6 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 # -------- Parts of figures
 
 
-def _name_rows(axes: Axes, names: Sequence[str]) -> None:
-    """Set the names of bars, from below, and for two or more kinds a legend above the axes."""
-    axes.set_yticks(range(len(names)), [fill(typeset(name), _NAME_LETTERS) for name in names])
-    axes.tick_params(axis="y", length=0)
-    axes.set_ylim(-0.6, len(names) - 0.4)
-    if len(axes.get_legend_handles_labels()[0]) > 1:
-        axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-
-
 def _rows_height(names: Iterable[str]) -> float:
     """Return the height [inches] of rows of bars, all as high as the name with the most lines."""
     lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in names]
@@ -449,15 +397,6 @@ def _rows_height(names: Iterable[str]) -> float:
 def _bar_errors(errors: FloatArray) -> FloatArray | None:
     """Return the errors, or None where no error is known, so that no bar of zero is drawn."""
     return None if np.isnan(errors).all() else errors
-
-
-def log_ticks(axes: Axes, parts: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Set ticks at ``parts`` of a decade where powers of ten alone leave at most one tick on the x axis."""
-    low, high = axes.get_xlim()
-    if high < _SHORT_AXIS * low:
-        axes.xaxis.set_major_locator(LogLocator(subs=parts))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def line_style(index: int) -> dict[str, Any]:

@@ -9,9 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -56,7 +55,7 @@ from mitsim.reconstruct.reconstruct import (
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
 from mitsim.reconstruct.solution import Solution, Status
 from mitsim.reconstruct.solver import automatic_lambda, prepare
-from mitsim.report.colour_image import ColourImage, begin_image
+from mitsim.report.colour_image import ColourImage, state_image
 from mitsim.report.folder_page import report_folder
 
 # -------- The image of one line
@@ -203,40 +202,57 @@ def reconstruct_colours(
     page, found = options.pop("page", True), open_lines(run, RUN, MOSAIC)
     lines = found.filters or read_colours(run, RUN)
     check_lines(lines, str(run), calibration)
-    kind = _AllAtOnce if found.filters else _OneByOne
-    work = kind(lines, run, calibration, overwrite, job, **options)
-    with output_folder(output, overwrite=work.may_replace(output)) as folder:
-        image = work.solve(folder, chart)
-        image.write(folder, **_origin(job, run, calibration))
+    boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
+    if len(boards) > 1:
+        raise MitsimError(
+            f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
+        )
+    work = _Work(lines, run, calibration, output, boards.pop(), chart, overwrite, job)
+    image = (_solve_at_once if found.filters else _solve_one_by_one)(work, **options)
     if page:
         report_folder(output)
     return image
 
 
-class _OneByOne:
-    """Solves each line of a run by itself, in a folder of its own."""
+class _Work(NamedTuple):
+    """Folders of a coloured image, the ``board`` that it is relative to, and the place of a chart in it."""
 
-    def __init__(
-        self, lines: ColourManifest, run: Path, calibration: Path, overwrite: bool, job: Job, **options: Any
-    ) -> None:
-        self.lines, self.run, self.calibration, self.overwrite = lines, run, calibration, overwrite
-        self.job, self.options = job, options
+    lines: ColourManifest
+    run: Path
+    calibration: Path
+    output: Path
+    board: float | None
+    chart: ChartPlace | None
+    overwrite: bool
+    job: Job
 
-    def may_replace(self, output: Path) -> bool:
-        """Return True if ``output`` holds an image of the same lines, or one that may be replaced anyway."""
-        return is_coloured(output) and (read_colours(output, IMAGE).names == self.lines.names or self.overwrite)
+    def finish(self, folder: Path, **found: Any) -> ColourImage:
+        """Combine the images of all lines to one in colour, and write it to ``folder``."""
+        known: dict[str, Any] = {
+            "lines": self.lines,
+            "board": self.board or 1.0,
+            "chart": self.chart,
+            "output": str(folder),
+        }
+        image = ColourImage(**known, **found)
+        image.write(folder, **_origin(self.job, self.run, self.calibration))
+        return image
 
-    def solve(self, folder: Path, chart: ChartPlace | None) -> ColourImage:
-        begins = not is_coloured(folder)
+
+def _solve_one_by_one(work: _Work, **options: Any) -> ColourImage:
+    """Solve each line of a run by itself, in a folder of its own, and write the image in colour."""
+    lines, run, calibration, output, _, _, overwrite, job = work
+    replaces = is_coloured(output) and (read_colours(output, IMAGE).names == lines.names or overwrite)
+    with output_folder(output, overwrite=replaces) as folder:
+        begins, images = not is_coloured(folder), dict[str, Judged]()
         if begins:
-            begin_image(folder, self.lines)
-        images = {}
+            state_image(folder, lines, status="incomplete")
         try:
-            for name in self.lines.names:
-                own = {"overwrite": self.overwrite, "job": self.job.apart(f"{name} "), **self.options}
-                images[name] = reconstruct(self.run / name, self.calibration / name, folder / name, **own)
+            for name in lines.names:
+                own = {"overwrite": overwrite, "job": job.apart(f"{name} "), **options}
+                images[name] = reconstruct(run / name, calibration / name, folder / name, **own)
         except BaseException:
-            if begins and not any((folder / name).is_dir() for name in self.lines.names):  # refused before any image
+            if begins and not any((folder / name).is_dir() for name in lines.names):  # refused before any image
                 (folder / COLOUR).unlink()
             raise
         solved = {name: judged.reconstruction for name, judged in images.items()}
@@ -245,11 +261,9 @@ class _OneByOne:
             raise MitsimError(f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid")
         truths = [judged.truth for judged in images.values() if judged.truth is not None]
         of_lines = {name: judged.summary() for name, judged in images.items()}
-        return ColourImage.of(
-            self.lines,
-            np.stack([each.image for each in solved.values()], axis=-1),
-            _board_of(self.calibration, self.lines),
-            chart,
+        return work.finish(
+            folder,
+            images=np.stack([each.image for each in solved.values()], axis=-1),
             truth=np.stack(truths, axis=-1) if len(truths) == len(images) else None,
             qualities={name: judged.quality for name, judged in images.items()},
             facts={
@@ -260,123 +274,91 @@ class _OneByOne:
             },
             warnings=one_paragraph({name: each.status for name, each in solved.items()}),
             seconds={"total": sum(each["seconds"]["total"] for each in of_lines.values())},
-            output=str(folder),
             of_lines=of_lines,
         )
 
 
-class _AllAtOnce:
-    """Solves all lines from the same frames, which were seen through colour filters."""
-
-    def __init__(
-        self,
-        lines: ColourManifest,
-        run: Path,
-        calibration: Path,
-        overwrite: bool,
-        job: Job,
-        way: str = JOINT,
-        lam: Lambda = "auto",
-    ) -> None:
-        check_joint(lam)
-        self.lines, self.calibration, self.overwrite = lines, calibration, overwrite
-        self.way, self.lam = check_way(way), lam
-        self.clock = job.apart("").clock
-        with self.clock.stage("read"):
-            self.mosaic = load_mosaic(run)
-            self.factors = {name: load_calibration(calibration / name) for name in lines.names}
-            for factors in self.factors.values():
-                factors.check_fit(self.mosaic.shots)
-
-    @cached_property
-    def inputs(self) -> dict[str, str | float]:
-        """What the image is made of, by which colour.json recognises it."""
-        calibration = "-".join(factors.fingerprint for factors in self.factors.values())
-        run = self.mosaic.shots.fingerprint
-        return {"run": run, "calibration": calibration, "mosaic": self.way, "lambda": self.lam}
-
-    def may_replace(self, output: Path) -> bool:
-        """Return True if ``output`` holds an image; MitsimError where that is of other inputs and must stay."""
-        if not is_coloured(output):
-            return False
+@single_threaded_blas()
+def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> ColourImage:
+    """Solve all lines from the same frames, which were seen through colour filters, and write the image in colour."""
+    lines, run, calibration, output, board, _, overwrite, job = work
+    check_joint(lam)
+    check_way(way)
+    clock = job.apart("").clock
+    with clock.stage("read"):
+        mosaic = load_mosaic(run)
+        factors, shots = {name: load_calibration(calibration / name) for name in lines.names}, mosaic.shots
+        for each in factors.values():
+            each.check_fit(shots)
+    made_of = "-".join(each.fingerprint for each in factors.values())
+    inputs = {"run": shots.fingerprint, "calibration": made_of, "mosaic": way, "lambda": lam}
+    replaces = is_coloured(output)
+    if replaces:
         read_colours(output, IMAGE)
-        if not self.overwrite:
-            check_same_inputs(output, read_json(output / COLOUR), self.inputs)
-        return True
-
-    @single_threaded_blas()
-    def solve(self, folder: Path, chart: ChartPlace | None) -> ColourImage:
-        lines, shots = self.lines, self.mosaic.shots
-        with self.clock.stage("accumulate"):
-            pairs = [(factors.left, factors.right) for factors in self.factors.values()]
-            camera = MosaicCamera.of(pairs, self.mosaic.weights, self.mosaic.manifest.mosaic)
-            solver, data, noise = Solver(self.way, camera, shots.patterns), 0.0, 0.0
-            for each in shots.pattern_measurements((len(camera.lefts[0]), len(camera.rights[0]))):
-                solver.add(each.frame, each.row, each.column)
-                data += float(np.square(each.frame).sum())
-                noise += float(np.maximum(shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
-        with self.clock.stage("solve"):
-            solved = solver.images(self.lam)
+        if not overwrite:
+            check_same_inputs(output, read_json(output / COLOUR), inputs)
+    with output_folder(output, overwrite=replaces) as folder:
+        with clock.stage("accumulate"):
+            pairs = [(each.left, each.right) for each in factors.values()]
+            camera = MosaicCamera.of(pairs, mosaic.weights, mosaic.manifest.mosaic)
+            solver, data, noise = Solver(way, camera, shots.patterns), 0.0, 0.0
+            for datum in shots.pattern_measurements((len(camera.lefts[0]), len(camera.rights[0]))):
+                solver.add(datum.frame, datum.row, datum.column)
+                data += float(np.square(datum.frame).sum())
+                noise += float(np.maximum(shots.manifest.digital.variance(datum.light, datum.shots), 0.0).sum())
+        with clock.stage("solve"):
+            solved = solver.images(lam)
         # What the noise of frames and factors leaves of the residual, as a part of the data.
         explained = 0.0
-        for factors in self.factors.values():
-            if (own := factors.manifest.noise) is not None:
-                sides = (own.left, factors.left), (own.right, factors.right)
+        for each in factors.values():
+            if (own := each.manifest.noise) is not None:
+                sides = (own.left, each.left), (own.right, each.right)
                 explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
         unexplained = float(np.sqrt(max(solved.residual**2 - (noise / data if data else 0.0) - explained, 0.0)))
-        board, qualities = _board_of(self.calibration, lines), dict[str, Quality | None].fromkeys(lines.names)
-        truth, steps = self.mosaic.truth(board), solved.joint and solved.joint.iterations
+        truth, joint, qualities = mosaic.truth(board), solved.joint, dict[str, Quality | None].fromkeys(lines.names)
         if truth is not None:
-            for number, (name, known) in enumerate(self.mosaic.truths.items()):
+            for number, (name, known) in enumerate(mosaic.truths.items()):
                 error = float(np.sqrt(np.square(known.standard_error).mean())) * known.board / (board or known.board)
                 qualities[name] = Quality.of(solved.images[number], truth[..., number], error)
-        begin_image(folder, lines, inputs=self.inputs)
-        for name, image in zip(lines.names, solved.images, strict=True):
-            with output_folder(folder / name, overwrite=True) as place:
-                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
-                write_bytes(place / PICTURE_FILE, png(image))
-        return ColourImage.of(
-            lines,
-            np.moveaxis(solved.images, 0, -1),
-            board,
-            chart,
-            truth=truth,
-            qualities=qualities,
-            facts={
-                "frames": "all lines at once, behind colour filters",
-                "solved": self.way if steps is None else f"{self.way}, {steps} steps",
-                "lambda": f"{solved.lam:.3g}",
-                "residual of the frames": f"{solved.residual:.1e}, of which {unexplained:.1e} is unexplained",
-            },
-            warnings=self._warnings(solved.joint, unexplained),
-            seconds=self.clock.seconds(),
-            output=str(folder),
-            solution={
-                "mosaic": self.way,
-                "lambda": solved.lam,
-                "steps": steps,
-                "residual": solved.residual,
-                "unexplained": unexplained,
-            },
-            inputs=self.inputs,
-        )
-
-    def _warnings(self, joint: Solution | None, unexplained: float) -> tuple[str, ...]:
-        warnings = []
+        warnings, steps = [], joint and joint.iterations
         if joint is not None and not joint.ok:
-            warnings.append(
-                f"Not converged: {joint.iterations} steps leave {joint.residual:.1e} of the normal equations; raise "
-                "lambda."
-            )
+            left = f"{joint.iterations} steps leave {joint.residual:.1e} of the normal equations"
+            warnings.append(f"Not converged: {left}; raise lambda.")
         if unexplained > UNEXPLAINED:
             warnings.append(
                 f"Misfit: {unexplained:.1e} of the measurements are explained by no image of these lines, beyond "
                 "noise; look for depth, light over several surfaces or another camera than was calibrated."
             )
-        flags = {"The capture": self.mosaic.warnings}
-        flags |= {f"The calibration of {name}": factors.warnings for name, factors in self.factors.items()}
-        flagged = [f"{what} was flagged: {text.rstrip('.')}." for what, texts in flags.items() for text in texts]
-        return (*warnings, *flagged)
+        flags = {"The capture": mosaic.warnings}
+        flags |= {f"The calibration of {name}": each.warnings for name, each in factors.items()}
+        warnings += [f"{what} was flagged: {text.rstrip('.')}." for what, texts in flags.items() for text in texts]
+        state_image(folder, lines, status="incomplete", inputs=inputs)
+        for name, image in zip(lines.names, solved.images, strict=True):
+            with output_folder(folder / name, overwrite=True) as place:
+                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
+                write_bytes(place / PICTURE_FILE, png(image))
+        return work.finish(
+            folder,
+            images=np.moveaxis(solved.images, 0, -1),
+            truth=truth,
+            qualities=qualities,
+            facts={
+                "frames": "all lines at once, behind colour filters",
+                "solved": way if steps is None else f"{way}, {steps} steps",
+                "lambda": f"{solved.lam:.3g}",
+                "residual of the frames": f"{solved.residual:.1e}, of which {unexplained:.1e} is unexplained",
+            },
+            warnings=tuple(warnings),
+            seconds=clock.seconds(),
+            solution={
+                "mosaic": way,
+                "lambda": solved.lam,
+                "steps": steps,
+                "residual": solved.residual,
+                "unexplained": unexplained,
+            },
+            inputs=inputs,
+        )
 
 
 def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
@@ -394,16 +376,6 @@ def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
         parts.append(f"{', '.join(names)}: {first.sentence}{of_first}{'; ' if first.remedy else ''}{first.remedy}.")
     flags = dict.fromkeys(flag for status in flagged.values() for flag in status.flags)
     return (" ".join([*parts, *flags]),) if parts else ()
-
-
-def _board_of(calibration: Path, lines: ColourManifest) -> float | None:
-    """Return the reflectance of the board that images are relative to, which all lines must share."""
-    boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
-    if len(boards) > 1:
-        raise MitsimError(
-            f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
-        )
-    return boards.pop()
 
 
 # -------- Ways from frames behind colour filters to images of the lines

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,9 +36,6 @@ from mitsim.reconstruct.reconstruct import MADE_OF, read_result
 from mitsim.reconstruct.request import METHODS, RESULT_FILE
 from mitsim.sessions.session_file import SESSION_FILE, SUMMARY, fields_of, read_session, session_text, value_of
 from mitsim.studies.framework.campaign import read_scope
-
-_PLANNED = "patterns", "accuracy", "seed", "effects"
-"""Fields of a request that light hangs on."""
 
 
 class _Opened(BaseModel):
@@ -112,128 +109,113 @@ def session_of(folder: Path | str) -> Repeat:
     if (folder / SUMMARY).is_file() and (folder / SESSION_FILE).is_file():
         tables = read_session(folder / SESSION_FILE).tables
         return Repeat(session_text(tables), (), tables)
-    found = _Found(folder.absolute())
-    data = read_json(folder / COLOUR) if is_coloured(folder) else {}
+    place, found, coloured = folder.absolute(), _Found(), is_coloured(folder)
+    data = read_json(folder / COLOUR) if coloured else {}
     if (folder / "demo.json").is_file():
-        found.demo()
+        manifest = read_manifest(place / "run", RunManifest)
+        found.add_scene(manifest, place, False)
+        found.tables["demo"] = {name: manifest.configuration[name] for name in ("patterns", "accuracy", "seed")}
     elif (folder / RESULT_FILE).is_file() or (isinstance(data, dict) and data.get("kind") == IMAGE):
-        found.image(folder.absolute())
-    elif (folder / MANIFEST).is_file() or is_coloured(folder):
-        found.run_or_calibration()
+        found.add_image(place)
+    elif coloured or (folder / MANIFEST).is_file():
+        manifest_data = read_json(_first(place) / MANIFEST)
+        if isinstance(manifest_data, dict) and manifest_data.get("kind") == "calibration":
+            found.add_calibration(place)
+        else:
+            found.add_run(place)
+            for path in sorted([*place.iterdir(), *place.parent.iterdir()]):
+                if path.is_dir() and _made_of(path).get("run") == str(place):
+                    found.add_image(path)
     else:
-        found.study()
+        found.add_study(place)
     tables = read_session(found.tables).tables  # which refuses values that a damaged folder states
-    notes = f"Repeats {folder.absolute()}: mitsim run FILE -o FOLDER", *found.warnings
+    notes = f"Repeats {place}: mitsim run FILE -o FOLDER", *found.warnings
     return Repeat(session_text(tables, None, *notes), tuple(found.warnings), tables, notes)
 
 
 @dataclass
 class _Found:
-    """Tables of a session, found in a ``folder``; ``warnings`` on what is not as it was; and the folders that the
-    tables of capture and calibration were ``taken`` from."""
+    """Tables of a session, found in folders; ``warnings`` on what is not as it was; and the folders that the tables of
+    capture and calibration were ``taken`` from."""
 
-    folder: Path
     tables: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     taken: dict[str, str] = field(default_factory=dict)
 
-    def run_or_calibration(self) -> None:
-        data = read_json(self._first(self.folder) / MANIFEST)
-        if isinstance(data, dict) and data.get("kind") == "calibration":
-            self.calibration(self.folder)
-            return
-        self.run(self.folder)
-        for image in self._images():
-            self.image(image)
+    def warn(self, text: str) -> None:
+        if text not in self.warnings:
+            self.warnings.append(text)
 
-    def _images(self) -> Iterator[Path]:
-        """Iterate over folders of images of the folder's frames, in the folder and next to it."""
-        for path in sorted([*self.folder.iterdir(), *self.folder.parent.iterdir()]):
-            made_of = _made_of(path) if path.is_dir() else {}
-            if made_of.get("run") == str(self.folder):
-                yield path
-
-    def _first(self, folder: Path) -> Path:
-        """Return the folder whose manifest describes a ``folder``: of several lines, that of the first."""
-        return next(iter(open_lines(folder, *KINDS).parts.values()))
-
-    def _scene(self, conf: Mapping[str, Any], opened: Mapping[str, Any] | None, folder: Path, coloured: bool) -> None:
-        """Add the table of the scene that a manifest's ``conf`` describes; raise MitsimError if another scene is there
-        already."""
+    def add_scene(self, manifest: RunManifest | CalibrationManifest, folder: Path, coloured: bool) -> None:
+        """Add the table of the scene that a ``manifest`` describes; raise MitsimError if another scene is there
+        already. Warn of files that differ from those that it describes."""
+        conf, where = manifest.configuration, f"{folder}/{MANIFEST}"
         if "scene" not in conf or "defines" not in conf:
             raise MitsimError(f"{folder}: is not of a simulated scene, so no session file makes it anew")
         if "board" in conf:
             raise MitsimError(f"{folder}: is of a bench before a board, which only Python makes")
-        if opened is None:
-            self._warn(f"{folder} does not tell its devices' files: the usual ones are taken")
-        where = f"{folder}/{MANIFEST}"
-        files, scene = validate(_Opened, dict(opened or {}), where), validate(_Scene, dict(conf), where)
+        if manifest.opened is None:
+            self.warn(f"{folder} does not tell its devices' files: the usual ones are taken")
+        files, scene = validate(_Opened, dict(manifest.opened or {}), where), validate(_Scene, dict(conf), where)
         if own := scene.defines.keys() & fields_of("scene").keys():
             raise MitsimError(f"{where}: defines.{min(own)} is no parameter of a scene; remove it")
         devices = {name: _short_name(getattr(files, name), "calibration") for name in ("camera", "projector")}
         usual = spectral_of(DEFAULT_VARIANT) if coloured else DEFAULT_VARIANT
-        table = {
+        given = {
             "scene": _short_name(scene.scene, "scenes"),
-            **{name: value for name, value in devices.items() if value is not None},
-            **({} if scene.variant == usual else {"variant": scene.variant}),
-            **({"allow_outside_files": True} if files.allow_outside_files else {}),
+            **devices,
+            "variant": None if scene.variant == usual else scene.variant,
+            "allow_outside_files": files.allow_outside_files or None,
             **{name: _value(text) for name, text in scene.defines.items()},
         }
+        table = {name: value for name, value in given.items() if value is not None}
         if self.tables.setdefault("scene", table) != table:
             raise MitsimError(f"{folder}: is of another scene or of other devices than its frames")
-        self._compare(conf, {scene.scene: scene.scene_sha256, **scene.scene_files}, devices, coloured)
-
-    def _compare(
-        self, conf: Mapping[str, Any], sums: Mapping[str, str | None], devices: Mapping[str, str | None], coloured: bool
-    ) -> None:
-        """Warn of files that differ from those that a manifest's ``conf`` and its ``sums`` describe."""
-        for name, known in sums.items():
+        for name, known in {scene.scene: scene.scene_sha256, **scene.scene_files}.items():
             if not Path(name).is_file():
-                self._warn(f"{name} is not there")
+                self.warn(f"{name} is not there")
             elif checksum(Path(name)) != known:
-                self._warn(f"{name} was changed since")
+                self.warn(f"{name} was changed since")
         try:
             camera, projector = check_devices(devices["camera"], devices["projector"])
             sensor, light = load_sensor(camera), load_model(projector, ProjectorModel)
         except MitsimError as error:
-            self._warn(str(error))
+            self.warn(str(error))
             return
+        shown = {**light.model_dump(mode="json", exclude={"contrast_ratio"}), "black_level": light.black_level}
         if plain(sensor.identity) != conf.get("sensor"):
-            self._warn(f"camera {camera} is not the one that the manifest tells")
-        own = {**light.model_dump(mode="json", exclude={"contrast_ratio"}), "black_level": light.black_level}
-        if plain(own) != conf.get("projector_model") and not coloured:
-            self._warn(f"projector {projector} is not the one that the manifest tells")
+            self.warn(f"camera {camera} is not the one that the manifest tells")
+        if plain(shown) != conf.get("projector_model") and not coloured:
+            self.warn(f"projector {projector} is not the one that the manifest tells")
         if (made := conf.get("versions")) != deciding_versions():
-            self._warn(f"it was made by {made}, and here is {deciding_versions()}")
+            self.warn(f"it was made by {made}, and here is {deciding_versions()}")
 
-    def _warn(self, text: str) -> None:
-        if text not in self.warnings:
-            self.warnings.append(text)
-
-    def run(self, folder: Path) -> None:
+    def add_run(self, folder: Path) -> None:
         """Add the request of the frames in a ``folder``."""
-        manifest = read_manifest(self._first(folder), RunManifest)
-        conf, coloured = manifest.configuration, is_coloured(folder)
-        self._scene(conf, manifest.opened, folder, coloured)
+        manifest = read_manifest(_first(folder), RunManifest)
+        conf = manifest.configuration
+        self.add_scene(manifest, folder, is_coloured(folder))
         request = {name: conf[name] for name in Request.model_fields if name in conf}
         if request.pop("seconds", None) is not None:
             request["accuracy"] = (manifest.plan or {}).get("accuracy")
-            self._warn("it was planned by seconds: the accuracy is what they bought then")
+            self.warn("it was planned by seconds: the accuracy is what they bought then")
+        always = "patterns", "accuracy", "seed"
         asked = {
-            name: value for name, value in request.items()
-            if name in ("patterns", "accuracy", "seed") or value != Request.model_fields[name].default
-        }  # fmt: skip
-        above = {name: asked[name] for name in _PLANNED if name in asked}
+            name: value
+            for name, value in request.items()
+            if name in always or value != Request.model_fields[name].default
+        }
+        above = {name: asked[name] for name in (*always, "effects") if name in asked}  # on which light depends
         if "light" in conf:
             self.tables["transport"] = {**above, **conf["light"]}
         elif "plan_seed" in conf:
             self.tables["plan"] = {**above, "seed": conf["plan_seed"]}
         if {"light", "plan_seed"} & conf.keys():
             asked = {name: value for name, value in asked.items() if name not in ("accuracy", "effects")}
-        self.tables["capture"] = {**asked, **self._colour(folder)}
+        self.tables["capture"] = {**asked, **self.colour_of(folder)}
         self.taken["capture"] = str(folder)
 
-    def _colour(self, folder: Path) -> dict[str, str]:
+    def colour_of(self, folder: Path) -> dict[str, str]:
         """Return the word of the colours of a ``folder``; nothing if none are told apart."""
         lines = open_lines(folder, *KINDS)
         if lines.colours is None or lines.filters:
@@ -243,68 +225,59 @@ class _Found:
         several = load_model(projector, ProjectorModel).wavelengths_nm or ()
         return {"colour": "lines" if count == len(several) else f"bands:{count}"}
 
-    def calibration(self, folder: Path) -> None:
+    def add_calibration(self, folder: Path) -> None:
         """Add the request of the calibration in a ``folder``."""
-        manifest = read_manifest(self._first(folder), CalibrationManifest)
+        manifest = read_manifest(_first(folder), CalibrationManifest)
         conf = manifest.configuration
-        if (
-            manifest.modelled
-            or "aged" in conf
-            or "depth_mm" in conf
-            or not {"accuracy", "seed", "recipe"} <= conf.keys()
-        ):
+        simulated = {"accuracy", "seed", "recipe"} <= conf.keys() and not {"aged", "depth_mm"} & conf.keys()
+        if manifest.modelled or not simulated:
             raise MitsimError(f"{folder}: is not of one simulated session, so no session file makes it anew")
-        self._scene(conf, manifest.opened, folder, is_coloured(folder))
+        self.add_scene(manifest, folder, is_coloured(folder))
         own = load_recipe().model_dump(exclude_defaults=True, exclude={"depths"})
         recipe = {} if conf["recipe"] == plain(own) else {"recipe": conf["recipe"]}
-        colour = self._colour(folder)
+        colour = self.colour_of(folder)
         if colour and (capture := self.tables.get("capture")):
             colour = {"colour": capture["colour"]}
         self.tables["calibrate"] = {"seed": conf["seed"], "accuracy": conf["accuracy"], **recipe, **colour}
         self.taken["calibrate"] = str(folder)
 
-    def image(self, folder: Path) -> None:
+    def add_image(self, folder: Path) -> None:
         """Add the request of the image in a ``folder``, of its frames and of its calibration."""
-        made_of = _made_of(folder)
+        made_of, first = _made_of(folder), _first(folder)
         if "calibration" not in made_of:
             raise MitsimError(f"{folder}: does not tell the calibration that it is made of")
-        first = self._first(folder)
         stated = read_result(first).get("inputs") if (first / RESULT_FILE).is_file() else {}
-        inputs = {
-            name: value for name, value in (stated if isinstance(stated, dict) else {}).items() if name not in made_of
-        }
+        stated = stated if isinstance(stated, dict) else {}
+        inputs = {name: value for name, value in stated.items() if name not in made_of}
         if inputs.get("method", METHODS[0]) not in METHODS:
-            raise MitsimError(
-                f"{folder}: was solved by {cut(str(inputs['method']))}, a trained network, whose file it does not tell"
-            )
+            method = cut(str(inputs["method"]))
+            raise MitsimError(f"{folder}: was solved by {method}, a trained network, whose file it does not tell")
         if isinstance(ends := inputs.get("bounds"), list):
-            inputs["bounds"] = [
-                end if end is not None else (-1) ** (place + 1) * math.inf for place, end in enumerate(ends)
-            ]
-        for name, verb, take in (("run", "capture", self.run), ("calibration", "calibrate", self.calibration)):
+            infinite = -math.inf, math.inf
+            inputs["bounds"] = [infinite[place % 2] if end is None else end for place, end in enumerate(ends)]
+        for name, verb, add in (
+            ("run", "capture", self.add_run),
+            ("calibration", "calibrate", self.add_calibration),
+        ):
             if self.taken.get(verb) == made_of[name]:
                 continue
             try:
                 if verb in self.taken:
                     raise MitsimError(f"{made_of[name]}: is another than that of the first image")
-                take(Path(made_of[name]))
+                add(Path(made_of[name]))
             except MitsimError as error:
-                self._warn(f"{error}; it is read where it is")
+                self.warn(f"{error}; it is read where it is")
                 inputs[name] = made_of[name]
         images = self.tables.setdefault("reconstruct", [])
         named = {} if folder.name in (each.get("output") for each in images) else {"output": folder.name}
         images.append({**inputs, **named})
 
-    def demo(self) -> None:
-        manifest = read_manifest(self.folder / "run", RunManifest)
-        conf = manifest.configuration
-        self._scene(conf, manifest.opened, self.folder, False)
-        self.tables["demo"] = {name: conf[name] for name in ("patterns", "accuracy", "seed")}
-
-    def study(self) -> None:
-        name, scope = read_scope(self.folder)
+    def add_study(self, folder: Path) -> None:
+        """Add the options of the study in a ``folder``."""
+        name, scope = read_scope(folder)
         setup = scope.setup
         given = {
+            "name": name,
             "scene": None if any(scope.pictures) else _short_name(setup.scene, "scenes"),
             "patterns": scope.patterns if name in ("sweep", "drift") else None,
             "seed": scope.seeds[0],
@@ -318,8 +291,12 @@ class _Found:
             "measure": ",".join(scope.measures) or None,
             "over": {knob: [*values] for knob, values in scope.sweep} or None,
         }
-        table = {"name": name, **{key: value for key, value in given.items() if value is not None}}
-        self.tables["study"] = [table]
+        self.tables["study"] = [{key: value for key, value in given.items() if value is not None}]
+
+
+def _first(folder: Path) -> Path:
+    """Return the folder whose manifest describes a ``folder``: of several lines, that of the first."""
+    return next(iter(open_lines(folder, *KINDS).parts.values()))
 
 
 def _made_of(folder: Path) -> dict[str, str]:
@@ -335,8 +312,7 @@ def _short_name(path: str | None, shelf: str) -> str | None:
     """Return the name of a shipped file at a ``path`` on its ``shelf``; else the path."""
     if path is None:
         return None
-    place = Path(path)
-    own = place.parent if shelf == "scenes" else place
+    own = Path(path).parent if shelf == "scenes" else Path(path)
     return own.stem if own.parent == shipped_path(shelf) else path
 
 

@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -49,10 +49,8 @@ from mitsim.sessions.session_file import (
     Session,
     Step,
     calibration_for,
-    image_request,
     portable,
     read_session,
-    request_of,
     session_text,
     sweep_options,
     swept_values,
@@ -68,32 +66,26 @@ if TYPE_CHECKING:
     from mitsim.light.plan import Plan
     from mitsim.verbs import RunKeys
 
-
-class _Made(Configuration):
-    """Files of a step: SHA-256 of its ``inputs``, and of each of its ``files`` by name; none of one that was begun."""
-
-    inputs: str
-    files: dict[str, str] = Field(default_factory=dict)
+KIND = "session"
+"""What session.json says that the folder is."""
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a step came to.
+    """Result of a step.
 
     Attributes
     ----------
     step, output
-        its verb, and its folder or file in the session's.
-    says
-        a line.
-    warnings
-        why it is flagged.
+        Its verb, and its folder or file in the session's.
+    says, warnings
+        A line, and why the step is flagged.
     seconds
-        wall time.
+        Wall time.
     page
-        of it, from the session's folder; empty without one.
+        Its page, from the session's folder; empty without one.
     left_alone
-        whether it was finished already.
+        Whether it was finished already.
     """
 
     step: str
@@ -107,7 +99,7 @@ class StepResult:
 
 @dataclass(frozen=True)
 class SessionResult:
-    """What a session came to: its ``steps``, in order; its folder ``output``, and the ``page`` in it (None without)."""
+    """Results of a session's ``steps``, in order; its folder ``output``, and the ``page`` in it (None without)."""
 
     steps: tuple[StepResult, ...]
     output: str
@@ -124,6 +116,21 @@ class SessionResult:
     def lines(self) -> list[str]:
         each = [f"{step.output}: {step.says}{' (finished before)' if step.left_alone else ''}" for step in self.steps]
         return [*each, f"Page: {self.page}" if self.page else f"Session: {self.output}"]
+
+
+class _Made(Configuration):
+    """Files of a step: SHA-256 of its ``inputs``, and of each of its ``files`` by name; none of one that was begun."""
+
+    inputs: str
+    files: dict[str, str] = Field(default_factory=dict)
+
+
+class _Earlier(BaseModel):
+    """Statements of session.json on an earlier run."""
+
+    kind: Literal["session"] = "session"
+    steps: tuple[StepResult, ...] = ()
+    made: dict[str, _Made] = Field(default_factory=dict)
 
 
 @takes(RunOptions)
@@ -161,31 +168,43 @@ def run(
     """
     asked = RunOptions(**options)
     read, place = read_session(session, values), Path(output)
-    again = (place / SUMMARY).is_file()
+    again, earlier = (place / SUMMARY).is_file(), _Earlier()
     if again and not asked.resume:
         raise MitsimError(f"output {place}: holds a session already; go on with resume=True, or choose another folder")
     with output_folder(place, overwrite=again) as folder:
-        steps = _Steps(read, folder, job or Job(), asked, _earlier(folder) if again else _Earlier())
-        prepared = [(step, steps.prepare(step)) for step in read.steps if steps.makes(step)]
-        steps.check_bench()
-        own = [folder / name for name in (SUMMARY, SESSION_FILE)]
-        before = {path: path.read_bytes() if path.is_file() else None for path in own}
+        if again:
+            known, where = read_json(folder / SUMMARY), f"resume=True: {folder / SUMMARY}"
+            if not isinstance(known, dict) or known.get("kind") != KIND:
+                raise MitsimError(f"{where} is not that of a session; use another folder")
+            earlier = validate(_Earlier, known, where)
+        steps = _Steps(read, folder, job or Job(), asked, {step.output: step for step in earlier.steps}, earlier.made)
+        work = [(step, steps.prepare(step)) for step in read.steps if steps.makes(step)]
+        steps.check_bench(work)
+        before = {
+            path: path.read_bytes() if path.is_file() else None for path in (folder / SUMMARY, folder / SESSION_FILE)
+        }
         head = {"kind": KIND, "session": portable(read.tables, folder), "versions": deciding_versions()}
         results, text = list[StepResult](), session_text(read.tables, folder)
 
         def note() -> None:
             """Write what is finished and what is at work, so that a killed session can be resumed."""
-            kept = {**steps.earlier.by_output, **{each.output: each for each in results}}
-            told = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
-            write_json(folder / SUMMARY, {**head, **told})
+            kept = {**steps.earlier, **{each.output: each for each in results}}
+            stated = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
+            write_json(folder / SUMMARY, {**head, **stated})
+            write_text(folder / SESSION_FILE, text)
 
         try:
-            for step, task in prepared:
-                if not (finished := steps.is_finished(step, task)):
-                    steps.begin(step)
-                note()
-                write_text(folder / SESSION_FILE, text)
-                results.append(_take(step, task, steps, finished))
+            for step, task in work:
+                started = time.perf_counter()
+                if steps.is_finished(step):
+                    note()
+                    found = replace(steps.earlier[step.output], left_alone=True)
+                else:
+                    with steps.making(step):
+                        note()
+                        says, warnings = _end(task)
+                    found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
+                results.append(replace(found, page=steps.page_of(step, found.left_alone)))
         except MitsimError:
             if all(each.left_alone for each in results):  # nothing was made: it is the session that it was
                 for path, data in before.items():
@@ -201,58 +220,12 @@ def run(
     return done
 
 
-KIND = "session"
-"""What session.json says that the folder is."""
-
-
-class _Earlier(BaseModel):
-    """What session.json states of an earlier run."""
-
-    kind: Literal["session"] = "session"
-    steps: tuple[StepResult, ...] = ()
-    made: dict[str, _Made] = Field(default_factory=dict)
-
-    @property
-    def by_output(self) -> dict[str, StepResult]:
-        return {step.output: step for step in self.steps}
-
-
-def _earlier(folder: Path) -> _Earlier:
-    """Return the state of an earlier run in a ``folder``; MitsimError if the folder holds no session."""
-    found = read_json(folder / SUMMARY)
-    if not isinstance(found, dict) or found.get("kind") != KIND:
-        raise MitsimError(f"resume=True: {folder / SUMMARY} is not that of a session; use another folder")
-    return validate(_Earlier, found, f"resume=True: {folder / SUMMARY}")
-
-
-def _take(step: Step, task: _Task, steps: _Steps, finished: bool) -> StepResult:
-    """Run the ``task`` of a ``step``, unless it is ``finished``, and write the step's page."""
-    started, folder, pictures = time.perf_counter(), steps.folder, steps.asked.pictures
-    place = folder / step.output
-    if finished:
-        found = replace(steps.earlier.by_output[step.output], left_alone=True)
-    else:
-        with steps.earlier_aside(step):
-            says, warnings = task.work()
-        steps.end(step)
-        found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
-    if pictures and step.verb in FOLDERS and not (found.left_alone and (place / PAGE).is_file()):
-        from mitsim.report.folder_page import report_folder
-
-        report_folder(place)
-    pages = [place / PAGE, *sorted(place.glob("*.html"))] if place.is_dir() else []
-    page = next((str(each.relative_to(folder)) for each in pages if each.is_file()), "")
-    return replace(found, page=page)
-
-
 def _write_page(folder: Path, session: str, results: Sequence[StepResult], job: Job | None) -> str:
     """Write the page of a session into its ``folder``, and return the page's path."""
     from mitsim.report.pages import render_page
 
-    images = [step.output for step in results if (folder / step.output / "image.png").is_file()]
     flagged = sum(bool(step.warnings) for step in results)
-    count = f"{len(results)} step{'s' * (len(results) > 1)}"
-    verdict = f"{count} done" + (f", {flagged} flagged" if flagged else "")
+    verdict = f"{len(results)} step{'s' * (len(results) > 1)} done" + (f", {flagged} flagged" if flagged else "")
     page = render_page(
         "session.html",
         folder=folder.absolute(),
@@ -260,7 +233,7 @@ def _write_page(folder: Path, session: str, results: Sequence[StepResult], job: 
         warnings=SessionResult(tuple(results), "").warnings,
         command=job and job.command,
         steps=results,
-        images=images,
+        images=[step.output for step in results if (folder / step.output / "image.png").is_file()],
         text=session,
         file=SESSION_FILE,
     )
@@ -271,55 +244,36 @@ def _write_page(folder: Path, session: str, results: Sequence[StepResult], job: 
 # ---- Steps -----------------------------------------------------------------------------------------------------------
 
 Said = tuple[str, Sequence[str]]
-"""What a step came to, in a line, and its warnings."""
+"""Result of a step in a line, and its warnings."""
+Work = Generator[None, None, Said]
+"""A step's work. It has checked the request at its first yield, and has written nothing. A step of a bench has checked
+the opened scene at a second yield. Then it makes its files, and returns what it came to."""
 
 
-@dataclass(frozen=True)
-class _Task:
-    """What a step does, checked.
-
-    Attributes
-    ----------
-    work
-        makes its files.
-    load
-        reads what later steps need, where it is finished.
-    check
-        refuses what only the opened scene shows, before anything is written.
-    goes_on
-        whether it looks itself into what an earlier run left, and is therefore never left alone.
-    """
-
-    work: Callable[[], Said]
-    load: Callable[[], object] = lambda: None
-    check: Callable[[], object] = lambda: None
-    goes_on: bool = False
+def _end(work: Work) -> Said:
+    """Finish the ``work`` of a step."""
+    try:
+        while True:
+            next(work)
+    except StopIteration as ended:
+        said: Said = ended.value
+        return said
 
 
 @dataclass
 class _Steps:
     """The steps of a ``session`` in a ``folder``, and what they share, which is made once.
 
-    Attributes
-    ----------
-    session, folder, job, asked
-        as of :func:`run`.
-    earlier
-        what an earlier run in the folder came to.
-    made
-        files of each step by its output, of the earlier run until a step begins again.
-    plan, light
-        that the capture is made by; None without a step that makes them.
+    ``earlier`` are results of an earlier run in the folder, and ``made`` the files, by the step's output. ``plan`` and
+    ``light`` are those of an earlier step, by which frames are captured.
     """
 
     session: Session
     folder: Path
     job: Job
     asked: RunOptions
-    earlier: _Earlier
-    made: dict[str, _Made] = field(init=False)
-    before: _Made | None = field(default=None, init=False)
-    checks: list[Callable[[], object]] = field(default_factory=list, init=False)
+    earlier: Mapping[str, StepResult]
+    made: dict[str, _Made]
     plan: Plan | None = field(default=None, init=False)
     light: Light | None = field(default=None, init=False)
 
@@ -327,24 +281,25 @@ class _Steps:
         """Return True if a ``step`` makes files itself; next to a sweep, some steps only state values of its points."""
         return self.session.step("sweep") is None or step.verb not in FOLDERS
 
-    def prepare(self, step: Step) -> _Task:
-        """Check a ``step`` before any work, and return its task."""
+    def prepare(self, step: Step) -> Work:
+        """Return the work of a ``step``, whose request is checked."""
         shared = step.verb == "sweep" or (step.verb == "study" and is_experiment(step.values["name"]))
         if not shared:
             idle = self.asked.without("resume", "pictures")
-            refuse_unused(
-                [name for name in idle if idle[name] != RunOptions.model_fields[name].default],
-                idle,
-                f"on [{step.verb}], which has no points to share",
-            )
-        task = _TASKS[step.verb](self, step)
-        self.checks += [task.check] if step.verb in OF_A_BENCH else []
-        return task
+            given = [name for name in idle if idle[name] != RunOptions.model_fields[name].default]
+            refuse_unused(given, idle, f"on [{step.verb}], which has no points to share")
+        work = _WORK[step.verb](self, step)
+        next(work)
+        return work
 
-    # ---- what is there already ----
+    def check_bench(self, prepared: Sequence[tuple[Step, Work]]) -> None:
+        """Open the scene if a step needs it, and refuse what only the opened scene shows."""
+        for step, work in prepared:
+            if step.verb in OF_A_BENCH:
+                self.bench  # noqa: B018 - opens it
+                next(work)
 
-    def __post_init__(self) -> None:
-        self.made = dict(self.earlier.made)
+    # ---- Files that are there already ----
 
     def inputs(self, step: Step) -> str:
         """Return the SHA-256 of all that decides the files of a ``step``: values, files that it reads, steps before."""
@@ -359,62 +314,60 @@ class _Steps:
             asked["read"] = [_checksums(place) for place in places if place.exists()]
         return hashlib.sha256(json.dumps(plain(asked), sort_keys=True).encode()).hexdigest()
 
-    def is_finished(self, step: Step, task: _Task) -> bool:
-        """Return True if an earlier run made the ``step``'s files from the same inputs and they have not changed; the
-        ``task`` then loads what later steps need."""
+    def is_finished(self, step: Step) -> bool:
+        """Return True if an earlier run made the ``step``'s files from the same inputs and they have not changed."""
         if step.verb == "transport":  # whose light is in no file
             capture = self.session.step("capture")
-            known = step.output in self.earlier.by_output
-            return known and capture is not None and self.is_finished(capture, task)
+            return step.output in self.earlier and capture is not None and self.is_finished(capture)
         made = self.made.get(step.output)
-        if task.goes_on or made is None or not made.files or step.output not in self.earlier.by_output:
-            return False
+        if step.verb in ("sweep", "study") or made is None or not made.files or step.output not in self.earlier:
+            return False  # a study looks itself into what an earlier run left
         there = _checksums(self.folder / step.output)
         same = made.inputs == self.inputs(step) and all(there.get(name) == each for name, each in made.files.items())
-        if same:
-            task.load()
+        if same and step.verb == "plan":
+            from mitsim.light.plan import Plan
+
+            self.plan = Plan.load(self.folder / step.output / "plan.json")
         return same
 
-    def begin(self, step: Step) -> None:
-        """Note that a ``step`` is at work, so that its earlier files no longer count as finished."""
-        self.before = self.made.get(step.output)
-        self.made[step.output] = _Made(inputs="")
-
-    def end(self, step: Step) -> None:
-        self.made[step.output] = _Made(inputs=self.inputs(step), files=_checksums(self.folder / step.output))
-
     @contextmanager
-    def earlier_aside(self, step: Step) -> Iterator[None]:
-        """Keep an earlier image or export aside until it is made again, and restore it if that is refused. MitsimError
-        if the folder has files that the session did not make."""
+    def making(self, step: Step) -> Iterator[None]:
+        """Note that a ``step`` is at work, so that its earlier files no longer count as finished, and what it made. An
+        earlier image or export is kept aside, and restored if the step is refused; MitsimError if its folder has files
+        that the session did not make."""
         place, aside = self.folder / step.output, self.folder / f".{step.output}.before"
         _remove(aside)
-        if self.before is None or step.verb not in ("reconstruct", "export") or not place.exists():
-            yield
-            return
-        others = _checksums(place).keys() - self.before.files.keys() if self.before.files else ()
-        if others or place.is_symlink():
-            self.made[step.output] = self.before
-            other = min(others, default="it")
-            raise MitsimError(f"output {place}: is made anew, and {other} is not the session's; move that away")
-        os.replace(place, aside)
+        before, self.made[step.output] = self.made.get(step.output), _Made(inputs="")
+        again = before is not None and step.verb in ("reconstruct", "export") and place.exists()
         try:
+            if again and before is not None:
+                others = _checksums(place).keys() - before.files.keys() if before.files else ()
+                if others or place.is_symlink():
+                    other = min(others, default="it")
+                    raise MitsimError(f"output {place}: is made anew, and {other} is not the session's; move that away")
+                os.replace(place, aside)
             yield
         except BaseException:
-            _remove(place)
-            os.replace(aside, place)
-            self.made[step.output] = self.before
+            if again and before is not None:
+                if aside.exists():
+                    _remove(place)
+                    os.replace(aside, place)
+                self.made[step.output] = before
             raise
         _remove(aside)
+        self.made[step.output] = _Made(inputs=self.inputs(step), files=_checksums(place))
 
-    # ---- the bench ----
+    def page_of(self, step: Step, left_alone: bool) -> str:
+        """Write the page of a finished ``step`` unless it is there, and return its name; empty without one."""
+        place = self.folder / step.output
+        if self.asked.pictures and step.verb in FOLDERS and not (left_alone and (place / PAGE).is_file()):
+            from mitsim.report.folder_page import report_folder
 
-    def check_bench(self) -> None:
-        """Open the scene if a step needs it, and refuse what only the opened scene shows."""
-        if self.checks:
-            self.bench  # noqa: B018 - opens it
-        for check in self.checks:
-            check()
+            report_folder(place)
+        pages = [place / PAGE, *sorted(place.glob("*.html"))] if place.is_dir() else []
+        return next((str(each.relative_to(self.folder)) for each in pages if each.is_file()), "")
+
+    # ---- The bench, and folders that steps read ----
 
     @cached_property
     def opening(self) -> Opening:
@@ -427,69 +380,66 @@ class _Steps:
         colours = {step.values.get("colour", NO) for step in self.session.steps} - {NO}
         return open_as(self.session.scene["scene"], self.opening, self.job, min(colours, default=NO))
 
-    def _check_bench(self, patterns: str | None, timing: Exposure | None, colour: str = NO) -> None:
-        self.opening.check(self.session.scene["scene"], patterns, timing, colour)
+    def _asked(self, request: Request, timing: Exposure | None, colour: str = NO) -> Generator[None, None, None]:
+        """Check a ``request``, and that its patterns fit the opened scene's projector."""
+        self.opening.check(self.session.scene["scene"], request.patterns, timing, colour)
+        yield
+        self.bench.family(request.patterns, request.seed)
+        yield
 
-    # ---- a verb each ----
+    def _source(self, step: Step, name: str) -> Path:
+        """Folder of the ``run`` or the ``calibration`` of a ``step``: the one that it names, or this session's."""
+        if name in step.values:
+            return Path(step.values[name])
+        own = self.session.step("capture" if name == "run" else "calibrate")
+        return self.folder / (own.output if own else name)
 
-    def _plan(self, step: Step) -> _Task:
-        asked, place = request_of(step), self.folder / step.output / "plan.json"
-        self._check_bench(Request.of(**asked).patterns, None)
+    def _check_folders(self, step: Step, coloured: bool) -> None:
+        """Refuse folders that a ``step`` reads and that are damaged, or of another kind."""
+        folders: dict[str, Any] = {"run": RunManifest, "calibration": CalibrationManifest}
+        for name, model in folders.items():
+            if name in step.values and not coloured and not is_coloured(folder := Path(step.values[name])):
+                from mitsim.core.exr import verify_files
 
-        def load() -> None:
-            from mitsim.light.plan import Plan
+                verify_files(folder, read_manifest(folder, model).checksums, "make it again, or copy it again")
 
-            self.plan = Plan.load(place)
+    # ---- A verb each ----
 
-        def work() -> Said:
-            self.plan = self.bench.plan(**asked)
-            place.parent.mkdir(exist_ok=True)
-            self.plan.save(place)
-            return (
-                f"{self.plan.predicted_seconds:.3g} s, error up to {self.plan.systematic_bound:.1e}",
-                self.plan.warnings,
-            )
+    def _plan(self, step: Step) -> Work:
+        asked, place = step.of(Request), self.folder / step.output / "plan.json"
+        yield from self._asked(Request(**asked), None)
+        self.plan = plan = self.bench.plan(**asked)
+        place.parent.mkdir(exist_ok=True)
+        plan.save(place)
+        return f"{plan.predicted_seconds:.3g} s, error up to {plan.systematic_bound:.1e}", plan.warnings
 
-        return _Task(work, load, self._fits(asked))
+    def _transport(self, step: Step) -> Work:
+        asked = step.of(Request)
+        yield from self._asked(Request(**asked), None)
+        self.light = self.bench.light(job=self.job.apart("transport "), **asked)
+        return f"{self.light.paths} paths of light by projector pixel", self.light.warnings
 
-    def _transport(self, step: Step) -> _Task:
-        asked = request_of(step)
-        self._check_bench(Request.of(**asked).patterns, None)
+    def _capture(self, step: Step) -> Work:
+        own, colour, place = step.of(Request), step.values.get("colour", NO), self.folder / step.output
+        above, request = self.session.step("transport") or self.session.step("plan"), Request(**own)
+        if above:
+            request = Request(**above.of(Request)).with_values(**request.model_dump(exclude_unset=True))
+        yield from self._asked(request, request.timing, colour)
+        task = Task(place, self.asked.resume, self.job.apart("capture "))
+        more = own if self.plan else {name: value for name, value in own.items() if name != "patterns"}
+        found = capture_in(self.bench, colour, self.plan or request.patterns, more, task, self.light)
 
-        def work() -> Said:
-            self.light = self.bench.light(job=self.job.apart("transport "), **asked)
-            return f"{self.light.paths} paths of light by projector pixel", self.light.warnings
+        def said(result: Mapping[str, Any]) -> Said:
+            size, bound = "x".join(map(str, result["shape"])), result["total_error_bound"]
+            says = f"{result['frames']} frames of {size}, error up to {bound:.1e}, {result['exposure_s']:.3g} s each"
+            return says, result["warnings"]
 
-        return _Task(work, check=self._fits(asked))
+        if isinstance(found, Mapping):
+            return _of_lines({name: said(run.summary()) for name, run in found.items()})
+        return said(found.summary())
 
-    def _fits(self, asked: Mapping[str, Any]) -> Callable[[], object]:
-        """Return a check that the patterns ``asked`` for fit the opened scene's projector."""
-        request = Request.of(**asked)
-        return lambda: self.bench.family(request.patterns, request.seed)
-
-    def _capture(self, step: Step) -> _Task:
-        own, colour, place = request_of(step), step.values.get("colour", NO), self.folder / step.output
-        above = self.session.step("transport") or self.session.step("plan")
-        planned = Request.of(**request_of(above)) if above else None
-        request = (
-            planned.with_values(**Request.of(**own).model_dump(exclude_unset=True)) if planned else Request.of(**own)
-        )
-        self._check_bench(request.patterns, request.timing, colour)
-
-        def work() -> Said:
-            task = Task(place, self.asked.resume, self.job.apart("capture "))
-            what = self.plan or request.patterns
-            more = own if self.plan else {name: value for name, value in own.items() if name != "patterns"}
-            found = capture_in(self.bench, colour, what, more, task, self.light)
-            if isinstance(found, Mapping):
-                return _of_lines({name: _of_run(run.summary()) for name, run in found.items()})
-            return _of_run(found.summary())
-
-        return _Task(work, check=self._fits({"patterns": request.patterns, "seed": request.seed}))
-
-    def _calibrate(self, step: Step) -> _Task:
-        place, colour = self.folder / step.output, step.values.get("colour", NO)
-        values = {name: value for name, value in step.values.items() if name in SessionRequest.model_fields}
+    def _calibrate(self, step: Step) -> Work:
+        values, colour = step.of(SessionRequest), step.values.get("colour", NO)
         if (own := values.get("recipe")) is not None:
             table = isinstance(own, Mapping)
             values["recipe"] = validate(SessionRecipe, dict(own), "recipe") if table else load_recipe(own)
@@ -497,30 +447,33 @@ class _Steps:
         recipe = asked.recipe or load_recipe()
         if colour != NO:
             recipe.of_one_depth()
-        self._check_bench("uniform", Exposure(None, recipe.exposure_fraction), colour)
+        timing = Exposure(None, recipe.exposure_fraction)
+        self.opening.check(self.session.scene["scene"], "uniform", timing, colour)
+        yield
+        from mitsim.calibrate.board_session import Session as BoardSession
 
-        def check() -> None:
-            from mitsim.calibrate.board_session import Session as BoardSession
+        if colour == NO and not recipe.depths:
+            BoardSession(self.bench, recipe, asked.seed).check_mask(self.job)
+        yield
+        task = Task(self.folder / step.output, self.asked.resume, self.job.apart("calibrate "))
+        said = {}
+        for name, factors in calibrate_in(self.bench, colour, asked, task).items():
+            result = factors.manifest.result
+            numbers = (result[each] for each in ("phi_error", "separability_residual"))
+            error, residual = (math.inf if each is None else each for each in numbers)  # JSON has no infinity
+            says = f"{result['frames']} frames, factor error {error:.1e}, separability residual {residual:.2%}"
+            said[name] = says, result["warnings"]
+        return said[""] if [*said] == [""] else _of_lines(said)
 
-            if colour == NO and not recipe.depths:
-                BoardSession(self.bench, recipe, asked.seed).check_mask(self.job)
-
-        def work() -> Said:
-            task = Task(place, self.asked.resume, self.job.apart("calibrate "))
-            found = calibrate_in(self.bench, colour, asked, task)
-            said = {name: _of_calibration(each.manifest.result) for name, each in found.items()}
-            return said[""] if [*said] == [""] else _of_lines(said)
-
-        return _Task(work, check=check)
-
-    def _reconstruct(self, step: Step) -> _Task:
-        values, place, options = step.values, self.folder / step.output, image_request(step)
+    def _reconstruct(self, step: Step) -> Work:
+        values, place, options = step.values, self.folder / step.output, step.of(ImageRequest)
         run, calibration = (self._source(step, name) for name in ("run", "calibration"))
-        capture = self.session.step("capture")
-        coloured = is_coloured(run) if "run" in values else bool(capture and capture.values.get("colour", NO) != NO)
-        mosaic = bool(capture and capture.values.get("colour") == "mosaic")
         if "run" in values:
-            mosaic = open_lines(run, RUN, MOSAIC).filters is not None
+            coloured, mosaic = is_coloured(run), open_lines(run, RUN, MOSAIC).filters is not None
+        else:
+            capture = self.session.step("capture")
+            colour = capture.values.get("colour", NO) if capture else NO
+            coloured, mosaic = colour != NO, colour == "mosaic"
         if str(options.get("method", "")).endswith(MODEL):
             from mitsim.learn.verbs import load_network
 
@@ -541,101 +494,73 @@ class _Steps:
             if not coloured:
                 raise ArgumentError("chart", f"{values['chart']}: the frames are not coloured; leave it out")
             chart = load_chart(values["chart"])
+        yield
+        from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
 
-        def work() -> Said:
-            from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
+        job = self.job.apart(f"{step.output} ")
+        if coloured:
+            colours = reconstruct_colours(run, calibration, place, chart, job=job, page=False, **options)
+            known = "" if colours.psnr_db is None else f", PSNR {colours.psnr_db:.2f} dB over all lines"
+            return f"an image of every line{known}", colours.warnings
+        judged = reconstruct(run, calibration, place, job=job, **options)
+        sentence = f"{judged.reconstruction.status.sentence}."
+        return str(judged.quality or sentence), judged.summary()["warnings"]
 
-            job = self.job.apart(f"{step.output} ")
-            if coloured:
-                colours = reconstruct_colours(run, calibration, place, chart, job=job, page=False, **options)
-                known = "" if colours.psnr_db is None else f", PSNR {colours.psnr_db:.2f} dB over all lines"
-                return f"an image of every line{known}", colours.warnings
-            judged = reconstruct(run, calibration, place, job=job, **options)
-            image = judged.reconstruction
-            return str(judged.quality or f"{image.status.sentence}."), judged.summary()["warnings"]
+    def _demo(self, step: Step) -> Work:
+        request = Request(**step.of(Request))
+        yield from self._asked(request, request.timing)
+        from mitsim.studies.demo import demo
 
-        return _Task(work)
+        found = demo(self.bench, self.folder / step.output, request, self.job.apart("demo "))
+        return found.verdict, found.warnings
 
-    def _check_folders(self, step: Step, coloured: bool) -> None:
-        """Refuse folders that a ``step`` reads and that are damaged, or of another kind."""
-        folders: dict[str, Any] = {"run": RunManifest, "calibration": CalibrationManifest}
-        for name, model in folders.items():
-            if name in step.values and not coloured and not is_coloured(folder := Path(step.values[name])):
-                from mitsim.core.exr import verify_files
-
-                remedy = "make it again, or copy it again"
-                verify_files(folder, read_manifest(folder, model).checksums, remedy)
-
-    def _source(self, step: Step, name: str) -> Path:
-        """Folder of the ``run`` or the ``calibration`` of a ``step``: the one that it names, or this session's."""
-        if name in step.values:
-            return Path(step.values[name])
-        own = self.session.step("capture" if name == "run" else "calibrate")
-        return self.folder / (own.output if own else name)
-
-    def _demo(self, step: Step) -> _Task:
-        request = Request.of(**request_of(step))
-        self._check_bench(request.patterns, request.timing)
-
-        def work() -> Said:
-            from mitsim.studies.demo import demo
-
-            found = demo(self.bench, self.folder / step.output, request, self.job.apart("demo "))
-            return found.verdict, found.warnings
-
-        return _Task(work, check=self._fits(request_of(step)))
-
-    def _sweep(self, step: Step) -> _Task:
-        options = {**sweep_options(self.session, step), **self.opening.given}
-        return self._study_of("sweep", self.session.scene["scene"], step, options)
-
-    def _study(self, step: Step) -> _Task:
-        values = {name: value for name, value in step.values.items() if name not in ("name", "scene")}
-        if "over" in values:
-            values["over"] = swept_values(values["over"])
-        return self._study_of(step.values["name"], step.values.get("scene"), step, values)
-
-    def _study_of(self, name: str, scene: str | None, step: Step, options: Mapping[str, Any]) -> _Task:
-        """Return the study of a ``name`` with its ``options``, of points shared as is asked for."""
+    def _study(self, step: Step) -> Work:
+        if step.verb == "sweep":
+            name, scene = "sweep", self.session.scene["scene"]
+            options = {**sweep_options(self.session, step), **self.opening.given}
+        else:
+            options = dict(step.values)
+            name, scene = options.pop("name"), options.pop("scene", None)
+            options |= {"over": swept_values(options["over"])} if "over" in options else {}
         asked = StudyOptions(**options, **self.asked.without("resume", "pictures"))
         study = prepare_study(name, scene, self.folder / step.output, asked, self.job.apart(f"{step.output} "))
+        yield
+        found = study()
+        return found.lines()[0], found.warnings
 
-        def work() -> Said:
-            found = study()
-            return found.lines()[0], found.warnings
-
-        return _Task(work, goes_on=True)
-
-    def _export(self, step: Step) -> _Task:
-        values = {name: value for name, value in step.values.items() if name in ("format", "projector")}
+    def _export(self, step: Step) -> Work:
+        values, place = step.values, self.folder / step.output
+        how = {name: values[name] for name in ("format", "projector") if name in values}
         run, calibration = self._source(step, "run"), None
-        if "calibration" in step.values or calibration_for(self.session, step):
+        if "calibration" in values or calibration_for(self.session, step):
             calibration = self._source(step, "calibration")
         check_format(values["format"], step.output, calibration, values.get("projector"))
-        if "run" in step.values and ("calibration" in step.values or calibration is None):
-            check_export(run, output=self.folder / step.output, calibration=calibration, **values)
+        if "run" in values and ("calibration" in values or calibration is None):
+            check_export(run, output=place, calibration=calibration, **how)
         self._check_folders(step, is_coloured(run))
         if step.output not in self.made:
-            check_output(self.folder / step.output, kind="folder" if values["format"] == PNG else "file")
-
-        def work() -> Said:
-            found = export(run, output=self.folder / step.output, calibration=calibration, **values)
-            return f"{found['frames']} frames as {found['format']}", ()
-
-        return _Task(work)
+            check_output(place, kind="folder" if values["format"] == PNG else "file")
+        yield
+        found = export(run, output=place, calibration=calibration, **how)
+        return f"{found['frames']} frames as {found['format']}", ()
 
 
-_TASKS: Mapping[str, Callable[[_Steps, Step], _Task]] = {
+_WORK = {
     "plan": _Steps._plan,
     "transport": _Steps._transport,
     "capture": _Steps._capture,
     "calibrate": _Steps._calibrate,
     "reconstruct": _Steps._reconstruct,
     "demo": _Steps._demo,
-    "sweep": _Steps._sweep,
+    "sweep": _Steps._study,
     "study": _Steps._study,
     "export": _Steps._export,
 }
+
+
+def _of_lines(each: Mapping[str, Said]) -> Said:
+    warnings = [f"{name}: {text}" for name, (_, texts) in each.items() for text in texts]
+    return "; ".join(f"{name} {says}" for name, (says, _) in each.items()), warnings
 
 
 def _checksums(place: Path) -> dict[str, str]:
@@ -671,22 +596,3 @@ def _remove(place: Path) -> None:
         shutil.rmtree(place)
     else:
         place.unlink(missing_ok=True)
-
-
-def _of_run(found: Mapping[str, Any]) -> Said:
-    size = "x".join(map(str, found["shape"]))
-    says = f"{found['frames']} frames of {size}, error up to {found['total_error_bound']:.1e}"
-    return f"{says}, {found['exposure_s']:.3g} s each", found["warnings"]
-
-
-def _of_calibration(result: Mapping[str, Any]) -> Said:
-    error, residual = (
-        math.inf if result[name] is None else result[name] for name in ("phi_error", "separability_residual")
-    )
-    says = f"{result['frames']} frames, factor error {error:.1e}, separability residual {residual:.2%}"
-    return says, result["warnings"]
-
-
-def _of_lines(each: Mapping[str, Said]) -> Said:
-    warnings = [f"{name}: {text}" for name, (_, texts) in each.items() for text in texts]
-    return "; ".join(f"{name} {says}" for name, (says, _) in each.items()), warnings

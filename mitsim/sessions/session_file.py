@@ -10,7 +10,6 @@ import sys
 import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -65,18 +64,18 @@ def _several_values(name: str, values: Any) -> Any:
     raise ArgumentError(name, f"{short_text(values)}: give a list of values, or {{ from = A, to = B, count = N }}")
 
 
-class _Placed(Options):
-    """Name of a step's folder or file in that of the session."""
-
-    output: FilePath | None = option(None, "folder of the step")
-
-
 def _recipe(recipe: Any) -> None:
     """Refuse a ``recipe`` that is neither a file's path nor a table of a recipe."""
     if isinstance(recipe, Mapping):
         validate(SessionRecipe, dict(recipe), "recipe")
     elif not is_path(recipe):
         raise ArgumentError("recipe", f"{short_text(recipe)}: give a path, or a table of a recipe's fields")
+
+
+class _Placed(Options):
+    """Name of a step's folder or file in that of the session."""
+
+    output: FilePath | None = option(None, "folder of the step")
 
 
 class _Scene(Opening):
@@ -153,69 +152,65 @@ TABLES: dict[str, type[Options]] = {
 }
 """Model of each table, in the order in which the steps are taken."""
 SEVERAL = "reconstruct", "study", "export"
-"""Tables that may stand there more than once, as ``[[reconstruct]]``."""
+"""Tables that may be there more than once, as ``[[reconstruct]]``."""
+OF_A_BENCH = "plan", "transport", "capture", "calibrate", "demo"
+"""Verbs that open the scene here; a sweep does so itself."""
+FOLDERS = {"capture": "run", "calibrate": "calibration", "reconstruct": "image"}
+"""Where the results of some steps go; those of others are called like their table."""
+SESSION_FILE, SUMMARY = "session.toml", "session.json"
+"""Files in a session's folder: the request, and the result of each step."""
+_RESERVED = PAGE, PICTURES, SESSION_FILE, SUMMARY
+"""Names in the session's folder that no step may write to."""
 _LEFT_OUT = {"scene": {"parameters"}, "export": {"overwrite"}, "study": {"shard", "scheduler", "experiment"}}
 """Fields of the models that a table does not have."""
-FOLDERS = {"capture": "run", "calibrate": "calibration", "reconstruct": "image"}
-"""Where the results of some steps go, which others are called like their table."""
+_SPELLED = {"lam": "lambda"}
+"""Fields that a file calls otherwise than Python."""
 
 
 def fields_of(table: str) -> dict[str, FieldInfo]:
     """Return the fields of a ``table`` by the names that a file gives them."""
-    left_out = _LEFT_OUT.get(table, set())
-    return {
-        "lambda" if name == "lam" else name: each
-        for name, each in TABLES[table].model_fields.items()
-        if name not in left_out
-    }
-
-
-# ---- Steps -----------------------------------------------------------------------------------------------------------
+    fields, left_out = TABLES[table].model_fields, _LEFT_OUT.get(table, set())
+    return {_SPELLED.get(name, name): each for name, each in fields.items() if name not in left_out}
 
 
 @dataclass(frozen=True)
 class Step:
-    """What one verb is asked for.
-
-    Attributes
-    ----------
-    verb
-        its name.
-    values
-        of its arguments, those that are given.
-    output
-        name of its folder, or file, in the session's.
-    """
+    """One verb, the ``values`` of its arguments that are given, and the name of its ``output`` in the session's."""
 
     verb: str
     values: Mapping[str, Any]
     output: str
 
+    def of(self, model: type[Options]) -> dict[str, Any]:
+        """Return the values of the fields of a ``model``."""
+        spelled = {name: _SPELLED.get(name, name) for name in model.model_fields}
+        return {name: self.values[key] for name, key in spelled.items() if key in self.values}
+
 
 @dataclass(frozen=True)
 class Session:
-    """What a session file says, checked.
+    """A session file, checked.
 
     Attributes
     ----------
     scene
-        arguments that open the bench; empty where no step needs one.
+        Arguments that open the bench; empty where no step needs one.
     steps
-        in the order in which they are taken.
+        Steps in the order in which they are taken.
     tables
-        as a file holds them, with whole paths; nothing of what the caller gave.
-    where
-        the file, for messages.
+        Tables as a file holds them, with whole paths; a copy of those of the caller.
     """
 
     scene: Mapping[str, Any]
     steps: tuple[Step, ...]
     tables: Mapping[str, Any]
-    where: str = "session"
 
     def step(self, verb: str) -> Step | None:
         """Return the first step of a ``verb``."""
         return next((step for step in self.steps if step.verb == verb), None)
+
+
+# ---- Text ------------------------------------------------------------------------------------------------------------
 
 
 def session_text(tables: Mapping[str, Any], base: Path | None = None, *notes: str) -> str:
@@ -232,8 +227,8 @@ def session_text(tables: Mapping[str, Any], base: Path | None = None, *notes: st
         lines of comment that it begins with; line ends and control characters in them become spaces.
     """
     held = portable(tables, base) if base else _copy(tables, unset=False)
-    parts = [" ".join(f"# {printable(note)}".split()) for note in notes]
-    parts = ["\n".join(parts) + "\n"] if parts else []
+    head = "".join(" ".join(f"# {printable(note)}".split()) + "\n" for note in notes)
+    parts = [head] if head else []
     for name in (name for name in TABLES if name in held):
         once = name not in SEVERAL
         # The library writes several short tables as one list on a line, which people read less well.
@@ -294,11 +289,12 @@ def read_session(source: Path | str | Mapping[str, Any], changes: Mapping[str, A
     found = _Mistakes(data, {_change(data, name, value, where) for name, value in (changes or {}).items()})
     for name, held in data.items():
         if name not in TABLES:
-            found.say((name,), f"got {short_text(held)}, no such field; {near_name(name, TABLES) or 'use '}"
-                               f"{', '.join(TABLES) if not near_name(name, TABLES) else ''}".rstrip())  # fmt: skip
+            hint = near_name(name, TABLES).strip() or f"use {', '.join(TABLES)}"
+            found.say((name,), f"got {short_text(held)}, no such field; {hint}")
     tables, steps = dict[str, Any](), list[Step]()
     for name in (name for name in TABLES if name in data):
         each = data[name] if name in SEVERAL and isinstance(data[name], list) else [data[name]]
+        tables[name] = [*each] if name in SEVERAL else data[name]
         for number, values in enumerate(each):
             place: Place = (name, number) if name in SEVERAL else (name,)
             if not isinstance(values, Mapping):
@@ -308,11 +304,9 @@ def read_session(source: Path | str | Mapping[str, Any], changes: Mapping[str, A
             own = {key: value for key, value in values.items() if key != "output"}
             first = str(own.get("name")) if name == "study" else FOLDERS.get(name, name)
             output = values.get("output") or f"{first}{f'-{number + 1}' if number else ''}"
-            steps.append(Step(name, own, str(output)))
-        tables[name] = [*each] if name in SEVERAL else data[name]
-    session = Session(
-        dict(tables.get("scene") or {}), tuple(step for step in steps if step.verb != "scene"), tables, where
-    )
+            if name != "scene":
+                steps.append(Step(name, own, str(output)))
+    session = Session(dict(tables.get("scene") or {}), tuple(steps), tables)
     _check_steps(session, found)
     if found.mistakes:
         raise refuse_together(where, [*dict.fromkeys(found.mistakes)])
@@ -336,33 +330,31 @@ class _Mistakes:
         line = 0 if place in self.changed or there in self.changed else self.data.line(there)
         self.mistakes.append((line, f"{'.'.join(map(str, place))}: {text}"))
 
-    def attempt(self, place: Place, call: Callable[[], object]) -> None:
+    def attempt(self, place: Place, call: Callable[..., object], *arguments: Any, **named: Any) -> None:
         """Note all that a ``call`` refuses of a table at a ``place``."""
         try:
-            call()
+            call(*arguments, **named)
         except ArgumentError as error:
             for one in (error, *error.others):
-                argument = "lambda" if one.argument == "lam" else one.argument
-                text = str(one).removeprefix(f"{one.argument} ")
-                self.say((*place, *argument.split(".")), text)
+                argument = _SPELLED.get(one.argument, one.argument)
+                self.say((*place, *argument.split(".")), str(one).removeprefix(f"{one.argument} "))
         except MitsimError as error:
             self.say(place, str(error))
 
 
 def _check_table(name: str, values: Mapping[str, Any], place: Place, found: _Mistakes) -> None:
     """Note the mistakes in the ``values`` of a table."""
-    fields, asked = fields_of(name), dict[str, Any]()
+    fields = fields_of(name)
     for key, value in values.items():
-        if key in fields:
-            asked["lam" if key == "lambda" else key] = value
-        elif name == "scene" and key != "parameters":
-            found.attempt(place, partial(_one_value, key, value))
-        else:
+        if name == "scene" and key not in fields and key != "parameters":
+            found.attempt(place, _one_value, key, value)
+        elif key not in fields:
             hint = near_name(key, fields).strip() or f"known fields: {', '.join(fields)}"
             found.say((*place, key), f"got {short_text(value)}, no such field; {hint}")
+    asked = Step(name, {key: value for key, value in values.items() if key in fields}, "").of(TABLES[name])
     if name == "reconstruct" and str(asked.get("method")).endswith(MODEL):
         del asked["method"]
-    found.attempt(place, partial(TABLES[name], **asked))
+    found.attempt(place, TABLES[name], **asked)
 
 
 def _change(data: Table, name: str, value: Any, where: str) -> Place:
@@ -444,87 +436,66 @@ def _is_file(table: str, key: str, value: str, base: Path) -> bool:
 
 # ---- Steps that need each other --------------------------------------------------------------------------------------
 
-OF_A_BENCH = "plan", "transport", "capture", "calibrate", "demo"
-"""Verbs that open the scene here; a sweep does so itself."""
-SESSION_FILE, SUMMARY = "session.toml", "session.json"
-"""Files in a session's folder: what was asked for, and the result of each step."""
-_RESERVED = PAGE, PICTURES, SESSION_FILE, SUMMARY
-"""Names in the session's folder that no step may write to."""
-
 
 def _check_steps(session: Session, found: _Mistakes) -> None:
-    """Note steps that lack another, or that stand in the way of another."""
-    numbers = dict[str, int]()
+    """Note steps that lack another, or that are in the way of another."""
+
+    def same(name: str) -> str:
+        """Return the spelling that names share which a file system may confuse, whatever their case and accents."""
+        return unicodedata.normalize("NFC", name).casefold()
+
+    numbers, outputs = dict[str, int](), [same(step.output) for step in session.steps]
     for step in session.steps:
         number = numbers[step.verb] = numbers.get(step.verb, -1) + 1
         place: Place = (step.verb, number) if step.verb in SEVERAL else (step.verb,)
-        if step.verb in _CHECKS and place not in found.tables and not (step.verb == "sweep" and found.mistakes):
-            _CHECKS[step.verb](session, step, place, found)
+        if place not in found.tables and not (step.verb == "sweep" and found.mistakes):
+            _check_step(session, step, place, found)
         if Path(step.output).name != step.output or step.output.startswith("."):
             found.say((*place, "output"), f"{cut(repr(step.output))}: give a name without folders and no dot before it")
-        elif (name := _same_name(step.output)) in map(_same_name, _RESERVED):
-            found.say(
-                (*place, "output"), f"{step.output!r} is the session's own; give another than {', '.join(_RESERVED)}"
-            )
-        elif [_same_name(other.output) for other in session.steps].count(name) > 1:
-            found.say(
-                (*place, "output"), f"{cut(repr(step.output))} is another step's too; give each a name of its own"
-            )
+        elif (name := same(step.output)) in map(same, _RESERVED):
+            others = ", ".join(_RESERVED)
+            found.say((*place, "output"), f"{step.output!r} is the session's own; give another than {others}")
+        elif outputs.count(name) > 1:
+            given = cut(repr(step.output))
+            found.say((*place, "output"), f"{given} is another step's too; give each a name of its own")
         if step.verb in (*OF_A_BENCH, "sweep") and not session.scene:
             found.say(place, 'is of a scene, and there is none; add a table [scene] with scene = "NAME"')
     if not session.steps:
         found.mistakes.append((0, f"asks for nothing; add a table, such as [capture]: {', '.join(TABLES)}"))
 
 
-def _same_name(name: str) -> str:
-    """Return the spelling that names share which a file system may take for one: whatever their case and accents."""
-    return unicodedata.normalize("NFC", name).casefold()
-
-
-def request_of(step: Step) -> dict[str, Any]:
-    """Return the fields of a request in the values of a ``step``."""
-    return {name: value for name, value in step.values.items() if name in Request.model_fields}
-
-
-def image_request(step: Step) -> dict[str, Any]:
-    """Return the options of an image in the values of a ``step``."""
-    named = {"lam" if name == "lambda" else name: value for name, value in step.values.items()}
-    return {name: value for name, value in named.items() if name in ImageRequest.model_fields}
-
-
-def _check_capture(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    plan, light = session.step("plan"), session.step("transport")
-    above = light or plan
-    if above is None:
-        return
-    planned = ("accuracy", "seconds", "effects", *(("noise_fraction",) if light else ()))
-    for name in (name for name in planned if name in step.values):
-        found.say((*place, name), f"is the {above.verb}'s; give it in [{above.verb}]")
-    if plan is not None and light is not None:
-        found.say(("plan",), "stands beside [transport], which plans itself; leave one of them out")
-    if step.values.get("colour", NO) != NO:
-        found.say((*place, "colour"), f"stands beside [{above.verb}], which tells no light apart; leave one out")
-
-
-def _check_calibrate(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    capture = session.step("capture")
-    own, other = (each.values.get("colour", NO) if each else None for each in (step, capture))
-    if capture and own != other:
-        found.say((*place, "colour"), f"{own}, but the capture's is {other}; give both the same")
-
-
-def _check_reconstruct(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    for name, verb in (("run", "capture"), ("calibration", "calibrate")):
-        if name not in step.values and session.step(verb) is None:
+def _check_step(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
+    """Note the mistakes of a ``step`` beside the other ones."""
+    values, capture = step.values, session.step("capture")
+    colour, plan, light = values.get("colour", NO), session.step("plan"), session.step("transport")
+    if step.verb == "capture" and (above := light or plan):
+        for name in ("accuracy", "seconds", "effects", *(("noise_fraction",) if light else ())):
+            if name in values:
+                found.say((*place, name), f"is the {above.verb}'s; give it in [{above.verb}]")
+        if plan is not None and light is not None:
+            found.say(("plan",), "stands beside [transport], which plans itself; leave one of them out")
+        if colour != NO:
+            found.say((*place, "colour"), f"stands beside [{above.verb}], which tells no light apart; leave one out")
+    elif step.verb == "calibrate" and capture and colour != (other := capture.values.get("colour", NO)):
+        found.say((*place, "colour"), f"{colour}, but the capture's is {other}; give both the same")
+    elif step.verb == "export":
+        calibration = values.get("calibration") or calibration_for(session, step)
+        found.attempt(place, check_format, values["format"], step.output, calibration, values.get("projector"))
+    elif step.verb == "sweep":
+        found.attempt(place, sweep_options, session, step)
+        for each in session.steps:
+            if each.verb in ("plan", "transport", "demo", "export"):
+                beside = "stands beside [sweep], whose points make no folders of it; leave one of them out"
+                found.say((each.verb,), beside)
+            fixed = _SWEPT if each.verb == "capture" else ()
+            if each.verb in FOLDERS:
+                for name in (name for name in each.values if name not in fixed):
+                    few = f"[capture]'s {', '.join(fixed)}" if fixed else "none of it"
+                    found.say((each.verb, name), f"is not in a sweep's points, which take {few}; leave it out")
+    needed = {"run": "capture", "calibration": "calibrate"} if step.verb == "reconstruct" else {}
+    for name, verb in ({"run": "capture"} if step.verb == "export" else needed).items():
+        if name not in values and session.step(verb) is None:
             found.say((*place, name), f"is missing, and there is no [{verb}]; give the folder, or add the table")
-
-
-def _check_export(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    values = step.values
-    calibration = values.get("calibration") or calibration_for(session, step)
-    found.attempt(place, partial(check_format, values["format"], step.output, calibration, values.get("projector")))
-    if "run" not in values and session.step("capture") is None:
-        found.say((*place, "run"), "is missing, and there is no [capture]; give the folder, or add the table")
 
 
 def calibration_for(session: Session, step: Step) -> str | None:
@@ -533,39 +504,15 @@ def calibration_for(session: Session, step: Step) -> str | None:
     return own.output if own and step.values["format"] != PNG else None
 
 
-def _check_sweep(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    found.attempt(place, lambda: sweep_options(session, step))
-    for other in session.steps:
-        if other.verb in ("plan", "transport", "demo", "export"):
-            found.say((other.verb,), "stands beside [sweep], whose points make no folders of it; leave one of them out")
-        fixed = {"capture": ("patterns", "seed", "accuracy")}.get(other.verb, ())
-        if other.verb in ("capture", "calibrate", "reconstruct"):
-            for name in (name for name in other.values if name not in fixed):
-                few = f"[capture]'s {', '.join(fixed)}" if fixed else "none of it"
-                found.say((other.verb, name), f"is not in a sweep's points, which take {few}; leave it out")
-
-
 def sweep_options(session: Session, step: Step) -> dict[str, Any]:
-    """Return the options of the study that a sweep is.
-
-    Parameters
-    ----------
-    session, step
-        which has a step ``[sweep]``.
-
-    Raises
-    ------
-    MitsimError
-        for what it cannot vary.
-    """
+    """Return the options of the study that a ``step`` [sweep] is; MitsimError for values that it cannot vary."""
     from mitsim.studies.framework.experiment import NO_SCENE, check_sweep
 
-    over = swept_values({**(step.values.get("scene") or {}), **(step.values.get("capture") or {})})
-    if outside := [
-        name for name in step.values.get("scene") or {} if name in (*NO_SCENE, *TABLES["scene"].model_fields)
-    ]:
-        raise ArgumentError("scene", f"{outside[0]}: is no parameter of the scene; a sweep varies these, and "
-                                     "capture.patterns, capture.seed and capture.accuracy")  # fmt: skip
+    scene = step.values.get("scene") or {}
+    over = swept_values({**scene, **(step.values.get("capture") or {})})
+    if outside := [name for name in scene if name in (*NO_SCENE, *TABLES["scene"].model_fields)]:
+        few = "a sweep varies these, and capture.patterns, capture.seed and capture.accuracy"
+        raise ArgumentError("scene", f"{outside[0]}: is no parameter of the scene; {few}")
     capture = session.step("capture")
     fixed = dict(capture.values) if capture else {}
     if "accuracy" in fixed:
@@ -579,18 +526,9 @@ def swept_values(swept: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Return the values that are ``swept``, by name, with ranges as lists of values."""
     from mitsim.studies.framework.experiment import values_of
 
-    def values(name: str, each: Any) -> list[Any]:
-        if not isinstance(each, Mapping):
-            return list(each)
-        return list(values_of(f"{name}={each['from']!r}:{each['to']!r}:{each['count']}")[1])
-
-    return {name: values(name, each) for name, each in swept.items()}
-
-
-_CHECKS: dict[str, Callable[[Session, Step, Place, _Mistakes], None]] = {
-    "capture": _check_capture,
-    "calibrate": _check_calibrate,
-    "reconstruct": _check_reconstruct,
-    "export": _check_export,
-    "sweep": _check_sweep,
-}
+    found = dict[str, list[Any]]()
+    for name, each in swept.items():
+        if isinstance(each, Mapping):
+            each = values_of(f"{name}={each['from']!r}:{each['to']!r}:{each['count']}")[1]
+        found[name] = list(each)
+    return found

@@ -47,7 +47,7 @@ from mitsim.reconstruct.factors import Estimate, Factors, decibels
 from mitsim.report import plots
 from mitsim.report.lit_scene import LINE, IdealCamera, LitScene, ShadowRow, lights, point_profiles, shadow_row
 from mitsim.report.pages import Mean, with_error
-from mitsim.report.plots import bars
+from mitsim.report.plots import grouped_bars
 from mitsim.studies import error_budget
 from mitsim.studies.causes import ablations, reform
 from mitsim.studies.drift_study import SESSION, DriftStand, squared_error
@@ -540,7 +540,8 @@ class CalibrationFindings(Findings):
             if abs(row.lost_db) >= _SAID_DB:
                 rated[_WOULD if row.of == error_budget.DRIFT else _HAS][row.name] = Mean(row.lost_db, row.error_db, 1)
         if any(rated.values()):
-            found["losses.png"] = bars(rated, "PSNR lost [dB]")
+            groups = {name: {kind: mean} for kind, means in rated.items() for name, mean in means.items()}
+            found["losses.png"] = grouped_bars(groups, "PSNR lost [dB]", ordered=True)
         if self.profiles:
             found["shadow.png"] = shadow_profiles(self.profiles, _PROFILE_MM)
         return found

@@ -40,9 +40,9 @@ from mitsim.report.plots import (
     GREEN,
     VERMILION,
     WIDTH,
-    bars,
     curves,
     figure_of,
+    grouped_bars,
     image_grid,
     label_axes,
 )
@@ -436,7 +436,11 @@ def _by_way(table: Table) -> Figure:
         if way != BY_LUX
     }
     floor = {"floor, no camera": rows.mean("floor")._replace(error=0.0)}
-    return bars({"found": means, "floor": floor}, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)} [1]")
+    groups = {
+        **{way: {"found": mean} for way, mean in means.items()},
+        **{way: {"floor": mean} for way, mean in floor.items()},
+    }
+    return grouped_bars(groups, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)} [1]", ordered=True)
 
 
 def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:

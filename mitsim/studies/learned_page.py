@@ -12,7 +12,7 @@ from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.report import IDEALISED, RENDERED, in_text, label
 from mitsim.report.pages import DASH, Mean
-from mitsim.report.plots import image_grid, pair_chart
+from mitsim.report.plots import grouped_bars, image_grid
 from mitsim.studies.framework.experiment import QUICK_IMAGES, Results
 from mitsim.studies.framework.page import Part
 from mitsim.studies.learned_cells import ELSEWHERE, PICTURES
@@ -168,7 +168,9 @@ def figures(results: Results) -> Mapping[str, Figure]:
         }
         axis = f"PSNR over the best classical image, {label(patterns).lower()} [dB]"
         name = f"mismatch_{patterns.replace(':', '')}.png"
-        drawn[name] = pair_chart(values, ("rendered frames", "mean of mismatches"), axis)
+        heads = "rendered frames", "mean of mismatches"
+        groups = {mismatch: dict(zip(heads, pair, strict=True)) for mismatch, pair in values.items()}
+        drawn[name] = grouped_bars(groups, axis, ordered=True)
     first = matrix.patterns[0]
     worst = min(
         ((matrix.gain(kind, name).prints.value, name) for kind in matrix.kinds if kind.patterns == first

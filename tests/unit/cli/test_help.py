@@ -8,7 +8,7 @@ import os
 import re
 import shlex
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from unittest.mock import patch
 
 import pytest
@@ -17,8 +17,9 @@ from typer.testing import CliRunner
 
 from mitsim.bench.request import Seeded
 from mitsim.cli import app
-from mitsim.cli.commands import show, verb
-from mitsim.cli.screen import parts_of
+from mitsim.cli.commands import Common, argument, parts_of
+from mitsim.cli.commands import command as command_of
+from mitsim.cli.commands import shown as changed
 from mitsim.core.configuration import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, option
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.patterns import pattern_names
@@ -133,61 +134,64 @@ class Group(Base):
 
     PANEL = WHAT
 
+    place: str = argument(..., "of it", "PLACE")
     name: str = option(..., "of it", metavar="NAME")
     sizes: list[int] | None = option(None, "of it", kind=list[int])
     level: float | Literal["auto"] = option("auto", "of it")
+
+
+class Some(Seeded, Common):
+    """A verb that shows an option otherwise, and first, and not another."""
+
+    FIRST, HIDDEN, CHANGES = "seed", "variant quiet verbose as_json", changed(seed={"help": "another"})
+
+
+def of_a_group(asked: Group) -> int:
+    return 0
+
+
+def of_some(asked: Some) -> int:
+    return 0
 
 
 def call(*words: str) -> Any:
     program, seen = typer.Typer(), []
 
     @program.command()
-    @verb
-    def read(*, place: Annotated[str, typer.Argument()], group: Group, last: int = 1, given: set[str]) -> int:
-        seen.append((given, place, group, last))
+    @command_of
+    def read(asked: Group) -> int:
+        seen.append(asked)
         return 0
 
     done = CliRunner().invoke(program, [*words])
     return seen[0] if seen else done.exception if isinstance(done.exception, ArgumentError) else done.exit_code
 
 
+def shown(function: Any) -> dict[str, Any]:
+    parameters = inspect.signature(command_of(function)).parameters.values()
+    return {each.name: each.annotation.__metadata__[0] for each in parameters if each.name != "context"}
+
+
 def test_the_fields_of_a_model_are_options() -> None:
     """Those that are given make the model, which knows them. (Planted: defaults that count as given.)"""
-    given, place, group, last = call("here", "--name", "x")
-    assert (given, place, group, last) == ({"place", "name"}, "here", Group(name="x"), 1)
-    assert group.given == {"name": "x"}
-    words = "there --seed 3 --sizes 1 --sizes 2 --quick --last 5 --name y --level 0.5"
-    *_, group, last = call(*words.split())
-    assert (group, last) == (Group(seed=3, quick=True, name="y", sizes=[1, 2], level=0.5), 5)
-    assert [*inspect.signature(verb(of_a_group)).parameters] == ["context", "name", "sizes", "level", "quick", "seed"]
+    asked = call("here", "--name", "x")
+    assert asked == Group(place="here", name="x") and asked.given == {"place": "here", "name": "x"}
+    words = "there --seed 3 --sizes 1 --sizes 2 --quick --name y --level 0.5"
+    assert call(*words.split()) == Group(place="there", seed=3, quick=True, name="y", sizes=[1, 2], level=0.5)
+    assert [*shown(of_a_group)] == ["place", "name", "sizes", "level", "quick", "seed"]
 
 
 def test_a_model_names_the_heading_of_its_own_options() -> None:
     """Not of those that it inherits, nor of one that names another. (Planted: the last model's for all.)"""
-    options = [each for each in inspect.signature(verb(of_a_group)).parameters.values() if each.name != "context"]
-    panels = {each.name: each.annotation.__metadata__[0].rich_help_panel for each in options}
+    panels = {name: mark.rich_help_panel for name, mark in shown(of_a_group).items() if name != "place"}
     assert panels == {"name": WHAT, "sizes": WHAT, "level": WHAT, "seed": QUALITY, "quick": OUTPUT}
 
 
 def test_a_verb_shows_some_fields_as_it_needs() -> None:
     """(Planted: changes of one verb that all others have, too.)"""
     for _ in range(2):
-        help_ = {
-            each.name: each.annotation.__metadata__[0].help
-            for each in inspect.signature(verb(of_some)).parameters.values()
-            if each.name != "context"
-        }
-        assert help_ == {"seed": "another", "name": "of it"}
-    plain = inspect.signature(verb(of_a_group)).parameters["seed"].annotation
-    assert plain.__metadata__[0].help == Group.model_fields["seed"].description == "root of every random stream"
-
-
-def of_a_group(group: Group) -> int:
-    return 0
-
-
-def of_some(group: Annotated[Group, show("seed name", seed={"help": "another"})]) -> int:
-    return 0
+        assert {name: mark.help for name, mark in shown(of_some).items()} == {"seed": "another"}
+    assert shown(of_a_group)["seed"].help == Group.model_fields["seed"].description == "root of every random stream"
 
 
 @pytest.mark.parametrize("words", ["here", "here --name x --seed y", "--name x", "here --name x --size 1"])

@@ -10,7 +10,8 @@ from typing import Any, cast
 import pytest
 from rich.console import Console
 
-from mitsim.cli import screen
+from mitsim.cli import commands as screen
+from mitsim.cli.bench_verbs import plan_lines
 from mitsim.core import job as progress
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Clock, Cost, Job
@@ -182,10 +183,10 @@ HARMLESS = "a ]0;title  b c [bold]d[/] \\x1b"
 def test_no_control_character_of_a_file_reaches_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     """Escape, bell, C1's CSI and a turn of direction; line ends of results stay. JSON escapes them by itself. (Planted:
     warnings as they are.)"""
-    assert screen.finish(False, {}, [f"{HOSTILE}\nnext"], [HOSTILE]) == 1
+    assert screen.print_result(False, {}, [f"{HOSTILE}\nnext"], [HOSTILE]) == 1
     out, err = capsys.readouterr()
     assert out == f"{HARMLESS}\nnext\n" and err == f"mitsim: warning: {HARMLESS}\n"
-    screen.finish(True, {"name": HOSTILE}, [], [])
+    screen.print_result(True, {"name": HOSTILE}, [], [])
     assert capsys.readouterr().out.isascii()
     with progress.progress() as job:
         job.progress(HOSTILE, 0.5)
@@ -228,7 +229,7 @@ def plan_of(*more: tuple[str, str, str, float | None], **fields: Any) -> Plan:
 def test_a_plan_says_first_what_it_comes_to_and_fits_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     """24 lines of 80; no reason is cut. (Planted: no room kept for the end; what is off and leaves nothing shown.)"""
     monkeypatch.setenv("COLUMNS", "80")
-    lines = screen.plan_lines(plan_of())
+    lines = plan_lines(plan_of())
     assert lines[0] == "Plan at accuracy 0.001: 7.6 s, error up to 7.1e-04"
     printed = [part for line in lines for part in screen.wrap_text(line)]
     assert len(printed) <= 24 and max(map(len, printed)) <= 80
@@ -244,7 +245,7 @@ def test_a_plan_says_first_what_it_comes_to_and_fits_a_screen(monkeypatch: pytes
 
 def test_what_is_left_out_is_named_within_two_decades_of_the_accuracy() -> None:
     """(Planted: one decade, and three.)"""
-    text = "\n".join(screen.plan_lines(plan_of(("glare", "off", "small", 1.1e-5), ("speckle", "off", "less", 0.9e-5))))
+    text = "\n".join(plan_lines(plan_of(("glare", "off", "small", 1.1e-5), ("speckle", "off", "less", 0.9e-5))))
     assert "\nglare " in text and "speckle" not in text and "3 that nothing calls for" in text
 
 
@@ -252,14 +253,14 @@ def test_rows_beyond_a_screen_are_named(monkeypatch: pytest.MonkeyPatch) -> None
     """The least ones. (Planted: all shown, 31 lines.)"""
     monkeypatch.setenv("COLUMNS", "80")
     more = [(f"effect-{k}", "exact", "for a reason of its own", 10.0**-k) for k in range(1, 9)]
-    lines = screen.plan_lines(plan_of(*more))
+    lines = plan_lines(plan_of(*more))
     assert sum(len(screen.wrap_text(line)) for line in lines) <= 24
     (unshown,) = (line for line in lines if line.startswith("No room for"))
     assert "effect-8" in unshown and "effect-1," not in unshown
 
 
 def test_all_of_a_plan_has_every_row_with_its_whole_reason() -> None:
-    lines = screen.plan_lines(plan_of(), everything=True)
+    lines = plan_lines(plan_of(), everything=True)
     assert all(f"    {reason}" in lines for _, _, reason, _ in ROWS)
     assert [line.split()[0] for line in lines[2::2]][: len(ROWS)] == [name for name, *_ in ROWS]
 
@@ -267,7 +268,7 @@ def test_all_of_a_plan_has_every_row_with_its_whole_reason() -> None:
 def test_names_in_a_plan_are_printable(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A surface that a scene calls "[/]" was an error of rich. (Planted: printed as it is.)"""
     made = plan_of(("gloss", "exact", f"of {HOSTILE}", 0.5), notes=("cells are chosen safely",))
-    screen.finish(False, {}, screen.plan_lines(made), ())
+    screen.print_result(False, {}, plan_lines(made), ())
     out = capsys.readouterr().out
     assert "\x1b]" not in out and "[/]" in out.replace("\n", "") and made.notes[0] in out
 
@@ -276,7 +277,7 @@ def test_lines_are_as_wide_as_the_terminal(monkeypatch: pytest.MonkeyPatch, caps
     """80 characters where there is none; a path is not broken. (Planted: printed as they are.)"""
     monkeypatch.delenv("COLUMNS", raising=False)
     path = "/a-folder/" * 9
-    screen.finish(False, {}, ["word " * 40, f"Image: {path}", "", "a  " * 40], ())
+    screen.print_result(False, {}, ["word " * 40, f"Image: {path}", "", "a  " * 40], ())
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines[:3])) <= 80 and len(lines) == 7
     assert f"  {path}" in lines and lines[-2:] == ["", "a  " * 40]

@@ -59,7 +59,7 @@ def read(folder: Path, data: dict[str, Any]) -> RunManifest | CalibrationManifes
         (RUN, "patterns.captures.0.row", False, "captures.0.row: got False"),
         (RUN, "patterns.captures.0.sign", True, "captures.0.sign: got True"),
         (RUN, "patterns.P_L", [[True]], "P_L.0.0: got True"),
-        (RUN, "format", 2, "format: got 2; give a number less than or equal to 1"),
+        (RUN, "format", 2, "format: got 2; give a number from 1 to 1"),
         (RUN, "format", True, "format: got True"),
         (RUN, "warnings", "too dark", "warnings: got 'too dark'"),
         (RUN, "mc_error", "0", "mc_error: got '0'"),

@@ -45,7 +45,7 @@ def test_all_mistakes_are_reported_together(tmp_path: Path) -> None:
     assert refused(tmp_path, text) == [
         "file mine.toml: has 6 mistakes:",
         "  line 3: names: got 'a', no such field; did you mean name?",
-        "  line 4: bits: got 30; give a number less than or equal to 24",
+        "  line 4: bits: got 30; give a number from 1 to 24",
         "  line 5: list: got [1], no such field; known fields: name, bits, kind, part, parts",
         "  line 9: part.side: got 1.5; give a whole number",
         "  line 10: part.gap_um: got 'wide'; give a number",
@@ -55,7 +55,7 @@ def test_all_mistakes_are_reported_together(tmp_path: Path) -> None:
 
 def test_one_mistake_is_one_line_with_its_place(tmp_path: Path) -> None:
     assert refused(tmp_path, 'name = "a"\nbits = 0\n') == [
-        "file mine.toml:2: bits: got 0; give a number greater than or equal to 1"
+        "file mine.toml:2: bits: got 0; give a number from 1 to 24"
     ]
 
 

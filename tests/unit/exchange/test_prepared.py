@@ -339,8 +339,8 @@ LISTS = {
     "a plane of no mosaic": ('[prepare]\nchannel = "green"\n', "prepare.channel: got 'green'; give 'r'"),
     "a mosaic without a plane": ('[prepare]\nmosaic = "RGGB"\n', "prepare: mosaic is of planes; give channel too"),
     "colours exchanged": ('[prepare]\nchannel = "r"\norientation = "file"\n', "would exchange the mosaic's colours"),
-    "a quarter turn": ("[prepare]\nturn_deg = 90.0\n", r"prepare.turn_deg: got 90.0; give a number less than or"),
-    "half a crop": ("[prepare]\ncrop = {row = -1}\n", r"prepare.crop.row: got -1; give a number greater than or"),
+    "a quarter turn": ("[prepare]\nturn_deg = 90.0\n", r"prepare.turn_deg: got 90.0; give a number from -45 to 45"),
+    "half a crop": ("[prepare]\ncrop = {row = -1}\n", r"prepare.crop.row: got -1; give a number at least 0, below"),
     "a flat's dark alone": ('[prepare]\nflat_dark = "a"\n', "flat_dark is taken off a flat; give flat too"),
     "bits of nothing": ("bits = 12\n", "bits are of digital's numbers; give digital too"),
     "numbers of no camera": (

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from mitsim.report.pages import Mean, page_figure
-from mitsim.report.plots import bars, curves, error_bars, figure_of, image_grid, pair_chart, singular_values, tells
+from mitsim.report.plots import curves, error_bars, figure_of, grouped_bars, image_grid, singular_values, tells
 
 
 def test_curves_are_in_the_order_of_their_numbers() -> None:
@@ -70,9 +70,8 @@ def test_an_error_that_nobody_knows_is_no_bar_of_zero() -> None:
         for error in (float("nan"), 0.5)
     )
     assert several.has_yerr and not single.has_yerr
-    both = pair_chart(
-        {"mask, 2 um": (Mean(2.0, float("nan"), 1), Mean(1.0, 0.2, 4))}, ("measured", "predicted"), "lost [dB]"
-    )
+    pair = {"measured": Mean(2.0, float("nan"), 1), "predicted": Mean(1.0, 0.2, 4)}
+    both = grouped_bars({"mask, 2 um": pair}, "lost [dB]")
     assert [container.has_xerr for container in both.axes[0].containers if hasattr(container, "has_xerr")] == [True]
     assert [tick.get_text() for tick in both.axes[0].get_yticklabels()] == ["mask, 2 \N{GREEK SMALL LETTER MU}m"]
 
@@ -86,13 +85,17 @@ def test_a_curve_alone_has_no_legend_and_a_long_name_of_an_axis_two_lines() -> N
 
 def test_what_an_image_has_lost_and_would_lose_are_told_apart() -> None:
     """Bars of two kinds are in one order, each kind in its colour. (Planted: one colour.)"""
-    kinds = {"has lost": {"noise": Mean(2.0, 0.1, 1)}, "would lose": {"b": Mean(3.0, 0.1, 1), "a": Mean(1.0, 0.1, 1)}}
-    (axes,) = bars(kinds, "lost [dB]").axes
-    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["a", "noise", "b"]
+    groups = {
+        "noise": {"has lost": Mean(2.0, 0.1, 1)},
+        "b": {"would lose": Mean(3.0, 0.1, 1)},
+        "a": {"would lose": Mean(1.0, 0.1, 1)},
+    }
+    (axes,) = grouped_bars(groups, "lost [dB]", ordered=True).axes
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["b", "noise", "a"], "from the top"
     legend = axes.get_legend()
     assert legend and [text.get_text() for text in legend.get_texts()] == ["has lost", "would lose"]
     assert len({patch.get_facecolor() for patch in axes.patches}) == 2
-    single = bars({"has lost": kinds["has lost"], "would lose": {}}, "lost [dB]").axes[0]
+    single = grouped_bars({"noise": groups["noise"]}, "lost [dB]").axes[0]
     assert single.get_legend() is None
 
 
@@ -144,7 +147,7 @@ def test_a_chart_of_nothing_tells_nothing() -> None:
         charts_of_nothing(), False
     )
     assert tells(image_grid({"a": [(np.zeros((2, 2)), "")]}, [""])) and tells(error_bars({"a": 1e-3, "b": 1e-4}))
-    assert tells(pair_chart({"a": (Mean(2.0, 0.1, 2), Mean(1.0, 0.1, 2))}, ("one", "other"), "x [dB]"))
+    assert tells(grouped_bars({"a": {"one": Mean(2.0, 0.1, 2), "other": Mean(1.0, 0.1, 2)}}, "x [dB]"))
 
 
 def test_ticks_of_many_numbers_do_not_run_into_each_other() -> None:

@@ -16,7 +16,6 @@ import pytest
 from PIL import Image
 
 from mitsim.cli.commands import Pictured, command_line
-from mitsim.cli.screen import finish_folder, finish_frame
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json
@@ -245,7 +244,7 @@ def test_a_full_disk_costs_the_page_alone(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", full)
-        assert finish_folder(Pictured(as_json=True), run, {"frames": 6}, ["said"], []) == 1
+        assert Pictured(as_json=True).finish_folder(run, {"frames": 6}, ["said"], []) == 1
     out, err = capsys.readouterr()
     assert json.loads(out) == {"frames": 6, "report": None}
     assert "No space left" in err and f"`mitsim report {run}` makes them later" in err
@@ -256,9 +255,9 @@ def test_pictures_are_made_unless_nobody_wants_them(
     folders: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = copy(folders.run, tmp_path / "run")
-    assert finish_folder(Pictured(no_pictures=True), run, {}, ["said"], []) == 0
+    assert Pictured(no_pictures=True).finish_folder(run, {}, ["said"], []) == 0
     assert capsys.readouterr().out == "said\n" and not (run / "report.html").exists()
-    assert finish_folder(Pictured(as_json=True), run, {}, [], []) == 0
+    assert Pictured(as_json=True).finish_folder(run, {}, [], []) == 0
     found = json.loads(capsys.readouterr().out)["report"]
     assert found["page"] == str(run / "report.html") and 0 < found["seconds"] < 60
     assert found["pictures"] == [
@@ -271,12 +270,12 @@ def test_a_frame_in_one_file_has_its_picture_beside(tmp_path: Path, capsys: pyte
     replaced by .png.)"""
     (tmp_path / "frame.png").write_bytes(b"another's")
     values = np.linspace(2.0, 4.0, 12).reshape(3, 4)
-    assert finish_frame(Pictured(), (tmp_path / "frame.exr", values, "W/m^2"), {}, ["said"], []) == 0
+    assert Pictured().finish_frame((tmp_path / "frame.exr", values, "W/m^2"), {}, ["said"], []) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert said.endswith(f"picture {tmp_path / 'frame.exr.png'}: black 2, white 4 W/m^2")
     assert (tmp_path / "frame.png").read_bytes() == b"another's"
     colour = np.stack([values, 0 * values, values], axis=-1)
-    assert finish_frame(Pictured(as_json=True), (tmp_path / "c.exr", colour, "W/m^2"), {}, [], []) == 0
+    assert Pictured(as_json=True).finish_frame((tmp_path / "c.exr", colour, "W/m^2"), {}, [], []) == 0
     assert np.asarray(Image.open(json.loads(capsys.readouterr().out)["picture"]["file"])).shape == (384, 512, 3)
 
 

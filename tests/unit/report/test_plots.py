@@ -40,7 +40,7 @@ def test_every_axis_has_a_unit() -> None:
     figures = (
         plots.singular_values({"a": np.ones(3)}),
         plots.error_bars({"a": 1e-3}, 1e-2),
-        plots.quality_bars({"a": (Mean(20.0, 1.0, 8), Mean(10.0, float("nan"), 1))}),
+        plots.grouped_bars({"a": {"b": Mean(20.0, 1.0, 8), "c": Mean(10.0, float("nan"), 1)}}, "PSNR [dB]"),
         costs(),
     )
     for figure in figures:

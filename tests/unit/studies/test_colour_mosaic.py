@@ -13,8 +13,7 @@ from mitsim.core.manifests import HALF, JOINT, WAYS, check_way
 from mitsim.core.runs import load_mosaic
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
-from mitsim.report.colour_image import ColourImage
-from mitsim.report.reconstruct_run import reconstruct_colours
+from mitsim.report.reconstruct_run import ColourImage, reconstruct_colours
 from tests.coloured import LINES, PLACE, WEIGHTS, mosaic_folders, scenes
 from tests.unit.studies.test_colour_by_line import main
 
