@@ -54,9 +54,7 @@ def test_all_mistakes_are_reported_together(tmp_path: Path) -> None:
 
 
 def test_one_mistake_is_one_line_with_its_place(tmp_path: Path) -> None:
-    assert refused(tmp_path, 'name = "a"\nbits = 0\n') == [
-        "file mine.toml:2: bits: got 0; give a number from 1 to 24"
-    ]
+    assert refused(tmp_path, 'name = "a"\nbits = 0\n') == ["file mine.toml:2: bits: got 0; give a number from 1 to 24"]
 
 
 def test_a_line_is_that_of_the_name_itself(tmp_path: Path) -> None:
