@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from mitsim.scene.load import LoadedScene
     from mitsim.transport.connect import OpticalSetup
     from mitsim.transport.projector import ProjectorOptics
-    from mitsim.transport.transmission import Contact
 
 
 _OF_COLOURS = {"quantum_efficiency_curve", "mosaic", "mosaic_curves"}
@@ -224,15 +223,16 @@ class Apparatus:
         farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
         shift = 1 / (2 * depth) - 1 / depth
         # Seen from the frames' middle, c off the axis: tangents are c / z less.
-        centres = [self._centre(axis) for axis in (0, 1)]
+        centres = [0.0, 0.0]
+        if self.geometry.roi is not None:
+            centres = [float(each[0] + each[-1]) / 2 for each in map(self.geometry.centres, (0, 1))]
         rows, columns = (
             ((far[0] - near[0]) / shift - centre, (far[1] - near[1]) / shift - centre)
             for near, far, centre in zip(window, farther, centres, strict=True)
         )
-        row_tan, column_tan = (
-            (first - centre / depth, last - centre / depth)
-            for (first, last), centre in zip(window, centres, strict=True)
-        )
+        (top, bottom), (left, right) = window
+        row_tan = top - centres[0] / depth, bottom - centres[0] / depth
+        column_tan = left - centres[1] / depth, right - centres[1] / depth
         return Parallax(
             depth_mm=depth,
             row_tan=row_tan,
@@ -244,10 +244,6 @@ class Apparatus:
             mask_distance_mm=self.geometry.mask_distance,
             stop_tan=self.geometry.tan_half_fov,
         )
-
-    def _centre(self, axis: int) -> float:
-        centres = self.geometry.centres(axis)
-        return 0.0 if self.geometry.roi is None else float(centres[0] + centres[-1]) / 2
 
     @property
     def field_stop_cuts(self) -> bool:
@@ -337,9 +333,8 @@ class Apparatus:
 
         folder, own = self.loaded.path.parent, self.counting.model_dump(include=_OF_COLOURS, exclude_none=True)
         named = self.loaded.own  # wherever they lie
-        files = {
-            named.get(str(path)) or os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]
-        }
+        others = self.loaded.files[1:]
+        files = {named.get(str(path)) or os.path.relpath(path, folder): checksum(path) for path in others}
         lit = self.projector.model_dump(mode="json", exclude={"contrast_ratio", *_NOT_SIMULATED})
         stated: dict[str, Any] = plain(
             {
@@ -416,23 +411,19 @@ def check_devices(camera: Path | str | None, projector: Path | str | None) -> tu
     first, second = (
         locate(default if name is None else name, "calibration", ".toml", field) for name, default, field in found
     )
-    if camera is not None:
-        _check_camera(first)
-    return first, second
-
-
-def _check_camera(path: Path) -> None:
+    if camera is None:
+        return first, second
     from mitsim.devices.sensor import SensorModel, sensor_table
 
-    table = read_toml(path)
-    mask = table.part("mask") if isinstance(table.get("mask"), dict) else None
-    found = mistakes(SensorModel, sensor_table(path))
-    if found and mask is not None:
+    table = read_toml(first)
+    wrong = mistakes(SensorModel, sensor_table(first))
+    if wrong and isinstance(table.get("mask"), dict):
         from mitsim.devices.mask_profile import MaskProfile  # only now: it imports numpy
 
-        found += mistakes(MaskProfile, mask)
-    if found:
-        raise refuse_together(f"file {path}", found)
+        wrong += mistakes(MaskProfile, table.part("mask"))
+    if wrong:
+        raise refuse_together(f"file {first}", wrong)
+    return first, second
 
 
 def open_apparatus(
@@ -448,7 +439,7 @@ def open_apparatus(
     defines = {name: spelling(value) for name, value in parameters.items()}
     path = check_scene(scene, defines, allow_outside_files)
     sensor_path, projector_path = check_devices(camera, projector)
-    from mitsim.devices.sensor import load_sensor
+    from mitsim.devices.sensor import PITCH_TOLERANCE, load_sensor
 
     sensor = load_sensor(sensor_path)
     # What imports numpy comes after what does not.
@@ -472,34 +463,25 @@ def open_apparatus(
     # Only now, with all else checked: the renderer takes a second to import.
     options = {"needs_projector": not for_render, "outside": allow_outside_files}
     loaded = _load(variant, path, defines, **options, **({} if camera is None else {"sensor": sensor}))
-    if camera is None and not for_render:
-        _check_pitch(loaded, sensor, f"camera {sensor_path}", scene)
-    _wear(loaded, mask, sensor_path)
-    _tune(loaded, light)
-    devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
-    # By their whole paths: who repeats this from another folder finds them.
-    whole = {**defines, **{name: path for path, name in loaded.own.items()}}
-    named = {
-        "camera": camera and str(sensor_path.absolute()),
-        "projector": projector and str(projector_path.absolute()),
-    }
-    opened = {**named, "allow_outside_files": allow_outside_files}
-    return Apparatus(loaded, devices, variant, whole, opened=opened)
-
-
-def _check_pitch(loaded: LoadedScene, sensor: SensorModel, where: str, scene: Path | str) -> None:
-    from mitsim.devices.sensor import PITCH_TOLERANCE
-
-    pitches = zip(
+    for name, own, stated in zip(
         ("pixel_pitch", "row_pitch"), sensor.pitches_mm[::-1], loaded.camera.geometry.pitches[::-1], strict=True
-    )
-    for name, own, stated in pitches:
-        if abs(own - stated) > PITCH_TOLERANCE * stated:
+    ):
+        if camera is None and not for_render and abs(own - stated) > PITCH_TOLERANCE * stated:
             raise MitsimError(
-                f"{where}: its binned {name.replace('_', ' ')} is {own * 1e3:g} um, but {scene} has "
+                f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {own * 1e3:g} um, but {scene} has "
                 f"{stated * 1e3:g} um; name the scene's own camera by --camera, whose pixels count then, or change "
                 f"{name}"
             )
+    _adapt(loaded, mask, sensor_path, light)
+    devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
+    # By their whole paths: who repeats this from another folder finds them.
+    whole = {**defines, **{name: path for path, name in loaded.own.items()}}
+    opened = {
+        "camera": camera and str(sensor_path.absolute()),
+        "projector": projector and str(projector_path.absolute()),
+        "allow_outside_files": allow_outside_files,
+    }
+    return Apparatus(loaded, devices, variant, whole, opened=opened)
 
 
 def reopen(bench: Opened, variant: str) -> Opened:
@@ -509,17 +491,14 @@ def reopen(bench: Opened, variant: str) -> Opened:
     camera = Path(bench.devices.camera_file)
     given = {} if bench.loaded.sensor_note is None else {"sensor": bench.sensor}
     loaded = _load(variant, bench.loaded.path, bench.defines, outside=True, **given)
-    _wear(loaded, load_mask(camera), camera)
-    _tune(loaded, bench.projector)
+    _adapt(loaded, load_mask(camera), camera, bench.projector)
     return replace(bench, loaded=loaded, variant=variant)
 
 
-def _wear(loaded: LoadedScene, mask: MaskProfile | None, camera: Path) -> None:
+def _adapt(loaded: LoadedScene, mask: MaskProfile | None, camera: Path, projector: ProjectorModel) -> None:
+    """Give a scene the mask of the file of its ``camera``, and its glass the index for the light of its projector."""
     if mask is not None:
         loaded.camera.wear(mask.put_on(loaded.camera.geometry, camera.parent))
-
-
-def _tune(loaded: LoadedScene, projector: ProjectorModel) -> None:
     if loaded.parting:
         from mitsim.transport.plugins.glass import tune
 
@@ -537,26 +516,24 @@ def _load(variant: str, path: Path, defines: Mapping[str, str], **options: Any) 
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     plugins.register()
     loaded = load_scene(path, defines, **options)
-    of_factored, of_reference = contacts(loaded.scene)
-    factored = _refusal_of(loaded, of_factored, "the factored estimator")
-    reference = _refusal_of(loaded, of_reference, "the reference")
+    refusals = list[MitsimError | None]()
+    for contact, estimator in zip(contacts(loaded.scene), ("the factored estimator", "the reference"), strict=True):
+        if contact is None:
+            refusals.append(None)
+            continue
+        got, rule = contact.words(estimator)
+        if loaded.shapes:
+            refusals.append(loaded.shapes[contact.shape].refusal("shape", got, rule))
+        else:
+            refusals.append(MitsimError(f"{loaded.path}: shape {contact.shape}: got {got}; {rule}"))
+    factored, reference = refusals
     if factored is not None and options.get("needs_projector", True):
         raise factored
-    unfit = replace(
-        loaded.unfit, factored=loaded.unfit.factored or factored, reference=loaded.unfit.reference or reference
-    )
+    own = loaded.unfit
+    unfit = replace(own, factored=own.factored or factored, reference=own.reference or reference)
     projectors = [emitter for emitter in loaded.scene.emitters() if emitter.class_name() == "Projector"]
     in_view = any(shines_in(loaded.scene, loaded.camera, each) for each in projectors)
     return replace(loaded, unfit=unfit, in_view=in_view, mirrors=loaded.mirrors or in_view)
-
-
-def _refusal_of(loaded: LoadedScene, contact: Contact | None, estimator: str) -> MitsimError | None:
-    if contact is None:
-        return None
-    got, rule = contact.words(estimator)
-    if loaded.shapes:
-        return loaded.shapes[contact.shape].refusal("shape", got, rule)
-    return MitsimError(f"{loaded.path}: shape {contact.shape}: got {got}; {rule}")
 
 
 def spelling(value: object) -> str:
