@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.seeds import stream
 
 MaskKind = Literal["separable", "flatcam", "open"]
 """How a plate is made from a code; see :class:`Mask`."""
@@ -70,23 +69,6 @@ class Dust(ByValue):
     def __post_init__(self) -> None:
         self._hold(centres_mm=np.array(self.centres_mm, dtype=np.float64))
 
-    @classmethod
-    def scatter(cls, per_mm2: float, radius_mm: float, opacity: float, extent_mm: float, seed: int) -> Dust:
-        """Dust drawn at random over a square mask: as many discs as Poisson's law gives, evenly.
-
-        Parameters
-        ----------
-        per_mm2, radius_mm, opacity
-            mean number, and of each disc.
-        extent_mm
-            side of the mask.
-        seed
-            which of all such dusts.
-        """
-        draws = stream(seed, "dust")
-        count = int(draws.poisson(per_mm2 * extent_mm**2))
-        return cls((draws.random((count, 2)) - 0.5) * extent_mm, radius_mm, opacity)
-
     def turn(self, quarters: int) -> Dust:
         """The same on a mask turned by so many ``quarters`` of a turn, as ``numpy.rot90`` turns its features."""
         row, column = self.centres_mm.T
@@ -115,11 +97,6 @@ class Flaws:
     turn_deg: float = 0.0
     tilt_mrad: tuple[float, float] = (0.0, 0.0)
     dust: Dust | None = None
-
-    @property
-    def clean(self) -> Flaws:
-        """The others, without dust."""
-        return Flaws(self.blur_mm, self.turn_deg, self.tilt_mrad)
 
     @property
     def margin_mm(self) -> float:
@@ -240,17 +217,12 @@ class Mask(ByValue):
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
         """Transmission (0..1) at points (``s_row``, ``s_col``) of the mask plane [mm]; the arrays broadcast."""
-        row, row_inside = self._feature(s_row)
-        column, column_inside = self._feature(s_col)
-        total = sum(weight * rows[row] * columns[column] for weight, rows, columns in self.terms)
-        return np.asarray(np.where(row_inside & column_inside, total, 0.0), dtype=np.float64)
-
-    def _feature(self, s: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
-        """Index of the feature that holds each coordinate, and whether the mask reaches there at all."""
         count = len(self.bits)
-        position = np.floor(np.asarray(s, dtype=np.float64) / self.feature_mm + count / 2)
-        inside = (position >= 0) & (position < count)
-        return np.where(inside, position, 0).astype(np.intp), inside
+        row, column = (np.floor(np.asarray(s, dtype=np.float64) / self.feature_mm + count / 2) for s in (s_row, s_col))
+        in_rows, in_columns = ((at >= 0) & (at < count) for at in (row, column))
+        i, j = np.where(in_rows, row, 0).astype(np.intp), np.where(in_columns, column, 0).astype(np.intp)
+        total = sum(weight * rows[i] * columns[j] for weight, rows, columns in self.terms)
+        return np.asarray(np.where(in_rows & in_columns, total, 0.0), dtype=np.float64)
 
 
 def mean_opening(is_open: BoolArray, widths: FloatArray) -> float:

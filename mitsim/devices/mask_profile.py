@@ -141,8 +141,10 @@ class MaskProfile(Configuration):
         extent = drawn.extent_mm + 2 * max(self.over_etch_um, 0.0) * 1e-3
         dust = None
         if self.dust_per_mm2:
-            radius = self.dust_radius_um * 1e-3
-            dust = Dust.scatter(self.dust_per_mm2, radius, self.dust_opacity, extent, self.dust_seed)
+            draws = stream(self.dust_seed, "dust")
+            count = int(draws.poisson(self.dust_per_mm2 * extent**2))
+            centres = (draws.random((count, 2)) - 0.5) * extent
+            dust = Dust(centres, self.dust_radius_um * 1e-3, self.dust_opacity)
         turn = self.rotation_deg
         if turn % _QUARTER == 0:
             quarters = int(turn // _QUARTER)

@@ -297,10 +297,8 @@ class Plate(ByValue):
         through anywhere; where features are not even, or turned, a square of :attr:`cover` features a side."""
         if self.grids is not None:
             return self.grids
-        if not self.plain:
-            every = np.ones(self.cover, dtype=bool)
-            return ((every, every),)
-        return ((np.asarray(self.values.any(axis=1)), np.asarray(self.values.any(axis=0))),)
+        rows, columns = (np.asarray(self.values.any(axis=axis)) for axis in (1, 0))
+        return ((rows, columns),) if self.plain else ((np.ones(self.cover, dtype=bool),) * 2,)
 
     @property
     def cover(self) -> int:
@@ -330,19 +328,16 @@ def within(plate: Plate, reach_mm: float) -> Plate:
     seen = reach_mm + flaws.margin_mm
     if flaws.dust is not None:
         lines, values = draw_dust(plate.lines, plate.values, flaws.dust, seen)
-        return within(replace(plate, lines_mm=lines, values=values, flaws=flaws.clean), reach_mm)
+        return within(replace(plate, lines_mm=lines, values=values, flaws=replace(flaws, dust=None)), reach_mm)
+    if plate.crosses is not None:
+        return plate
     if plate.lines_mm is not None:
         inside = (plate.lines_mm[1:] > -seen) & (plate.lines_mm[:-1] < seen)
-        part, lines = (
-            plate.values[np.ix_(inside, inside)],
-            plate.lines_mm[np.append(inside, False) | np.append(False, inside)],
-        )
-        few = plate.crosses is not None or inside.all() or not part.any()
-        return plate if few else replace(plate, values=part, lines_mm=lines)
-    beyond = int((plate.extent_mm / 2 - seen) / plate.feature_mm)
-    if beyond <= 0 or plate.crosses is not None:
-        return plate
-    more = 1
+        part, ends = plate.values[np.ix_(inside, inside)], np.append(inside, False) | np.append(False, inside)
+        if inside.all() or not part.any():
+            return plate
+        return replace(plate, values=part, lines_mm=plate.lines_mm[ends])
+    beyond, more = int((plate.extent_mm / 2 - seen) / plate.feature_mm), 1
     while beyond > 0:
         part = plate.values[beyond:-beyond, beyond:-beyond]
         if part.any():

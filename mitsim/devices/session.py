@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import random
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -164,19 +163,17 @@ class Drift(Configuration):
 
     @model_validator(mode="after")
     def _ripples_have_a_frequency(self) -> Drift:
-        for name, amplitude, hertz in self._ripples:
-            if amplitude and hertz is None:
+        for name in ("power", "lamp"):
+            if getattr(self, f"{name}_ripple") and getattr(self, f"{name}_ripple_hz") is None:
+                amplitude = getattr(self, f"{name}_ripple")
                 raise ValueError(f"{name}_ripple {amplitude:g} has no frequency; give {name}_ripple_hz")
         return self
 
     @property
-    def _ripples(self) -> tuple[tuple[str, float, float | None], ...]:
-        return ("power", self.power_ripple, self.power_ripple_hz), ("lamp", self.lamp_ripple, self.lamp_ripple_hz)
-
-    @property
     def ripples(self) -> Mapping[str, tuple[float, float]]:
-        """Amplitude, as a part of its light, and frequency [Hz] of each source that ripples: ``power``, ``lamp``."""
-        return {name: (amplitude, hertz) for name, amplitude, hertz in self._ripples if amplitude and hertz}
+        """Return amplitude, relative to its light, and frequency [Hz] of sources that ripple: ``power``, ``lamp``."""
+        both = ("power", self.power_ripple, self.power_ripple_hz), ("lamp", self.lamp_ripple, self.lamp_ripple_hz)
+        return {name: (amplitude, hertz) for name, amplitude, hertz in both if amplitude and hertz}
 
     def alone(self, kind: str, amount: float | None = None) -> Drift:
         """One ``kind`` of it without the others, by another ``amount`` where one is given.
@@ -316,12 +313,9 @@ def load_recipe(path: Path | str | None = None) -> SessionRecipe:
 
 def recipe_text(recipe: SessionRecipe) -> str:
     """The ``recipe`` as TOML that :func:`load_recipe` reads."""
-    fields = recipe.model_dump(mode="json", exclude_defaults=True)
-    tables = {name: value for name, value in fields.items() if isinstance(value, dict)}
-    lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items() if name not in tables]
-    for name, table in tables.items():
-        lines += ["", f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
-    return "\n".join(lines) + "\n"
+    import tomli_w  # here: only those who print a recipe need it
+
+    return tomli_w.dumps(recipe.model_dump(mode="json", exclude_defaults=True))
 
 
 # -------- The order in which a session's frames are taken
