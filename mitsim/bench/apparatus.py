@@ -463,10 +463,10 @@ def open_apparatus(
     # Only now, with all else checked: the renderer takes a second to import.
     options = {"needs_projector": not for_render, "outside": allow_outside_files}
     loaded = _load(variant, path, defines, **options, **({} if camera is None else {"sensor": sensor}))
-    for name, own, stated in zip(
-        ("pixel_pitch", "row_pitch"), sensor.pitches_mm[::-1], loaded.camera.geometry.pitches[::-1], strict=True
-    ):
-        if camera is None and not for_render and abs(own - stated) > PITCH_TOLERANCE * stated:
+    names = () if camera is not None or for_render else ("row_pitch", "pixel_pitch")
+    for axis, name in reversed([*enumerate(names)]):
+        own, stated = sensor.pitches_mm[axis], loaded.camera.geometry.pitches[axis]
+        if abs(own - stated) > PITCH_TOLERANCE * stated:
             raise MitsimError(
                 f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {own * 1e3:g} um, but {scene} has "
                 f"{stated * 1e3:g} um; name the scene's own camera by --camera, whose pixels count then, or change "

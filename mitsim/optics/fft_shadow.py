@@ -223,15 +223,13 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
         places = np.stack(mask.flaws.turned_back(middles[:, None], middles)) + (whole - 1) / 2
         light = _waves(even, spectrum, step, whole)
         return np.asarray(scipy.ndimage.map_coordinates(light, places, order=3, mode="nearest"))
-    total, mirrored = np.zeros((count, count)), mask.mirrored
+    total = np.zeros((count, count))
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
-        total += share * _intensity(*_fields(shadow, float(wavelength), step, count), mirrored, mask.symmetric)
+        total += share * _intensity(shadow, mask, float(wavelength), step, count)
     return total
 
 
-def _fields(
-    shadow: ShadowGeometry, wavelength_nm: float, step: float, count: int
-) -> tuple[npt.NDArray[np.complex64], npt.NDArray[np.complex64], int]:
+def _intensity(shadow: ShadowGeometry, mask: Plate, wavelength_nm: float, step: float, count: int) -> FloatArray:
     distance = shadow.distance_mm * shadow.shrink
     points = points_per_cell(wavelength_nm, distance, step)
     if count * points > _MOST_WAVE_POINTS:
@@ -241,11 +239,10 @@ def _fields(
         )
     between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
     half = count * step / 2
-    span = half + shadow.mask.extent_mm / 2 + step
+    span = half + mask.extent_mm / 2 + step
     waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span, single=True)
-    terms, lines = shadow.mask.terms, shadow.mask.lines
-    axes = (1,) if shadow.mask.symmetric else (1, 2)  # type: ignore[union-attr]
-    profiles = [Steps.between(term[axis], lines) for axis in axes for term in terms]
+    terms, axes = mask.terms, (1,) if mask.symmetric else (1, 2)
+    profiles = [Steps.between(term[axis], mask.lines) for axis in axes for term in terms]
 
     def fields(start: int) -> npt.NDArray[np.complex64]:
         several = waves.fields(profiles[start : start + _FIELDS_AT_ONCE], -half)
@@ -253,7 +250,27 @@ def _fields(
 
     seen = np.concatenate(in_threads(fields, range(0, len(profiles), _FIELDS_AT_ONCE)))
     weights = np.array([weight for weight, *_ in terms], dtype=np.complex64)
-    return (weights[:, None] * seen[: len(terms)]).T, seen[-len(terms) :], points
+    rows, columns = (weights[:, None] * seen[: len(terms)]).T, seen[-len(terms) :]
+    mirrored = mask.mirrored
+    kept = [count // 2 if half_alone else count for half_alone in mirrored]
+    columns = columns[:, : kept[1] * points]
+    means = np.empty(kept)
+    at_once = max(1, _AT_ONCE // max(columns.shape[1], 1) // points)
+
+    def square(start: int) -> None:
+        some, beyond = slice(start, min(start + at_once, kept[0])), start if mask.symmetric else 0
+        field = rows[some.start * points : some.stop * points] @ columns[:, beyond * points :]
+        light = np.square(field.real) + np.square(field.imag)
+        down = light.reshape(-1, points, light.shape[1]).sum(axis=1)
+        blocks = sum(down[:, place::points].astype(np.float64) for place in range(points))
+        means[some, beyond:] = blocks / points**2
+        if mask.symmetric:
+            means[beyond:, some] = means[some, beyond:].T
+
+    in_threads(square, range(0, kept[0], at_once))
+    if mirrored[0]:
+        means = np.concatenate((means, means[::-1]))
+    return np.concatenate((means, means[:, ::-1]), axis=1) if mirrored[1] else means
 
 
 def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
@@ -266,35 +283,6 @@ def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDA
     means[1:-1] -= np.diff(means, 2) / 24
     power = float(np.square(np.abs(means)).mean())
     return np.asarray(means * (np.square(np.abs(field)).mean() / power) ** 0.5) if power else means
-
-
-def _intensity(
-    rows: npt.NDArray[np.complex64],
-    columns: npt.NDArray[np.complex64],
-    points: int,
-    mirrored: tuple[bool, bool],
-    symmetric: bool,
-) -> FloatArray:
-    whole = len(rows) // points, columns.shape[1] // points
-    kept = [count // 2 if half else count for count, half in zip(whole, mirrored, strict=True)]
-    columns = columns[:, : kept[1] * points]
-    means = np.empty(kept)
-    at_once = max(1, _AT_ONCE // max(columns.shape[1], 1) // points)
-
-    def square(start: int) -> None:
-        some, beyond = slice(start, min(start + at_once, kept[0])), start if symmetric else 0
-        field = rows[some.start * points : some.stop * points] @ columns[:, beyond * points :]
-        light = np.square(field.real) + np.square(field.imag)
-        down = light.reshape(-1, points, light.shape[1]).sum(axis=1)
-        blocks = sum(down[:, place::points].astype(np.float64) for place in range(points))
-        means[some, beyond:] = blocks / points**2
-        if symmetric:
-            means[beyond:, some] = means[some, beyond:].T
-
-    in_threads(square, range(0, kept[0], at_once))
-    if mirrored[0]:
-        means = np.concatenate((means, means[::-1]))
-    return np.concatenate((means, means[:, ::-1]), axis=1) if mirrored[1] else means
 
 
 # -------- Frames behind a mask drawn on a raster

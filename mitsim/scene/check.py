@@ -254,7 +254,7 @@ class _Tree:
         if name is None:
             got = "no text" if "filename" in node.props else "nothing"
             raise tag.refusal("filename", got, f"a {plugin} reads one file")
-        path = self.files.resource(tag, name)
+        path = self.files.find(tag, name)
         if self.files.own.get(path) in PREPARED:
             return  # mitsim reads it itself, and makes a file of it that is as Mitsuba needs it
         try:

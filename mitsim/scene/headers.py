@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -93,7 +92,7 @@ def check_ply(path: Path) -> tuple[bool, str]:
         file.seek(found.end())
         body = file.read()
     order, parts = _ply_header(found[0])
-    points, indices = _ply_text(body, parts) if order is None else _ply_binary(body, order, parts)
+    points, indices = _ply_body(body, order, parts)
     _check_points(points)
     count = parts["vertex"].count
     if indices.min() < 0 or indices.max() >= count:
@@ -274,51 +273,38 @@ def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:
     return order, parts
 
 
-def _check_claim(parts: Mapping[str, _Element], claimed: int, held: int, what: str) -> None:
-    if claimed > held:
-        counts = f"{parts['vertex'].count} vertices and {parts['face'].count} triangles"
-        raise ValueError(f"claims {counts}, more than its {what} hold{'s' * (what == 'text')}; export the mesh again")
-
-
-def _check_triangles(corners: npt.NDArray[Any], more: int) -> None:
-    if (corners != 3).any():
-        raise ValueError("has faces that are no triangles; export triangles")
-    if more:
-        raise ValueError("holds more than its header claims; export the mesh again")
-
-
-def _ply_binary(body: bytes, order: str, parts: Mapping[str, _Element]) -> _Mesh:
-    types = {name: part.dtype(order) for name, part in parts.items()}
-    sizes = {name: part.count * types[name].itemsize for name, part in parts.items()}
-    starts = dict(zip(parts, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
-    claimed = sum(sizes.values())
-    _check_claim(parts, claimed, len(body), "bytes")
-    points, triangles = (
-        np.frombuffer(body, types[name], parts[name].count, offset=starts[name]) for name in ("vertex", "face")
-    )
-    _check_triangles(triangles[_CORNERS], len(body) - claimed)
-    coordinates = np.stack([points[axis].astype(np.float64) for axis in "xyz"])
-    return coordinates, triangles[_INDICES].astype(np.int64)
-
-
-def _ply_text(body: bytes, parts: Mapping[str, _Element]) -> _Mesh:
-    if len(body) > _MOST_TEXT:
+def _ply_body(body: bytes, order: str | None, parts: Mapping[str, _Element]) -> _Mesh:
+    if order is None and len(body) > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary")
-    words, start, tables = body.split(), 0, dict[str, npt.NDArray[np.float64]]()
-    claimed = sum(part.count * part.words for part in parts.values())
-    _check_claim(parts, claimed, len(words), "text")
-    for name, part in parts.items():
-        end = start + part.count * part.words
-        if name in ("vertex", "face"):
-            try:
-                tables[name] = np.array(words[start:end]).astype(np.float64).reshape(part.count, part.words)
-            except ValueError:
-                raise ValueError("holds words that are no numbers; export the mesh again") from None
-        start = end
-    first = parts["face"].column(parts["face"].lists[0])
-    triangles = tables["face"][:, first : first + 4]
-    _check_triangles(triangles[:, 0], len(words) - claimed)
-    if not np.isfinite(triangles).all():
+    words = body.split() if order is None else []
+    types = {name: part.dtype(order or "<") for name, part in parts.items()}
+    widths = {name: part.words if order is None else types[name].itemsize for name, part in parts.items()}
+    starts = np.cumsum([0, *(part.count * widths[name] for name, part in parts.items())]).tolist()
+    first = dict(zip(parts, starts, strict=False))
+    held, vertices, faces = len(words if order is None else body), parts["vertex"], parts["face"]
+    if starts[-1] > held:
+        counts = f"{vertices.count} vertices and {faces.count} triangles"
+        holder = "text holds" if order is None else "bytes hold"
+        raise ValueError(f"claims {counts}, more than its {holder}; export the mesh again")
+    if order is None:
+        try:
+            vertex, face = (
+                np.array(words[first[name] :][: part.count * part.words]).astype(np.float64).reshape(-1, part.words)
+                for name, part in (("vertex", vertices), ("face", faces))
+            )
+        except ValueError:
+            raise ValueError("holds words that are no numbers; export the mesh again") from None
+        points = np.stack([vertex[:, vertices.column(axis)] for axis in "xyz"])
+        at = faces.column(faces.lists[0])
+        lengths, corners = face[:, at], face[:, at + 1 : at + 4]
+    else:
+        vertex, face = (np.frombuffer(body, types[n], parts[n].count, first[n]) for n in ("vertex", "face"))
+        points = np.stack([vertex[axis].astype(np.float64) for axis in "xyz"])
+        lengths, corners = face[_CORNERS], face[_INDICES]
+    if (lengths != 3).any():
+        raise ValueError("has faces that are no triangles; export triangles")
+    if held > starts[-1]:
+        raise ValueError("holds more than its header claims; export the mesh again")
+    if not np.isfinite(corners).all():
         raise ValueError("has corners that are no numbers; export the mesh again")
-    coordinates = [tables["vertex"][:, parts["vertex"].column(axis)] for axis in "xyz"]
-    return np.stack(coordinates), triangles[:, 1:].astype(np.int64)
+    return points, corners.astype(np.int64)

@@ -319,21 +319,14 @@ class SceneFiles:
 
     def include(self, tag: Tag, name: str) -> Path:
         """Return the file ``name`` of the ``<include>`` at ``tag``, relative to the file that names it."""
-        path = self._find(tag, tag.path.parent, name)
+        path = self.find(tag, name, tag.path.parent)
         _check_native(tag.path, path.parent)
         return path
 
     def spectrum(self, tag: Tag, folder: Path, name: str) -> None:
         """Check the file ``name`` of a spectrum, for which Mitsuba looks in ``folder`` first."""
-        if self._find(tag, folder, name).stat().st_size > _MOST_SPECTRUM:
+        if self.find(tag, name, folder).stat().st_size > _MOST_SPECTRUM:
             raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
-
-    def resource(self, tag: Tag, name: str) -> Path:
-        """Return the bitmap or mesh ``name`` at ``tag``, relative to the scene's folder.
-
-        Raises MitsimError if it lies elsewhere, or is no plain file of at most 512 MiB.
-        """
-        return self._find(tag, self.folder, name)
 
     def find_named(self, parameter: str, name: str) -> Path:
         """Return the path of the file that a user names for a scene ``parameter``.
@@ -362,7 +355,12 @@ class SceneFiles:
         self.own[path] = parameter
         return path
 
-    def _find(self, tag: Tag, folder: Path, name: str) -> Path:
+    def find(self, tag: Tag, name: str, folder: Path | None = None) -> Path:
+        """Return the file ``name`` at ``tag``, relative to a ``folder`` (None: the scene's).
+
+        Raises MitsimError if it lies outside the scene's folder, or is no plain file of at most 512 MiB.
+        """
+        folder = folder or self.folder
         path = folder / name
         try:
             status = path.stat()
