@@ -286,10 +286,14 @@ def _ply_body(body: bytes, order: str | None, parts: Mapping[str, _Element]) -> 
         counts = f"{vertices.count} vertices and {faces.count} triangles"
         holder = "text holds" if order is None else "bytes hold"
         raise ValueError(f"claims {counts}, more than its {holder}; export the mesh again")
+    vertex: npt.NDArray[Any]
+    face: npt.NDArray[Any]
     if order is None:
         try:
             vertex, face = (
-                np.array(words[first[name] :][: part.count * part.words]).astype(np.float64).reshape(-1, part.words)
+                np.array(words[first[name] : first[name] + part.count * part.words])
+                .astype(np.float64)
+                .reshape(-1, part.words)
                 for name, part in (("vertex", vertices), ("face", faces))
             )
         except ValueError:
