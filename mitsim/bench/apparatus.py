@@ -132,20 +132,10 @@ class Apparatus:
         from mitsim.transport.projector import ProjectorOptics
 
         grid, model = self.loaded.pixels, self.projector
-        return ProjectorOptics(
-            self.loaded.projector,
-            grid.n,
-            grid.first_row,
-            grid.first_column,
-            grid.canvas,
-            model.aperture_radius_mm,
-            model.focus_mm or self.geometry.scene_distance,
-            model.blur_pixels,
-            self.lines,
-            bool(self.loaded.parting),
-            1 - model.glare,
-            model.glare_spread * grid.n,
-        )
+        window = grid.n, grid.first_row, grid.first_column, grid.canvas
+        lens = model.aperture_radius_mm, model.focus_mm or self.geometry.scene_distance, model.blur_pixels
+        glare = 1 - model.glare, model.glare_spread * grid.n
+        return ProjectorOptics(self.loaded.projector, *window, *lens, self.lines, bool(self.loaded.parting), *glare)
 
     @property
     def setup(self) -> OpticalSetup:

@@ -162,15 +162,6 @@ def _with_value(owner: Any, name: str, value: object) -> Any:
     return owner.model_copy(update={name: value}) if isinstance(owner, BaseModel) else replace(owner, **{name: value})
 
 
-def _registry(*effects: Effect) -> Mapping[str, Effect]:
-    table: dict[str, Effect] = {}
-    for effect in effects:
-        if effect.name in table:
-            raise ValueError(f"effect {effect.name!r} is registered twice")
-        table[effect.name] = effect
-    return MappingProxyType(table)
-
-
 def _always(*light: str) -> Callable[[Physics], frozenset[str]]:
     return lambda physics: frozenset(light)
 
@@ -196,7 +187,7 @@ def _lens(bench: Apparatus) -> str:
     return f"a lens of radius {lens.aperture:g} mm, sharp at {lens.focus:g} mm: spots of {spot:.3g} mm at {far:g} mm"
 
 
-EFFECTS: Mapping[str, Effect] = _registry(
+_TABLE = (
     Effect(
         "interreflection",
         {"interreflection": False},
@@ -288,6 +279,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
         in_frames=False,
     ),
 )
+EFFECTS: Mapping[str, Effect] = MappingProxyType({effect.name: effect for effect in _TABLE})
 """All effects in the order of a plan's rows."""
 
 DISCRETISED: Mapping[str, str] = MappingProxyType({

@@ -302,11 +302,8 @@ def previews(bench: Apparatus, layout: Layout) -> tuple[Preview, Preview]:
     left = np.cross([0.0, 1.0, 0.0], ahead)
     left /= np.linalg.norm(left)
     aside[:3, :3] = np.stack([left, np.cross(ahead, left), ahead], axis=1)
-    lit = (
-        layout.window
-        if layout.depths is None
-        else np.concatenate([layout.window, *map(layout.window_at, layout.depths)])
-    )
+    places = [layout.window, *map(layout.window_at, layout.depths or ())]
+    lit = np.concatenate(places)
     local = (lit - aside[:3, 3]) @ aside[:3, :3]
     wide = 2 * float(np.degrees(np.arctan(_MARGIN * np.abs(local[:, :2] / local[:, 2:]).max())))
     first, second = (
@@ -441,12 +438,10 @@ def mask_fault(bench: Apparatus) -> Fault | None:
         )
     needed = 2 * max(float(np.abs(each).max()) for each in crossings)
     if mask.flaws.turn_deg:
-        return Fault(
+        turned = (
             f"the mask ({geometry.mask_words}) has no two factors as it is mounted, because the best separable one "
-            f"leaves {residual:.0%} of it",
-            "mount it straight",
-            residual,
         )
+        return Fault(f"{turned}leaves {residual:.0%} of it", "mount it straight", residual)
     least, feature = math.ceil(needed / mask.feature_mm), f"{mask.feature_mm * 1e3:g} um"
     order = least.bit_length()
     larger = f"use order {order} ({2**order - 1} features of {feature}), or larger features"

@@ -17,7 +17,6 @@ from pydantic.json_schema import SkipJsonSchema
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, validate
-from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
 from mitsim.devices.mask import NO_FLAWS, CameraMask, Mask, MaskKind, mls_mask
 from mitsim.devices.plate import FEW, Plate, within
@@ -352,9 +351,7 @@ def side_of(shape: tuple[int, int]) -> float:
 
 
 def centred_edges(count: int, pitch: float) -> FloatArray:
-    """Return the (count + 1,) edges of ``count`` equal cells about zero in the unit of ``pitch``; refuse no cells."""
-    if count < 1 or not (np.isfinite(pitch) and pitch > 0):
-        raise MitsimError(f"a grid of {count} cells of size {pitch} is empty; give at least 1 cell and a size above 0")
+    """Return the (count + 1,) edges of ``count`` equal cells about zero in the unit of ``pitch``."""
     return np.asarray((np.arange(count + 1, dtype=np.float64) - count / 2) * pitch)
 
 

@@ -91,10 +91,6 @@ class Plate(ByValue):
         most = LARGEST if self.lines_mm is None and not self.irradiance else _MOST_LINES
         if values.ndim != 2 or values.shape[0] != values.shape[1] or not 1 <= len(values) <= most:
             raise MitsimError(f"{self.words}: has shape {values.shape}; give a square of 1 to {most} features a side")
-        if not (np.isfinite(self.feature_mm) and self.feature_mm > 0):
-            raise MitsimError(f"{self.words}: feature size is {self.feature_mm} mm; give a finite number above 0")
-        if not (np.isfinite(values).all() if self.irradiance else values.min() >= 0 and values.max() <= 1):
-            raise MitsimError(f"{self.words}: transmissions are {values.min():g} to {values.max():g}; give 0 to 1")
         if not values.max() > (0 if self.irradiance else _ROUNDING):
             raise MitsimError(f"{self.words}: no feature lets light through; open some")
         self._hold(values=values)

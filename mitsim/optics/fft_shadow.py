@@ -97,8 +97,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
     """Draw the :func:`raster` of a camera that states its cells; the last rasters are cached."""
     mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
-    if not isinstance(mask, Plate):
-        raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
+    assert isinstance(mask, Plate), "other masks have a closed form"
     pixel = geometry.pixel_pitch * shadow.shrink
     step = pixel / cells_per_pixel(geometry)
     count = _cells(geometry, mask, step, spectrum)
@@ -298,12 +297,10 @@ def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDA
 
 _APART = 8
 """Step in pixels of the first lit pixel, so that light in cells of other sizes reuses the raster's spectra."""
-_WHOLE = 1e-6
-"""Part of a raster cell by which a pixel may differ from a whole number of cells: rounding."""
 
 
 class Correlation:
-    """Shadow of a raster at one depth, prepared once; raises MitsimError if a pixel is no whole number of cells.
+    """Shadow of a raster at one depth, prepared once; a pixel is a whole number of cells.
 
     Parameters
     ----------
@@ -378,8 +375,6 @@ class _Side:
         length = shadow.pixel_centres_mm[-1] - shadow.pixel_centres_mm[0]
         step = length * shadow.shrink / max(pixels - 1, 1) / shadow.mask.feature_mm
         phases = max(round(step), 1)
-        if pixels > 1 and abs(step - phases) > _WHOLE:
-            raise MitsimError(f"a pixel is {step:g} cells of the mask's raster; draw one of a whole number")
         cell, blur, count = shadow.mask.feature_mm, shadow.mask.blur_mm, len(cast("Plate", shadow.mask).values)
         halves = shadow.half_pixel / cell, shadow.half_cell(directions) / cell
         crossings = (shadow.shrink * shadow.pixel_centres_mm[0] + shadow.distance_mm * directions.centres) / cell

@@ -14,7 +14,6 @@ import numpy as np
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import Devices, side_of
 from mitsim.devices.patterns import Lighting
@@ -402,12 +401,7 @@ Kernel = Callable[[FloatArray], FloatArray]
 
 
 def add_speckle(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
-    """Multiply ``irradiance`` (any shape and unit) by a gamma field of mean 1 and standard deviation ``contrast``.
-
-    Raises MitsimError for a contrast outside 0..1, because single fully developed speckle has 1.
-    """
-    if not 0 <= contrast <= 1:
-        raise MitsimError(f"speckle contrast is {contrast}; give a number from 0 (none) to 1 (fully developed)")
+    """Multiply ``irradiance`` (any shape and unit) by a gamma field of mean 1 and standard deviation ``contrast``."""
     if contrast == 0:
         return irradiance
     return np.asarray(irradiance * rng.gamma(contrast**-2, contrast**2, size=irradiance.shape))
@@ -425,13 +419,7 @@ def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArra
     lit
         (n, n) light of each projector pixel, any unit.
 
-    Raises
-    ------
-    MitsimError
-        If no pixel is lit.
     """
-    if not lit.any():
-        raise MitsimError("speckle contrast: no projector pixel is lit; light makes it")
     coherence, spectrum = devices.projector.speckle or Coherence(), devices.projector.spectrum
     wavelengths = spectrum.wavelengths_nm
     inverse, pairs = 1 / wavelengths, np.eye(len(wavelengths))

@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.plate import FEW, RASTER_LEFT_OUT, Plate
@@ -396,12 +395,7 @@ def _stack(parts: Sequence[FloatArray]) -> FloatArray:
 
 
 def anchor_positions(count: int, half_width: float) -> FloatArray:
-    """Return the (``count``,) coordinates of anchors on a sensor of ``half_width``: Chebyshev nodes.
-
-    Raises MitsimError for a count below one.
-    """
-    if count < 1:
-        raise MitsimError(f"number of anchors a side is {count}; give at least 1")
+    """Return the (``count``,) coordinates of anchors on a sensor of ``half_width``: Chebyshev nodes."""
     k = np.arange(count)
     return -half_width * np.cos(np.pi * (2 * k + 1) / (2 * count))
 

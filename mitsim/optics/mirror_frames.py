@@ -23,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels
-from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import SampledTerm, geometric_samplers, wave_samplers
@@ -126,19 +125,8 @@ def specular_frames(
         Boxes along a sensor pixel, at least 2, because a box turned by 45 degrees must not reach a third pixel. Any
         number is exact where beams are aligned with the pixels' rows and columns.
 
-    Raises
-    ------
-    MitsimError
-        If ``labels`` do not cover the beams' projector pixels, or for fewer than two boxes.
     """
     labels = np.asarray(labels)
-    if boxes_per_pixel < 2:
-        raise MitsimError(f"boxes_per_pixel is {boxes_per_pixel}; give at least 2")
-    if len(beams) and int(beams.pixel.max()) >= len(labels):
-        raise MitsimError(
-            f"labels has {len(labels)} entries, but light leaves projector pixel {int(beams.pixel.max())}; "
-            "give one class for each of the n * n pixels"
-        )
     corners = beams.sensor.reshape(len(beams), 4, 2)
     on_sensor = (corners.max(axis=1) > -geometry.half_width) & (corners.min(axis=1) < geometry.half_width)
     reached = np.flatnonzero(on_sensor.all(axis=1))

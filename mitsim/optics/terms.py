@@ -408,12 +408,8 @@ class ModelledCamera:
         @lru_cache(maxsize=_KEPT)
         def form(placement: Placement) -> tuple[FloatArray, FloatArray]:
             shifts = placement.mask_shift_row, placement.mask_shift_column
-            by_row, by_column = (
-                axis(placement.mask_distance, own + shift, directions)
-                for own, shift, directions in zip(
-                    self.geometry.mask_offset, shifts, self._directions(placement), strict=True
-                )
-            )
+            offsets = zip(self.geometry.mask_offset, shifts, self._directions(placement), strict=True)
+            by_row, by_column = (axis(placement.mask_distance, own + more, each) for own, more, each in offsets)
             terms = [(left, right) for (left, _), (_, right) in zip(by_row, by_column, strict=True)]
             best = best_term(centre_terms(terms) if self.geometry.centred else terms)
             return best.left, best.right

@@ -187,27 +187,14 @@ def load_scene(
         for shape, bsdf in zip(shapes, bsdfs, strict=True)
     )
     normals = [np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n).ravel() for shape in shapes if one_sided]
-    return LoadedScene(
-        path,
-        checked.files,
-        scene,
-        cameras[0],
-        projectors[0] if grid else None,
-        grid,
-        tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector"),
-        mirrors,
-        glossy,
-        unfit,
-        checked.shapes if len(checked.shapes) == len(shapes) else (),
-        tuple(zip(small, checked.small_lamps, strict=True)),
-        checked.coloured,
-        checked.parting,
-        checked.samples,
-        notes,
-        bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED,
-        sensor_note,
-        checked.own,
-    )
+    devices = cameras[0], projectors[0] if grid else None, grid
+    lamps = tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector")
+    tags = checked.shapes if len(checked.shapes) == len(shapes) else ()
+    small_lamps = tuple(zip(small, checked.small_lamps, strict=True))
+    facts: dict[str, Any] = {name: getattr(checked, name) for name in ("coloured", "parting", "samples", "own")}
+    facts |= {"one_way": bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED, "notes": notes}
+    seen = mirrors, glossy, unfit, tags, small_lamps
+    return LoadedScene(path, checked.files, scene, *devices, lamps, *seen, sensor_note=sensor_note, **facts)
 
 
 def _one_projector(path: Path, found: Sequence[mi.Emitter]) -> MitsimError:

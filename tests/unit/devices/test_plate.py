@@ -224,7 +224,7 @@ def test_other_tables_are_refused_in_one_line(table: str, word: str, tmp_path: P
         load_mask(path)
 
 
-@pytest.mark.parametrize("values", [np.zeros((3, 3)), np.full((2, 2), 1.1), np.ones((2, 3))])
+@pytest.mark.parametrize("values", [np.zeros((3, 3)), np.ones((4097, 4097))])
 def test_impossible_plates_are_refused_in_one_line(values: np.ndarray) -> None:
     with pytest.raises(MitsimError, match=r"^it: [^\n]+$"):
         Plate(0.06, values, "it")

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from mitsim.core.configuration import load_model, shipped_path, validate
 from mitsim.core.errors import MitsimError
-from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
+from mitsim.devices.projector import Lines, ProjectorModel
 
 BASE = {"name": "test", "effective_wavelength_nm": 550.0}
 
@@ -98,22 +98,6 @@ def test_a_spectrum_is_of_photons_and_some_line_has_power() -> None:
     spectrum = validate(ProjectorModel, {**lines, "radiant_shares": [2.0, 3.0]}, "here").spectrum
     assert spectrum.weights == pytest.approx([180 / 540, 360 / 540])
     assert validate(ProjectorModel, BASE, "here").spectrum.wavelengths_nm.tolist() == [550.0]
-
-
-@pytest.mark.parametrize(
-    ("wavelengths", "weights"),
-    [
-        ([], []),
-        ([500.0], [0.5, 0.5]),
-        ([-1.0], [1.0]),
-        ([math.nan], [1.0]),
-        ([500.0], [0.9]),
-        ([1.0, 2.0], [2.0, -1.0]),
-    ],
-)
-def test_arrays_that_are_no_spectrum_are_refused(wavelengths: list[float], weights: list[float]) -> None:
-    with pytest.raises(MitsimError, match=r"^spectrum [^\n]+$"):
-        Spectrum(np.array(wavelengths), np.array(weights))
 
 
 def test_speckle_is_a_number_or_a_table(tmp_path: Path) -> None:

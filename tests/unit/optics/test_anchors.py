@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mitsim.core.errors import MitsimError
 from mitsim.optics.image_formation import anchor_positions, anchor_weights
 
 
@@ -22,8 +21,3 @@ def test_interpolation_is_exact_for_polynomials_of_one_degree_less_than_anchors(
     assert weights.shape == (9, count)
     np.testing.assert_allclose(weights @ polynomial(anchors), polynomial(at), rtol=1e-12)
     np.testing.assert_allclose(anchor_weights(anchors, anchors), np.eye(count), atol=1e-14)
-
-
-def test_no_anchors_are_refused() -> None:
-    with pytest.raises(MitsimError, match="anchors a side is 0; give at least 1"):
-        anchor_positions(0, 1.0)

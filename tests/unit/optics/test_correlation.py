@@ -16,7 +16,6 @@ from mitsim.devices.plate import RASTER_LEFT_OUT, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics import fft_shadow as rasters
 from mitsim.optics import image_formation
-from mitsim.optics.fft_shadow import Correlation
 from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_weights
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
 
@@ -179,10 +178,3 @@ def test_waves_of_large_drawings_are_refused_before_they_are_drawn() -> None:
     with pytest.raises(MitsimError, match=r"drawing noise\.png: .* use --effects=-diffraction"):
         rasters.check_waves(camera, Spectrum(np.array([500.0]), np.ones(1)))
     assert camera.is_drawn(waves=False) and camera.mask_terms == 1
-
-
-def test_a_raster_of_no_whole_pixel_is_refused() -> None:
-    camera = turned()
-    shadow = replace(ShadowGeometry.of(camera, 300.0), mask=Plate(0.0071, np.ones((9, 9)), "it", irradiance=True))
-    with pytest.raises(MitsimError, match="a whole number"):
-        Correlation(shadow, ROWS, COLUMNS)

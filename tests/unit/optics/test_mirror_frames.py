@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import ProfileSampler, geometric_samplers, wave_samplers
@@ -223,19 +222,6 @@ def test_a_profile_sampler_takes_means() -> None:
     assert sampler(np.array([0.0]), np.array([8.0])) == pytest.approx([0.375])
     assert sampler(np.array([-0.75, 0.25, 5.0, -5.0]), np.full(4, 0.0)) == pytest.approx([1, 3, 0, 0])
     assert sampler(np.array([0.5]), np.array([0.2])) == pytest.approx([2.5])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"labels": np.zeros(3, np.int64)}, "labels has 3 entries.*pixel 4"),
-        ({"boxes_per_pixel": 1}, "boxes_per_pixel is 1"),
-    ],
-)
-def test_bad_arguments_are_refused(change: dict[str, object], message: str) -> None:
-    arguments = {"labels": LABELS, **change}
-    with pytest.raises(MitsimError, match=message):
-        specular_frames(beams(turned(0, 0.4)), geometry(), geometric_samplers(geometry()), **arguments)
 
 
 def test_a_beam_that_passes_the_sensors_corner_lights_no_pixel() -> None:

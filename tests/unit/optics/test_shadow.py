@@ -127,23 +127,13 @@ def test_narrow_cells_tend_to_points():
     np.testing.assert_allclose(factors[2], factors[0], rtol=0, atol=1e-12)
 
 
-def test_equal_edges_make_directions_and_unequal_ones_are_refused():
+def test_equal_edges_make_directions():
     at = Directions.cells([-0.2, -0.1, 0.0, 0.1])
     np.testing.assert_allclose(at.centres, [-0.15, -0.05, 0.05], rtol=0, atol=1e-15)
     assert at.width == pytest.approx(0.1)
     assert at == Directions([*at.centres], at.width) and at != Directions(at.centres, 0.0)
     with pytest.raises(ValueError, match="read-only"):
         at.centres[0] = 1
-    with pytest.raises(MitsimError, match="are not equal"):
-        Directions.cells([0.0, 0.1, 0.3])
-
-
-@pytest.mark.parametrize(
-    ("centres", "width"), [([], 0.1), ([0.1, 0.1], 0.0), ([np.nan], 0.0), ([0.0], -1), ([0.0], np.inf)]
-)
-def test_bad_directions_are_refused_in_one_line(centres, width):
-    with pytest.raises(MitsimError, match=r"^[^\n]+$"):
-        Directions(centres, width)
 
 
 def test_a_fill_factor_dims_both_axes_once_and_shades_each_by_its_own_directions():
