@@ -193,8 +193,8 @@ def load_scene(
     small_lamps = tuple(zip(small, checked.small_lamps, strict=True))
     facts: dict[str, Any] = {name: getattr(checked, name) for name in ("coloured", "parting", "samples", "own")}
     facts |= {"one_way": bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED, "notes": notes}
-    seen = mirrors, glossy, unfit, tags, small_lamps
-    return LoadedScene(path, checked.files, scene, *devices, lamps, *seen, sensor_note=sensor_note, **facts)
+    facts |= {"mirrors": mirrors, "glossy": glossy, "unfit": unfit, "shapes": tags, "small_lamps": small_lamps}
+    return LoadedScene(path, checked.files, scene, *devices, lamps, sensor_note=sensor_note, **facts)
 
 
 def _one_projector(path: Path, found: Sequence[mi.Emitter]) -> MitsimError:
