@@ -111,8 +111,7 @@ class Exposure:
         _check_range("exposure_fraction", self.fraction, *EXPOSURE_FRACTION, "a part of the full well, {}")
 
     def check(self, sensor: SensorModel, camera_file: Path | str) -> None:
-        """MitsimError when the ``sensor``, of a ``camera_file``, sees through colour filters, whose frames are captured
-        otherwise, or the time is to follow from a full well that it does not have."""
+        """Refuse a ``sensor`` under colour filters, and one without the full well that decides the time."""
         if sensor.mosaic is not None:
             raise MitsimError(
                 f"camera {camera_file}: has a mosaic {sensor.mosaic}, whose frames show all lines at once; "
@@ -125,8 +124,7 @@ class Exposure:
             )
 
     def choose(self, devices: Devices, peak_irradiance: float) -> float:
-        """Exposure time [s] of ``devices`` for frames whose brightest expected pixel has ``peak_irradiance``
-        [W m^-2]."""
+        """Return the exposure time [s] for a brightest expected pixel of ``peak_irradiance`` [W m^-2]."""
         if self.seconds is not None:
             return self.seconds
         from mitsim.sensor.chain import exposure_for_peak  # here: it needs numpy, and checking a request does not
@@ -136,7 +134,7 @@ class Exposure:
 
 
 def _check_range(name: str, value: float, least: float, most: float, rule: str) -> float:
-    """``value``, or ArgumentError with the ``rule``, which has {} in place of the least and the most."""
+    """Return ``value``, or raise ArgumentError with the ``rule``, in which {} stands for the range."""
     if not least <= value <= most:
         raise ArgumentError(name, f"{value}: give {rule.format(f'{least:g} to {most:g}')}")
     return value
@@ -153,8 +151,7 @@ def check_psnr(psnr: float) -> float:
 
 
 def check_samples(estimator: str, spp: int | None) -> None:
-    """Refuse an unknown ``estimator``, and too few or too many samples ``spp`` a pixel of the reference; None stands
-    for those of the scene."""
+    """Refuse an unknown ``estimator``, and too few or too many samples ``spp`` a pixel of the reference."""
     if estimator not in ESTIMATORS:
         raise ArgumentError("estimator", f"{estimator!r}: use {' or '.join(ESTIMATORS)}")
     if estimator == REFERENCE and spp is not None and not FEWEST_PASSES <= spp <= MOST_SAMPLES:
@@ -262,7 +259,7 @@ class Timed(Seeded):
 
     @property
     def timing(self) -> Exposure:
-        """How the exposure time is found."""
+        """Return how the exposure time is found."""
         return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
 
 
@@ -320,8 +317,7 @@ class Request(Timed, Planned):
 
     @property
     def deciding(self) -> dict[str, Any]:
-        """The fields that decide frames, as the manifest's configuration holds them, with either an accuracy or
-        seconds."""
+        """Return the fields that decide frames, as the manifest's configuration holds them."""
         unused = {"accuracy" if self.seconds is not None else "seconds"}
         # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
         return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
@@ -411,8 +407,7 @@ class Opening(LitScene):
     )
 
     def traced_in(self, colour: str) -> str:
-        """Return the variant that light is traced in for a ``colour``: one that knows wavelengths if lines are told
-        apart."""
+        """Return the variant that traces light for a ``colour``: one that knows wavelengths if lines are told apart."""
         return self.variant if colour in (NO, AUTO) else spectral_of(self.variant)
 
     def check(
@@ -465,14 +460,14 @@ class Opening(LitScene):
 
     @property
     def texts(self) -> dict[str, str]:
-        """The parameters as a scene spells them."""
+        """Return the parameters as a scene spells them."""
         from mitsim.bench.apparatus import spelling
 
         return {name: spelling(value) for name, value in self.parameters.items()}
 
     @property
     def models(self) -> list[Path]:
-        """Files of the camera and its mask, and of the projector, that are named."""
+        """Return the files of the camera and its mask, and of the projector, that are named."""
         from mitsim.devices.mask_profile import load_mask  # here: it imports numpy
 
         named = (self.camera, CAMERA), (self.projector, PROJECTOR)

@@ -57,9 +57,9 @@ class Dust(ByValue):
     Attributes
     ----------
     centres_mm
-        (k, 2) rows and columns of their centres.
+        (k, 2) rows and columns of the centres.
     radius_mm, opacity
-        of each; the part of the light that it takes, where discs overlap each its own.
+        Radius of each disc, and the part of the light that it takes, also where discs overlap.
     """
 
     centres_mm: FloatArray
@@ -70,7 +70,7 @@ class Dust(ByValue):
         self._hold(centres_mm=np.array(self.centres_mm, dtype=np.float64))
 
     def turn(self, quarters: int) -> Dust:
-        """The same on a mask turned by so many ``quarters`` of a turn, as ``numpy.rot90`` turns its features."""
+        """Return the dust on a mask turned by ``quarters`` of a turn, as ``numpy.rot90`` turns its features."""
         row, column = self.centres_mm.T
         for _ in range(quarters % 4):
             row, column = -column, row
@@ -100,18 +100,18 @@ class Flaws:
 
     @property
     def margin_mm(self) -> float:
-        """How far its blur reaches [mm]."""
+        """Return the distance that the blur reaches [mm]."""
         return _REACH * self.blur_mm
 
     def reach(self, extent_mm: float) -> float:
-        """Side [mm] of a square that holds a mask of side ``extent_mm`` as it is mounted."""
+        """Return the side [mm] of a square that holds a mask of side ``extent_mm`` as it is mounted."""
         angle = np.radians(self.turn_deg)
         # A tilted mask meets a ray beside where an even one does, by less than the tangent of its tilt.
         tilt = 1 + sum(abs(angle) for angle in self.tilt_mrad) * 1e-3
         return float(extent_mm * (abs(np.cos(angle)) + abs(np.sin(angle))) * tilt**2 + 2 * self.margin_mm)
 
     def turned_back(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coordinates on the mask itself of points (``row``, ``column``) of its plane."""
+        """Return the coordinates on the mask itself of points (``row``, ``column``) of its plane."""
         if not self.turn_deg:
             return row, column
         cosine, sine = np.cos(np.radians(self.turn_deg)), np.sin(np.radians(self.turn_deg))
@@ -159,17 +159,17 @@ class Mask(ByValue):
 
     @property
     def extent_mm(self) -> float:
-        """Side of the patterned square [mm]; it spans -extent/2 .. +extent/2."""
+        """Return the side of the patterned square [mm]; it spans -extent/2 .. +extent/2."""
         return len(self.bits) * self.feature_mm
 
     @property
     def lines(self) -> FloatArray:
-        """(N + 1,) coordinates of the lines between rows, and between columns [mm]."""
+        """Return the (N + 1,) coordinates of the lines between rows, and between columns [mm]."""
         return np.asarray((np.arange(len(self.bits) + 1) - len(self.bits) / 2) * self.feature_mm)
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """Transmission as a sum of terms (weight, row profile (N,), column profile (N,))."""
+        """Return the transmission as a sum of terms (weight, row profile (N,), column profile (N,))."""
         ones = np.ones(len(self.bits))
         if self.kind == "open":
             return ((1.0, ones, ones),)
@@ -200,14 +200,14 @@ class Mask(ByValue):
 
     @property
     def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
-        """What is open, as grids that do not overlap: (N,) rows and (N,) columns of each, open where both say so."""
+        """Return the openings as grids that do not overlap: (N,) rows and (N,) columns of each, open where both are."""
         bits = self.bits.astype(bool)
         if self.kind == "open":
             return ((np.ones_like(bits), np.ones_like(bits)),)
         return ((bits, bits),) if self.kind == "separable" else ((bits, bits), (~bits, ~bits))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
-        """Transmission (0..1) at points (``s_row``, ``s_col``) of the mask plane [mm]; the arrays broadcast."""
+        """Return the transmission (0..1) at points (``s_row``, ``s_col``) of the mask plane [mm]; arrays broadcast."""
         count = len(self.bits)
         row, column = (np.floor(np.asarray(s, dtype=np.float64) / self.feature_mm + count / 2) for s in (s_row, s_col))
         in_rows, in_columns = ((at >= 0) & (at < count) for at in (row, column))
@@ -217,7 +217,7 @@ class Mask(ByValue):
 
 
 def mean_opening(is_open: BoolArray, widths: FloatArray) -> float:
-    """Mean width of openings down the rows of a mask, in the unit of ``widths``; 0 without one.
+    """Return the mean width of openings down the rows of a mask, in the unit of ``widths``; 0 without one.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def mean_opening(is_open: BoolArray, widths: FloatArray) -> float:
 
 @cache
 def mls_code(order: int) -> npt.NDArray[np.int8]:
-    """(2**order - 1,) bits of the maximum length sequence of an ``order`` from 2 to 16, read-only.
+    """Return the (2**order - 1,) bits of the maximum length sequence of an ``order`` from 2 to 16, read-only.
 
     The bits of ``scipy.signal.max_len_seq(order)[0]``, whose import alone takes a second: a linear feedback shift
     register that starts with ones. Polynomial and phase matter: another sequence moves the system's condition number
@@ -250,7 +250,7 @@ def mls_code(order: int) -> npt.NDArray[np.int8]:
 
 
 def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int = 9) -> Mask:
-    """The mask of :func:`mls_code`; the defaults are the paper's.
+    """Return the mask of :func:`mls_code`; the defaults are the paper's.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int 
 
 
 def etch(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Lines (2 N + 2,) and transmissions (2 N + 1, 2 N + 1) of a mask whose openings have grown on each side.
+    """Return lines (2 N + 2,) and transmissions (2 N + 1, 2 N + 1) of a mask whose openings have grown on each side.
 
     Every place gets the greatest transmission within a square of half-side ``grow_mm``, or the least where that is
     below 0; beyond the mask it is opaque.
@@ -297,7 +297,7 @@ def etch(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatAr
 
 
 def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float) -> tuple[FloatArray, FloatArray]:
-    """A mask's lines and transmissions with dust on it.
+    """Return a mask's lines and transmissions with dust on it.
 
     Parameters
     ----------

@@ -125,7 +125,7 @@ class MaskProfile(Configuration):
         return self
 
     def plate(self, folder: Path) -> Plate:
-        """The plate as it is made; files count from ``folder``. MitsimError for one too large."""
+        """Return the plate as it is made; files count from ``folder``. Raises MitsimError if it is too large."""
         drawn = self.plate_drawing(folder)
         if not self._stated:
             return drawn
@@ -155,7 +155,7 @@ class MaskProfile(Configuration):
         return Plate(feature, values, ", ".join([drawn.words, *stated]), lines, flaws)
 
     def plate_of_light(self, folder: Path, mask_distance_mm: float) -> Plate:
-        """The light behind a phase mask as a plate: how much brighter each place is than without a mask.
+        """Return the light behind a phase mask as a plate: how much brighter each place is than without a mask.
 
         A point at depth z0 lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask. Of its light the
         aperture's area goes through, and the picture says where.
@@ -186,12 +186,12 @@ class MaskProfile(Configuration):
 
     @property
     def _stated(self) -> set[str]:
-        """The flaws that differ from none."""
+        """Return the names of the flaws that the mask has."""
         named = {name for name in _FLAWS - _DUST if getattr(self, name) != type(self).model_fields[name].default}
         return named | (_DUST if self.dust_per_mm2 else set())
 
     def plate_drawing(self, folder: Path) -> Plate:
-        """The plate as it is drawn; files count from ``folder``."""
+        """Return the plate as it is drawn; files count from ``folder``."""
         if self.kind in get_args(MaskKind):
             if 2**self.order - 1 > LARGEST:
                 raise MitsimError(
@@ -212,7 +212,7 @@ class MaskProfile(Configuration):
         return Plate(self.feature_mm, (draws < self.open_part).astype(np.float64), words)
 
     def put_on(self, camera: CameraGeometry, folder: Path) -> CameraGeometry:
-        """The ``camera`` with this mask; a drawing's file counts from ``folder``. MitsimError as for a plate."""
+        """Return the ``camera`` with this mask; a drawing's file counts from ``folder``. Raises as :meth:`plate`."""
         mask: dict[str, object] = {"mask_feature": self.feature_mm, "mask_plate": None}
         if self.kind == "psf":
             picture = self.plate_of_light(folder, camera.mask_distance)
@@ -225,7 +225,7 @@ class MaskProfile(Configuration):
 
 
 def mura(features: int) -> FloatArray:
-    """(p, p) modified uniformly redundant array of an odd prime p ``features``, 0 and 1: one period of it.
+    """Return the (p, p) modified uniformly redundant array of an odd prime p ``features``, 0 and 1: one period of it.
 
     Gottesman and Fenimore, Applied Optics 28, 4344 (1989), equation 11: row 0 is closed, else column 0 is open, else
     what C_i C_j = 1 makes so, with C_k = 1 for squares modulo p and -1 for others.
@@ -238,7 +238,7 @@ def mura(features: int) -> FloatArray:
 
 
 def load_mask(path: Path | str) -> MaskProfile | None:
-    """The table ``[mask]`` of the camera file ``path``, None without one. MitsimError naming field, value and rule."""
+    """Return the table ``[mask]`` of the camera file ``path``, None without one. Errors name field, value and rule."""
     table = read_toml(path)
     if "mask" not in table:
         return None
@@ -263,7 +263,7 @@ is centred does not reach."""
 
 
 def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> FloatArray:
-    """The point spread function in a picture (PNG, TIFF, NPY, OpenEXR).
+    """Return the point spread function in a picture (PNG, TIFF, NPY, OpenEXR).
 
     Colours are averaged, the median of a frame along the edges is taken off as background, ``reduce`` x ``reduce``
     pixels are averaged, what is left below zero (noise around the background) is zero, and the sum is made 1.

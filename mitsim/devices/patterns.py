@@ -48,7 +48,7 @@ class Shot:
 
     @property
     def names(self) -> tuple[str, int, int, int]:
-        """Names of the shot's random streams."""
+        """Return the names of the shot's random streams."""
         return ("capture", self.row, self.column, self.sign)
 
 
@@ -69,18 +69,18 @@ class Lighting:
 
     @classmethod
     def uniform(cls, n: int) -> Lighting:
-        """One shot with each of ``n`` x ``n`` projector pixels fully lit."""
+        """Return one shot with each of ``n`` x ``n`` projector pixels fully lit."""
         import numpy as np
 
         return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
 
     @property
     def lit(self) -> float:
-        """Part of all pixels that a shot lights, in the mean, by their power."""
+        """Return the part of all pixels that a shot lights in the mean, by their power."""
         return float(self.weights.mean(axis=0)[self.labels].mean())
 
     def shots(self, chosen: list[int] | npt.NDArray[np.int64]) -> Lighting:
-        """The same classes in the ``chosen`` shots only."""
+        """Return the classes in the ``chosen`` shots only."""
         return replace(self, weights=self.weights[chosen])
 
 
@@ -102,24 +102,24 @@ class PatternFamily:
 
     @property
     def n(self) -> int:
-        """Projector pixels a side."""
+        """Return the projector pixels a side."""
         return int(self.left.shape[0])
 
     @property
     def signed(self) -> bool:
-        """Whether the patterns take the value -1."""
+        """Return True if patterns take the value -1."""
         return bool((self.left < 0).any() or (self.right < 0).any())
 
     @property
     def shots(self) -> tuple[Shot, ...]:
-        """Every frame to project, row-major over (i, j); a positive half is followed by its negative half."""
+        """Return every frame to project, row-major over (i, j); a positive half is followed by its negative half."""
         signs = (1, -1) if self.signed else (0,)
         return tuple(
             Shot(i, j, sign) for i in range(self.left.shape[1]) for j in range(self.right.shape[1]) for sign in signs
         )
 
     def light(self, shot: Shot) -> FloatArray:
-        """(n, n) fraction 0..1 of full power that each projector pixel emits in one ``shot``."""
+        """Return the (n, n) fraction 0..1 of full power that each projector pixel emits in one ``shot``."""
         import numpy as np
 
         pattern = np.outer(self.left[:, shot.row], self.right[:, shot.column]).astype(np.float64)
@@ -127,7 +127,7 @@ class PatternFamily:
 
     @cached_property
     def lighting(self) -> Lighting:
-        """The finest partition of the pixels whose members are always lit alike, and every shot's light of it."""
+        """Return the finest partition of pixels that are always lit alike, and every shot's light of it."""
         import numpy as np
 
         _, row = np.unique(self.left, axis=0, return_inverse=True)
@@ -153,9 +153,9 @@ Way = tuple[Literal["doubled", "skew", "symmetric", "product"], int]
 
 
 def way_to(order: int) -> Way:
-    """How the matrix of that ``order`` is built.
+    """Return how the matrix of that ``order`` is built.
 
-    MitsimError for an order that no construction here reaches, with the nearest ones that are reached.
+    Raises MitsimError for an order that no construction here reaches, with the nearest ones that are reached.
     """
     way = _way(order)
     if way is None:
@@ -165,14 +165,14 @@ def way_to(order: int) -> Way:
 
 
 def hadamard_orders(limit: int) -> list[int]:
-    """Orders up to ``limit`` that :func:`hadamard_matrix` can build."""
+    """Return the orders up to ``limit`` that :func:`hadamard_matrix` can build."""
     return [order for order in range(1, limit + 1) if _way(order)]
 
 
 def stripe_count(n: int) -> int:
-    """N, the stripe patterns of a side for ``n`` projector pixels: the smallest order of at least n.
+    """Return N, the stripe patterns of a side for ``n`` projector pixels: the smallest order of at least n.
 
-    MitsimError where no order up to 2 n is reached.
+    Raises MitsimError if no order up to 2 n is reached.
     """
     found = next(filter(_way, range(n, 2 * n + 1)), None)  # with a power of two among them
     if found is None:
@@ -202,9 +202,9 @@ def is_prime(value: int) -> bool:
 
 
 def hadamard_matrix(order: int) -> PatternFactor:
-    """(``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones.
+    """Return the (``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones.
 
-    MitsimError as :func:`way_to`.
+    Raises MitsimError as :func:`way_to`.
     """
     import numpy as np
 
@@ -231,7 +231,7 @@ def _construct(order: int) -> npt.NDArray[np.int64]:
 
 
 def _conference(q: int) -> npt.NDArray[np.int64]:
-    """(q + 1, q + 1) Paley conference matrix of the prime q: skew for q = 3 mod 4, symmetric for q = 1 mod 4."""
+    """Return the (q + 1, q + 1) Paley conference matrix of a prime q: skew for q = 3 mod 4, symmetric for 1 mod 4."""
     import numpy as np
 
     squares = set((np.arange(1, q) ** 2 % q).tolist())
@@ -245,9 +245,9 @@ def _conference(q: int) -> npt.NDArray[np.int64]:
 
 
 def stripe_signs(n: int) -> PatternFactor:
-    """(``n``, N) first rows of the smallest Hadamard matrix that has them; column 0 is all +1.
+    """Return the (``n``, N) first rows of the smallest Hadamard matrix that has them; column 0 is all +1.
 
-    The +-1 patterns of a calibration's stripes. MitsimError as :func:`mitsim.devices.patterns.stripe_count`.
+    They are the +-1 patterns of a calibration's stripes. Raises as :func:`stripe_count`.
     """
     return hadamard_matrix(stripe_count(n))[:n]
 
@@ -380,14 +380,15 @@ def random_binary(axis: PatternAxis) -> PatternFactor:
 
 
 def pattern_names() -> str:
-    """How all families are called, for help and messages: "uniform, dots:K, dots:RxC, hadamard:K or random:K"."""
+    """Return the names of all families for messages: "uniform, dots:K, dots:RxC, hadamard:K or random:K"."""
     *most, last = (form for family in FAMILIES.values() for form in family.forms)
     return f"{', '.join(most)} or {last}"
 
 
 def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
-    """Family and periods (one, or those of rows and of columns) of the patterns ``text``, for ``n`` projector pixels a
-    side; None: any number.
+    """Return family and periods (one, or those of rows and of columns) of the patterns ``text``.
+
+    ``n`` is the number of projector pixels a side, None for any number.
 
     Raises
     ------
@@ -418,19 +419,19 @@ def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
 
 
 def takes_seed(text: str) -> bool:
-    """Whether the patterns ``text`` are drawn at random."""
+    """Return True if the patterns ``text`` are drawn at random."""
     name = text.partition(":")[0]
     return name in FAMILIES and FAMILIES[name].random
 
 
 def shot_count(text: str) -> int:
-    """How many shots the patterns ``text`` take, two of each with the value -1. MitsimError as :func:`read_name`."""
+    """Return the number of shots of the patterns ``text``, two for each with -1; errors as :func:`read_name`."""
     family, periods = read_name(text)
     return periods[0] * periods[-1] * (2 if any(map(family.signed, periods)) else 1)
 
 
 def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
-    """The patterns of a name.
+    """Return the patterns of a name.
 
     Parameters
     ----------

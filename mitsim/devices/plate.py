@@ -102,7 +102,7 @@ class Plate(ByValue):
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the transmissions, and of the lines where they are not even, 64 hexadecimal digits."""
+        """Return the SHA-256 of the transmissions, and of uneven lines, as 64 hexadecimal digits."""
         digest = hashlib.sha256(np.ascontiguousarray(self.values).tobytes())
         if self.lines_mm is not None:
             digest.update(self.lines_mm.tobytes())
@@ -110,52 +110,54 @@ class Plate(ByValue):
 
     @property
     def identity(self) -> str:
-        """What manifests say of it: equal for equal plates alone."""
+        """Return what manifests state, which is equal for equal plates alone."""
         return f"{self.words}, features of {self.feature_mm:g} mm, sha256 {self.digest}"
 
     @property
     def extent_mm(self) -> float:
-        """Side of the square [mm]; it spans -extent/2 .. +extent/2."""
+        """Return the side of the square [mm]; it spans -extent/2 .. +extent/2."""
         return len(self.values) * self.feature_mm if self.lines_mm is None else float(np.ptp(self.lines_mm))
 
     @cached_property
     def lines(self) -> FloatArray:
-        """(N + 1,) coordinates of the lines between rows, and between columns [mm]."""
+        """Return the (N + 1,) coordinates of the lines between rows, and between columns [mm]."""
         if self.lines_mm is not None:
             return self.lines_mm
         return np.asarray((np.arange(len(self.values) + 1) - len(self.values) / 2) * self.feature_mm)
 
     @property
     def blur_mm(self) -> float:
-        """Standard deviation of the Gaussian that its profiles are blurred by [mm]."""
+        """Return the standard deviation of the Gaussian that blurs the profiles [mm]."""
         return self.flaws.blur_mm
 
     @property
     def even(self) -> bool:
-        """Whether its features are squares of one size with sharp edges."""
+        """Return True if features are squares of one size with sharp edges."""
         return self.lines_mm is None and not self.blur_mm
 
     @property
     def plain(self) -> bool:
-        """Whether it has square features, and no flaws."""
+        """Return True if features are square and there are no flaws."""
         return self.lines_mm is None and self.flaws == NO_FLAWS
 
     @property
     def open_part(self) -> float:
-        """Mean transmission of the square, without dust."""
+        """Return the mean transmission of the square, without dust."""
         width = np.diff(self.lines) / self.extent_mm
         return float(width @ self.values @ width)
 
     @cached_property
     def opening_mm(self) -> float:
-        """Mean width of its openings along rows, or along columns if that is less [mm]: of what lets half as much light
-        through as its clearest feature. Of a drawing it is that of what is drawn, however fine its pixels are."""
+        """Return the mean width of the openings along rows, or along columns if that is less [mm].
+
+        Open is what lets half as much light through as the clearest feature, however fine a drawing's pixels are.
+        """
         is_open, widths = self.values >= self.values.max() / 2, np.diff(self.lines)
         return min(mean_opening(is_open, widths), mean_opening(is_open.T, widths))
 
     @cached_property
     def crosses(self) -> tuple[Term, ...] | None:
-        """The transmission as at most two exact terms (weight, row profile (N,), column profile (N,)), or None."""
+        """Return the transmission as at most two exact terms (weight, row (N,), column profile (N,)), or None."""
         rest = self.values.copy()
         terms: list[Term] = []
         while True:
@@ -170,12 +172,12 @@ class Plate(ByValue):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The transmission as terms (weight, row profile (N,), column profile (N,)), but for :attr:`left_out`."""
+        """Return the transmission as terms (weight, row profile (N,), column profile (N,)) up to :attr:`left_out`."""
         return self._terms_and_rest[0]
 
     @property
     def left_out(self) -> float:
-        """What the terms leave of the transmission, root mean square, as a part of all; 0 where they are exact."""
+        """Return the relative rms part of the transmission that the terms leave; 0 if they are exact."""
         return self._terms_and_rest[1]
 
     @cached_property
@@ -205,7 +207,7 @@ class Plate(ByValue):
 
     @cached_property
     def most_terms(self) -> int:
-        """Its distinct rows or columns, whichever are fewer: terms that it takes at most."""
+        """Return the number of distinct rows or columns, whichever are fewer: terms that the plate takes at most."""
         if self.crosses is not None:
             return len(self.crosses)
         both = self.values, np.ascontiguousarray(self.values.T)
@@ -213,18 +215,17 @@ class Plate(ByValue):
 
     @property
     def many(self) -> bool:
-        """Whether it has so many terms that its frames are never their sum."""
+        """Return True if there are so many terms that frames are never their sum."""
         return self.most_terms > _MOST_DECOMPOSED
 
     @cached_property
     def largest(self) -> LargestTerms:
-        """Terms of the light that pixels see of large values, where some hundreds hold it."""
+        """Return the terms of the light that pixels see of large values, where some hundreds hold it."""
         return LargestTerms(self.values, self.averaged)
 
     @cached_property
     def residuals(self) -> tuple[float, float]:
-        """Rms residual of the best single separable term, relative to the transmission; and the same once the means of
-        rows and columns are subtracted."""
+        """Return the relative rms residual of the best separable term, with and without means of rows and columns."""
         width = None if self.lines_mm is None else np.diff(self.lines_mm)
         centred = self.values - np.average(self.values, axis=0, weights=width)
         centred -= np.average(centred, axis=1, weights=width)[:, None]
@@ -232,52 +233,53 @@ class Plate(ByValue):
 
     @property
     def centred(self) -> bool:
-        """Whether a separable solver does better without the means of rows and columns, as for a FlatCam mask."""
+        """Return True if a separable solver does better without the means of rows and columns, as for a FlatCam."""
         plain, without = self.residuals
         return without < plain
 
     @property
     def residual(self) -> float:
-        """Rms residual of the best separable mask, relative to what a solver uses of this one."""
+        """Return the rms residual of the best separable mask, relative to the part that a solver uses."""
         return min(self.residuals)
 
     @cached_property
     def amplitude(self) -> Plate:
-        """The plate whose values are the factors of a field: roots of the transmissions, without phase."""
+        """Return the plate whose values are the factors of a field: roots of the transmissions, without phase."""
         return self if self.binary else replace(self, values=np.sqrt(self.values))
 
     @cached_property
     def binary(self) -> bool:
-        """Whether every feature is open or closed."""
+        """Return True if every feature is open or closed."""
         return bool(np.isin(self.values, (0, 1)).all())
 
     @property
     def mirrored(self) -> tuple[bool, bool]:
-        """Whether it is its own mirror image along rows, and along columns."""
+        """Return whether the plate is its own mirror image along rows, and along columns."""
         even = self.lines_mm is None or np.array_equal(self.lines_mm, -self.lines_mm[::-1])
         return tuple(even and np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether its rows are its columns; the profiles of each of its singular terms then are the same."""
+        """Return True if rows equal columns; the profiles of each singular term then are the same."""
         return np.array_equal(self.values, self.values.T)
 
     @property
     def uneven_part(self) -> float:
-        """Part of it that tells all of it: an eighth of a zone plate."""
+        """Return the part that determines the whole by symmetry: an eighth of a zone plate."""
         return float(0.5 ** (sum(self.mirrored) + self.symmetric))
 
     @property
     def diffracts(self) -> bool:
-        """Whether its diffraction is worked out: not of light that has gone through it, nor behind blurred edges of
-        more than one separable term."""
+        """Return True if diffraction is computed: not for light behind a plate, nor for several blurred terms."""
         sharp = not self.blur_mm or (self.crosses is not None and len(self.crosses) == 1 and not self.flaws.turn_deg)
         return not self.irradiance and sharp
 
     @cached_property
     def grids(self) -> tuple[tuple[BoolArray, BoolArray], ...] | None:
-        """What is open as grids that do not overlap, as :attr:`mitsim.devices.mask.Mask.openings`; None where over 4,
-        and for a mask that has no even features."""
+        """Return the openings as grids that do not overlap, as :attr:`mitsim.devices.mask.Mask.openings`.
+
+        The value is None for more than 4 grids, and for a mask without even features.
+        """
         if not self.binary or not self.plain:
             return None
         patterns, which = np.unique(self.values[self.values.any(axis=1)], axis=0, return_inverse=True)
@@ -289,8 +291,10 @@ class Plate(ByValue):
 
     @property
     def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
-        """Grids that hold all that is open: exactly that with :attr:`grids`, else all rows and columns that let light
-        through anywhere; where features are not even, or turned, a square of :attr:`cover` features a side."""
+        """Return grids that hold all openings: exactly with :attr:`grids`, else all rows and columns that have any.
+
+        If features are uneven or turned, it is a square of :attr:`cover` features a side.
+        """
         if self.grids is not None:
             return self.grids
         rows, columns = (np.asarray(self.values.any(axis=axis)) for axis in (1, 0))
@@ -298,12 +302,11 @@ class Plate(ByValue):
 
     @property
     def cover(self) -> int:
-        """Side, in features, of the smallest centred square that holds the mask as it is mounted."""
+        """Return the side, in features, of the smallest centred square that holds the mask as it is mounted."""
         return int(np.ceil(self.flaws.reach(self.extent_mm) / self.feature_mm))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
-        """Transmission (0..1) at points (``s_row``, ``s_col``) of the mask plane [mm], blur and dust apart; the arrays
-        broadcast."""
+        """Return the transmission (0..1) at points (``s_row``, ``s_col``) of the plane [mm], without blur and dust."""
         count = len(self.values)
         s_row, s_col = self.flaws.turned_back(np.asarray(s_row), np.asarray(s_col))
         if self.lines_mm is None:
@@ -317,7 +320,7 @@ class Plate(ByValue):
 
 @lru_cache(maxsize=8)
 def within(plate: Plate, reach_mm: float) -> Plate:
-    """The ``plate`` with its dust, and without what lies beyond ``reach_mm`` of its centre where that saves terms."""
+    """Return the ``plate`` with its dust, and cut at ``reach_mm`` from its centre where that saves terms."""
     flaws = plate.flaws
     if flaws.turn_deg:
         reach_mm *= 2**0.5
@@ -346,8 +349,9 @@ def within(plate: Plate, reach_mm: float) -> Plate:
 def _distinct(
     values: FloatArray, lines: FloatArray | None = None
 ) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
-    """Distinct rows and columns of ``values``, of which drawings have few; they count by their number, and by their
-    widths between ``lines`` where these are not even.
+    """Return the distinct rows and columns of ``values``, of which drawings have few.
+
+    They count by their number, and by their widths between uneven ``lines``.
 
     Returns
     -------
@@ -368,8 +372,7 @@ def _distinct(
 
 
 class LargestTerms:
-    """The terms of large ``values`` (N, N) that hold their means over squares of ``averaged`` values a side, but for
-    1e-4 of them, rms.
+    """Terms of large ``values`` (N, N) that hold means over squares of ``averaged`` values a side up to 1e-4, rms.
 
     With S the means along an axis, at most a third of a square apart, and U sigma W^T the singular vectors of S V S^T
     that are kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
@@ -414,20 +417,20 @@ class LargestTerms:
         self._squared, self._turn = squared[::-1][: self.count], directions @ turn[:, ::-1][:, : self.count]
 
     def terms(self) -> tuple[Term, ...]:
-        """The terms (weight, row profile (N,), column profile (N,))."""
+        """Return the terms (weight, row profile (N,), column profile (N,))."""
         with single_threaded_blas():
             left = self._values @ self._spread(self._turn)
             right = (self._spread(self._seen @ self._turn) / self._squared).T @ self._values
         return tuple((1.0, left[:, k], right[k]) for k in range(self.count))
 
     def _means(self, values: FloatArray) -> FloatArray:
-        """(starts, m) means S ``values`` of (N, m), beyond which there is no light."""
+        """Return the (starts, m) means S ``values`` of (N, m), beyond which there is no light."""
         below = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
         ends = np.minimum(self._starts + self._averaged, len(values))
         return np.asarray((below[ends] - below[np.maximum(self._starts, 0)]) / self._averaged)
 
     def _spread(self, means: FloatArray) -> FloatArray:
-        """(N, k) S^T ``means`` of (starts, k)."""
+        """Return S^T ``means`` (N, k) of (starts, k)."""
         below = np.concatenate((np.zeros((1, means.shape[1])), np.cumsum(means, axis=0)))
         places = np.arange(len(self._values))
         first, beyond = (np.searchsorted(self._starts, places - less, "right") for less in (self._averaged, 0))
@@ -435,7 +438,7 @@ class LargestTerms:
 
 
 def _beyond_one(values: FloatArray, lines: FloatArray | None) -> float:
-    """What the best separable product leaves of ``values`` between ``lines``, root mean square, as a part of them."""
+    """Return the relative rms part that the best separable product leaves of ``values`` between ``lines``."""
     *_, weighted = _distinct(values, lines)
     total = np.linalg.norm(weighted)
     if not total:
@@ -459,7 +462,7 @@ _PICTURES = ".png", ".tif", ".tiff"
 
 
 def read_drawing(path: Path) -> FloatArray:
-    """(rows, columns) transmissions, 0 to 1, of the drawing ``path``; a picture's values are linear in transmission.
+    """Return the (rows, columns) transmissions, 0 to 1, of the drawing ``path``; pictures are linear in transmission.
 
     Row 0 is at the top and column 0 at the left of who looks from the sensor toward the scene. MitsimError for a file
     that is no PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
@@ -480,8 +483,10 @@ def read_drawing(path: Path) -> FloatArray:
 
 
 def make_square(values: FloatArray, feature_mm: float) -> tuple[float, FloatArray]:
-    """A drawing ``values`` (rows, columns) of pixels of ``feature_mm`` with opaque margins that make it square about
-    its centre, and before it the side of its pixels: half of that where the margins need half a pixel."""
+    """Return a drawing of pixels of ``feature_mm`` with opaque margins that make it square about its centre.
+
+    Before it, the side of its pixels is returned, which is halved if margins of half a pixel are needed.
+    """
     if (values.shape[0] - values.shape[1]) % 2:
         values, feature_mm = values.repeat(2, axis=0).repeat(2, axis=1), feature_mm / 2
     side = max(values.shape)

@@ -44,7 +44,7 @@ class Spectrum(ByValue):
 
     @property
     def mean(self) -> Spectrum:
-        """All photons at their mean wavelength."""
+        """Return all photons at their mean wavelength."""
         return Spectrum(np.array([np.sum(self.wavelengths_nm * self.weights)]), np.ones(1))
 
 
@@ -65,32 +65,31 @@ class Lines:
 
     @property
     def several(self) -> bool:
-        """Whether light is told apart by line."""
+        """Return True if light is told apart by line."""
         return len(self.wavelengths_nm) > 1
 
     @property
     def single(self) -> tuple[Lines, ...]:
-        """Each of them alone."""
+        """Return each of the lines alone."""
         return tuple(Lines((nm,), (share,)) for nm, share in zip(self.wavelengths_nm, self.shares, strict=True))
 
     @property
     def apart(self) -> tuple[Lines, ...]:
-        """Each of them at its own place among all: a path carries the one, and the others are that wavelength without
-        power."""
+        """Return each line at its own place among all; the other places have its wavelength without power."""
         size, pairs = len(self.shares), zip(self.wavelengths_nm, self.shares, strict=True)
         alone = [(nm, tuple(share * (at == place) for at in range(size))) for place, (nm, share) in enumerate(pairs)]
         return tuple(Lines((nm,) * size, shares) for nm, shares in alone)
 
     @property
     def mean_nm(self) -> float:
-        """The one wavelength that carries as many photons per watt [nm], to a picometre."""
+        """Return the one wavelength that carries as many photons per watt [nm], to a picometre."""
         if not self.several:
             return self.wavelengths_nm[0]
         return round(float(np.average(self.wavelengths_nm, weights=self.shares)), 3)
 
     @property
     def shining(self) -> Lines:
-        """Those that have power, shortest first."""
+        """Return the lines that have power, shortest first."""
         power: dict[float, float] = {}
         for wavelength, share in sorted(zip(self.wavelengths_nm, self.shares, strict=True)):
             if share > 0:
@@ -98,11 +97,11 @@ class Lines:
         return Lines(tuple(power), tuple(power.values()))
 
     def bands(self, count: int) -> tuple[Lines, ...]:
-        """The lines of each of ``count`` bands, shortest first: neighbours, cut where the power's mean squared distance
-        from its band's :attr:`mean_nm` is least. By each band's mean and power, a sum over lines is a Gauss rule of
-        one node for it.
+        """Return the lines of each of ``count`` bands, shortest first.
 
-        MitsimError for fewer than one band, or more than lines with power.
+        Bands are cut where the power's mean squared distance from its band's :attr:`mean_nm` is least, so that a sum
+        over bands is a Gauss rule of one node for each. Raises MitsimError for fewer than one band, or more than lines
+        with power.
         """
         lines = self.shining
         size = len(lines.shares)
@@ -264,7 +263,7 @@ class ProjectorModel(Configuration):
 
     @property
     def black_level(self) -> float:
-        """Light of a black pixel, as a part of a white one's."""
+        """Return the light of a black pixel, relative to a white one."""
         return 1 / self.contrast_ratio
 
     @property
@@ -289,19 +288,19 @@ class ProjectorModel(Configuration):
 
     @property
     def lines(self) -> Lines:
-        """Lines of the light, the effective wavelength where none are known, and the part of the power in each."""
+        """Return the lines of the light with their shares of the power; the effective wavelength if none are known."""
         shares = self.radiant_shares or (1.0,)
         total = sum(shares)
         return Lines(self.wavelengths_nm or (self.effective_wavelength_nm,), tuple(share / total for share in shares))
 
     def at(self, wavelength_nm: float) -> ProjectorModel:
-        """The same projector that shows one line of ``wavelength_nm`` alone."""
+        """Return a projector that shows one line of ``wavelength_nm`` alone."""
         alone = {"wavelengths_nm": (wavelength_nm,), "radiant_shares": (1.0,), "effective_wavelength_nm": wavelength_nm}
         return self.model_copy(update=alone)
 
     @property
     def traced_lines(self) -> Lines:
-        """Its lines, which paths carry together; MitsimError for more than they can."""
+        """Return the lines, which paths carry together; raise MitsimError for more than they can carry."""
         lines = self.lines
         if len(lines.shares) > MOST_LINES:
             raise MitsimError(
@@ -311,15 +310,14 @@ class ProjectorModel(Configuration):
         return lines
 
     def in_bands(self, count: int) -> ProjectorModel:
-        """The same projector whose lines are ``count`` bands of its own, each at its mean wavelength, as
-        :meth:`Lines.bands` cuts them. MitsimError as there."""
+        """Return a projector whose lines are ``count`` bands of its own (:meth:`Lines.bands`), at their means."""
         bands = self.lines.bands(count)
         waves, shares = tuple(band.mean_nm for band in bands), tuple(sum(band.shares) for band in bands)
         return self.model_copy(update={"wavelengths_nm": waves, "radiant_shares": shares})
 
     @property
     def spectrum(self) -> Spectrum:
-        """Photons at each line: power times wavelength."""
+        """Return the photons at each line: power times wavelength."""
         wavelengths = np.array(self.lines.wavelengths_nm)
         photons = np.array(self.radiant_shares or (1.0,)) * wavelengths
         return Spectrum(wavelengths, photons / photons.sum())
@@ -378,9 +376,9 @@ class Response(ByValue):
 
     @classmethod
     def of(cls, sensor: SensorModel) -> Response:
-        """Of a ``sensor`` without a mosaic; one number of efficiency is that at every wavelength.
+        """Return the response of a ``sensor`` without a mosaic; one number of efficiency counts at every wavelength.
 
-        MitsimError for a sensor whose efficiency is not known, or not at any wavelength of :data:`SPECTRA_NM`.
+        Raises MitsimError for a sensor whose efficiency is not known, or not at any wavelength of :data:`SPECTRA_NM`.
         """
         curve = sensor.quantum_efficiency_curve
         if curve is None:
@@ -389,8 +387,7 @@ class Response(ByValue):
 
     @classmethod
     def of_each(cls, sensor: SensorModel) -> tuple[Response, ...]:
-        """Of a ``sensor`` with a mosaic the pixels under filters of each colour; else of all. MitsimError as
-        :meth:`of`."""
+        """Return the responses of pixels under filters of each colour, or of all pixels without a mosaic."""
         if sensor.mosaic is None:
             return (cls.of(sensor),)
         colours = {name: getattr(sensor.mosaic_curves, name) for name in dict.fromkeys(sensor.mosaic)}
@@ -401,7 +398,7 @@ class Response(ByValue):
 
     @classmethod
     def _along(cls, curve: EfficiencyCurve, sensor: SensorModel, planes: tuple[int, ...] = _PLANES) -> Response:
-        """Of a ``curve`` of a ``sensor``, which some ``planes`` have."""
+        """Return the response of a ``curve`` of a ``sensor``, which some ``planes`` have."""
         wavelengths = np.linspace(*SPECTRA_NM, _PLACES)
         known, efficiency = np.array(curve.wavelengths_nm), np.array(curve.efficiency)
         first, last = max(SPECTRA_NM[0], known[0]), min(SPECTRA_NM[1], known[-1])
@@ -418,18 +415,18 @@ class Response(ByValue):
 
     @property
     def part(self) -> float:
-        """Part of the sensor's pixels that it is of."""
+        """Return the part of the sensor's pixels that have this response."""
         return len(self.planes) / len(_PLANES)
 
     def bands(self, count: int, part: int = 0, parts: int = 1) -> tuple[Band, ...]:
-        """Equal bands of what is counted [nm].
+        """Return equal bands of the wavelengths that are counted [nm].
 
         Parameters
         ----------
         count
-            of them.
+            Number of bands.
         part, parts
-            number, from 0, of the only part of each band that is meant, and into how many it is cut.
+            Number, from 0, of the only part of each band that is returned, and number of parts of a band.
         """
         first, last = self.range_nm
         edges = first + (last - first) * np.arange(count * parts + 1) / (count * parts)
@@ -464,22 +461,22 @@ class CountedLamps(ByValue):
 
     @property
     def range_nm(self) -> Band:
-        """Wavelengths that all pixels count [nm]."""
+        """Return the wavelengths that all pixels count [nm]."""
         firsts, lasts = zip(*(response.range_nm for response in self.responses), strict=True)
         return max(firsts), min(lasts)
 
     def rows(self, response: int) -> slice:
-        """Those of the bands that are of a ``response``, by its number."""
+        """Return the places of the bands of a ``response``, given by its number."""
         return slice(response * MOST_LINES, (response + 1) * MOST_LINES)
 
     def units_of(self, lines: Lines) -> tuple[float, ...]:
-        """Irradiance [W m^-2] of each of the projector's ``lines`` for a count of 1."""
+        """Return the irradiance [W m^-2] of each of the projector's ``lines`` for a count of 1."""
         known = dict(self.units)
         return tuple(known[wavelength] for wavelength in lines.wavelengths_nm)
 
     @property
     def whole(self) -> Spectrum:
-        """All bands in one."""
+        """Return all bands in one."""
         shares = np.ones(len(self.spectra)) / len(self.spectra) if self.shares is None else self.shares
         wavelengths = [spectrum.wavelengths_nm for spectrum in self.spectra]
         weights = [share * spectrum.weights for share, spectrum in zip(shares, self.spectra, strict=True)]
@@ -487,7 +484,7 @@ class CountedLamps(ByValue):
 
 
 def line_units(sensor: SensorModel, lines: Lines) -> tuple[float, ...]:
-    """Irradiance [W m^-2] of each of the ``lines`` at which the ``sensor`` counts 1.
+    """Return the irradiance [W m^-2] of each of the ``lines`` at which the ``sensor`` counts 1.
 
     Behind a mosaic the lines have parts of the count, as of their power, that make as many in the mean over all pixels:
     s_l / sum_k s_k w_k lambda_k, with w_k the electrons a photon of line k. A line's own light is then as much beside

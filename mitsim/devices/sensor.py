@@ -214,19 +214,19 @@ class SensorModel(Configuration, defer_build=True):
         return self
 
     def efficiency(self, wavelength_nm: float, plane: Plane | None = None) -> float:
-        """Electrons per photon.
+        """Return the electrons per photon.
 
         Parameters
         ----------
         wavelength_nm
-            of the light; a camera whose file states one number has it at all wavelengths.
+            Wavelength of the light; a camera whose file states one number has it at all wavelengths.
         plane
-            whose pixels, of a camera with a mosaic; None for one without.
+            Colour of the filter, for a camera with a mosaic; None for one without.
 
         Raises
         ------
         MitsimError
-            outside the curve, for a camera whose file states no efficiency, or a plane that it has not.
+            Outside the curve, for a camera whose file states no efficiency, or a plane that it does not have.
         """
         if (self.mosaic is None) != (plane is None):
             filters = f"a mosaic {self.mosaic}" if self.mosaic else "no mosaic"
@@ -247,7 +247,7 @@ class SensorModel(Configuration, defer_build=True):
         return float(found)
 
     def planes(self, wavelengths_nm: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Electrons per photon of the mosaic's four pixels, row by row, each at these ``wavelengths_nm``.
+        """Return the electrons per photon of the mosaic's four pixels, row by row, each at the ``wavelengths_nm``.
 
         MitsimError for a camera without a mosaic, and outside its curves.
         """
@@ -258,80 +258,80 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def states_efficiency(self) -> bool:
-        """Whether light makes a known number of electrons in a pixel without colour filters."""
+        """Return True if light makes a known number of electrons in a pixel without colour filters."""
         return self.quantum_efficiency is not None or self.quantum_efficiency_curve is not None
 
     @property
     def sensor_only(self) -> bool:
-        """Whether it characterises alone: no source gives what light becomes, so it can neither capture nor sense."""
+        """Return True if no source states what light becomes, so that the camera can neither capture nor sense."""
         return not self.states_efficiency and self.mosaic is None
 
     @property
     def frame_shape(self) -> tuple[int, int] | None:
-        """Rows and columns of superpixels that are read, whole ones; None: as many as the scene's film has."""
+        """Return rows and columns of whole superpixels that are read; None for those of the scene's film."""
         if self.rows is None or self.columns is None:
             return None
         return self.rows // self.binning, self.columns // self.binning
 
     @property
     def pitches_mm(self) -> tuple[float, float]:
-        """Distances between rows, and between columns of superpixels [mm]."""
+        """Return the distances between rows, and between columns of superpixels [mm]."""
         row = self.row_pitch_um or self.pixel_pitch_um
         return row * self.binning * 1e-3, self.superpixel_pitch_um * 1e-3
 
     @property
     def identity(self) -> dict[str, object]:
-        """What manifests say of it: all fields but the source, and but effects that it does not name."""
+        """Return what manifests state: all fields but the source, and but effects that the file does not name."""
         fields, stated = type(self).model_fields, self.model_dump(exclude={"source"}).items()
         return {name: value for name, value in stated if name in _ALWAYS or value != fields[name].default}
 
     @property
     def has_fixed_pattern(self) -> bool:
-        """Whether its pixels differ: in offset, response, dark current, or by defects."""
+        """Return True if pixels differ in offset, response or dark current, or by defects."""
         return any((*self.offset_parts, *self.response_parts, self.dark_current_spread_e_per_s, self.has_defects))
 
     @property
     def has_defects(self) -> bool:
-        """Whether some pixels are hot or dead."""
+        """Return True if some pixels are hot or dead."""
         return self.hot_pixels > 0 or self.dead_pixels > 0
 
     @property
     def offset_parts(self) -> tuple[float, float, float]:
-        """Standard deviations of a superpixel's offset by pixel, row and column [electrons].
+        """Return the standard deviations of a superpixel's offset by pixel, row and column [electrons].
 
-        Of b^2 readings b share a row's offset, in each of b rows: (b^2, b^3, b^3)^(1/2) of one pixel's; on chip it is
-        one reading.
+        Of b^2 readings b share a row's offset, in each of b rows. Therefore they are (b^2, b^3, b^3)^(1/2) of one
+        pixel's; on chip there is one reading.
         """
         pixel, line = self._readings
         return self.dsnu_pixel_e * pixel, self.dsnu_row_e * line, self.dsnu_column_e * line
 
     @property
     def response_parts(self) -> tuple[float, float, float]:
-        """Relative standard deviations of a superpixel's response by pixel, row and column: of means of b^2, b, b."""
+        """Return the relative standard deviations of a superpixel's response by pixel, row and column."""
         line = math.sqrt(self.binning)
         return self.prnu_pixel / self.binning, self.prnu_row / line, self.prnu_column / line
 
     @property
     def _readings(self) -> tuple[float, float]:
-        """How many times a pixel's own noise, and one that a row shares, a superpixel has."""
+        """Return the factors by which a superpixel has a pixel's own noise, and one that a row shares."""
         return (1.0, 1.0) if self.binning_on_chip else (float(self.binning), self.binning**1.5)
 
     @property
     def codes(self) -> int:
-        """Codes that are summed in a superpixel."""
+        """Return the number of codes that are summed in a superpixel."""
         return 1 if self.binning_on_chip else self.binning**2
 
     @property
     def dark_factor(self) -> float:
-        """Dark current over the stated one, 2^((T - T_stated) / T_doubling) (EMVA 1288 4.0, dark current)."""
+        """Return the dark current over the stated one, 2^((T - T_stated) / T_doubling) (EMVA 1288 4.0)."""
         if self.temperature_c is None or self.dark_current_temperature_c is None or self.dark_doubling_c is None:
             return 1.0
         return float(2 ** ((self.temperature_c - self.dark_current_temperature_c) / self.dark_doubling_c))
 
     def known_line_time_s(self) -> float:
-        """From the begin of a row's exposure to that of the next one [s]: 0 of a global shutter.
+        """Return the time between the beginnings of two rows' exposures [s]; 0 for a global shutter.
 
-        MitsimError for a rolling one whose file does not state it.
+        Raises MitsimError for a rolling shutter whose file does not state it.
         """
         if self.shutter == "global":
             return 0.0
@@ -344,70 +344,68 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def superpixel_crosstalk(self) -> float:
-        """Part of a superpixel's light that its neighbours get: of even light, that of the pixels at its sides."""
+        """Return the part of a superpixel's even light that its neighbours get from the pixels at its sides."""
         return self.crosstalk / self.binning
 
     @property
     def superpixel_row_noise_e(self) -> float:
-        """Standard deviation of the noise that a row of superpixels shares [electrons]."""
+        """Return the standard deviation of the noise that a row of superpixels shares [electrons]."""
         return self.row_noise_e * self._readings[1]
 
     @property
     def superpixel_reading_noise_e(self) -> float:
-        """Standard deviation of all noise of a superpixel's reading, its own and its row's [electrons]."""
+        """Return the standard deviation of a superpixel's reading by its own and its row's noise [electrons]."""
         own = self.superpixel_read_noise_e
         return math.hypot(own, self.superpixel_row_noise_e) if self.row_noise_e else own
 
     @property
     def full_well_dn(self) -> float:
-        """Digital number, not yet rounded, of a superpixel whose full well is full; inf without one."""
+        """Return the digital number, not yet rounded, of a superpixel whose full well is full; inf without one."""
         full = self.superpixel_full_well_e
         bent = full * (1 + sum(self.linearity)) if self.linearity else full
         return bent * self.gain_dn_per_e + self.superpixel_black_level_dn
 
     @property
     def superpixel_pitch_um(self) -> float:
-        """Distance between superpixel centres in a row, um."""
+        """Return the distance between superpixel centres in a row [um]."""
         return self.pixel_pitch_um * self.binning
 
     @property
     def superpixel_area_m2(self) -> float:
-        """Light-collecting area, m^2 (the fill factor is part of the quantum efficiency)."""
+        """Return the light-collecting area [m^2]; the fill factor is part of the quantum efficiency."""
         if self.row_pitch_um is None:
             return (self.superpixel_pitch_um * 1e-6) ** 2
         return self.superpixel_pitch_um * self.row_pitch_um * self.binning * 1e-12
 
     @property
     def superpixel_full_well_e(self) -> float:
-        """Electrons a superpixel holds: b^2 full wells, or what the node on chip does."""
+        """Return the electrons that a superpixel holds: b^2 full wells, or less if the node on chip holds less."""
         full = self.full_well_e * self.binning**2
         return full if self.binned_full_well_e is None else min(full, self.binned_full_well_e)
 
     @property
     def superpixel_read_noise_e(self) -> float:
-        """Standard deviation of a superpixel's reading, electrons: b^2 independent readings add in
-        variance; on chip it is one.
-        """
+        """Return the standard deviation of a superpixel's reading [electrons], of b^2 readings, or one on chip."""
         return self.read_noise_e * self._readings[0]
 
     @property
     def superpixel_dark_current_e_per_s(self) -> float:
-        """Dark electrons a second and superpixel at the sensor's temperature, without those of hot pixels."""
+        """Return the dark electrons a second and superpixel at the sensor's temperature, without hot pixels."""
         return self.dark_current_e_per_s * self.binning**2 * self.dark_factor
 
     @property
     def superpixel_black_level_dn(self) -> float:
-        """Digital number of a superpixel without charge."""
+        """Return the digital number of a superpixel without charge."""
         return self.black_level_dn * self.codes
 
     @property
     def largest_dn(self) -> int | None:
-        """The largest code of a superpixel, b^2 (2^bits - 1), on chip 2^bits - 1; None for real-valued output."""
+        """Return the largest code of a superpixel, b^2 (2^bits - 1), on chip 2^bits - 1; None for real numbers."""
         return None if self.bits is None else (2**self.bits - 1) * self.codes
 
 
 def check_exposure(seconds: float) -> float:
-    """Exposure of every frame of a camera, ``seconds``; ArgumentError where no camera has it."""
+    """Return the exposure of every frame, ``seconds``; raise ArgumentError if no camera has it."""
     shortest, longest = EXPOSURE_S
     if not shortest <= seconds <= longest:
         raise ArgumentError("exposure", f"{seconds:g}: give the seconds of every frame, {shortest:g} to {longest:g}")
@@ -415,14 +413,16 @@ def check_exposure(seconds: float) -> float:
 
 
 def load_sensor(path: Path | str) -> SensorModel:
-    """The sensor in the TOML file at ``path``; MitsimError names the file, field, value and rule."""
+    """Return the sensor in the TOML file at ``path``; a MitsimError names the file, field, value and rule."""
     return validate(SensorModel, sensor_table(path), f"file {path}")
 
 
 def sensor_table(path: Path | str) -> Table:
-    """Fields of the sensor in the TOML file at ``path``, whose table ``[mask]`` is another's
-    (:func:`mitsim.devices.mask_profile.load_mask`). A line ``base`` names a shipped camera, or a file beside it, whose
-    fields count where the file has none of its own. MitsimError for a base that there is not."""
+    """Return the fields of the sensor in the TOML file at ``path``, without its table ``[mask]``.
+
+    A line ``base`` names a shipped camera, or a file beside it, whose fields count where the file has none of its own.
+    Raises MitsimError if there is no such base.
+    """
     table, read, first = read_toml(path), [Path(path).resolve()], path
     while (base := table.pop(BASE, None)) is not None:
         if not isinstance(base, str):
@@ -457,7 +457,7 @@ def sensor_table(path: Path | str) -> Table:
 
 
 def digital_of(sensor: SensorModel, exposure_s: float) -> Digital:
-    """What frames of the binned ``sensor`` mean at an exposure of ``exposure_s``."""
+    """Return how digital numbers of the binned ``sensor`` become electrons a second at an exposure [s]."""
     full = sensor.full_well_dn
     largest = math.inf if sensor.largest_dn is None else float(sensor.largest_dn)
     end = min(full if math.isinf(full) else float(math.floor(full)), largest)
@@ -511,7 +511,7 @@ class EfficiencyCurve(Configuration):
         return self
 
     def at(self, wavelength_nm: float) -> float:
-        """Electrons per photon of ``wavelength_nm``; MitsimError outside the curve."""
+        """Return the electrons per photon of ``wavelength_nm``; raise MitsimError outside the curve."""
         first, last = self.wavelengths_nm[0], self.wavelengths_nm[-1]
         if not first <= wavelength_nm <= last:
             raise MitsimError(

@@ -50,7 +50,7 @@ class BoardShape(Configuration):
 
     @property
     def words(self) -> str:
-        """The board in words, without what it does not have."""
+        """Return the board in words, without parts that are zero."""
         parts = [] if self.size_mm is None else [f"{self.size_mm:g} mm a side"]
         parts += [f"bow {self.bow_mm:g} mm"] if self.bow_mm else []
         if self.tilt_row_deg or self.tilt_column_deg:
@@ -176,9 +176,9 @@ class Drift(Configuration):
         return {name: (amplitude, hertz) for name, amplitude, hertz in both if amplitude and hertz}
 
     def alone(self, kind: str, amount: float | None = None) -> Drift:
-        """One ``kind`` of it without the others, by another ``amount`` where one is given.
+        """Return one ``kind`` of drift without the others, by another ``amount`` if one is given.
 
-        MitsimError for a kind that there is not, or an amount that is not allowed.
+        Raises MitsimError for an unknown kind, or an amount that is not allowed.
         """
         if kind not in DRIFT_UNITS:
             raise MitsimError(f"drift {kind!r}: there is no such kind; use {', '.join(DRIFT_UNITS)}")
@@ -187,31 +187,31 @@ class Drift(Configuration):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """What moves."""
+        """Return the names of the kinds of drift that move something."""
         return tuple(kind for kind in DRIFT_UNITS if getattr(self, kind))
 
     @property
     def mask_mm(self) -> tuple[float, float, float]:
-        """How far the mask moves along rows, columns and axis [mm], for all reasons."""
+        """Return how far the mask moves along rows, columns and axis [mm], for all reasons."""
         axis = self.mask_axis_um + self.gap_um_per_k * self.temperature_k
         return self.mask_rows_um / 1e3, self.mask_columns_um / 1e3, axis / 1e3
 
     @property
     def tilt_mrad(self) -> tuple[float, float] | None:
-        """How the mask's distance comes to grow along rows and along columns [mrad]; None where it does not."""
+        """Return how the mask's distance comes to grow along rows and along columns [mrad]; None without a tilt."""
         tilt = self.mask_tilt_rows_mrad, self.mask_tilt_columns_mrad
         return tilt if any(tilt) else None
 
     @property
     def motion(self) -> MaskMotion | None:
-        """How the mask is turned and shakes; None where it does neither."""
+        """Return how the mask is turned and shakes; None if it does neither."""
         if not (self.mask_rotation_mrad or self.vibration_um):
             return None
         return MaskMotion(rotation_mrad=self.mask_rotation_mrad, vibration_um=self.vibration_um)
 
 
 def amount_in_words(kind: str, amount: float) -> str:
-    """An ``amount`` of a ``kind`` of drift with its unit; parts of a whole as a percentage."""
+    """Return an ``amount`` of a ``kind`` of drift with its unit; parts of a whole as a percentage."""
     unit = DRIFT_UNITS[kind]
     return f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"
 
@@ -296,7 +296,7 @@ class SessionRecipe(Configuration):
         return self
 
     def of_one_depth(self) -> SessionRecipe:
-        """Itself, as the recipe of one calibration; MitsimError where it has depths."""
+        """Return the recipe itself as that of one calibration; raise MitsimError if it has depths."""
         if self.depths:
             raise MitsimError(
                 f"recipe: has {len(self.depths)} depths, and this makes one calibration; use calibrate_depths, or "
@@ -307,12 +307,12 @@ class SessionRecipe(Configuration):
 
 @check_arguments
 def load_recipe(path: Path | str | None = None) -> SessionRecipe:
-    """The recipe in the TOML file at ``path``, or the shipped one; MitsimError names the field that breaks a rule."""
+    """Return the recipe in the TOML file at ``path``, or the shipped one; errors name the field that breaks a rule."""
     return load_model(Path(path) if path is not None else shipped_path("calibration", "session.toml"), SessionRecipe)
 
 
 def recipe_text(recipe: SessionRecipe) -> str:
-    """The ``recipe`` as TOML that :func:`load_recipe` reads."""
+    """Return the ``recipe`` as TOML that :func:`load_recipe` reads."""
     import tomli_w  # here: only those who print a recipe need it
 
     return tomli_w.dumps(recipe.model_dump(mode="json", exclude_defaults=True))
@@ -331,7 +331,7 @@ Half = tuple[Side, int, int]
 
 
 def halves(count: int, pairs: bool) -> Iterator[list[Half]]:
-    """What shows each pattern, in the order of the list: horizontal stripes, then vertical ones.
+    """Yield the halves that show each pattern, in the order of the list: horizontal stripes, then vertical ones.
 
     Parameters
     ----------
@@ -348,7 +348,7 @@ def halves(count: int, pairs: bool) -> Iterator[list[Half]]:
 
 
 def halves_in_order(count: int, pairs: bool, order: Order = "listed", seed: int = 0) -> list[Half]:
-    """The same in the order in which they are taken. What is subtracted in a pair is taken one after the other.
+    """Return the halves in the order in which they are taken; those that are subtracted follow one another.
 
     Parameters
     ----------
@@ -423,12 +423,14 @@ class Modelling:
 
     @property
     def free(self) -> tuple[str, ...]:
-        """What is fitted, each once."""
+        """Return the names of the numbers that are fitted, each once."""
         return tuple(name for name in UNITS if name in (*self.fitted, "gain"))
 
     def used_patterns(self, changes: Sequence[int], pairs: bool, repeats: int) -> list[tuple[Side, int]]:
-        """Side and number of the +-1 patterns whose frames are used: uniform light, then ever finer stripes, vertical
-        and horizontal ones. Coarse stripes cast the deepest shadows, which a mask's fringes change least.
+        """Return side and number of the +-1 patterns whose frames are used.
+
+        They are uniform light, then ever finer stripes, vertical and horizontal ones. Coarse stripes cast the deepest
+        shadows, which a mask's fringes change least.
 
         Parameters
         ----------
@@ -447,7 +449,7 @@ class Modelling:
 
 
 def frames_of(chosen: Sequence[tuple[Side, int]], pairs: bool, repeats: int) -> int:
-    """How many frames the ``chosen`` patterns are.
+    """Return the number of frames of the ``chosen`` patterns.
 
     Parameters
     ----------
