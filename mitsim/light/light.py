@@ -451,11 +451,7 @@ class Group:
                 self._give(accumulating, name, accumulator.fetch(), samples)
 
     def _give(
-        self,
-        accumulating: Behind[Accumulation],
-        name: str,
-        by_line: Sequence[PathSamples | DeviceSums],
-        samples: int,
+        self, accumulating: Behind[Accumulation], name: str, by_line: Sequence[PathSamples | DeviceSums], samples: int
     ) -> None:
         def add(line: int, found: PathSamples | DeviceSums) -> None:
             means, light = self._means[line], self.simulation.accumulate(name, found, self.labels, samples)

@@ -258,11 +258,7 @@ def test_what_a_plan_was_made_for_is_not_changed() -> None:
     three left out.)"""
     made = replace(invented_plan(), request=Request.of(patterns="dots:3", accuracy=2e-2, effects="-blur", seed=3))
     timed = replace(made, request=Request.of(seconds=3.0))
-    for own, changes in (
-        (made, {"accuracy": 1e-2}),
-        (made, {"effects": {}}),
-        (timed, {"seconds": 4.0}),
-    ):
+    for own, changes in ((made, {"accuracy": 1e-2}), (made, {"effects": {}}), (timed, {"seconds": 4.0})):
         (name,) = changes
         with pytest.raises(ArgumentError, match="plan anew") as caught:
             capture.request_of(own, changes)

@@ -82,11 +82,7 @@ D65_UNIT = 98.99741751876255
 
 
 def counted(
-    lamp: str,
-    sheet: str,
-    curve: bool | dict[float, float],
-    low: float = SPECTRA_NM[0],
-    high: float = SPECTRA_NM[1],
+    lamp: str, sheet: str, curve: bool | dict[float, float], low: float = SPECTRA_NM[0], high: float = SPECTRA_NM[1]
 ) -> float:
     """Integral from ``low`` to ``high`` [nm] of what the camera counts, or pixels of a ``curve``."""
     known = curve if isinstance(curve, dict) else CURVE

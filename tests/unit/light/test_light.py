@@ -257,14 +257,7 @@ def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Light
             assert found.variance == pytest.approx(known.variance, rel=1e-9)
     assert [
         looked.at(which, which.rows_of(shots), shots.weights.shape[1]) is not None for which, shots, _ in cases
-    ] == [
-        True,
-        False,
-        True,
-        False,
-        False,
-        False,
-    ]
+    ] == [True, False, True, False, False, False]
 
 
 def test_what_is_made_of_all_lines_meets_the_target(bench: Bench, plan: Plan, family: Lighting) -> None:

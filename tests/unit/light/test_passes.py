@@ -63,10 +63,7 @@ def test_a_new_pass_is_its_row_and_its_integrator(small_scene: Callable[..., Pat
     (Planted, each in the code that reads the table: a pass left out of the pilot; of tracing; of rounds; of plans.)
     """
     patch = TOY.read_text()
-    assert re.findall(r"^\+\+\+ b/(.*)$", patch, re.MULTILINE) == [
-        "mitsim/light/passes.py",
-        "mitsim/transport/veil.py",
-    ]
+    assert re.findall(r"^\+\+\+ b/(.*)$", patch, re.MULTILINE) == ["mitsim/light/passes.py", "mitsim/transport/veil.py"]
     row = patch[: patch.index("diff --git a/mitsim/transport")]
     assert len(re.findall(r"^\+(?!\+)", row, re.MULTILINE)) == 2, "an import and a row"
     package = Path(mitsim.__file__).parent

@@ -22,13 +22,7 @@ from mitsim.light.settings import (
     Settings,
     SharpPixels,
 )
-from mitsim.planner.choose import (
-    _UNEVEN_GROUPS,
-    Candidates,
-    counts_of,
-    predicted_candidate,
-    value_of_refining,
-)
+from mitsim.planner.choose import _UNEVEN_GROUPS, Candidates, counts_of, predicted_candidate, value_of_refining
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,

@@ -44,9 +44,7 @@ EXTRA = """<emitter type="constant"><spectrum name="radiance" value="0.02"/></em
 def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
     print_ = np.random.default_rng(4).integers(20, 256, (48, 48))
     return open_bench(
-        shared_scene("pilot", reflectance=print_, extra=EXTRA, pitch=0.375, mask_feature=0.3),
-        variant,
-        for_render=True,
+        shared_scene("pilot", reflectance=print_, extra=EXTRA, pitch=0.375, mask_feature=0.3), variant, for_render=True
     )
 
 

@@ -53,9 +53,7 @@ class Alone(SensorPoints):
 def beside(shared_scene: Callable[..., Path], variant: str) -> Bench:
     """A mirror before the upper half of a shiny wall, and a large sensor."""
     return open_bench(
-        shared_scene("beside", extra=CORNER + BEFORE, pitch=0.375, mask_feature=0.3),
-        variant,
-        for_render=True,
+        shared_scene("beside", extra=CORNER + BEFORE, pitch=0.375, mask_feature=0.3), variant, for_render=True
     )
 
 

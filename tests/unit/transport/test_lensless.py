@@ -27,12 +27,7 @@ def rays(geometry: CameraGeometry, count: int = 4000) -> tuple[np.ndarray, ...]:
 
 def plugin(geometry: CameraGeometry) -> dict[str, object]:
     values = geometry.model_dump(exclude={"pixels"}, exclude_none=True)
-    film = {
-        "type": "hdrfilm",
-        "width": geometry.pixels,
-        "height": geometry.pixels,
-        "rfilter": {"type": "box"},
-    }
+    film = {"type": "hdrfilm", "width": geometry.pixels, "height": geometry.pixels, "rfilter": {"type": "box"}}
     return {**values, "film": film}
 
 
