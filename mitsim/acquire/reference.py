@@ -176,16 +176,6 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     return mean.reshape(*mean.shape[:2], -1), np.sqrt(variance).reshape(*mean.shape[:2], -1)
 
 
-def _of_sampler(loaded: LoadedScene) -> tuple[str, ...]:
-    sampler = loaded.camera.sampler().class_name()
-    if sampler in _SAMPLERS:
-        return ()
-    return (
-        f"{loaded.path}: the points of sampler {sampler} depend on each other (at 4 paths by 15 to 80 %), so light "
-        'over several turns may come out wrong; use <sampler type="independent"/>, the first turn is stratified anyway',
-    )
-
-
 def _samples(bench: Apparatus, estimator: str, spp: int | None) -> int:
     check_samples(estimator, spp)
     stated = bench.loaded.samples
@@ -238,10 +228,19 @@ def render(
     warnings, notes, bound = tuple[str, ...](), bench.loaded.notes, None
     started = time.perf_counter()
     if estimator == REFERENCE:
-        notes += _of_the_factored(bench)
+        if bench.loaded.projector is not None:
+            absent = names(lambda effect: effect.in_frames and not effect.in_reference) - {"black-level"}
+            left_out = ", ".join(name for name in present(bench) if name in absent)
+            notes += (f"the reference leaves out {left_out}; --estimator factored does not",) if left_out else ()
         mean, error = reference(bench.loaded, spp, seed, job)
         warnings = (bench.loaded.unfit.caustics,) if bench.loaded.unfit.caustics else ()
-        warnings += _of_sampler(bench.loaded)
+        sampler = bench.loaded.camera.sampler().class_name()
+        if sampler not in _SAMPLERS:
+            warnings += (
+                f"{bench.loaded.path}: the points of sampler {sampler} depend on each other (at 4 paths by 15 to 80 "
+                '%), so light over several turns may come out wrong; use <sampler type="independent"/>, the first turn '
+                "is stratified anyway",
+            )
         if bench.loaded.in_view:
             warnings += (
                 f"{bench.loaded.path}: the projector shines on the sensor itself, and the reference has no light of it "
@@ -277,14 +276,6 @@ def render(
         rule = "too few paths met any light to tell how much there is; give more samples (--spp), or more light"
         return replace(rendered, warnings=(*warnings, f"relative noise {rendered.mc_error:.1e}: {rule}"))
     return rendered
-
-
-def _of_the_factored(bench: Apparatus) -> tuple[str, ...]:
-    if bench.loaded.projector is None:
-        return ()
-    absent = names(lambda effect: effect.in_frames and not effect.in_reference) - {"black-level"}
-    left_out = [name for name in present(bench) if name in absent]
-    return (f"the reference leaves out {', '.join(left_out)}; --estimator factored does not",) if left_out else ()
 
 
 def rendered_psf(

@@ -223,7 +223,7 @@ class PilotRuns:
 
     @cached_property
     def forming(self) -> Forming:
-        """What the cost of forming frames depends on."""
+        """Return the quantities that determine the cost of forming frames."""
         return self.fine.forming(self.lighting)
 
     @cached_property

@@ -102,7 +102,7 @@ class Sample:
 
     @property
     def finer(self) -> Sample:
-        """The same with more samples, so that standard errors are at least halved."""
+        """Return a copy with more samples, so that standard errors are at least halved."""
         return replace(self, times=FINER * self.times)
 
     @property
