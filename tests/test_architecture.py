@@ -552,7 +552,7 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 
 SIZES = {
     "__main__": (1, 18),
-    "acquire": (6, 1507),
+    "acquire": (6, 1502),
     "api": (2, 224),
     "bench": (6, 1403),
     "calibrate": (7, 1605),
@@ -561,11 +561,11 @@ SIZES = {
     "devices": (10, 2342),
     "exchange": (8, 1677),
     "learn": (8, 1639),
-    "light": (9, 1910),
+    "light": (9, 1906),
     "metrics": (1, 81),
     "mitsim": (1, 102),
     "optics": (10, 1944),
-    "planner": (6, 1956),
+    "planner": (6, 1948),
     "reconstruct": (27, 7321),
     "report": (9, 2383),
     "scene": (8, 1788),
