@@ -347,7 +347,7 @@ def free_memory() -> float:
 
 
 def memory_from_here() -> float:
-    """Bytes of memory that this process holds; :func:`peak_memory` counts anew from here, where the system lets it."""
+    """Return the bytes of memory that this process holds, and count the peak from here where the system lets it."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")  # proc(5): the peak becomes what is held now
     import psutil
@@ -355,22 +355,17 @@ def memory_from_here() -> float:
     return float(psutil.Process().memory_info().rss)
 
 
-def peak_memory() -> float:
-    """Most bytes of memory that this process has held since it began, or since :func:`memory_from_here`."""
+def memory_since(held: float) -> float:
+    """Return the bytes of memory taken at most beyond those ``held`` at :func:`memory_from_here`."""
     try:
         # Not getrusage, where there is this: its peak is inherited from the process that started this one.
         lines = Path("/proc/self/status").read_text().splitlines()
-        return next(int(line.split()[1]) * 1024.0 for line in lines if line.startswith("VmHWM"))
+        peak = next(int(line.split()[1]) * 1024.0 for line in lines if line.startswith("VmHWM"))
     except (OSError, StopIteration):
         import resource  # not on Windows
 
-        peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-        return peak if sys.platform == "darwin" else peak * 1024
-
-
-def memory_since(held: float) -> float:
-    """Bytes of memory taken at most beyond those ``held`` at :func:`memory_from_here`."""
-    return max(peak_memory() - held, 0.0)
+        peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * (1 if sys.platform == "darwin" else 1024)
+    return max(peak - held, 0.0)
 
 
 def running_seconds() -> float:

@@ -314,21 +314,20 @@ class FrameFacts(Options):
         bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
         if self.shape is None or not bare:
             self.refuse(_OF_BARE, "on files that have a header, or without a shape")
-        said: dict[str, Any] = {"prepare": self._preparation(listed.prepare)}
-        if self.patterns is not None:
-            said["patterns"] = self.patterns
+        stated = {
+            "patterns": self.patterns, "closing_frame": self.closing_frame, "order": self.order, "seed": self.seed,
+            "closing_exposure_s": self.closing_exposure,
+        }  # fmt: skip
+        said: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+        said["prepare"] = self._preparation(listed.prepare)
         if self.ambient_frame is not None:
-            said |= {"ambient": str(self.ambient_frame), "ambient_shots": self.ambient_shots}
-        elif listed.ambient_shots is None:
+            said["ambient"] = str(self.ambient_frame)
+        if self.ambient_frame is not None or listed.ambient_shots is None:
             said["ambient_shots"] = self.ambient_shots
-        last = {"closing_frame": self.closing_frame, "closing_exposure_s": self.closing_exposure, "order": self.order}
-        said |= {name: value for name, value in last.items() if value is not None}
         if self.projector_pixels is not None or self.calibration is not None:
             said["n"] = self.projector_pixels
         if self.shape is not None:
             said["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little")
-        if self.seed is not None:
-            said["seed"] = self.seed
         known = RealCapture(
             listed.model_copy(update=said),
             None if self.camera is None else str(self.camera),

@@ -133,8 +133,7 @@ def label_capture(shots: Capture) -> Dataset:
         "pattern_column": ("shot", [each.column for each in captures], _attributes("1", "index j of the pattern")),
         "sign": ("shot", [each.sign for each in captures], _attributes("1", "half of a signed pattern; 0: unsigned")),
     }
-    for name, axis, count in zip(("y", "x"), ("row", "column"), shots.dn.shape[1:], strict=True):
-        places |= _sensor_places(shots.manifest.camera, name, axis, count)
+    places |= _sensor_places(shots.manifest.camera, shots.dn.shape[1:])
     facts: dict[str, Any] = {"exposure_s": shots.exposure_s, "fingerprint": shots.fingerprint}
     if shots.manifest.patterns.family is not None:
         facts["patterns"] = shots.manifest.patterns.family
@@ -152,9 +151,7 @@ def label_factors(factors: Factors) -> Dataset:
         name: ((axis, f"scene_{axis}"), side, _attributes("electron0.5 s-0.5", f"factor of the {axis}s"))
         for name, axis, side in (("left", "row", factors.left), ("right", "column", factors.right))
     }
-    places = _scene_places(factors)
-    for name, axis, side in (("y", "row", factors.left), ("x", "column", factors.right)):
-        places |= _sensor_places(factors.manifest.camera, name, axis, len(side))
+    places = _scene_places(factors) | _sensor_places(factors.manifest.camera, (len(factors.left), len(factors.right)))
     facts = {"status": str(factors.status), "condition": factors.condition, "fingerprint": factors.fingerprint}
     return _dataset("calibration", numbers, places, facts)
 
@@ -207,18 +204,20 @@ def _dataset(title: str, numbers: Labels, places: Labels, facts: Mapping[str, An
     return Dataset(numbers, places, {**about, **facts})
 
 
-def _sensor_places(camera: Mapping[str, Any], name: str, axis: str, count: int) -> Labels:
-    """Return the middles of a frame's rows or columns on the sensor [mm], where a ``camera`` states its pixels."""
-    known = camera.get("geometry")
-    if not isinstance(known, Mapping) or "pixel_pitch" not in known:
-        return {}
-    row = axis == "row"
-    pitch = (known.get("row_pitch") if row else None) or known["pixel_pitch"]
-    whole = known.get("rows" if row else "columns") or known["pixels"]
-    first = 0 if not known.get("roi") else known["roi"][0 if row else 1]
-    middles: FloatArray = pitch * (first + np.arange(count) - (whole - 1) / 2)
-    said = _attributes("mm", f"place of the {axis} on the sensor, from the optical axis, growing with its number")
-    return {name: (axis, middles, said)}
+def _sensor_places(camera: Mapping[str, Any], shape: tuple[int, ...]) -> Labels:
+    """Return the middles of a frame's rows and columns on the sensor [mm], where a ``camera`` states its pixels."""
+    known, found = camera.get("geometry"), Labels()
+    for letter, axis, count in zip("yx", ("row", "column"), shape, strict=True):
+        if isinstance(known, Mapping) and "pixel_pitch" in known:
+            row = axis == "row"
+            pitch = (known.get("row_pitch") if row else None) or known["pixel_pitch"]
+            whole = known.get(f"{axis}s") or known["pixels"]
+            first = 0 if not known.get("roi") else known["roi"][0 if row else 1]
+            said = _attributes(
+                "mm", f"place of the {axis} on the sensor, from the optical axis, growing with its number"
+            )
+            found[letter] = axis, pitch * (first + np.arange(count) - (whole - 1) / 2), said
+    return found
 
 
 def _scene_places(factors: Factors) -> Labels:

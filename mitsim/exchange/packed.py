@@ -20,7 +20,7 @@ from mitsim.core import files, manifests
 from mitsim.core.arrays import PACKED, checked_hdf5, hdf5_errors, whole_hdf5
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata, Value, checksum, read_frame, verify, write_frame
-from mitsim.core.files import MOST_BYTES, parse_json, read_text, whole_folder, write_text
+from mitsim.core.files import MOST_BYTES, parse_json, read_text, write_text
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import CalibrationManifest, ColourManifest, MosaicManifest, RunManifest, ShotFile
 from mitsim.core.runs import TRUTH, load_run
@@ -59,15 +59,6 @@ class Packed(Generic[Manifest]):
     names: tuple[str, ...]
     read: Callable[[str], tuple[Channels, Metadata]]
     place: Path
-
-    def save(self, folder: Path | str) -> Path:
-        """Write the ``folder``, new or empty, whole or not at all; return it.
-
-        MitsimError where that cannot be written, or a file cannot be read.
-        """
-        with whole_folder(folder) as place:
-            self.fill(place)
-        return Path(folder)
 
     def fill(self, folder: Path) -> None:
         """Write all files into a ``folder`` that this process holds (:func:`mitsim.core.files.whole_folder`).
