@@ -89,11 +89,6 @@ def transparent(path: Path) -> None:
 
 def few_bits(path: Path) -> None:
     """A grey PNG of 4 bits, whose numbers Pillow multiplies by 17."""
-    import zlib
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
     header, rows = struct.pack(">IIBBBBB", 4, 2, 4, 0, 0, 0, 0), b"\0\x01\x23" * 2
     parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
     path.write_bytes(PngImagePlugin._MAGIC + parts)

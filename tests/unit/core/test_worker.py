@@ -7,7 +7,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -37,10 +40,19 @@ TELL = HEED + "    end_stopped()\n"
 STUBBORN = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + WAIT
 
 
-def start(work: str) -> subprocess.Popen[str]:
+@pytest.fixture(autouse=True)
+def _interrupts() -> Iterator[None]:
+    """A shell's background jobs ignore SIGINT, those of nohup SIGHUP, and so would what they start."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def start(work: str, **more: Any) -> subprocess.Popen[str]:
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     command, pipe = [sys.executable, "-c", PROGRAM.format(work=work)], subprocess.PIPE
-    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=buffered)
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=buffered, **more)
 
 
 def started(work: str) -> tuple[subprocess.Popen[str], int]:
@@ -48,6 +60,11 @@ def started(work: str) -> tuple[subprocess.Popen[str], int]:
     process = start(work)
     assert process.stdout is not None
     return process, int(process.stdout.readline())
+
+
+def ended_by(number: signal.Signals) -> str:
+    """The line that says so."""
+    return "mitsim: interrupted\n" if number == signal.SIGINT else f"mitsim: ended by {number.name}\n"
 
 
 def insist(process: subprocess.Popen[str]) -> None:
@@ -104,13 +121,9 @@ def test_a_worker_that_dies_leaves_one_clear_line(work: str, name: str, words: s
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_the_parent_stops_the_worker(number: signal.Signals) -> None:
-    # A shell's background jobs ignore SIGINT, those of nohup SIGHUP, and so would what they start.
-    before = signal.signal(number, signal.SIG_DFL)
     process, _ = started(TELL)
-    signal.signal(number, before)
     process.send_signal(number)
-    words = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
-    assert (*process.communicate(timeout=HANGS_S), process.returncode) == ("", f"mitsim: {words}\n", 128 + number)
+    assert (*process.communicate(timeout=HANGS_S), process.returncode) == ("", ended_by(number), 128 + number)
 
 
 LATE = """
@@ -151,12 +164,9 @@ def test_a_signal_just_before_a_wait_ends_it() -> None:
 def test_a_signal_in_a_workers_last_moment_is_told_as_any(number: signal.Signals) -> None:
     """Python gives up its handlers before it ends, and the signal itself ends the worker then. (Planted: told as a
     second signal.)"""
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     process, _ = started(f"signal.signal({int(number)}, signal.SIG_DFL)\n" + WAIT)
-    signal.signal(signal.SIGINT, before)
     process.send_signal(number)
-    words = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
-    assert (*process.communicate(timeout=HANGS_S), process.returncode) == ("", f"mitsim: {words}\n", 128 + number)
+    assert (*process.communicate(timeout=HANGS_S), process.returncode) == ("", ended_by(number), 128 + number)
 
 
 def test_control_c_on_a_terminal_reaches_both_and_stops_once() -> None:
@@ -164,13 +174,8 @@ def test_control_c_on_a_terminal_reaches_both_and_stops_once() -> None:
 
     On a busy machine the latter may come too late, so that one more is sent while the worker cleans up.
     """
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     cleaning = HEED + "    print('cleaning up', flush=True)\n    time.sleep(0.3)\n    print('cleaned up')\n"
-    command = [sys.executable, "-c", PROGRAM.format(work=cleaning)]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    signal.signal(signal.SIGINT, before)
+    process = start(cleaning, start_new_session=True)
     assert process.stdout is not None
     worker = int(process.stdout.readline())
     os.killpg(process.pid, signal.SIGINT)
@@ -245,11 +250,8 @@ def test_a_worker_killed_from_outside_is_noticed() -> None:
 
 def test_signals_that_are_ignored_stay_ignored() -> None:
     """`nohup` and a shell's background jobs ignore signals before the program starts."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        process, _ = started("print(os.getpid(), flush=True)\ntime.sleep(0.3)\nprint('done')")
-    finally:
-        signal.signal(signal.SIGHUP, before)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    process, _ = started("print(os.getpid(), flush=True)\ntime.sleep(0.3)\nprint('done')")
     process.send_signal(signal.SIGHUP)
     out, err = process.communicate(timeout=HANGS_S)
     assert (out, err, process.returncode) == ("done\n", "", 0)
@@ -279,9 +281,7 @@ except KeyboardInterrupt:
 def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
     """Python prints a traceback and goes on; so did a program that was stopped while it imported. (Planted: the hook
     left out.)"""
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a job in the background of a shell ignores it
     process = start(DROPPED)
-    signal.signal(signal.SIGINT, before)
     out, err = process.communicate(timeout=HANGS_S)
     assert (out, err, process.returncode) == ("", "mitsim: interrupted\n", 130)
 
@@ -304,15 +304,8 @@ def test_control_c_during_start_up_is_one_line(moment: float, gap: float) -> Non
 
     Before there is a worker Python itself starts, and says in its own way that it was interrupted.
     """
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(
-        [*MITSIM, "plan", "photograph"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    signal.signal(signal.SIGINT, before)
+    command, pipe = [*MITSIM, "plan", "photograph"], subprocess.PIPE
+    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
     parent = psutil.Process(process.pid)
     while not (children := parent.children()):
         assert process.poll() is None
@@ -333,13 +326,8 @@ def limited(kilobytes: int, *arguments: str) -> subprocess.CompletedProcess[str]
     import resource
 
     space = kilobytes * 1024
-    return subprocess.run(
-        [*MITSIM, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=HANGS_S,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (space, space)),
-    )
+    limit = partial(resource.setrlimit, resource.RLIMIT_AS, (space, space))
+    return subprocess.run([*MITSIM, *arguments], capture_output=True, text=True, timeout=HANGS_S, preexec_fn=limit)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems do not hold to RLIMIT_AS")
@@ -382,13 +370,10 @@ except KeyboardInterrupt:
 def test_a_signal_waits_for_what_holds_it_back(number: signal.Signals, threads: int) -> None:
     """As the import of Mitsuba does, in which an interrupt ended with a traceback, and so it did where a thread of
     OpenBLAS took it. (Planted: nothing held back; handlers left in their places; what was kept not raised.)"""
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     process, _ = started(HELD.format(threads=threads))
-    signal.signal(signal.SIGINT, before)
     process.send_signal(number)
-    words = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
     out, err = process.communicate("\n", timeout=HANGS_S)
-    assert (out, err, process.returncode) == ("imported\n", f"mitsim: {words}\n", 128 + number)
+    assert (out, err, process.returncode) == ("imported\n", ended_by(number), 128 + number)
 
 
 IMPORT = """
@@ -409,9 +394,7 @@ except KeyboardInterrupt:
 
 def test_control_c_while_mitsuba_is_imported_waits_for_it() -> None:
     """(Planted: nothing held back.)"""
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     process = start(IMPORT)
-    signal.signal(signal.SIGINT, before)
     assert (*process.communicate(), process.returncode) == ("True True\n", "mitsim: interrupted\n", 130)
 
 
@@ -434,13 +417,8 @@ with open("kept", "w"):
 def test_a_closed_stream_is_no_file(tmp_path: Path, number: int) -> None:
     """A file would get its number, and whatever is printed. (Planted: nothing in its place: "err" came out on stdout,
     and "out" in the file.)"""
-    done = subprocess.run(
-        [sys.executable, "-c", CLOSED.format(number=number, program=PRINTS)],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        check=False,
-    )
+    command = [sys.executable, "-c", CLOSED.format(number=number, program=PRINTS)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
     if number == 1:
         line = "mitsim: standard output is closed; give it a file, a pipe or /dev/null\n"
         assert (done.returncode, done.stdout, done.stderr) == (2, "", line) and not (tmp_path / "kept").exists()
