@@ -232,8 +232,11 @@ class Session:
         self._first_cost.check("calibration", job.limits)
         with job.planning("calibration", first_shadow(self.board, {})):
             plan, started = make_plan(self.board, _lines(n), accuracy, self.seed), time.perf_counter()
-            # Drawn here in the cells that were chosen, a shadow is the session's own.
-            terms = self._terms_of(plan.settings)
+            geometry, waves, terms = self.board.geometry, in_waves(plan.settings.effects), 1.0
+            if geometry.is_drawn(waves):
+                # Drawn here in the cells that were chosen, a shadow is the session's own.
+                geometry = geometry.model_copy(update={"mask_cells": plan.settings.raster_cells})
+                terms = number_of_terms(raster(geometry, self.distance, self.board.waves if waves else None))
             planning = plan.predicted["plan"] + time.perf_counter() - started
         seconds = session_seconds(self.board, count, self.shots, plan.settings, terms)
         if told := spent.get("mask", 0.0):
@@ -245,13 +248,6 @@ class Session:
         cost.check("calibration", job.limits)
         job.clock.predict(plan.predicted)
         return replace(plan, cost=cost)
-
-    def _terms_of(self, settings: Settings) -> float:
-        geometry, waves = self.board.geometry, in_waves(settings.effects)
-        if not geometry.is_drawn(waves):
-            return 1.0
-        geometry = geometry.model_copy(update={"mask_cells": settings.raster_cells})
-        return number_of_terms(raster(geometry, self.distance, self.board.waves if waves else None))
 
     def trace(self, plan: Plan, job: Job) -> SampledLight:
         """Trace the board's light by projector pixel as the ``plan`` says."""
@@ -389,9 +385,15 @@ def stripe_frames(
         Number of the first pattern.
     """
     count, n = stripes.weights.shape
-    lines, pixels = None, side_of(shape)
+    lines, pixels, removed = None, side_of(shape), False
     if lines_held(n, count, pixels) and not mixes(n, count, pixels):
-        lines = _stripe_lines(light, Lighting(stripes.labels, np.eye(n)), seed, shape)
+        held, single = np.empty((n, math.prod(shape))), Lighting(stripes.labels, np.eye(n))
+        for start in range(0, n, together := at_once(pixels)):
+            numbers = np.arange(start, min(start + together, n))
+            formed = [*light.frames(single.shots(numbers), seed, leaking=False)]
+            held[numbers] = [frame.irradiance.ravel() for frame in formed]
+            removed = removed or any(frame.removed for frame in formed)
+        lines = None if removed else held
     # Lots that hang on the sensor alone: what is formed together shows in the last bits.
     step = count if mixes(n, count, pixels) else at_once(pixels)
     for start in range(0, count, step):
@@ -403,17 +405,6 @@ def stripe_frames(
         else:
             frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in _mix(stripes.weights[numbers], lines, shape))
         yield from (item for item in zip(numbers.tolist(), frames, strict=True) if item[0] >= first)
-
-
-def _stripe_lines(light: SampledLight, lines: Lighting, seed: int, shape: tuple[int, int]) -> FloatArray | None:
-    frames = np.empty((len(lines.weights), math.prod(shape)))
-    for start in range(0, len(frames), step := at_once(side_of(shape))):
-        numbers = np.arange(start, min(start + step, len(frames)))
-        for number, frame in zip(numbers, light.frames(lines.shots(numbers), seed, leaking=False), strict=True):
-            if frame.removed:
-                return None
-            frames[number] = frame.irradiance.ravel()
-    return frames
 
 
 def _mix(weights: FloatArray, lines: FloatArray, shape: tuple[int, int]) -> FloatArray:

@@ -1,47 +1,49 @@
-"""Rendered calibration sessions: factors of a camera and their error, estimated as from a user's frames."""
+"""Rendered calibration sessions: factors of a camera and their error, estimated as from a user's frames.
+
+Finished parts of a session are kept in its CAL folder, so that it can be resumed. A part is a ``.npz`` file with a
+SHA-256 of the session's configuration and of the data; a damaged or foreign part is computed again.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
 import math
 import time
-from collections.abc import Sequence
-from contextlib import nullcontext
-from dataclasses import asdict, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from scipy import sparse
 
 from mitsim.acquire.capture import colour_folder
 from mitsim.acquire.spectral import SpectralBench, without_filters
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, SessionRequest, Task
 from mitsim.calibrate.board_session import Session
-from mitsim.calibrate.checkpoint import (
-    MOST_TIFF,
-    Checkpoint,
-    KeptFrames,
-    SessionSums,
-    claimed_session,
-    is_finished,
-    keep_light,
-    kept_light,
-)
-from mitsim.calibrate.lit_session import LitSession, Response
+from mitsim.calibrate.lit_session import MOST_TIFF, KeptFrames, LitSession, Response
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import output_folder, whole_folder
+from mitsim.core.files import PARTS, output_folder, plain, read_json, remove_page, whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Job, Limits
-from mitsim.core.manifests import CALIBRATION, CalibrationManifest
+from mitsim.core.manifests import CALIBRATION, MANIFEST, CalibrationManifest, resumable
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light.light import SampledLight
+from mitsim.light.passes import GRIDS, LightEstimate
 from mitsim.light.plan import Plan
+from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import Frame
-from mitsim.optics.terms import Lacking, lacking
+from mitsim.optics.terms import lacking
 from mitsim.reconstruct.colour import behind
 from mitsim.reconstruct.factors import (
     SEPARABLE_RESIDUAL,
@@ -60,6 +62,186 @@ _SAVED_EVERY, _SAVED_AFTER_S = 8, 0.5
 """Responses and seconds between two checkpoints."""
 _REPEATS_BEHIND_FILTERS = 4
 """Default repeats behind filters, because most pixels see a tenth of a line that fills others."""
+
+
+# ---- Finished parts of a session in its folder ----
+
+KIND = "calibration"
+_SUFFIX = PARTS.removeprefix("*")
+_DIGEST = hashlib.sha256().digest_size
+
+
+class Checkpoint:
+    """Parts of one session; nothing is kept without a folder."""
+
+    def __init__(self, folder: Path | None = None, configuration: Mapping[str, Any] | None = None) -> None:
+        self.folder, self.configuration = folder, dict(configuration or {})
+        self._session = json.dumps(plain(self.configuration), sort_keys=True).encode()
+
+    def begin(self) -> None:
+        """Mark the folder as an unfinished session."""
+        if self.folder is not None:
+            remove_page(self.folder)
+            head = {"kind": KIND, "status": "incomplete", "configuration": plain(self.configuration)}
+            write_json(self.folder / MANIFEST, head)
+
+    def save(self, name: str, arrays: Mapping[str, npt.ArrayLike]) -> None:
+        """Write ``arrays`` as the part ``name`` atomically; raise MitsimError if that fails."""
+        if self.folder is None:
+            return
+        memory = io.BytesIO()
+        np.savez(memory, allow_pickle=False, **{key: np.asarray(value) for key, value in arrays.items()})
+        with whole_file(self.folder / f"{name}{_SUFFIX}") as part, part.open("wb") as file:
+            file.write(memory.getbuffer())
+            file.write(self._digest(memory.getbuffer()))
+
+    def load(self, name: str) -> dict[str, npt.NDArray[Any]] | None:
+        """Return the arrays of the part ``name``; None if it is missing, damaged, or of another session."""
+        path = None if self.folder is None else self.folder / f"{name}{_SUFFIX}"
+        if path is None or not path.is_file():
+            return None
+        data = memoryview(path.read_bytes())
+        if self._digest(data[:-_DIGEST]) != data[-_DIGEST:]:
+            return None
+        with np.load(io.BytesIO(data[:-_DIGEST]), allow_pickle=False) as arrays:
+            return dict(arrays)
+
+    def clear(self) -> None:
+        """Remove the parts of a complete session."""
+        if self.folder is not None:
+            for path in self.folder.glob(PARTS):
+                path.unlink()
+
+    def _digest(self, data: memoryview) -> bytes:
+        return hashlib.sha256(hashlib.sha256(self._session).digest() + data).digest()
+
+
+@contextmanager
+def claimed_session(
+    output: Path | None, configuration: Mapping[str, Any], resume: bool = False
+) -> Iterator[Checkpoint]:
+    """Claim the place for a session's parts before any work; remove a new folder if the session fails before writing.
+
+    Parameters
+    ----------
+    output
+        CAL folder; None keeps nothing.
+    configuration
+        All values that determine the factors.
+    resume
+        Allow a folder with a session of the same configuration.
+
+    Raises
+    ------
+    MitsimError
+        If the place cannot be written, or holds other files or another configuration.
+    """
+    if output is None:
+        yield Checkpoint(None, configuration)
+        return
+    again = resume and (output / MANIFEST).is_file()
+    if again:
+        _check_same(output, plain(configuration))
+    with output_folder(output, overwrite=again) as folder:
+        yield Checkpoint(folder, configuration)
+
+
+def is_finished(output: Path, configuration: Mapping[str, Any]) -> bool:
+    """Return True if the folder holds a finished session; raise MitsimError for another ``configuration``."""
+    if not (output / MANIFEST).is_file():
+        return False
+    _check_same(output, plain(configuration))
+    return bool(read_json(output / MANIFEST).get("status") == "complete")
+
+
+def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
+    before = resumable(path, KIND).get("configuration")
+    before = before if isinstance(before, dict) else {}
+    changed = [key for key in {**configuration, **before} if before.get(key) != configuration.get(key)]
+    if changed:
+        raise MitsimError(
+            f"resume=True: {path} holds a session of another configuration ({', '.join(changed)} differ); "
+            "use the same options, or another folder"
+        )
+
+
+# ---- Light and sums of responses as parts of a checkpoint ----
+
+
+def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledLight | None:
+    """Return the stored light of a session's board, or None."""
+    arrays = checkpoint.load("light")
+    if arrays is None:
+        return None
+    by_grid = {
+        name: sparse.csr_array(
+            tuple(arrays[f"{row.key}_{part}"] for part in ("data", "indices", "indptr")),
+            shape=tuple(arrays[f"{row.key}_shape"]),
+        )
+        for name, row in GRIDS.items()
+    }
+    return SampledLight(
+        groups=(LightEstimate(by_grid, float(arrays["received"]), float(arrays["outside"])),),
+        simulation=Simulation(session.board, plan.settings),
+        plan=plan,
+        seed=session.seed,
+        labels=arrays["labels"],
+        flux=arrays["flux"],
+        flux_error=arrays["flux_error"],
+        paths=int(arrays["paths"]),
+        sampling_error=float(arrays["sampling_error"]),
+        reached=bool(arrays["reached"]),
+    )
+
+
+def keep_light(checkpoint: Checkpoint, light: SampledLight) -> None:
+    """Save a ``light`` of one group in a ``checkpoint``."""
+    (group,) = light.groups
+    own = ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
+    facts = {name: getattr(light, name) for name in own}
+    facts |= {name: getattr(group, name) for name in ("received", "outside")}
+    for name, row in GRIDS.items():
+        matrix = group[name]
+        facts |= {f"{row.key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
+    checkpoint.save("light", facts)
+
+
+@dataclass
+class SessionSums:
+    """Sums over finished stripes by kind and side, and the number of ``saturated`` shots."""
+
+    sums: dict[str, tuple[StripeSums, StripeSums]]
+    saturated: int
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Save the sums in a ``checkpoint``."""
+        arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
+        for kind, both in self.sums.items():
+            for sums in both:
+                arrays |= {f"{kind}_{sums.side}_{name}": value for name, value in vars(sums).items() if name != "side"}
+        checkpoint.save("stripes", arrays)
+
+    @classmethod
+    def from_checkpoint(cls, checkpoint: Checkpoint, kinds: Sequence[str]) -> SessionSums | None:
+        """Return the sums of an interrupted session for some ``kinds`` of responses, or None."""
+        arrays = checkpoint.load("stripes")
+        if arrays is None:
+            return None
+        by_kind = {}
+        for kind in kinds:
+            both = []
+            for side in SIDES:
+                own = {name.removeprefix(f"{kind}_{side}_"): values for name, values in arrays.items()}
+                single = float(own["misfit"]), float(own["energy"]), int(own["done"])
+                sums = StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single)
+                sums.misfits, sums.energies, sums.ambient = own["misfits"], own["energies"], own["ambient"]
+                sums.lights = own["lights"]
+                both.append(sums)
+            by_kind[kind] = both[0], both[1]
+        return cls(by_kind, int(arrays["saturated"]))
+
+
+# ---- Sessions ----
 
 
 def calibrate(bench: Apparatus, request: SessionRequest, task: Task) -> Factors:
@@ -186,7 +368,9 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
     (noisy, clean), saturated, faults = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
     if lit.kept is not None:
         lit.kept.finish(digital)
-    lacks = _lacking(lit, clean)
+    physics, lacks = lit.light.simulation.physics, None
+    if physics.geometry.few_wave_terms:
+        lacks = lacking(session.shadow(physics.geometry, physics.spectrum), clean.left, clean.right)
     warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
     warnings += faults.warnings
     if saturated:
@@ -260,26 +444,19 @@ def estimates(
         unsteady=bool(drift.session_ramp or drift.session_flicker),
     )
     with job.clock.stage("estimate"):
-        judged = [
-            _check_session(session, sums, taken) if kind == NOISY else CheckedSession(sums)
-            for kind, sums in found.sums.items()
-        ]
+        judged = [CheckedSession(sums) for sums in found.sums.values()]
+        if kinds[0] == NOISY:
+            try:
+                judged[0] = check_session(found.sums[NOISY], session.signs, taken)
+            except MitsimError as error:
+                # A real session would be refused. A simulated one is flagged, because the bench asks for it, and the
+                # exact factors show what that costs.
+                judged[0].doubts += [*session.mask_warnings[:1], str(error)]
         factors = [
             each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
             for kind, each in zip(kinds, judged, strict=True)
         ]
     return factors, found.saturated, judged[0]
-
-
-def _check_session(session: Session, sums: tuple[StripeSums, StripeSums], taken: SessionConditions) -> CheckedSession:
-    """Return the checked session, flagged where real frames would be refused.
-
-    Simulated frames are not refused because the bench asks for them, and the exact factors show what they cost.
-    """
-    try:
-        return check_session(sums, session.signs, taken)
-    except MitsimError as error:
-        return CheckedSession(sums, doubts=[*session.mask_warnings[:1], str(error)])
 
 
 def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None) -> SessionSums:
@@ -329,13 +506,6 @@ def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Ch
                 stripes.save(checkpoint)
                 saved = time.monotonic()
     return stripes
-
-
-def _lacking(lit: LitSession, clean: Estimate) -> Lacking | None:
-    physics = lit.light.simulation.physics
-    if not physics.geometry.few_wave_terms:
-        return None
-    return lacking(lit.session.shadow(physics.geometry, physics.spectrum), clean.left, clean.right)
 
 
 def _factor_error(noisy: Estimate, clean: Estimate) -> float:

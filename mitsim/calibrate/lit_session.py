@@ -1,21 +1,30 @@
-"""Responses of a calibration session with traced light, noisy as a user has them or noise-free."""
+"""Responses of a calibration session with traced light, noisy as a user has them or noise-free, and its frames.
+
+Written frames contain only what a real user has: digital numbers, patterns and camera settings; no expected light,
+exact factors, parallax, seeds or plan.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from PIL import Image
 
 from mitsim.acquire.exposure import Exposer, in_chunks
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.board_session import Session, stripe_frames
-from mitsim.calibrate.checkpoint import KeptFrames, repeat_names
 from mitsim.core.arrays import FloatArray
+from mitsim.core.files import whole_file, write_json
 from mitsim.core.job import Job
+from mitsim.core.manifests import Digital
 from mitsim.core.parallel import in_threads
+from mitsim.devices.framelist import LISTS, DarkFile, FrameList, StripeFile
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES
@@ -29,6 +38,71 @@ _NUMBERS_AT_ONCE = 2**15
 """Numbers that become a response at a time, so that they stay in the cache."""
 SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quantisation"
 """Sources of a frame's noise."""
+
+
+# ---- Frames as a real camera's user has them ----
+
+MOST_TIFF = 2**16 - 1
+"""Largest digital number of a 16-bit TIFF; frames with larger or real numbers become NPY."""
+Names = tuple[str | int, ...]
+"""Side and number of a frame's shot, or ``dark`` with numbers of exposure and frame."""
+
+
+def repeat_names(shot: tuple[str, int], exposure: int, repeat: int) -> Names:
+    """Return the names of a frame of a shot."""
+    own: Names = ("exposure", exposure) if exposure else ()
+    return (*shot, *own, "repeat", repeat) if repeat else (*shot, *own)
+
+
+class KeptFrames:
+    """Frames of a ``session`` in a ``folder``, named by the order in which they are taken."""
+
+    def __init__(self, session: Session, folder: Path) -> None:
+        self._session, self._folder, recipe = session, folder, session.recipe
+        largest = session.bench.sensor.largest_dn
+        self._tiff = largest is not None and largest <= MOST_TIFF
+        end, exposures = ".tif" if self._tiff else ".npy", range(len(recipe.exposure_ladder))
+        self._lit: dict[Names, StripeFile] = {}
+        for half, exposure, repeat in product(session.order, exposures, range(recipe.repeats)):
+            names, (side, index, sign) = repeat_names(session.shot(half), exposure, repeat), half
+            file = f"frame_{len(self._lit):05d}{end}"
+            self._lit[names] = StripeFile(
+                file=file, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat
+            )
+        self._dark: dict[Names, DarkFile] = {}
+        for exposure, number in product(exposures, range(recipe.dark_frames)):
+            file = f"dark_{len(self._dark):05d}{end}"
+            self._dark["dark", exposure, number] = DarkFile(file=file, exposure=exposure)
+
+    def write(self, names: Names, numbers: DigitalNumbers) -> None:
+        """Write one frame of digital ``numbers`` (rows, columns)."""
+        place = (self._dark if names[0] == "dark" else self._lit)[names].file
+        with whole_file(self._folder / place) as part, part.open("wb") as file:
+            if self._tiff:
+                Image.fromarray(numbers.astype(np.uint16)).save(file, "TIFF")
+            else:
+                np.save(file, numbers)
+
+    def finish(self, digital: Digital) -> None:
+        """Write the list when all frames are complete."""
+        session, recipe = self._session, self._session.recipe
+        listed = FrameList(
+            camera=session.bench.identity(),
+            n=session.bench.n,
+            signed_capture=recipe.signed_capture,
+            repeats=recipe.repeats,
+            exposure_ladder=recipe.exposure_ladder,
+            ladder_merge=recipe.ladder_merge,
+            digital=digital,
+            centre=session.centre,
+            board_reflectance=recipe.board_reflectance,
+            frames=tuple(self._lit.values()),
+            dark=tuple(self._dark.values()),
+        )
+        write_json(self._folder / LISTS[1], listed.model_dump(mode="json", exclude_defaults=True))
+
+
+# ---- Responses ----
 
 
 @dataclass(frozen=True)
@@ -138,10 +212,14 @@ class LitSession:
         first
             Number of the first pattern.
         """
+        black = self.light.simulation.physics.black_level
+        leak = black * self.white.irradiance
 
         def use_response(item: tuple[int, Frame]) -> Result:
             number, frame = item
-            return use((number, self._with_leak(frame) if number else frame))
+            if number and black:
+                frame = replace(frame, irradiance=(1 - black) * frame.irradiance + leak)
+            return use((number, frame))
 
         job.progress(f"{side} stripes", first / self.session.signs.shape[1])
         chunks = in_chunks(self._stripes(side, first))
@@ -164,41 +242,25 @@ class LitSession:
         shape = self.session.bench.geometry.frame_shape
         yield from stripe_frames(self.light, stripes, self.session.seed, shape, max(first, 1))
 
-    def _with_leak(self, frame: Frame) -> Frame:
-        black = self.light.simulation.physics.black_level
-        if not black:
-            return frame
-        light = (1 - black) * frame.irradiance
-        light += self._leak
-        return replace(frame, irradiance=light)
-
-    @cached_property
-    def _leak(self) -> FloatArray:
-        return np.asarray(self.light.simulation.physics.black_level * self.white.irradiance)
-
     def noisy(self, side: str, number: int, frame: Frame) -> Response:
         """Return the response to a +-1 pattern as a user of noisy frames has it."""
+        rate: FloatArray = np.empty(frame.irradiance.shape)
         if not self.session.pairs:
             shot, uniform = self._expose(frame.irradiance, side, number + 1), self._uniform[side]
-            rate = self._rates(lambda rows: 2 * self._rate(shot, rows) - uniform.rate[rows], shot)
+            for rows in _chunks(rate):
+                rate[rows] = 2 * self._rate(shot, rows) - uniform.rate[rows]
             if self._dark is not None:
                 rate -= self._dark[side]
             return Response(rate, shot.saturated + (uniform.saturated if number == 0 else 0))
-        negative = self._both - frame.irradiance
-        shots = (
-            self._expose(frame.irradiance, side, 2 * number),
-            # Rounding leaves pixels that see the +1 stripes alone a little below zero.
-            self._expose(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1),
-        )
-        light: FloatArray = np.empty(frame.irradiance.shape)
-
-        def difference(rows: slice) -> FloatArray:
-            one, other = self._rate(shots[0], rows), self._rate(shots[1], rows)
-            np.add(one, other, out=light[rows])
-            return one - other
-
-        rate = self._rates(difference, shots[0])
-        return Response(rate, sum(shot.saturated for shot in shots), light)
+        negative, light = self._both - frame.irradiance, np.empty_like(rate)
+        one = self._expose(frame.irradiance, side, 2 * number)
+        # Rounding leaves pixels that see the +1 stripes alone a little below zero.
+        other = self._expose(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1)
+        for rows in _chunks(rate):
+            both = self._rate(one, rows), self._rate(other, rows)
+            np.add(*both, out=light[rows])
+            np.subtract(*both, out=rate[rows])
+        return Response(rate, one.saturated + other.saturated, light)
 
     def noise_free(self, frame: Frame) -> FloatArray:
         """Return the (m, m') response from the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
@@ -232,9 +294,7 @@ class LitSession:
             return {side: Ladder(digitals) for side in SIDES}
         recipe, found = self.session.recipe, dict[str, Ladder]()
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
-            uniform, _ = self._mean_of_repeats(
-                self._shot_electrons(self.white.irradiance, 0, other, 0), 0, True, other, 0
-            )
+            uniform, _ = self._mean_of_repeats(self.white.irradiance, 0, True, other, 0)
             rate = self._exposers[0].rate(uniform)
             found[side] = Ladder.of(digitals, rate, recipe.repeats, recipe.ladder_merge)
         return found
@@ -273,42 +333,27 @@ class LitSession:
     def _expose(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
         ladder = self.ladders[side]
         found = [
-            self._mean_of_repeats(
-                self._shot_electrons(irradiance, exposure, side, index),
-                exposure,
-                ladder.used_pixels(exposure),
-                side,
-                index,
-            )
+            self._mean_of_repeats(irradiance, exposure, ladder.used_pixels(exposure), side, index)
             for exposure in range(len(self._exposers))
         ]
         return _Shot(ladder, tuple(digital for digital, _ in found), sum(saturated for _, saturated in found))
 
-    def _shot_electrons(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
-        passed = Frame(self.session.through_filters(irradiance), 0.0, 0.0, 0.0)
-        return self._exposers[exposure].shot_electrons(passed, "calibration", *names)
-
     def _mean_of_repeats(
-        self, lit: FloatArray, exposure: int, used: Chosen, side: str, index: int
+        self, irradiance: FloatArray, exposure: int, used: Chosen, side: str, index: int
     ) -> tuple[DigitalNumbers, int]:
-        exposer, repeats = self._exposers[exposure], self.session.recipe.repeats
-        powers = self.session.powers[side, index][exposure]
-
-        def read(repeat: int) -> tuple[DigitalNumbers, int]:
-            light = powers[repeat] * lit
+        """Return the mean digital numbers of a shot at one exposure, and its frames with saturated ``used`` pixels."""
+        exposer, repeats, count = self._exposers[exposure], self.session.recipe.repeats, 0
+        passed = Frame(self.session.through_filters(irradiance), 0.0, 0.0, 0.0)
+        lit = exposer.shot_electrons(passed, "calibration", side, index)
+        mean: FloatArray = np.zeros(0)
+        for repeat, power in enumerate(self.session.powers[side, index][exposure]):
+            light = power * lit
             digital = self._read(exposer, light, *repeat_names((side, index), exposure, repeat))
-            if used is True:
-                return digital, int(exposer.saturates(digital, light))
-            return digital, int(exposer.saturates(np.where(used, digital, 0), np.where(used, light, 0.0)))
-
-        digital, count = read(0)
-        if repeats == 1:
-            return digital, count
-        mean = digital.astype(np.float64)
-        for repeat in range(1, repeats):
-            digital, saturated = read(repeat)
-            count += saturated
-            mean += digital
+            shown = (digital, light) if used is True else (np.where(used, digital, 0), np.where(used, light, 0.0))
+            count += int(exposer.saturates(*shown))
+            if repeats == 1:
+                return digital, count
+            mean = mean + digital if repeat else digital.astype(np.float64)
         mean /= repeats
         return mean, count
 
@@ -326,15 +371,6 @@ class LitSession:
     def _without_filters(self, rate: FloatArray, rows: slice = slice(None)) -> FloatArray:
         return rate if self.session.filters is None else rate / self.session.filters[rows]
 
-    @staticmethod
-    def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:
-        rates: FloatArray = np.empty(shot.digital[0].shape)
-        step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
-        for start in range(0, len(rates), step):
-            rows = slice(start, start + step)
-            rates[rows] = of(rows)
-        return rates
-
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
@@ -343,3 +379,9 @@ class _Shot:
     ladder: Ladder
     digital: tuple[DigitalNumbers, ...]
     saturated: int
+
+
+def _chunks(rates: FloatArray) -> Iterator[slice]:
+    """Yield slices of rows of which each has few enough numbers for the cache."""
+    step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
+    return (slice(start, start + step) for start in range(0, len(rates), step))

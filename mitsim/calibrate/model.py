@@ -85,53 +85,42 @@ def calibrate_model(
         For numbers that these frames cannot distinguish, frames of another size, an output that cannot be written, and
         as :meth:`mitsim.api.bench.Bench.calibrate`.
     """
+    job, request = job or Job(), SessionRequest(seed=seed, accuracy=modelling.accuracy, recipe=recipe)
     with nullcontext() if output is None else output_folder(output) as place:
-        factors = _fit_factors(
-            bench,
-            modelling,
-            frames,
-            SessionRequest(seed=seed, accuracy=modelling.accuracy, recipe=recipe),
-            job or Job(),
+        camera = model_of(bench, modelling.model)
+        if frames is not None:
+            listed = frames if isinstance(frames, SessionFrames) else load_frames(frames)
+            shown, digital, used = _of_frames(bench, listed, modelling)
+            reflectance = listed.listed.board_reflectance
+            configuration: dict[str, Any] = {"frames": str(listed.folder)}
+        else:
+            recipe = request.recipe or load_recipe()
+            if recipe.depths:
+                raise MitsimError("recipe: has depths; a model is fitted on the aligned plane, so leave them out")
+            session = Session(bench, recipe, request.seed)
+            plan = session.plan(request.accuracy, job)
+            lit = LitSession.of(session, session.trace(plan, job), job)
+            with job.clock.stage("sensor"):
+                shown, used = simulate_responses(lit, modelling)
+            digital, reflectance = digital_of(bench.sensor, lit.exposure_s), recipe.board_reflectance
+            configuration = {"seed": request.seed, "recipe": recipe.model_dump(exclude_defaults=True)}
+        job.progress("fit", 0.5)
+        with job.clock.stage("fit"):
+            fitted = fit_placement(camera, shown, modelling.free)
+        manifest = CalibrationManifest(
+            configuration={**bench.provenance(), **bench.identity(), **configuration},
+            camera=bench.identity(),
+            centre=bench.geometry.centred,
+            board_reflectance=reflectance,
+            digital=digital,
+            parallax=bench.parallax,
+            versions=versions(),
+            command=job.command,
         )
+        factors = modelled_factors(camera, fitted, used, manifest, job)
         if place is not None:
             factors.write(place)
     return factors
-
-
-def _fit_factors(
-    bench: Apparatus, modelling: Modelling, frames: Path | str | SessionFrames | None, request: SessionRequest, job: Job
-) -> Factors:
-    camera = model_of(bench, modelling.model)
-    if frames is not None:
-        listed = frames if isinstance(frames, SessionFrames) else load_frames(frames)
-        shown, digital, used = _of_frames(bench, listed, modelling)
-        reflectance = listed.listed.board_reflectance
-        configuration: dict[str, Any] = {"frames": str(listed.folder)}
-    else:
-        recipe = request.recipe or load_recipe()
-        if recipe.depths:
-            raise MitsimError("recipe: has depths; a model is fitted on the aligned plane, so leave them out")
-        session = Session(bench, recipe, request.seed)
-        plan = session.plan(request.accuracy, job)
-        lit = LitSession.of(session, session.trace(plan, job), job)
-        with job.clock.stage("sensor"):
-            shown, used = simulate_responses(lit, modelling)
-        digital, reflectance = digital_of(bench.sensor, lit.exposure_s), recipe.board_reflectance
-        configuration = {"seed": request.seed, "recipe": recipe.model_dump(exclude_defaults=True)}
-    job.progress("fit", 0.5)
-    with job.clock.stage("fit"):
-        fitted = fit_placement(camera, shown, modelling.free)
-    manifest = CalibrationManifest(
-        configuration={**bench.provenance(), **bench.identity(), **configuration},
-        camera=bench.identity(),
-        centre=bench.geometry.centred,
-        board_reflectance=reflectance,
-        digital=digital,
-        parallax=bench.parallax,
-        versions=versions(),
-        command=job.command,
-    )
-    return modelled_factors(camera, fitted, used, manifest, job)
 
 
 def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
@@ -213,13 +202,32 @@ def modelled_factors(
     left, right = (side.astype(np.float32).astype(np.float64) for side in camera.factors(fitted.placement))
     noise = _noise(camera, fitted)
     model: Model = "wave" if camera.spectrum else "geometric"
-    warnings, status = (*_rotation(camera, fitted),), _status(model, fitted, frames)
-    if not status.ok:
-        warnings = (str(status), *warnings)
+    warnings, unexplained = list[str](), fitted.unexplained
+    status = Status(Verdict.CALIBRATED, f"Modelled: the {model} model explains {frames} frames")
+    if unexplained > SEPARABLE_RESIDUAL:
+        other = "check the scene's numbers of mask and window" if camera.spectrum else "take the wave-optical model"
+        status = Status(
+            Verdict.NOT_SEPARABLE,
+            f"The {model} model does not explain the responses: {unexplained:.1%} of them is left over "
+            f"({decibels(unexplained):.1f} dB)",
+            f"{other}, or measure the factors with all patterns",
+        )
+        warnings.append(str(status))
+    angle, error = fitted.placement.mask_rotation, fitted.errors.get("mask_rotation")
+    if error is not None and abs(angle) >= _SIGNIFICANT * error:
+        turned = [(angle * one, other) for one, other in camera.rotation_terms(fitted.placement)]
+        lost = best_term([camera.factors(fitted.placement), *turned]).residual
+        if lost > SEPARABLE_RESIDUAL:
+            warnings.append(
+                f"the mask is turned by {1e3 * angle:.2f} mrad (+-{1e3 * error:.2g}): no separable factors have that, "
+                f"and {lost:.1%} of the shadow is lacking ({decibels(lost):.1f} dB); straighten the mask"
+            )
     numbers = {
         name: FittedNumber(value=getattr(fitted.placement, name), standard_error=fitted.errors.get(name), unit=unit)
         for name, unit in UNITS.items()
     }
+    both = zip((noise.left, noise.right), (left, right), strict=True)
+    relative = [error * np.sqrt(side.size) / np.linalg.norm(side) for error, side in both]
     result: dict[str, Any] = {
         "n": camera.n,
         "frames": frames,
@@ -230,23 +238,16 @@ def modelled_factors(
         "unexplained_residual": fitted.unexplained,
         "noise_free_residual": None,
         "phi_error": None,
-        "predicted_phi_error": float(
-            np.hypot(
-                *(
-                    error * np.sqrt(side.size) / np.linalg.norm(side)
-                    for error, side in zip((noise.left, noise.right), (left, right), strict=True)
-                )
-            )
-        ),
+        "predicted_phi_error": float(np.hypot(*relative)),
         "condition": max(squared_condition(left), squared_condition(right)),
         "exposure_s": manifest.digital.exposure_s if manifest.digital else None,
         "seconds": job.clock.seconds(),
         "kernels": job.clock.kernels(),
-        "warnings": warnings,
+        "warnings": tuple(warnings),
     }
     update = {
         "result": result,
-        "warnings": warnings,
+        "warnings": tuple(warnings),
         "noise": noise,
         "modelled": ModelledFactors(model=model, frames=frames, chi_square=fitted.chi_square, parameters=numbers),
         "estimate": str(status),
@@ -266,35 +267,6 @@ def _noise(camera: ModelledCamera, fitted: Fitted) -> FactorNoise:
         for slopes in (np.stack(side) for side in zip(*places, strict=True))
     )
     return FactorNoise(left=left, right=right, unexplained=fitted.unexplained)
-
-
-def _status(model: Model, fitted: Fitted, frames: int) -> Status:
-    left = fitted.unexplained
-    if left > SEPARABLE_RESIDUAL:
-        other = (
-            "take the wave-optical model" if model == "geometric" else "check the scene's numbers of mask and window"
-        )
-        return Status(
-            Verdict.NOT_SEPARABLE,
-            f"The {model} model does not explain the responses: {left:.1%} of them is left over "
-            f"({decibels(left):.1f} dB)",
-            f"{other}, or measure the factors with all patterns",
-        )
-    return Status(Verdict.CALIBRATED, f"Modelled: the {model} model explains {frames} frames")
-
-
-def _rotation(camera: ModelledCamera, fitted: Fitted) -> Sequence[str]:
-    angle, error = fitted.placement.mask_rotation, fitted.errors.get("mask_rotation")
-    if error is None or abs(angle) < _SIGNIFICANT * error:
-        return ()
-    turned = [(angle * left, right) for left, right in camera.rotation_terms(fitted.placement)]
-    lost = best_term([camera.factors(fitted.placement), *turned]).residual
-    if lost <= SEPARABLE_RESIDUAL:
-        return ()
-    return (
-        f"the mask is turned by {1e3 * angle:.2f} mrad (+-{1e3 * error:.2g}): no separable factors have that, and "
-        f"{lost:.1%} of the shadow is lacking ({decibels(lost):.1f} dB); straighten the mask",
-    )
 
 
 # -------- Where mask and projector are
@@ -400,7 +372,7 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
     """
     at = _first_guess(camera, shown[0], free)
     for _ in range(_PASSES):
-        pass_ = _Pass.of(camera, shown, free, at)
+        pass_ = _Pass(camera, shown, free, at)
         bounds = -_REACH, _REACH
         done = least_squares(pass_.residual, np.zeros(len(free)), pass_.jacobian, bounds, xtol=1e-6, ftol=1e-10)
         jacobian = pass_.jacobian(done.x)
@@ -411,53 +383,47 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
     chi_square = 2 * float(done.cost) / (len(done.fun) - len(free))
     scale = np.array([*pass_.steps.values()])
     covariance = max(chi_square, 1.0) * inverse * scale[:, None] * scale
-    return Fitted(at, tuple(free), covariance, chi_square, _unexplained_part(pass_.terms(at), shown))
+    left = energy = 0.0
+    for each in shown:
+        frame = sum(np.multiply.outer(*pair) for pair in _vectors_of(pass_.terms(at), each))
+        left += float(np.square(each.rate - frame).sum()) - each.rate.size * each.noise**2
+        energy += float(np.square(each.rate).sum())
+    return Fitted(at, tuple(free), covariance, chi_square, float(np.sqrt(max(left, 0.0) / energy)))
 
 
-@dataclass(frozen=True, eq=False)
 class _Pass:
-    """One least-squares problem: coefficients of responses in directions that are valid near ``start``."""
+    """One least-squares problem: coefficients of responses in directions that are valid near a ``start``."""
 
-    camera: ModelledCamera
-    start: Placement
-    steps: dict[str, float]
-    turned: SeparableTerms
-    shown: Sequence[Shown]
-    directions: list[tuple[FloatArray, FloatArray]]
-    data: FloatArray
-
-    @classmethod
-    def of(cls, camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str], start: Placement) -> _Pass:
-        steps = {name: STEPS.get(name, GAIN_STEP * start.gain) for name in free}
-        turned = camera.rotation_terms(start) if "mask_rotation" in free else []
-        empty = cls(camera, start, steps, turned, shown, [], np.zeros(0))
-        far = [(name, sign * _REACH * step) for name, step in steps.items() if name != "gain" for sign in (-1, 1)]
+    def __init__(self, camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str], start: Placement) -> None:
+        self._camera, self._start, self._shown = camera, start, shown
+        self.steps = {name: STEPS.get(name, GAIN_STEP * start.gain) for name in free}
+        self._turned = camera.rotation_terms(start) if "mask_rotation" in free else []
+        far = [(name, sign * _REACH * step) for name, step in self.steps.items() if name != "gain" for sign in (-1, 1)]
         near = [start, *(start.move({name: step}) for name, step in far)]
         # A rotation of 0 would leave out its directions.
-        spanning = [*turned, *(term for place in near for term in empty.terms(place)[:1])]
-        directions, data = [], []
+        spanning = [*self._turned, *(camera.factors(place) for place in near)]
+        self._directions, data = list[tuple[FloatArray, FloatArray]](), []
         for each in shown:
             lefts, rights = (np.stack(vectors, axis=1) for vectors in zip(*_vectors_of(spanning, each), strict=True))
             across, along = np.linalg.qr(lefts)[0], np.linalg.qr(rights)[0]
-            directions.append((across, along))
+            self._directions.append((across, along))
             data.append((across.T @ each.rate @ along / each.noise).ravel())
-        return cls(camera, start, steps, turned, shown, directions, np.concatenate(data))
+        self._data = np.concatenate(data)
 
     def placement(self, x: FloatArray) -> Placement:
-        return self.start.move(
-            {name: step * float(value) for (name, step), value in zip(self.steps.items(), x, strict=True)}
-        )
+        moves = {name: step * float(value) for (name, step), value in zip(self.steps.items(), x, strict=True)}
+        return self._start.move(moves)
 
     def terms(self, placement: Placement) -> SeparableTerms:
-        angle = placement.mask_rotation
-        return [self.camera.factors(placement), *((angle * left, right) for left, right in self.turned)]
+        turned = ((placement.mask_rotation * left, right) for left, right in self._turned)
+        return [self._camera.factors(placement), *turned]
 
     def residual(self, x: FloatArray) -> FloatArray:
         terms, model = self.terms(self.placement(x)), []
-        for each, (across, along) in zip(self.shown, self.directions, strict=True):
+        for each, (across, along) in zip(self._shown, self._directions, strict=True):
             frame = sum(np.multiply.outer(across.T @ left, along.T @ right) for left, right in _vectors_of(terms, each))
             model.append(np.ravel(frame) / each.noise)
-        return np.asarray(np.concatenate(model) - self.data)
+        return np.asarray(np.concatenate(model) - self._data)
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         here = self.residual(x)
@@ -515,12 +481,3 @@ def _first_guess(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) ->
 
 _SHIFTS = ("mask_shift_row", "mask_shift_column")
 """Shifts of the mask that are tried before the fit."""
-
-
-def _unexplained_part(terms: SeparableTerms, shown: Sequence[Shown]) -> float:
-    left = energy = 0.0
-    for each in shown:
-        frame = sum(np.multiply.outer(*pair) for pair in _vectors_of(terms, each))
-        left += float(np.square(each.rate - frame).sum()) - each.rate.size * each.noise**2
-        energy += float(np.square(each.rate).sum())
-    return float(np.sqrt(max(left, 0.0) / energy))

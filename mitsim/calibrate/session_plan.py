@@ -42,7 +42,6 @@ from mitsim.metrics import psnr as psnr_of
 from mitsim.metrics import truth_for
 from mitsim.reconstruct.factors import Estimate, Factors, StripeSums, factors_of_sums
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.sensor.moments import frame_moments
 
 _DRAWS = 8
 """Sessions whose mean PSNR is used: single ones scatter by 0.4 dB, the mean by 0.14 dB."""
@@ -225,7 +224,9 @@ def plan_calibration(
         own = job.apart("session ")
         plan = session.plan(accuracy, own)
         predicted = PredictedSession.of(LitSession.of(session, session.trace(plan, own), own), own)
-    search = _Search(shots, predicted, recipe, job)
+    truth = truth_for(shots, recipe.board_reflectance)
+    assert truth is not None
+    search = _Search(shots, predicted, recipe, truth, job)
     with job.clock.stage("solve"):
         ceiling = search.trial(None)
         trial = search.least(psnr, ceiling)
@@ -257,12 +258,13 @@ class _Search:
     shots: Capture
     predicted: PredictedSession
     recipe: SessionRecipe
+    truth: FloatArray
     job: Job
 
     def trial(self, recipe: SessionRecipe | None) -> Trial:
         draws = range(_DRAWS if recipe else 1)
         images = [reconstruct(self.shots, self.predicted.factors(recipe, draw)) for draw in draws]
-        found = [psnr_of(image.image, self._truth) for image in images]
+        found = [psnr_of(image.image, self.truth) for image in images]
         budget = images[0].uncertainties.budget if images[0].uncertainties else {}
         largest = max(budget, key=lambda name: budget[name], default="").replace("_", " ")
         return Trial(recipe, float(np.mean(found)), float(np.std(found, ddof=1)) if len(found) > 1 else 0.0, largest)
@@ -272,25 +274,15 @@ class _Search:
 
         def quality(dose: float) -> float:
             if dose not in trials:
-                trials[dose] = self.trial(self._by(dose))
+                fraction = float(f"{dose * self.recipe.exposure_fraction:.{_DIGITS}g}")
+                update = {"repeats": round(dose)} if dose > 1 else {"repeats": 1, "exposure_fraction": fraction}
+                trials[dose] = self.trial(self.recipe.model_copy(update=update))
                 self.job.progress(f"solve: {len(trials)} sessions", min(_TRIED * len(trials), 1.0))
             return trials[dose].psnr_db
 
         out_of_reach = quality(1.0) < wanted and ceiling.psnr_db < wanted
         smallest = EXPOSURE_FRACTION[0] / self.recipe.exposure_fraction
         return trials[1.0 if out_of_reach else least_dose(quality, wanted, smallest)]
-
-    @property
-    def _truth(self) -> FloatArray:
-        truth = truth_for(self.shots, self.recipe.board_reflectance)
-        assert truth is not None
-        return truth
-
-    def _by(self, dose: float) -> SessionRecipe:
-        if dose > 1:
-            return self.recipe.model_copy(update={"repeats": round(dose)})
-        fraction = float(f"{dose * self.recipe.exposure_fraction:.{_DIGITS}g}")
-        return self.recipe.model_copy(update={"repeats": 1, "exposure_fraction": fraction})
 
 
 def least_dose(quality: Callable[[float], float], wanted: float, smallest: float) -> float:
@@ -314,20 +306,12 @@ def least_dose(quality: Callable[[float], float], wanted: float, smallest: float
         if high == MOST_REPEATS:
             return high
         low, high = high, min(high * _STEP, float(MOST_REPEATS))
-    while not _is_close(low, high, quality(high) - wanted):
-        dose = _next_dose(low, high, quality(low) - wanted, quality(high) - wanted)
+    while (low < 1 or high - low > 1) and quality(high) - wanted > _NEAR_DB and high / low >= 1 + 10.0 ** (1 - _DIGITS):
+        part = (_NEAR_DB / 2 - quality(low) + wanted) / (quality(high) - quality(low))
+        dose = float(low * (high / low) ** min(max(part, 0.2), 0.8))
+        dose = min(max(float(round(dose)), low + 1), high - 1) if low >= 1 else dose
         low, high = (low, dose) if quality(dose) >= wanted else (dose, high)
     return high
-
-
-def _is_close(low: float, high: float, beyond_db: float) -> bool:
-    return (low >= 1 and high - low <= 1) or beyond_db <= _NEAR_DB or high / low < 1 + 10.0 ** (1 - _DIGITS)
-
-
-def _next_dose(low: float, high: float, under_db: float, over_db: float) -> float:
-    part = min(max((_NEAR_DB / 2 - under_db) / (over_db - under_db), 0.2), 0.8)
-    dose = float(low * (high / low) ** part)
-    return min(max(float(round(dose)), low + 1), high - 1) if low >= 1 else dose
 
 
 # ---- A session whose responses are known without noise; factors as any exposure and repeats would leave them ----
@@ -385,32 +369,19 @@ class PredictedSession:
 
 
 def _noisy(lit: LitSession, sums: StripeSums, draw: int) -> StripeSums:
-    own, shared = _variances(lit)
-    weights = np.square(sums.common / np.dot(sums.common, sums.common))
-    by_row = own if sums.side == SIDES[0] else own.T
+    """Return ``sums`` with noise of their responses' own, and with noise that all responses of a side share."""
+    own, shared = (
+        np.broadcast_to(np.sum([*np.broadcast_arrays(*parts.values())], axis=0), lit.uniform_rate.shape)
+        for parts in lit.response_variances(sums.side)
+    )
+    across, weights = sums.side == SIDES[0], np.square(sums.common / np.dot(sums.common, sums.common))
     random = stream(lit.session.seed, "foreseen", sums.side, draw)
-    noise = np.sqrt(by_row @ weights)[:, None] * random.standard_normal(sums.vectors.shape)
-    if shared is not None:
-        by_row = shared if sums.side == SIDES[0] else shared.T
-        noise += np.sqrt(by_row @ weights)[:, None] * random.standard_normal((len(sums.vectors), 1))
-        own = own + shared
+    noise = np.sqrt((own if across else own.T) @ weights)[:, None] * random.standard_normal(sums.vectors.shape)
+    if shared.any():
+        by_row = (shared if across else shared.T) @ weights
+        noise += np.sqrt(by_row)[:, None] * random.standard_normal((len(sums.vectors), 1))
     # One number a row (or column) of each response was fitted.
-    energy, fitted = sums.done * float(own.sum()), 1 - 1 / len(sums.common)
+    energy, fitted = sums.done * float((own + shared).sum()), 1 - 1 / len(sums.common)
     return replace(
         sums, vectors=sums.vectors + noise, misfit=sums.misfit + fitted * energy, energy=sums.energy + energy
     )
-
-
-def _variances(lit: LitSession) -> tuple[FloatArray, FloatArray | None]:
-    """Return (m, m') noise variances of a +-1 response [(electrons/s)^2]: its own, and that shared by a side.
-
-    Shots of a pattern are assumed to be half as bright as uniform light, which is exact over all patterns and over a
-    pair.
-    """
-    bench, time, recipe = lit.session.bench, lit.exposure_s, lit.session.recipe
-    white = Exposer(bench.devices, time, lit.session.seed).electrons(lit.white)
-    unit = recipe.repeats * (bench.sensor.gain_dn_per_e * time) ** 2
-    half = frame_moments(white / 2, time, bench.sensor)[1] / unit
-    if lit.session.pairs:
-        return 2 * half, None
-    return 4 * half, frame_moments(white, time, bench.sensor)[1] / unit

@@ -123,39 +123,20 @@ class LitFrame:
     slopes: tuple[FloatArray, FloatArray]
     blocks: tuple[IndexArray, IndexArray]
 
-    @cached_property
-    def ranges(self) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal columns that span the columns of both factors."""
-        return orthonormal(self.factors[0]), orthonormal(self.factors[1])
-
-    @cached_property
-    def wider(self) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal columns that span the columns of both factors and their slopes."""
-        left, right = (
-            orthonormal(np.hstack([columns, slope])) for columns, slope in zip(self.factors, self.slopes, strict=True)
-        )
-        return left, right
-
     def beyond(self, left: FloatArray, right: FloatArray) -> float:
         """Return the energy beyond the noise outside the orthonormal ranges ``left`` (m, r) and ``right`` (m', r')."""
         seen = left.T @ self.frame @ right
         beyond = np.square(self.frame).sum() - np.square(seen).sum() - (self.frame.size - seen.size) * self.variance
         return float(beyond)
 
-    @cached_property
-    def moments(self) -> FloatArray:
-        """Sums of squares of the lit pixels' light, and of its dipoles along rows and along columns."""
-        inverse = [np.linalg.pinv(np.hstack(both)) for both in zip(self.factors, self.slopes, strict=True)]
-        found = inverse[0] @ self.frame @ inverse[1].T
-        rows, columns = (side.shape[1] for side in self.factors)
-        parts = found[:rows, :columns], found[rows:, :columns], found[:rows, columns:]
-        return np.array([np.square(part).sum() for part in parts])
+    def of_depths(self, ranges: Sequence[FloatArray], wider: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return normal matrix and right side of dipoles that are one multiple of the light in a block.
 
-    def of_depths(self) -> tuple[FloatArray, FloatArray]:
-        """Return normal matrix and right side of dipoles that are one multiple of the light in a block."""
-        (left, right), (wide, wide_) = self.ranges, self.wider
+        ``ranges`` span the columns of both factors, and ``wider`` their slopes too.
+        """
+        wide, wide_ = wider
         image = np.linalg.pinv(self.factors[0]) @ self.frame @ np.linalg.pinv(self.factors[1]).T
-        own, own_ = wide.T @ left, wide_.T @ right
+        own, own_ = wide.T @ ranges[0], wide_.T @ ranges[1]
         seen, slid = ([wide.T @ of[0], wide_.T @ of[1]] for of in (self.factors, self.slopes))
 
         def outside(frame: FloatArray) -> FloatArray:
@@ -173,8 +154,12 @@ class LitFrames:
     """Sums of measurements that show a few groups of scene pixels alone."""
 
     def __init__(self, factors: tuple[FloatArray, FloatArray], patterns: tuple[FloatArray, FloatArray]) -> None:
-        self._factors = factors
-        sides = [_lit_groups(side) for side in patterns]
+        self._factors, sides = factors, list[list[tuple[IndexArray, FloatArray]]]()
+        for side in patterns:
+            groups = group_pixels(side)
+            lit = [(group.pixels, group.shared[1]) for group in groups if group.shared and group.shared[1].any()]
+            alone = all(group.shared for group in groups)
+            sides.append([(pixels, psi / np.dot(psi, psi)) for pixels, psi in lit] if alone else [])
         self._apart = all(sides)
         places = {(int(row * len(sides[0])), int(column * len(sides[1]))) for row, column in _PLACES}
         self._groups = [(sides[0][row], sides[1][column]) for row, column in sorted(places)] if self._apart else []
@@ -194,21 +179,13 @@ class LitFrames:
         """Return :func:`print_part` of these frames; NaN where pixels of patterns overlap."""
         if not self._apart:
             return float("nan")
-        slopes = [factor_slope(side, spline=True) for side in self._factors]
+        slopes, (left, right) = [factor_slope(side, spline=True) for side in self._factors], self._factors
         frames = []
         for ((rows, _), (columns, _)), frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
-            lit = self._factors[0][:, rows], self._factors[1][:, columns]
-            blocks = block_indices(rows, self._factors[0].shape[1]), block_indices(columns, self._factors[1].shape[1])
+            lit = left[:, rows], right[:, columns]
+            blocks = rows * _BLOCKS // left.shape[1], columns * _BLOCKS // right.shape[1]
             frames.append(LitFrame(frame, variance, lit, (slopes[0][:, rows], slopes[1][:, columns]), blocks))
         return print_part(frames)
-
-
-def _lit_groups(patterns: FloatArray) -> list[tuple[IndexArray, FloatArray]]:
-    groups = group_pixels(patterns)
-    if any(group.shared is None for group in groups):
-        return []
-    lit = [(group.pixels, group.shared[1]) for group in groups if group.shared and group.shared[1].any()]
-    return [(pixels, psi / np.dot(psi, psi)) for pixels, psi in lit]
 
 
 def print_part(frames: Sequence[LitFrame]) -> float:
@@ -219,20 +196,24 @@ def print_part(frames: Sequence[LitFrame]) -> float:
     print. The depths are estimated from the other frames, because dipoles of print may add up to any depth in one.
     Light beyond a pixel's edge has another cause.
     """
-    light, *dipoles = np.sum([each.moments for each in frames], axis=0)
-    if max(dipoles) > _EDGE**2 * light:
-        return 0.0
-    own = sum(each.beyond(*each.ranges) for each in frames)
-    left_over = 0.0
+    moments, own, left_over, depths = np.zeros(3), 0.0, 0.0, list[tuple[FloatArray, FloatArray]]()
     for each in frames:
-        (left, right), (wide, wide_) = each.ranges, each.wider
-        spare = each.frame.size - wide.shape[1] * wide_.shape[1]
-        if spare <= 0:
+        both = [np.hstack(pair) for pair in zip(each.factors, each.slopes, strict=True)]
+        ranges, wider = [orthonormal(side) for side in each.factors], [orthonormal(side) for side in both]
+        # Sums of squares of the lit pixels' light, and of its dipoles along rows and along columns.
+        found = np.linalg.pinv(both[0]) @ each.frame @ np.linalg.pinv(both[1]).T
+        rows, columns = (side.shape[1] for side in each.factors)
+        parts = found[:rows, :columns], found[rows:, :columns], found[:rows, columns:]
+        moments += [np.square(part).sum() for part in parts]
+        own += each.beyond(ranges[0], ranges[1])
+        size, (left, right), (wide, wide_) = each.frame.size, ranges, wider
+        if size <= wide.shape[1] * wide_.shape[1]:
             return 0.0
-        left_over += each.beyond(wide, wide_) * (each.frame.size - left.shape[1] * right.shape[1]) / spare
-    if own <= 0:
+        spare = (size - left.shape[1] * right.shape[1]) / (size - wide.shape[1] * wide_.shape[1])
+        left_over += each.beyond(wide, wide_) * spare
+        depths.append(each.of_depths(ranges, wider))
+    if max(moments[1:]) > _EDGE**2 * moments[0] or own <= 0:
         return 0.0
-    depths = [each.of_depths() for each in frames]
     whole = np.tile(np.eye(2), _BLOCKS**2)
     of_depth = max(
         _predicted_energy(depths),
@@ -255,11 +236,6 @@ def orthonormal(matrix: FloatArray) -> FloatArray:
     """Return orthonormal columns that span those of ``matrix``, without directions that are rounding."""
     left, singular, _ = np.linalg.svd(matrix, full_matrices=False)
     return np.asarray(left[:, singular > singular[0] * max(matrix.shape) * np.finfo(np.float64).eps])
-
-
-def block_indices(pixels: IndexArray, size: int) -> IndexArray:
-    """Return the block along a side of ``size`` scene pixels of each of the ``pixels``."""
-    return pixels * _BLOCKS // size
 
 
 def offset_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> FloatArray:
@@ -360,7 +336,9 @@ class FrameNoise:
         self._digital = manifest.digital
         self.ambient = ambient
         self.light_error = manifest.light_error or 0.0
-        self._sampling, self._systematic = manifest.mc_error or 0.0, _number(manifest.plan, "systematic_error")
+        stated: Any = (manifest.plan or {}).get("systematic_error")
+        known = isinstance(stated, (int, float)) and not isinstance(stated, bool) and np.isfinite(stated)
+        self._sampling, self._systematic = manifest.mc_error or 0.0, float(stated) if known else 0.0
         counts = len(manifest.patterns.P_L[0]), len(manifest.patterns.P_R[0])
         self.variance: FloatArray = np.zeros(counts)
         self.means: FloatArray = np.zeros(counts)
@@ -411,13 +389,6 @@ class FrameNoise:
 
     def _own(self, light: FloatArray | float, shots: int) -> FloatArray:
         return np.maximum(self._digital.variance(light, shots), 0.0)
-
-
-def _number(plan: dict[str, Any] | None, name: str) -> float:
-    value = (plan or {}).get(name)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        return 0.0
-    return float(value)
 
 
 # ---- Energies beside the image: noise of factors, and separable terms that they lack ----
@@ -522,6 +493,12 @@ class Accumulation:
         """W (r, r') of all frames."""
         problem = self.prepared.problem(self.frames)
         return np.where(problem.sigma > 0, problem.projected, 0.0)
+
+    @property
+    def lit_everywhere(self) -> tuple[int, int] | None:
+        """A pattern that lights all scene pixels, or None."""
+        lit = [np.flatnonzero((side > 0).all(axis=0)) for side in self.shots.patterns]
+        return (int(lit[0][0]), int(lit[1][0])) if all(map(len, lit)) else None
 
     def measurements_again(self) -> Iterable[Measurement]:
         """Return the kept measurements, or read them again."""

@@ -13,9 +13,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,8 +38,8 @@ from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_f
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.sensor import digital_of, load_sensor
 from mitsim.devices.session import SIDES, UNIFORM, Half, Merge, Side
-from mitsim.reconstruct.factors import Estimate, Factors, ResponseFit, StripeSums, stripe_sums
-from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
+from mitsim.reconstruct.factors import Factors, ResponseFit, StripeSums, stripe_sums
+from mitsim.reconstruct.session_check import SessionConditions, check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 """Fields of a list's `digital` that a camera's file may supply."""
@@ -91,14 +93,11 @@ def calibrate_frames(
     doubts: tuple[str, ...] = ()
     if camera is not None:
         session, doubts = _with_camera(session, camera)
-    _check_sizes(session)
-    session, doubt = _without_factor(session)
-    doubts += doubt
-    if output is None:
-        return _calibrate(session, job, doubts)
-    with output_folder(output) as place:
-        factors = _calibrate(session, job, doubts)
-        factors.write(place)
+    session, doubt = _checked(session)
+    with nullcontext() if output is None else output_folder(output) as place:
+        factors = _calibrate(session, job, doubts + doubt)
+        if place is not None:
+            factors.write(place)
     return factors
 
 
@@ -137,9 +136,7 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
 
     Raises MitsimError for a saturated frame.
     """
-    _check_sizes(session)
-    session, _ = _without_factor(session)
-    readings = _Readings(session)
+    readings = _Readings(_checked(session)[0])
     for side, index in chosen:
         rate, variance, _ = readings.response(side, index)
         if readings.saturated:
@@ -150,10 +147,16 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
         yield rate, float(np.sqrt(variance))
 
 
-def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
-    listed = session.listed
-    readings = _Readings(session)
-    estimate, noise, found = _estimate(readings, job)
+@single_threaded_blas()
+def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...]) -> Factors:
+    listed, readings = session.listed, _Readings(session)
+    signs = stripe_signs(listed.n).astype(np.float64)
+    sums, variances = _sums(readings, signs.shape[1], job)
+    taken = SessionConditions(session.order, session.frame_name, bool(readings.saturated), wrong=readings.wrong())
+    found = check_session(sums, signs, taken)
+    noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if listed.digital.noise_is_stated else None
+    with job.clock.stage("estimate"):
+        estimate = found.estimate(signs, noise)
     warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
     warnings += (*found.warnings, *readings.odd.values())
     if readings.saturated:
@@ -161,7 +164,17 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
             f"ADC's end, first {min(readings.saturated)}, so responses are not linear; expose for less",
         )
-    error = float(np.hypot(*estimate.predicted_error))
+    exact = "nobody has exact factors of a real camera; predicted_phi_error is by noise"
+    end = "frames count as saturated at the largest number of their file, if at all"
+    not_known = (
+        (True, f"phi_error, noise_free_residual: {exact}"),
+        (noise is None, "digital.read_noise_e: noise and what no separable camera explains are not told apart"),
+        (listed.digital.saturation_dn is None, f"digital.saturation_dn: {end}"),
+        (listed.board_reflectance is None, "board_reflectance: 1 in an image is this board, whatever it reflects"),
+        (listed.parallax is None, "parallax: `reconstruct --focus` has no other depth than the board's"),
+        (not session.pairs, "motion, ambient light, proportion to light: without pairs hardly seen; take pairs"),
+        (bool(session.dark) and session.pairs, "dark: pairs have no dark signal, and dark frames are not used"),
+    )
     result = {
         "n": listed.n,
         "frames": len(session.files),
@@ -169,7 +182,7 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
         "unexplained_residual": estimate.unexplained,
         "noise_free_residual": None,
         "phi_error": None,
-        "predicted_phi_error": error,
+        "predicted_phi_error": float(np.hypot(*estimate.predicted_error)),
         "response_noise": noise,
         "faults": [asdict(fault) for fault in found.faults],
         "lamp": found.lamp,
@@ -178,17 +191,17 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
         "saturated_frames": len(readings.saturated),
         "dark_frames": len(session.dark),
         "divided_by": session.listed.prepare.divide_by or 1,
-        "not_known": [*_not_known(session)],
+        "not_known": [words for unknown, words in not_known if unknown],
         "seconds": job.clock.seconds(),
         "warnings": warnings,
     }
     with job.clock.stage("checksums"):
-        sums = in_threads(lambda name: checksum(session.folder / name), session.files)
+        digests = in_threads(lambda name: checksum(session.folder / name), session.files)
     manifest = CalibrationManifest(
         configuration={
             "frames": str(session.folder),
             "list": listed.model_dump(mode="json"),
-            "frames_sha256": dict(zip(session.files, sums, strict=True)),
+            "frames_sha256": dict(zip(session.files, digests, strict=True)),
         },
         camera=listed.camera,
         centre=listed.centre,
@@ -203,27 +216,22 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
     return Factors.of(estimate, manifest)
 
 
-# ---- What is not known, and what is refused ----
+# ---- What is refused ----
 
 
-def _not_known(session: SessionFrames) -> Iterator[str]:
-    listed = session.listed
-    yield "phi_error, noise_free_residual: nobody has exact factors of a real camera; predicted_phi_error is by noise"
-    if not listed.digital.noise_is_stated:
-        yield "digital.read_noise_e: what noise leaves and what no separable camera explains are not told apart"
-    if listed.digital.saturation_dn is None:
-        yield "digital.saturation_dn: frames count as saturated at the largest number of their file, if at all"
-    if listed.board_reflectance is None:
-        yield "board_reflectance: 1 in an image is this board, whatever it reflects"
-    if listed.parallax is None:
-        yield "parallax: `reconstruct --focus` has no other depth than the board's"
-    if not session.pairs:
-        yield "motion, ambient light, proportion to light: without pairs their change is hardly seen; take pairs"
-    if session.dark and session.pairs:
-        yield "dark: the difference of a pair's halves has no dark signal, and dark frames are not used"
-
-
-def _without_factor(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
+def _checked(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
+    """Return a session whose frames have one size, without a common factor of their numbers, and doubts about it."""
+    first, *others = session.files
+    size = image_size(session.folder / first, session.wanted)
+    for name in session.files:
+        verify(session.folder, name, {}, "")  # no link out of it
+    for name in others:
+        own = image_size(session.folder / name, session.wanted)
+        if own != size:
+            raise MitsimError(
+                f"frames {session.folder}: {name} is {own[0]} x {own[1]} pixels, but {first} is {size[0]} x {size[1]}; "
+                "take all with one camera setting"
+            )
     prepare, end = session.listed.prepare, session.listed.digital.saturation_dn
     if prepare.divide_by is None:
         common = CommonFactor()
@@ -238,31 +246,6 @@ def _without_factor(session: SessionFrames) -> tuple[SessionFrames, tuple[str, .
             prepare = prepare.model_copy(update={"divide_by": factor})
             session = replace(session, listed=session.listed.model_copy(update={"prepare": prepare}))
     return session.with_preparer(), ()
-
-
-def _check_sizes(session: SessionFrames) -> None:
-    first, *others = session.files
-    size = image_size(session.folder / first, session.wanted)
-    for name in session.files:
-        verify(session.folder, name, {}, "")  # no link out of it
-    for name in others:
-        own = image_size(session.folder / name, session.wanted)
-        if own != size:
-            raise MitsimError(
-                f"frames {session.folder}: {name} is {own[0]} x {own[1]} pixels, but {first} is {size[0]} x {size[1]}; "
-                "take all with one camera setting"
-            )
-
-
-def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
-    first = session.repeats_of((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
-    values, digital = session.read(first.file), session.listed.digital
-    if digital.rate(values).max() <= 0 or not uniform.any():
-        raise MitsimError(
-            f"frames {session.folder}: {first.file}, a uniform frame, reaches {values.max():g}, and the list's "
-            f"digital.black_level_dn {digital.black_level_dn:g} and dark_current_e_per_s "
-            f"{digital.dark_current_e_per_s:g} leave no light of it; state them in the files' numbers"
-        )
 
 
 # ---- Frames as electrons a second ----
@@ -283,20 +266,14 @@ class _Reading:
         return max(self.ladder.variance(self.rate), 0.0) / self.shots
 
 
-@dataclass(frozen=True)
-class _Compared:
+class _Compared(NamedTuple):
+    """Two frames that should be alike: squared difference, light, and the first one's light over the other's."""
+
     names: tuple[str, str]
     kind: int
     squared: float
     light: float
     part: float
-
-    @classmethod
-    def of(cls, names: tuple[str, str], kind: int, one: FloatArray, other: FloatArray) -> _Compared:
-        light = max(float(np.square(other).mean()), float(np.square(one).mean()))
-        product = float(np.dot(one.ravel(), other.ravel())) / other.size
-        size = float(np.square(other).mean())
-        return cls(names, kind, float(np.square(one - other).mean()), light, product / size if size else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,10 +394,13 @@ class _Readings:
             both = np.asarray(used & ladder.used_pixels(0))
             if number and both.any():
                 names = frames[0].file, self.session.repeats_of(half)[0].file
-                self._compare(half, _Compared.of(names, -number, rates[-1][both], rates[0][both]))
+                self._compare(half, names, -number, rates[-1][both], rates[0][both])
         return _Reading(ladder.merge(rates), ladder, self.session.listed.repeats)
 
-    def _compare(self, half: Half, compared: _Compared) -> None:
+    def _compare(self, half: Half, names: tuple[str, str], kind: int, one: FloatArray, other: FloatArray) -> None:
+        size = float(np.square(other).mean())
+        light, part = max(size, float(np.square(one).mean())), float(np.dot(one.ravel(), other.ravel())) / other.size
+        compared = _Compared(names, kind, float(np.square(one - other).mean()), light, part / size if size else 0.0)
         known = self.compared.setdefault(half, [])
         if compared not in known:
             known.append(compared)
@@ -440,7 +420,7 @@ class _Readings:
                 if before is not None:
                     names = frame.file, frames[place - 1].file
                     half = frame.side, frame.index, frame.sign
-                    self._compare(half, _Compared.of(names, frame.exposure, rate, before))
+                    self._compare(half, names, frame.exposure, rate, before)
                 before = rate
         assert total is not None
         return _Reading(digital.rate(total / len(frames)), Ladder((digital,)), len(frames))
@@ -449,23 +429,19 @@ class _Readings:
 # ---- Sums over responses, and the estimate ----
 
 
-@single_threaded_blas()
-def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, CheckedSession]:
-    session = readings.session
-    signs = stripe_signs(session.listed.n).astype(np.float64)
-    sums, variances = _sums(readings, signs.shape[1], job)
-    taken = SessionConditions(session.order, session.frame_name, bool(readings.saturated), wrong=readings.wrong())
-    found = check_session(sums, signs, taken)
-    noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
-    with job.clock.stage("estimate"):
-        return found.estimate(signs, noise), noise, found
-
-
 def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first
-    _check_levels(readings.session, max((left, right), key=lambda response: float(response.mean())))
+    session, uniform = readings.session, max((left, right), key=lambda response: float(response.mean()))
+    brightest = session.repeats_of((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
+    values, digital = session.read(brightest.file), session.listed.digital
+    if digital.rate(values).max() <= 0 or not uniform.any():
+        raise MitsimError(
+            f"frames {session.folder}: {brightest.file}, a uniform frame, reaches {values.max():g}, and the list's "
+            f"digital.black_level_dn {digital.black_level_dn:g} and dark_current_e_per_s "
+            f"{digital.dark_current_e_per_s:g} leave no light of it; state them in the files' numbers"
+        )
     lights = [light for *_, light in first]
     sums = stripe_sums(left, right, count, readings.session.listed.centre, lights=lights)
     variances = [variance for _, variance, _ in first]

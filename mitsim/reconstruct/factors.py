@@ -8,7 +8,7 @@ up to (c Phi_L, Phi_R / c) only. They are returned balanced, |Phi_L 1| = |Phi_R 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -172,13 +172,8 @@ class StripeSums:
 
         ``light`` (rows, columns) is the sum of the two frames whose difference the response is.
         """
-        shape = len(self.vectors), len(self.common)
-        shape = shape if self.side == "horizontal" else shape[::-1]
-        checked = _response(response, f"{self.side} response {number}", shape, self.centre)
-        return self._fit_checked(checked, np.asarray(response), light)
-
-    def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
-        across = self.side == "horizontal"
+        across, shape, given = self.side == "horizontal", (len(self.vectors), len(self.common)), np.asarray(response)
+        response = _response(given, f"{self.side} response {number}", shape if across else shape[::-1], self.centre)
         common = self.common / np.dot(self.common, self.common)
         vector = (response if across else response.T) @ common
         rows, columns = (vector, self.common) if across else (self.common, vector)
@@ -226,10 +221,8 @@ def stripe_sums(
     a, v = _rank_one_split(mean)
     left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
     right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
-    for sums, checked, response, light in zip(
-        (left, right), (first, second), (horizontal, vertical), lights, strict=True
-    ):
-        sums.put(sums._fit_checked(checked, np.asarray(response), light))
+    for sums, response, light in zip((left, right), (horizontal, vertical), lights, strict=True):
+        sums.put(sums.fit_response(response, 0, light))
     return left, right
 
 
@@ -271,17 +264,28 @@ def estimate_factors(
     MitsimError
         For a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
     """
-    signs = _checked_signs(H, uniform is not None)
-    count = signs.shape[1]
-    rows, columns = iter(horizontal), iter(vertical)
-    first = _next(rows, "horizontal", 0, count), _next(columns, "vertical", 0, count)
-    left, right = stripe_sums(*first, count, centre, uniform)
-    for sums, rest in ((left, rows), (right, columns)):
+    signs = np.asarray(H, dtype=np.float64)
+    if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
+        raise MitsimError(f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard")
+    if not np.array_equal(signs @ signs.T, signs.shape[1] * np.eye(len(signs))):
+        raise MitsimError(f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix")
+    if uniform is None and not (signs[:, 0] == 1).all():
+        raise MitsimError("column 0 of H is not all +1 and no uniform response was given; give one of the two")
+    count, rests = signs.shape[1], (iter(horizontal), iter(vertical))
+
+    def following(side: str, index: int) -> npt.ArrayLike:
+        response = next(rests[side == "vertical"], None)
+        if response is None:
+            raise MitsimError(f"only {index} {side} responses were given; H has {count} columns, give one for each")
+        return response
+
+    both = stripe_sums(following("horizontal", 0), following("vertical", 0), count, centre, uniform)
+    for sums, rest in zip(both, rests, strict=True):
         while sums.done < count:
-            sums.add(_next(rest, sums.side, sums.done, count))
+            sums.put(sums.fit_response(following(sums.side, sums.done), sums.done))
         if next(rest, None) is not None:
             raise MitsimError(f"more than {count} {sums.side} responses were given; give one for each column of H")
-    return factors_of_sums(left, right, signs, noise)
+    return factors_of_sums(*both, signs, noise)
 
 
 def factors_of_sums(
@@ -303,31 +307,46 @@ def factors_of_sums(
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
     allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, NOISE_MODEL * float(np.sqrt(expected)))
-    singular = _Singular.of(phi[0]), _Singular.of(phi[1])
-    condition = max(values.squared_condition for values in singular)
-    predicted, rank = [], []
+    n, predicted, rank = len(signs), list[float](), list[int]()
+    singular = [np.asarray(np.linalg.svd(factor, compute_uv=False)) for factor in phi]
+    condition = max(squared_condition(factor, values) for factor, values in zip(phi, singular, strict=True))
     for factor, common, values, more in zip(phi, (v, a), singular, extra, strict=True):
         error = predicted_error(factor, noise, float(np.linalg.norm(common)), count)
         if more:
             error = float(np.hypot(error, np.sqrt(more / count) / np.linalg.norm(factor)))
         predicted.append(error)
-        rank.append(values.rank(factor, error))
-    n = len(signs)
+        rank.append(rank_above_noise(factor, error, values))
     figures = (
         f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
         f"rank {rank[0]} of {n} and {rank[1]} of {n}, condition {condition:.1e}."
     )
-    return Estimate(
-        left=phi[0],
-        right=phi[1],
-        separability_residual=residual,
-        unexplained=unexplained,
-        condition=condition,
-        noise=noise,
-        predicted_error=(predicted[0], predicted[1]),
-        rank=(rank[0], rank[1]),
-        status=_status(unexplained > allowed, unexplained, max(predicted), (n - rank[0], n - rank[1]), figures),
-    )
+    if unexplained > allowed:
+        status = Status(
+            Verdict.NOT_SEPARABLE,
+            f"Responses are not separable: {unexplained:.1%} of them is left over ({decibels(unexplained):.1f} dB)",
+            "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure",
+            figures,
+        )
+    elif max(predicted) > LARGEST_ERROR:
+        status = Status(
+            Verdict.MOSTLY_NOISE,
+            f"Factors are mostly noise: an error of {max(predicted):.0%} is expected of them, allowed are "
+            f"{LARGEST_ERROR:.0%}",
+            "raise the exposure or average captures",
+            figures,
+        )
+    elif rank != [n, n]:
+        status = Status(
+            Verdict.RANK_DEFICIENT,
+            f"Factors are rank deficient: {n - rank[0]} directions of scene rows and {n - rank[1]} of columns are not "
+            "above noise and rounding",
+            "use fewer scene pixels, a larger distance from sensor to mask or more exposure",
+            figures,
+        )
+    else:
+        status = Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
+    errors, ranks = (predicted[0], predicted[1]), (rank[0], rank[1])
+    return Estimate(phi[0], phi[1], residual, unexplained, condition, noise, errors, ranks, status)
 
 
 # ---- The error that noise makes ----
@@ -380,7 +399,7 @@ class AmbientLight:
         return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
 
 
-# ---- Whether the factors can be used ----
+# ---- Decibels, condition and rank ----
 
 
 def decibels(part: float) -> float:
@@ -388,80 +407,53 @@ def decibels(part: float) -> float:
     return float(20 * np.log10(part))
 
 
-def _status(inseparable: bool, residual: float, error: float, lost: tuple[int, int], figures: str) -> Status:
-    if inseparable:
-        return Status(
-            Verdict.NOT_SEPARABLE,
-            f"Responses are not separable: {residual:.1%} of them is left over ({decibels(residual):.1f} dB)",
-            "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure",
-            figures,
-        )
-    if error > LARGEST_ERROR:
-        return Status(
-            Verdict.MOSTLY_NOISE,
-            f"Factors are mostly noise: an error of {error:.0%} is expected of them, allowed are {LARGEST_ERROR:.0%}",
-            "raise the exposure or average captures",
-            figures,
-        )
-    if any(lost):
-        return Status(
-            Verdict.RANK_DEFICIENT,
-            f"Factors are rank deficient: {lost[0]} directions of scene rows and {lost[1]} of columns are not above "
-            "noise and rounding",
-            "use fewer scene pixels, a larger distance from sensor to mask or more exposure",
-            figures,
-        )
-    return Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
+def squared_condition(phi: FloatArray, values: FloatArray | None = None) -> float:
+    """Return cond(phi)^2 of a factor ``phi`` (m, n) of known singular ``values``; inf when it is rank deficient."""
+    values = np.asarray(np.linalg.svd(phi, compute_uv=False)) if values is None else values
+    lost = phi.shape[0] < phi.shape[1] or values[-1] <= _rounding(phi, values)
+    return float("inf") if lost else float((values[0] / values[-1]) ** 2)
 
 
-# ---- Singular values: condition and rank ----
+def rank_above_noise(phi: FloatArray, error: float, values: FloatArray | None = None) -> int:
+    """Return the number of singular ``values`` of ``phi`` (m, n) above rounding and noise of a relative ``error``.
+
+    Along a direction that the sensor does not see the factor has m independent numbers of noise. Their squared norm
+    is chi-square with m degrees of freedom, of which the limit is three standard deviations above the mean.
+    """
+    if not phi.any():
+        return 0
+    values = np.asarray(np.linalg.svd(phi, compute_uv=False)) if values is None else values
+    deviation, rows = error * np.linalg.norm(phi) / np.sqrt(phi.size), phi.shape[0]
+    noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
+    return int(np.count_nonzero(values > max(float(noise), _rounding(phi, values))))
 
 
-@dataclass(frozen=True, eq=False)
-class _Singular:
-    values: FloatArray
-    rounding: float
-    wide: bool
-
-    @classmethod
-    def of(cls, phi: FloatArray) -> _Singular:
-        values = np.asarray(np.linalg.svd(phi, compute_uv=False))
-        rounding = float(values[0] * max(phi.shape) * np.finfo(np.float64).eps)
-        return cls(values, rounding, phi.shape[0] < phi.shape[1])
-
-    @property
-    def squared_condition(self) -> float:
-        lost = self.wide or self.values[-1] <= self.rounding
-        return float("inf") if lost else float((self.values[0] / self.values[-1]) ** 2)
-
-    def rank(self, phi: FloatArray, error: float) -> int:
-        """Return the number of singular values above rounding and the noise of a relative ``error``.
-
-        Along a direction that the sensor does not see the factor has m independent numbers of noise. Their squared norm
-        is chi-square with m degrees of freedom, of which the limit is three standard deviations above the mean.
-        """
-        if not phi.any():
-            return 0
-        deviation, rows = error * np.linalg.norm(phi) / np.sqrt(phi.size), phi.shape[0]
-        noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
-        return int(np.count_nonzero(self.values > max(float(noise), self.rounding)))
-
-
-def squared_condition(phi: FloatArray) -> float:
-    """Return cond(phi)^2 of a factor ``phi`` (m, n); inf when it is rank deficient."""
-    return _Singular.of(phi).squared_condition
-
-
-def rank_above_noise(phi: FloatArray, error: float) -> int:
-    """Return the number of singular values of ``phi`` (m, n) above rounding and noise of a relative ``error``."""
-    return _Singular.of(phi).rank(phi, error)
+def _rounding(phi: FloatArray, values: FloatArray) -> float:
+    return float(values[0] * max(phi.shape) * np.finfo(np.float64).eps)
 
 
 # ---- The uniform response as a product of two vectors ----
 
 
 def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    right = _largest_right_vector(mean)
+    """Return a (m,) and v (n,) whose product is the largest part of rank one of a uniform response ``mean`` (m, n).
+
+    A uniform response is nearly of rank one, and its SVD takes half a minute at 2048 x 2048, so that power iteration is
+    used unless it does not converge.
+    """
+
+    def unit(vector: FloatArray) -> FloatArray:
+        norm = float(np.linalg.norm(vector))
+        return vector / norm if norm else vector
+
+    # No direction of the data: what starts across the first singular vector would not find it.
+    right = unit(np.random.default_rng(0).standard_normal(len(mean)) @ mean)
+    for _ in range(_TURNS):
+        before, right = right, unit(unit(mean @ right) @ mean)
+        if np.linalg.norm(right - before) <= _TURNED:
+            break
+    else:
+        right = np.asarray(np.linalg.svd(mean, full_matrices=False)[2][0])
     left = mean @ right
     size = float(np.linalg.norm(left))
     if size == 0:
@@ -470,34 +462,7 @@ def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     return left * (root / size), right * root
 
 
-def _largest_right_vector(matrix: FloatArray) -> FloatArray:
-    """Return the right singular vector (n,) of the largest singular value of a ``matrix`` (m, n), of either sign.
-
-    A uniform response is nearly of rank one, and its SVD takes half a minute at 2048 x 2048, so that power iteration is
-    used unless it does not converge.
-    """
-    # No direction of the data: what starts across the first singular vector would not find it.
-    vector = _unit(np.random.default_rng(0).standard_normal(len(matrix)) @ matrix)
-    for _ in range(_TURNS):
-        before, vector = vector, _unit(_unit(matrix @ vector) @ matrix)
-        if np.linalg.norm(vector - before) <= _TURNED:
-            return vector
-    return np.asarray(np.linalg.svd(matrix, full_matrices=False)[2][0])
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    norm = float(np.linalg.norm(vector))
-    return vector / norm if norm else vector
-
-
 # ---- Responses and patterns as they are read ----
-
-
-def _next(responses: Iterator[npt.ArrayLike], side: str, index: int, count: int) -> npt.ArrayLike:
-    response = next(responses, None)
-    if response is None:
-        raise MitsimError(f"only {index} {side} responses were given; H has {count} columns, give one for each")
-    return response
 
 
 def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None, centre: bool) -> FloatArray:
@@ -510,16 +475,7 @@ def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None,
     return centre_frame(values) if centre else values
 
 
-def _checked_signs(H: npt.ArrayLike, has_uniform: bool) -> FloatArray:
-    signs = np.asarray(H, dtype=np.float64)
-    if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
-        raise MitsimError(f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard")
-    if not np.array_equal(signs @ signs.T, signs.shape[1] * np.eye(len(signs))):
-        raise MitsimError(f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix")
-    if not has_uniform and not (signs[:, 0] == 1).all():
-        raise MitsimError("column 0 of H is not all +1 and no uniform response was given; give one of the two")
-    return signs
-
+# ---- Factors of a calibrated camera ----
 
 _LACKING = "lacking"
 """Prefix of channels with terms that a factor lacks."""
@@ -566,10 +522,15 @@ class Factors:
     def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[SeparableTerm] = ()) -> Factors:
         """Return the factors of an ``estimate`` with the ``manifest`` of its camera, and the terms that they lack."""
         left, right = _single(estimate.left), _single(estimate.right)
+        own, other = (
+            float(error * float(np.linalg.norm(side)) / np.sqrt(side.size))
+            for side, error in zip((estimate.left, estimate.right), estimate.predicted_error, strict=True)
+        )
+        known = np.isfinite([own, other]).all()
         update = {
             "estimate": str(estimate.status),
             "verdict": estimate.status.verdict.value,
-            "noise": _factor_noise(estimate),
+            "noise": FactorNoise(left=own, right=other, unexplained=estimate.unexplained) if known else None,
         }
         terms = tuple((_single(a), _single(b)) for a, b in lacking)
         return cls(left, right, manifest.model_copy(update=update), estimate.status, estimate=estimate, lacking=terms)
@@ -737,16 +698,6 @@ def _parts(camera: Mapping[str, Any]) -> dict[str, Any]:
         inner = value.items() if isinstance(value, Mapping) else ()
         found |= {f"{part}.{name}": each for name, each in inner} if inner else {part: value}
     return found
-
-
-def _factor_noise(estimate: Estimate) -> FactorNoise | None:
-    left, right = (
-        error * float(np.linalg.norm(side)) / np.sqrt(side.size)
-        for side, error in zip((estimate.left, estimate.right), estimate.predicted_error, strict=True)
-    )
-    if not np.isfinite([left, right]).all():
-        return None
-    return FactorNoise(left=float(left), right=float(right), unexplained=estimate.unexplained)
 
 
 @check_arguments

@@ -46,7 +46,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -284,22 +284,20 @@ class _State:
         return lengths(slopes_of(self.image))
 
     @cached_property
-    def _flattened(self) -> float:
-        if not self.prior.weight:
-            return 0.0
-        low = np.minimum(self._slopes, self.smooth)
-        return self.prior.weight * (float(low.sum(dtype=np.float64)) - _dot(low, low) / (2 * self.smooth))
-
-    @cached_property
     def objective(self) -> float:
         squares = _dot(self.residual, self.residual) + self.prior.ridge * _dot(self.image, self.image)
         if not self.prior.weight:
             return squares / 2
         return squares / 2 + self.prior.weight * float(self._slopes.sum(dtype=np.float64))
 
-    @property
+    @cached_property
     def smoothed(self) -> float:
-        return self.objective - self._flattened
+        """Objective whose TV is quadratic where slopes are small."""
+        if not self.prior.weight:
+            return self.objective
+        low = np.minimum(self._slopes, self.smooth)
+        flattened = float(low.sum(dtype=np.float64)) - _dot(low, low) / (2 * self.smooth)
+        return self.objective - self.prior.weight * flattened
 
     @cached_property
     def _stiffness(self) -> Array:
@@ -362,9 +360,16 @@ class _State:
             held = length * length / np.maximum(length, self.smooth)
             variation = self.prior.weight * float((length - held).sum(dtype=np.float64))
         free, slope, direction, power = self.free, self.gradient, None, 1.0
-        pressed, left = self._parts(slope)
-        best = pressed + self._most_lowered(math.sqrt(_dot(left, left)))
-        seen = np.zeros_like(self.residual)
+        ridge, reach = self.prior.ridge, math.sqrt(_dot(self.image, self.image))
+
+        def lowered(slope: Array) -> float:
+            pressed, left = self._parts(slope)
+            length = math.sqrt(_dot(left, left))
+            if length <= ridge * reach:
+                return pressed + (length * length / (2 * ridge) if ridge else 0.0)
+            return pressed + length * reach - ridge * reach**2 / 2
+
+        best, seen = lowered(slope), np.zeros_like(self.residual)
         for _ in range(_TIGHTENED):
             left = np.where(free, slope, self.precise(0))
             turned = self.divide(left) * free
@@ -375,8 +380,7 @@ class _State:
             ahead = self.light.image_of(direction)
             seen = seen + self.precise(power / max(_dot(ahead, ahead), _NOTHING)) * ahead
             slope = self.gradient + self.light.correlate(seen)
-            pressed, left = self._parts(slope)
-            best = min(best, pressed + _dot(seen, seen) / 2 + self._most_lowered(math.sqrt(_dot(left, left))))
+            best = min(best, _dot(seen, seen) / 2 + lowered(slope))
         return max(variation, 0.0) + best
 
     def _parts(self, slope: Array) -> tuple[float, Array]:
@@ -402,12 +406,6 @@ class _State:
             total += 0.0 if room is None else abs(_dot(room, part))
         return total, left
 
-    def _most_lowered(self, slope: float) -> float:
-        ridge, reach = self.prior.ridge, math.sqrt(_dot(self.image, self.image))
-        if slope <= ridge * reach:
-            return slope * slope / (2 * ridge) if ridge else 0.0
-        return slope * reach - ridge * reach**2 / 2
-
 
 def _dot(first: Array, second: Array) -> float:
     return float(np.vdot(first, second))
@@ -416,8 +414,7 @@ def _dot(first: Array, second: Array) -> float:
 # ---- Minimising ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Minimum:
+class Minimum(NamedTuple):
     """Image near the minimum.
 
     Attributes
@@ -559,13 +556,6 @@ def frame_noise(frame: Array) -> float:
     bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
     # The 9 weights have squares of 36 in all; half of normal numbers are below 0.6745 deviations.
     return float(np.median(np.abs(bent))) / 6 / 0.6745
-
-
-def _noise_variance(frames: Array) -> float:
-    rows, columns = (max(size // 16, 1) for size in frames.shape[1:])
-    strips = [strip for frame in frames for strip in np.array_split(frame, rows)]
-    tiles = [tile for strip in strips for tile in np.array_split(strip, columns, axis=1)]
-    return float(np.mean([frame_noise(tile) ** 2 for tile in tiles]))
 
 
 def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, int]:
@@ -710,7 +700,11 @@ class PointSpreadFit:
 def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> PointSpreadFit:
     """Return the fit of ``frames`` to ``light``; ``variance`` is their mean noise variance, None if not stated."""
     small, seen, factor = _shrink(light, frames)
-    noise = max(_noise_variance(seen) if variance is None else variance / factor**2, 1e-300)
+    rows, columns = (max(size // 16, 1) for size in seen.shape[1:])
+    strips = [strip for frame in seen for strip in np.array_split(frame, rows)]
+    tiles = [tile for strip in strips for tile in np.array_split(strip, columns, axis=1)]
+    measured = float(np.mean([frame_noise(tile) ** 2 for tile in tiles])) if variance is None else variance / factor**2
+    noise = max(measured, 1e-300)
     error = math.hypot(math.sqrt(noise), _MODEL_ERROR * float(seen.mean()))
 
     def cost(psf: FloatArray, rough: float) -> tuple[float, float]:
@@ -722,8 +716,12 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
     rough, fine = _ROUGH
     (objective, left), (alternative, chi_square) = cost(small.psf, rough), cost(small.psf, fine)
     rough, objective = (fine, alternative) if left > _LEFT else (rough, objective)
-    copies = {name: small.psf[::rows, ::columns] for name, (rows, columns) in _TURNED.items()}
-    others = {name: cost(copy, rough)[0] for name, copy in copies.items() if _likeness(small.psf, copy) < _ALIKE}
+    others, grid = dict[str, float](), [2 * size for size in small.psf.shape]
+    for name, (down, across) in _TURNED.items():
+        copy = small.psf[::down, ::across]
+        shifted = fft.irfft2(fft.rfft2(small.psf, grid) * fft.rfft2(copy, grid).conj(), grid)
+        if shifted.max() < _ALIKE * math.sqrt(float(np.square(small.psf).sum() * np.square(copy).sum())):
+            others[name] = cost(copy, rough)[0]
     reading = min(others, key=lambda name: others[name], default="")
     energy = max(float(np.mean(np.square(seen, dtype=np.float64))), 1e-300)
     off = [float(np.average(place, weights=np.abs(light.psf))) for place in np.indices(light.psf.shape)]
@@ -737,9 +735,3 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
         off=(off[0] - (rows - 1) / 2, off[1] - (columns - 1) / 2),
         size=(rows, columns),
     )
-
-
-def _likeness(first: FloatArray, second: FloatArray) -> float:
-    grid = [2 * size for size in first.shape]
-    shifted = fft.irfft2(fft.rfft2(first, grid) * fft.rfft2(second, grid).conj(), grid)
-    return float(shifted.max() / math.sqrt(float(np.square(first).sum() * np.square(second).sum())))

@@ -138,21 +138,29 @@ def reconstruct_psf_request(
     request.check_point_spread(reduce)
     clock = (job or Job()).apart("").clock
     with clock.stage("read"):
-        light, seen = _light(psf, reduce), _Frames(shots, reduce)
-        patterns = None if seen.uniform else shots.patterns
-        camera = ShiftedLight(light, seen.sensor, patterns, np.float32)
-        grid = camera.grid[0] * camera.grid[1]
-        numbers = grid + camera.count * camera.sensor[0] * camera.sensor[1]
+        light, (left, right), digital, saturated = _light(psf, reduce), shots.patterns, shots.manifest.digital, 0
+        rows, columns = shots.read(shots.manifest.patterns.captures[0].file)[0]["DN"].shape
+        if min(rows, columns) < reduce:
+            raise MitsimError(f"{shots.name}: frames of {rows} x {columns} pixels; reduce by less than {reduce}")
+        uniform = left.shape[1] == right.shape[1] == 1 and bool((left == 1).all() and (right == 1).all())
+        sensor = rows // reduce, columns // reduce
+        camera = ShiftedLight(light, sensor, None if uniform else shots.patterns, np.float32)
+        numbers = camera.grid[0] * camera.grid[1] + camera.count * sensor[0] * sensor[1]
         Cost(memory_bytes=4.0 * _NUMBERS * numbers).check(f"{shots.name}: its image", Limits())
-        frames = seen.read()
+        frames, variance = np.empty((camera.count, *sensor), np.float32), 0.0
+        for each in shots.pattern_measurements((rows, columns)):
+            frames[each.row * right.shape[1] + each.column] = reduce_frame(each.frame, reduce)
+            saturated += each.saturated
+            variance += float(np.mean(np.maximum(digital.variance(each.light, each.shots), 0.0)))
     with clock.stage("solve"):
         solution = solve_point_spread(camera, frames, request.name, request.lam, **request.iterative)
     with clock.stage("misfit"):
-        fit = find_fit(camera, frames, seen.variance)
+        known = variance / reduce**2 / camera.count if digital.noise_is_stated else None
+        fit = find_fit(camera, frames, known)
     status = fit.judge(solution.status)
     flags = [f"The capture was flagged: {' '.join(warning.split()).rstrip('.')}." for warning in shots.warnings]
-    if seen.saturated:
-        flags.append(f"{seen.saturated} readings are at the full well or the ADC's end: expose for less.")
+    if saturated:
+        flags.append(f"{saturated} readings are at the full well or the ADC's end: expose for less.")
     return Reconstruction(
         **{**vars(solution), "status": replace(status, flags=(*status.flags, *flags))},
         rank=None,
@@ -190,27 +198,3 @@ def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
     if light.ndim != 2 or min(light.shape) < reduce:
         raise ArgumentError("psf", f"shape {light.shape}: give rows x columns, at least {reduce} a side")
     return reduce_frame(light, reduce)
-
-
-class _Frames:
-    def __init__(self, shots: Capture, reduce: int) -> None:
-        self._shots, self._reduce = shots, reduce
-        self.saturated = 0
-        self.variance: float | None = 0.0 if shots.manifest.digital.noise_is_stated else None
-        left, right = shots.patterns
-        self.uniform = left.shape[1] == right.shape[1] == 1 and bool((left == 1).all() and (right == 1).all())
-        first = shots.read(shots.manifest.patterns.captures[0].file)[0]["DN"].shape
-        if min(first) < reduce:
-            raise MitsimError(f"{shots.name}: frames of {first[0]} x {first[1]} pixels; reduce by less than {reduce}")
-        self.sensor = (first[0] // reduce, first[1] // reduce)
-        self._shape, self._columns, self._count = (first[0], first[1]), right.shape[1], left.shape[1] * right.shape[1]
-
-    def read(self) -> FloatArray:
-        frames = np.empty((self._count, *self.sensor), np.float32)
-        for each in self._shots.pattern_measurements(self._shape):
-            frames[each.row * self._columns + each.column] = reduce_frame(each.frame, self._reduce)
-            self.saturated += each.saturated
-            if self.variance is not None:
-                variance = np.maximum(self._shots.manifest.digital.variance(each.light, each.shots), 0.0)
-                self.variance += float(np.mean(variance)) / self._reduce**2 / self._count
-        return frames

@@ -19,11 +19,10 @@ from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising, print_energy
-from mitsim.reconstruct.defects import LeftOut
 from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import light_margin, move_factors, widen_factors
-from mitsim.reconstruct.misfit import Cause, Misfit, faulty_frames, find_misfit
+from mitsim.reconstruct.misfit import Cause, LeftOut, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.request import (
     IMAGE_FILE,
     PICTURE_FILE,

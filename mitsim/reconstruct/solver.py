@@ -100,19 +100,9 @@ class DiagonalProblem:
     struck: FloatArray | float = 0.0
     least: float = 0.0
 
-    def residual_energy(self, lam: float) -> float:
-        """Return ||Y - model||^2 of the Tikhonov solution at ``lam``."""
-        outside = max(self.energy - float(np.sum(np.square(self.projected))), 0.0)
-        return outside + self.taken_energy(lam)
-
     def taken_energy(self, lam: float) -> float:
         """Return the energy within the model's range that the Tikhonov solution at ``lam`` omits."""
         return float(np.sum(np.square((1 - self.kept_share(lam)) * self.projected)))
-
-    def image_energy(self, lam: float) -> float:
-        """Return ||X||^2 of the Tikhonov image X at ``lam``."""
-        kept = self.kept_share(lam)
-        return float(np.sum(np.square((kept * self.projected)[kept > 0] / self.sigma[kept > 0])))
 
     def kept_share(self, lam: float) -> FloatArray:
         """Return the share sigma^2 / (sigma^2 + ``lam``) of each coefficient (r, r'), 0 beyond the rank."""
@@ -251,7 +241,10 @@ def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
     """
     moved = np.array([movement(problem, lam) for lam in lambdas])
     if len(moved) > 1 and moved[-1] < moved[-2]:
-        moved /= [problem.image_energy(lam) for lam in lambdas]
+        for number, lam in enumerate(lambdas):
+            kept = problem.kept_share(lam)
+            measured = kept > 0
+            moved[number] /= np.sum(np.square((kept * problem.projected)[measured] / problem.sigma[measured]))
     count = len(moved)
     if problem.halves and np.isfinite(problem.halves.typical):
         noise = noise_variance(problem)
@@ -329,6 +322,11 @@ class Halves:
 def half_spread(half: FloatArray) -> FloatArray:
     """Return the variance (r,) of W_0 - G W for white noise of variance 1: diag G (I - G) with G ``half``."""
     return np.asarray(np.diag(half) - np.einsum("ij,ji->i", half, half))
+
+
+def robust_scatter(values: FloatArray) -> float:
+    """Return 1.4826 times the median absolute deviation of ``values``, the standard deviation of normal numbers."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 def _medians(squares: FloatArray) -> FloatArray:
@@ -532,8 +530,11 @@ class Prepared:
         filtered = np.divide(
             sigma * problem.projected, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0
         )
-        residual = problem.residual_energy(lam)
-        rounding = self._rounding(problem, lam)
+        outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
+        residual = outside + problem.taken_energy(lam)
+        measured = sigma[sigma > 0]
+        magnified = float(float(measured.max()) * (measured / (np.square(measured) + lam)).max())
+        rounding = _ROUNDING_UNITS * max(magnified, 1.0) * self.left.spread * self.right.spread
         return Solution(
             image=self.image(filtered),
             lam=lam,
@@ -541,12 +542,6 @@ class Prepared:
             status=replace(self._status(lam, rounding, problem.scale), flags=flags),
             rounding=rounding,
         )
-
-    def _rounding(self, problem: DiagonalProblem, lam: float) -> float:
-        sigma = problem.sigma[problem.sigma > 0]
-        power = np.square(sigma) + lam
-        magnified = float(sigma.max()) * (sigma / power).max()
-        return _ROUNDING_UNITS * max(float(magnified), 1.0) * self.left.spread * self.right.spread
 
     def _status(self, lam: float, rounding: float, scale: float) -> Status:
         figures = f"{self.extent}, rounding below {rounding:.0e}."
@@ -617,7 +612,12 @@ def prepare(
             )
     same = np.array_equal(factors[0], factors[1]) and np.array_equal(patterns[0], patterns[1])
     if centre:
-        factors = [_centre_factor(factor) for factor in factors]
+        centred = [centre_columns(factor) for factor in factors]
+        # Exact zeros for a column of equal numbers.
+        dust = [len(factor) * np.finfo(np.float64).eps * np.abs(factor).max(axis=0) for factor in factors]
+        factors = [
+            np.where(np.abs(own).max(axis=0) > least, own, 0.0) for own, least in zip(centred, dust, strict=True)
+        ]
     for name, factor, pattern in zip(("left", "right"), factors, patterns, strict=True):
         if not (factor.any() and pattern.any()):
             what = " once centred" if centre else ""
@@ -630,13 +630,6 @@ def prepare(
         if factorised.singular.max() < _UNSEEN:
             raise MitsimError(f"patterns light no scene pixel that the {name} factor sees; light those that it sees")
     return Prepared(left_side, right_side, centre)
-
-
-def _centre_factor(factor: FloatArray) -> FloatArray:
-    """Remove the means of the columns, with exact zeros for a column of equal numbers."""
-    centre_frame = centre_columns(factor)
-    dust = len(factor) * np.finfo(np.float64).eps * np.abs(factor).max(axis=0)
-    return np.where(np.abs(centre_frame).max(axis=0) > dust, centre_frame, 0.0)
 
 
 def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
@@ -713,12 +706,29 @@ class Accumulator:
         MitsimError
             If the shape, a value or the index is not allowed, or a pattern is added twice.
         """
-        self._check_index(row, column)
-        values = self.prepared.as_solved(self._check_frame(frame, row, column))
+        (rows, columns), name, given = self._seen.shape, f"frame of pattern ({row}, {column})", np.asarray(frame)
+        whole = all(isinstance(k, (int, np.integer)) and not isinstance(k, bool) for k in (row, column))
+        if not (whole and 0 <= row < rows and 0 <= column < columns):
+            raise MitsimError(f"pattern index is ({row}, {column}); allowed are 0 to {rows - 1} and 0 to {columns - 1}")
+        if self._seen[row, column]:
+            raise MitsimError(f"{name} was added before; average repeated captures first")
+        expected = (self.prepared.left.sensor_size, self.prepared.right.sensor_size)
+        if given.shape != expected or given.dtype.kind not in "buif":
+            raise MitsimError(
+                f"{name} is {given.dtype} of shape {given.shape}; the factors take real numbers of shape {expected}"
+            )
+        values = self.prepared.as_solved(given.astype(np.float64, copy=False))
         flat = values.ravel()
         energy = float(np.dot(flat, flat))
         if not 1 / _LARGEST_SUM**2 <= energy <= _LARGEST_SUM**2 and (energy or values.any()):
-            raise MitsimError(_out_of_range(f"frame of pattern ({row}, {column})", values))
+            bad = int(np.count_nonzero(~np.isfinite(values)))
+            wrong = f"has {bad} values that are not finite; capture it again"
+            if not bad:
+                wrong = (
+                    f"has numbers up to {np.abs(values).max():.1e}; allowed are 0 and {1 / _LARGEST_SUM:g} to "
+                    f"{_LARGEST_SUM:g}, choose another unit"
+                )
+            raise MitsimError(f"{name} {wrong}")
         left, right = self.prepared.slabs((row, column))
         where = self.prepared.places((row, column))
         halves = self.prepared.left.halves, self.prepared.right.halves
@@ -727,24 +737,6 @@ class Accumulator:
         self._energy += energy
         self._seen[row, column] = True
         return np.asarray(found.sum(axis=(0, 1)))
-
-    def _check_index(self, row: int, column: int) -> None:
-        rows, columns = self._seen.shape
-        whole = all(isinstance(k, (int, np.integer)) and not isinstance(k, bool) for k in (row, column))
-        if not (whole and 0 <= row < rows and 0 <= column < columns):
-            raise MitsimError(f"pattern index is ({row}, {column}); allowed are 0 to {rows - 1} and 0 to {columns - 1}")
-        if self._seen[row, column]:
-            raise MitsimError(f"frame of pattern ({row}, {column}) was added before; average repeated captures first")
-
-    def _check_frame(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
-        values = np.asarray(frame)
-        expected = (self.prepared.left.sensor_size, self.prepared.right.sensor_size)
-        if values.shape != expected or values.dtype.kind not in "buif":
-            raise MitsimError(
-                f"frame of pattern ({row}, {column}) is {values.dtype} of shape {values.shape}; "
-                f"the factors take real numbers of shape {expected}"
-            )
-        return values.astype(np.float64, copy=False)
 
 
 def project_frames(left: Side, right: Side, frames: FloatArray) -> FloatArray:
@@ -766,16 +758,6 @@ def centre_columns(matrix: FloatArray) -> FloatArray:
 def centre_frame(frame: FloatArray) -> FloatArray:
     """Return C Y C of a ``frame`` Y, C = I - 1 1^T / m, without row and column means."""
     return centre_columns(frame - frame.mean(axis=1, keepdims=True))
-
-
-def _out_of_range(name: str, values: FloatArray) -> str:
-    bad = int(np.count_nonzero(~np.isfinite(values)))
-    if bad:
-        return f"{name} has {bad} values that are not finite; capture it again"
-    return (
-        f"{name} has numbers up to {np.abs(values).max():.1e}; "
-        f"allowed are 0 and {1 / _LARGEST_SUM:g} to {_LARGEST_SUM:g}, choose another unit"
-    )
 
 
 def _project(

@@ -120,7 +120,7 @@ def solve_tv(
     """
     problem = prepared.problem(frames)
     lam = automatic_weight(problem) if weight == "auto" else check_lambda(weight)
-    return _solve(prepared, problem, Prior(weight=lam, bounds=bounds or Prior.bounds), iterations, tolerance)
+    return _Minimum(prepared, problem, Prior(weight=lam, bounds=bounds or Prior.bounds)).find(iterations, tolerance)
 
 
 def solve_nonnegative(
@@ -144,91 +144,160 @@ def solve_nonnegative(
     """
     problem = prepared.problem(frames)
     ridge = automatic_lambda(problem) if lam == "auto" else check_lambda(lam)
-    found = _solve(prepared, problem, Prior(ridge=ridge, bounds=bounds or (0.0, math.inf)), iterations, tolerance)
+    prior = Prior(ridge=ridge, bounds=bounds or (0.0, math.inf))
+    found = _Minimum(prepared, problem, prior).find(iterations, tolerance)
     flags = end_of_range(problem, ridge) if lam == "auto" else ()
     return replace(found, status=replace(found.status, flags=flags))
 
 
-def _solve(prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float) -> Solution:
-    if iterations < 1:
-        raise MitsimError(f"iterations are {iterations}; give at least 1")
-    if not prior.weight and not prior.bounded:
-        square = np.square(problem.sigma) + prior.ridge
-        measured = problem.sigma > 0
-        least = np.divide(problem.sigma * problem.projected, square, out=np.zeros_like(square), where=measured)
-        return _solution(prepared, problem, prior, prepared.image(least), 0, 0.0, True)
-    image, spent, gap = _minimise(prepared, problem, prior, iterations, tolerance)
-    return _solution(prepared, problem, prior, image, spent, gap, gap <= tolerance)
+class _Minimum:
+    """The image of a diagonal ``problem`` that is most likely by its data and a ``prior``."""
 
+    def __init__(self, prepared: Prepared, problem: DiagonalProblem, prior: Prior) -> None:
+        self.prepared, self.problem, self.prior = prepared, problem, prior
 
-def _minimise(
-    prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float
-) -> tuple[FloatArray, int, float]:
-    """Return the image (n, n'), the number of steps and the relative gap."""
-    weight, ridge = prior.weight, prior.ridge
-    squared, data = np.square(problem.sigma) + ridge, problem.sigma * problem.projected
-    rho = _penalty(problem)
-    smooth = prepared.image(data / (squared + rho))
-    slopes = slopes_of(smooth)
-    rho_slopes = weight / max(float(lengths(slopes).mean()), _NOTHING)
-    # Without bounds nothing is held to them.
-    inside, rho_inside = np.clip(smooth, *prior.bounds), rho if prior.bounded else 0.0
-    dual, dual_slopes, dual_inside = np.zeros_like(smooth), np.zeros_like(slopes), np.zeros_like(smooth)
-    rows, columns = (2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in smooth.shape)
-    laplacian = rows[:, None] + columns
-    spent, relative = 0, float("inf")
-    while spent < iterations and relative > tolerance:
-        spent += 1
-        target = smooth - dual
-        seen, kept = prepared.coefficients(target), rho / (ridge + rho)
-        # Directions outside the basis (under-determined sides) are not measured: they keep the target.
-        updated = kept * target + prepared.image((data + rho * seen) / (squared + rho) - kept * seen)
-        before, before_inside = smooth, inside
-        source = rho * (_RELAXED * updated + (1 - _RELAXED) * smooth + dual)
-        total: FloatArray | float = rho
-        bounded, pressed = dual_slopes, dual_inside
-        if weight:
-            target = slopes - dual_slopes
-            length = lengths(target)
-            shrunk = target * (np.maximum(length - weight / rho_slopes, 0.0) / np.maximum(length, _NOTHING))
-            bounded = rho_slopes * (target - shrunk)
-            relaxed_slopes = _RELAXED * shrunk + (1 - _RELAXED) * slopes
-            source += rho_slopes * slopes_adjoint(relaxed_slopes + dual_slopes)
-            total = total + rho_slopes * laplacian
-        if prior.bounded:
-            target = smooth - dual_inside
-            inside = np.clip(target, *prior.bounds)
-            pressed = rho_inside * (target - inside)
-            relaxed_inside = _RELAXED * inside + (1 - _RELAXED) * smooth
-            source += rho_inside * (relaxed_inside + dual_inside)
-            total = total + rho_inside
-        smooth = idctn(dctn(source, norm="ortho") / total, norm="ortho") if weight else source / total
+    def find(self, iterations: int, tolerance: float) -> Solution:
+        """Return the image whose relative gap is at most ``tolerance``, or that after so many ``iterations``."""
+        if iterations < 1:
+            raise MitsimError(f"iterations are {iterations}; give at least 1")
+        problem = self.problem
+        if self.prior.weight or self.prior.bounded:
+            image, iterations, gap = self._iterate(iterations, tolerance)
+            converged = gap <= tolerance
+        else:
+            square, measured = np.square(problem.sigma) + self.prior.ridge, problem.sigma > 0
+            least = np.divide(problem.sigma * problem.projected, square, out=np.zeros_like(square), where=measured)
+            image, iterations, gap, converged = self.prepared.image(least), 0, 0.0, True
+        modelled = problem.sigma * self.prepared.coefficients(image)
+        outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
+        misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
+        lost, limit = self.prepared.lost
+        figures, name = f"{self.prepared.extent}.", "total variation" if self.prior.weight else "least squares"
+        if not converged:
+            far = f"may still be {gap:.1e} above its minimum" if gap <= 1 else "is not proven to be near its minimum"
+            status = Status(
+                Verdict.NOT_CONVERGED,
+                f"Not converged: after {iterations} iterations {name} {far}",
+                f"take a {'weight' if self.prior.weight else 'lambda'} nearer the automatic one, or allow more "
+                "iterations or a larger tolerance",
+                figures,
+            )
+        elif lost:
+            status = Status(
+                Verdict.PARTLY_MEASURED,
+                f"Solved in {iterations} iterations, but {lost} of {self.prepared.unknowns} directions are not "
+                f"measured above {limit} and follow from {name} alone",
+                "use more patterns",
+                figures,
+            )
+        else:
+            sentence = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"
+            status = Status(Verdict.SOLVED, sentence, "", figures)
+        return Solution(
+            image=image,
+            lam=self.prior.weight or self.prior.ridge,
+            iterations=iterations,
+            objective=outside / 2 + self._objective(image),
+            relative_gap=gap,
+            residual=float(np.sqrt(misfit / problem.energy)) if problem.energy > 0 else 0.0,
+            status=status,
+        )
+
+    def _iterate(self, iterations: int, tolerance: float) -> tuple[FloatArray, int, float]:
+        """Return the image (n, n'), the number of steps and the relative gap."""
+        problem, weight, ridge = self.problem, self.prior.weight, self.prior.ridge
+        squared, data = np.square(problem.sigma) + ridge, problem.sigma * problem.projected
+        # The penalty sets the speed alone: Tikhonov's lambda balances both of its steps.
+        measured = np.square(problem.sigma[problem.sigma > 0])
+        rho = automatic_lambda(problem) if problem.data_count > measured.size else 0.0
+        if rho <= problem.scale * np.finfo(np.float64).eps:
+            rho = float(np.exp(np.mean(np.log(measured))))
+        smooth = self.prepared.image(data / (squared + rho))
         slopes = slopes_of(smooth)
-        dual += _RELAXED * updated + (1 - _RELAXED) * before - smooth
-        if weight:
-            dual_slopes += relaxed_slopes - slopes
-        if prior.bounded:
-            dual_inside += relaxed_inside - smooth
-        if spent % _JUDGED_EACH == 0 or spent == iterations:
-            image = np.clip(smooth, *prior.bounds)
-            objective = _objective(prepared, problem, image, prior)
-            parts = _gap(prepared, problem, image, prior, bounded, pressed)
-            relative = sum(parts) / max(objective, _SINGLE * problem.energy, _NOTHING)
-            # Gradients that are bound too tightly leave the data behind, and the other way round.
-            factor = _towards(*parts, power=0.25)
-            rho_slopes, dual_slopes = rho_slopes * factor, dual_slopes / factor
-        if spent % _BALANCED_EACH == 0:
-            # Primal and dual residual, each over what it is a difference of (Boyd et al., sections 3.3 and 3.4.1).
-            apart = _norm(updated - smooth) / max(_norm(updated), _norm(smooth), _NOTHING)
-            moved = _norm(smooth - before) / max(_norm(dual), _NOTHING)
-            factor = _towards(apart, moved, power=0.5)
-            rho, dual = rho * factor, dual / factor
-            if prior.bounded:
-                apart = _norm(inside - smooth) / max(_norm(inside), _norm(smooth), _NOTHING)
-                moved = _norm(inside - before_inside) / max(_norm(dual_inside), _NOTHING)
+        rho_slopes = weight / max(float(lengths(slopes).mean()), _NOTHING)
+        # Without bounds nothing is held to them.
+        inside, rho_inside = np.clip(smooth, *self.prior.bounds), rho if self.prior.bounded else 0.0
+        dual, dual_slopes, dual_inside = np.zeros_like(smooth), np.zeros_like(slopes), np.zeros_like(smooth)
+        rows, columns = (2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in smooth.shape)
+        laplacian = rows[:, None] + columns
+        spent, relative = 0, float("inf")
+        while spent < iterations and relative > tolerance:
+            spent += 1
+            target = smooth - dual
+            seen, kept = self.prepared.coefficients(target), rho / (ridge + rho)
+            # Directions outside the basis (under-determined sides) are not measured: they keep the target.
+            updated = kept * target + self.prepared.image((data + rho * seen) / (squared + rho) - kept * seen)
+            before, before_inside = smooth, inside
+            source = rho * (_RELAXED * updated + (1 - _RELAXED) * smooth + dual)
+            total: FloatArray | float = rho
+            bounded, pressed = dual_slopes, dual_inside
+            if weight:
+                target = slopes - dual_slopes
+                length = lengths(target)
+                shrunk = target * (np.maximum(length - weight / rho_slopes, 0.0) / np.maximum(length, _NOTHING))
+                bounded = rho_slopes * (target - shrunk)
+                relaxed_slopes = _RELAXED * shrunk + (1 - _RELAXED) * slopes
+                source += rho_slopes * slopes_adjoint(relaxed_slopes + dual_slopes)
+                total = total + rho_slopes * laplacian
+            if self.prior.bounded:
+                target = smooth - dual_inside
+                inside = np.clip(target, *self.prior.bounds)
+                pressed = rho_inside * (target - inside)
+                relaxed_inside = _RELAXED * inside + (1 - _RELAXED) * smooth
+                source += rho_inside * (relaxed_inside + dual_inside)
+                total = total + rho_inside
+            smooth = idctn(dctn(source, norm="ortho") / total, norm="ortho") if weight else source / total
+            slopes = slopes_of(smooth)
+            dual += _RELAXED * updated + (1 - _RELAXED) * before - smooth
+            if weight:
+                dual_slopes += relaxed_slopes - slopes
+            if self.prior.bounded:
+                dual_inside += relaxed_inside - smooth
+            if spent % _JUDGED_EACH == 0 or spent == iterations:
+                image = np.clip(smooth, *self.prior.bounds)
+                objective = self._objective(image)
+                parts = self._gap(image, bounded, pressed)
+                relative = sum(parts) / max(objective, _SINGLE * problem.energy, _NOTHING)
+                # Gradients that are bound too tightly leave the data behind, and the other way round.
+                factor = _towards(*parts, power=0.25)
+                rho_slopes, dual_slopes = rho_slopes * factor, dual_slopes / factor
+            if spent % _BALANCED_EACH == 0:
+                # Primal and dual residual, each over what it is a difference of (Boyd et al., sections 3.3 and 3.4.1).
+                apart = _norm(updated - smooth) / max(_norm(updated), _norm(smooth), _NOTHING)
+                moved = _norm(smooth - before) / max(_norm(dual), _NOTHING)
                 factor = _towards(apart, moved, power=0.5)
-                rho_inside, dual_inside = rho_inside * factor, dual_inside / factor
-    return np.asarray(np.clip(smooth, *prior.bounds)), spent, relative
+                rho, dual = rho * factor, dual / factor
+                if self.prior.bounded:
+                    apart = _norm(inside - smooth) / max(_norm(inside), _norm(smooth), _NOTHING)
+                    moved = _norm(inside - before_inside) / max(_norm(dual_inside), _NOTHING)
+                    factor = _towards(apart, moved, power=0.5)
+                    rho_inside, dual_inside = rho_inside * factor, dual_inside / factor
+        return np.asarray(np.clip(smooth, *self.prior.bounds)), spent, relative
+
+    def _objective(self, image: FloatArray) -> float:
+        misfit = self.problem.projected - self.problem.sigma * self.prepared.coefficients(image)
+        variation = self.prior.weight * float(lengths(slopes_of(image)).sum()) if self.prior.weight else 0.0
+        return 0.5 * float(np.square(misfit).sum() + self.prior.ridge * np.square(image).sum()) + variation
+
+    def _gap(self, image: FloatArray, bounded: FloatArray, pressed: FloatArray) -> tuple[float, float]:
+        """Return the parts of the gap by variation and bounds, and by the quadratic."""
+        problem = self.problem
+        pull, variation = pressed, self.prior.slack(image, pressed)
+        if self.prior.weight:
+            slopes = slopes_of(image)
+            variation += self.prior.weight * float(lengths(slopes).sum()) - float(np.sum(bounded * slopes))
+            pull = pull + slopes_adjoint(bounded)
+        pull = pull + self.prior.ridge * image
+        along, seen = self.prepared.coefficients(pull), self.prepared.coefficients(image)
+        unmeasured = float(np.square(pull - self.prepared.image(along)).sum())
+        squared = np.square(problem.sigma) + self.prior.ridge
+        gradient = np.square(problem.sigma * (problem.sigma * seen - problem.projected) + along)
+        dampings, reach = problem.scale * _DAMPINGS, float(np.square(image).sum())
+        quadratic = min(
+            0.5 * (float(np.sum(gradient / (squared + mu))) + unmeasured / (self.prior.ridge + mu) + mu * reach)
+            for mu in dampings.tolist()
+        )
+        return max(variation, 0.0), quadratic
 
 
 def _towards(first: float, second: float, power: float) -> float:
@@ -237,36 +306,8 @@ def _towards(first: float, second: float, power: float) -> float:
     return 1.0 if 1 / _BALANCE <= ratio <= _BALANCE else float(np.clip(ratio**power, 1 / _STEP, _STEP))
 
 
-def _objective(prepared: Prepared, problem: DiagonalProblem, image: FloatArray, prior: Prior) -> float:
-    misfit = problem.projected - problem.sigma * prepared.coefficients(image)
-    variation = prior.weight * float(lengths(slopes_of(image)).sum()) if prior.weight else 0.0
-    return 0.5 * float(np.square(misfit).sum() + prior.ridge * np.square(image).sum()) + variation
-
-
-def _gap(
-    prepared: Prepared,
-    problem: DiagonalProblem,
-    image: FloatArray,
-    prior: Prior,
-    bounded: FloatArray,
-    pressed: FloatArray,
-) -> tuple[float, float]:
-    pull, variation = pressed, prior.slack(image, pressed)
-    if prior.weight:
-        slopes = slopes_of(image)
-        variation += prior.weight * float(lengths(slopes).sum()) - float(np.sum(bounded * slopes))
-        pull = pull + slopes_adjoint(bounded)
-    pull = pull + prior.ridge * image
-    along, seen = prepared.coefficients(pull), prepared.coefficients(image)
-    unmeasured = float(np.square(pull - prepared.image(along)).sum())
-    squared = np.square(problem.sigma) + prior.ridge
-    gradient = np.square(problem.sigma * (problem.sigma * seen - problem.projected) + along)
-    dampings, reach = problem.scale * _DAMPINGS, float(np.square(image).sum())
-    quadratic = min(
-        0.5 * (float(np.sum(gradient / (squared + mu))) + unmeasured / (prior.ridge + mu) + mu * reach)
-        for mu in dampings.tolist()
-    )
-    return max(variation, 0.0), quadratic
+def _norm(values: FloatArray) -> float:
+    return float(np.linalg.norm(values))
 
 
 def slopes_of(image: FloatArray) -> FloatArray:
@@ -285,65 +326,6 @@ def slopes_adjoint(slopes: FloatArray) -> FloatArray:
 
 def lengths(slopes: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.square(slopes).sum(axis=0)))
-
-
-def _norm(values: FloatArray) -> float:
-    return float(np.linalg.norm(values))
-
-
-def _penalty(problem: DiagonalProblem) -> float:
-    """Return the ADMM penalty, which sets the speed only: Tikhonov's lambda balances both of its steps."""
-    measured = np.square(problem.sigma[problem.sigma > 0])
-    if problem.data_count > measured.size:
-        lam = automatic_lambda(problem)
-        if lam > problem.scale * np.finfo(np.float64).eps:
-            return lam
-    return float(np.exp(np.mean(np.log(measured))))
-
-
-def _solution(
-    prepared: Prepared,
-    problem: DiagonalProblem,
-    prior: Prior,
-    image: FloatArray,
-    iterations: int,
-    gap: float,
-    converged: bool,
-) -> Solution:
-    modelled = problem.sigma * prepared.coefficients(image)
-    outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
-    misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
-    lost, limit = prepared.lost
-    figures, name = f"{prepared.extent}.", "total variation" if prior.weight else "least squares"
-    if not converged:
-        far = f"may still be {gap:.1e} above its minimum" if gap <= 1 else "is not proven to be near its minimum"
-        status = Status(
-            Verdict.NOT_CONVERGED,
-            f"Not converged: after {iterations} iterations {name} {far}",
-            f"take a {'weight' if prior.weight else 'lambda'} nearer the automatic one, or allow more iterations or a "
-            "larger tolerance",
-            figures,
-        )
-    elif lost:
-        status = Status(
-            Verdict.PARTLY_MEASURED,
-            f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured above "
-            f"{limit} and follow from {name} alone",
-            "use more patterns",
-            figures,
-        )
-    else:
-        sentence = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"
-        status = Status(Verdict.SOLVED, sentence, "", figures)
-    return Solution(
-        image=image,
-        lam=prior.weight or prior.ridge,
-        iterations=iterations,
-        objective=outside / 2 + _objective(prepared, problem, image, prior),
-        relative_gap=gap,
-        residual=float(np.sqrt(misfit / problem.energy)) if problem.energy > 0 else 0.0,
-        status=status,
-    )
 
 
 # ---- Solvers by name -------------------------------------------------------------------------------------------------

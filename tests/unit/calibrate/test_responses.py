@@ -18,8 +18,7 @@ import pytest
 
 from mitsim.acquire.exposure import Exposer
 from mitsim.calibrate.board_session import Session
-from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
-from mitsim.calibrate.checkpoint import Checkpoint
+from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, Checkpoint, estimate, estimates
 from mitsim.calibrate.lit_session import LitSession, _Shot
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job

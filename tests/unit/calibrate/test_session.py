@@ -18,7 +18,7 @@ from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.calibrate.board_session import Session, session_cost
-from mitsim.calibrate.checkpoint import Checkpoint
+from mitsim.calibrate.calibrate import Checkpoint
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import checksum, read_frame
 from mitsim.core.job import Job

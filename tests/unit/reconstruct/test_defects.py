@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.reconstruct.defects import defects_of
+from mitsim.reconstruct.misfit import defects_of
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import BLACK, CODES, bench, picture
 from tests.unit.reconstruct.test_faults import Frames, with_frames

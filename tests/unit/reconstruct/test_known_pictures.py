@@ -20,7 +20,8 @@ from mitsim.core.images import orient
 from mitsim.core.manifests import CALIBRATION, Digital, read_colours
 from mitsim.core.prepare import Preparer
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.shifted_codes import TURNS, _differences_of_turned, plane_offsets
+from mitsim.reconstruct.known_pictures import _differences_of_turned
+from mitsim.reconstruct.shifted_codes import TURNS, plane_offsets
 from mitsim.reconstruct.solution import Verdict
 from tests.known_camera import PLANES, SCALES, KnownCamera, factor_error, write_known
 

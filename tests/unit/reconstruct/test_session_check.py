@@ -17,8 +17,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.session import SIDES, Half, halves_in_order
 from mitsim.reconstruct.factors import StripeSums, stripe_sums
-from mitsim.reconstruct.moving_shadow import MovingShadow
-from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session, frame_words
+from mitsim.reconstruct.session_check import CheckedSession, MovingShadow, SessionConditions, check_session, frame_words
 from tests.shadow_factor import scene_factor
 
 N, PIXELS = 32, (90, 100)
