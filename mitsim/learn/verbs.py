@@ -1,5 +1,6 @@
-"""Pairs, training and trained networks for programs: folders and options in, pairs or a network out, or the line that
-says what is missing. torch, an extra, is imported when it is used.
+"""Pairs, training and trained networks for programs: folders and options in, pairs or a network out.
+
+torch, an extra, is imported when it is used; a MitsimError states how to install it.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def check_torch() -> None:
-    """MitsimError where torch is not installed."""
+    """Raise MitsimError if torch is not installed."""
     if find_spec("torch") is None:
         raise MitsimError("torch is not installed, which networks need; type: pip install 'mitsim[learn]'")
 
@@ -41,27 +42,25 @@ def make_pairs(
     job: Job | None = None,
     **options: Unpack[PairKeys],
 ) -> PairStore:
-    """Pairs to learn from: pictures on a scene's print, and the frames that the camera takes of them.
+    """Make pairs to learn from: pictures on a scene's print, and the frames that the camera takes of them.
 
     Parameters
     ----------
-    bench
-        of the scene.
     output
-        folder of the pairs.
+        Folder of the pairs.
     count
-        of pairs.
+        Number of pairs.
     patterns
-        name of their family.
+        Name of the pattern family.
     resume
-        whether to go on where interrupted work of the same request stopped.
+        True to continue interrupted work of the same request.
     job
-        its limits, and who is told how far it is.
+        Limits, and the receiver of progress.
 
     Raises
     ------
     MitsimError
-        for a request that cannot be served, a scene without a print, pictures that cannot be read, an output that
+        For a request that cannot be served, a scene without a print, pictures that cannot be read, an output that
         cannot be written or holds something else, and more memory, disk or time than is allowed.
     """
     output = Path(output)
@@ -80,19 +79,19 @@ def make_pairs(
 
 @check_arguments
 def load_network(path: Path | str, device: str = "cpu") -> LearnedSolver:
-    """A trained network, to give as ``method`` of :func:`mitsim.reconstruct`.
+    """Load a trained network, which :func:`mitsim.reconstruct` takes as ``method``.
 
     Parameters
     ----------
     path
-        file of `mitsim train`.
+        File of `mitsim train`.
     device
-        of torch that it is to work on.
+        Device of torch for the network.
 
     Raises
     ------
     MitsimError
-        where torch is not installed, or the file is none of these.
+        If torch is not installed, or the file does not hold a network.
     """
     check_plain(path, "model")
     check_torch()
@@ -116,20 +115,20 @@ def train(
     Parameters
     ----------
     method
-        one of :data:`mitsim.learn.requests.METHODS`.
+        One of :data:`mitsim.learn.requests.METHODS`.
     pairs, output
-        folder of `mitsim pairs`, and the file, which ends in ``.pt``.
+        Folder of `mitsim pairs`, and the file, which ends in ``.pt``.
     calibration
-        CAL folder of the pairs' camera; None: the folder ``calibration`` in that of the pairs.
+        CAL folder of the pairs' camera; None takes the folder ``calibration`` in that of the pairs.
     resume
-        whether to go on where an interrupted training of the same options stopped.
+        True to continue an interrupted training of the same options.
     job
-        its limits, and who is told how far it is.
+        Limits, and the receiver of progress.
 
     Raises
     ------
     MitsimError
-        where torch is not installed, for options that no network is trained by, folders that cannot be read or do not
+        If torch is not installed, for options that no network is trained by, folders that cannot be read or do not
         fit each other, a file that is there, and more time or memory than is allowed.
     """
     request = Training(method=method, **options)

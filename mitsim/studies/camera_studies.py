@@ -221,9 +221,9 @@ _LEAST_STEP = 0.05
 
 
 def contrast(image: FloatArray, axis: int) -> float:
-    """(I_max - I_min) / (I_max + I_min) of an ``image`` of bars, averaged along them, which lie along ``axis``.
+    """Return (I_max - I_min) / (I_max + I_min) of bars along an ``axis``, averaged along them.
 
-    The paper's definition; above 1 where the least is negative.
+    This is the paper's definition. It exceeds 1 where the least value is negative.
     """
     profile = image.mean(axis=axis)
     high, low = float(profile.max()), float(profile.min())
@@ -231,16 +231,15 @@ def contrast(image: FloatArray, axis: int) -> float:
 
 
 def modulation(image: FloatArray, axis: int, frequency: float) -> float:
-    """Contrast of an image of bars at their own frequency, which noise of others does not feign.
+    """Return the contrast of bars along an ``axis`` at their own frequency, which noise at others does not imitate.
 
-    Amplitude over mean of the fundamental of the profile across the bars; a square wave of contrast c has 4 c / pi.
+    It is the amplitude over the mean of the fundamental of the profile across the bars, times pi / 4, because a square
+    wave of contrast c has a fundamental of 4 c / pi.
 
     Parameters
     ----------
-    image, axis
-        as for :func:`contrast`.
     frequency
-        cycles a pixel.
+        Cycles a pixel.
     """
     profile = image.mean(axis=axis)
     phase = 2 * np.pi * frequency * np.arange(len(profile))
@@ -250,15 +249,10 @@ def modulation(image: FloatArray, axis: int, frequency: float) -> float:
 
 
 def slanted_edge(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Modulation transfer function of an ``image`` (rows, columns) of one edge, a few degrees off its columns.
+    """Return the modulation transfer of an ``image`` of one edge, a few degrees off its columns, by frequency.
 
-    Returns frequencies [cycles a pixel], up to half a cycle, and the transfer, 1 at zero; without that of the bins and
-    of the difference that stands for the derivative.
-
-    Raises
-    ------
-    MitsimError
-        for an image without an edge from left to right.
+    Frequencies [cycles a pixel] end at half a cycle. The transfer is 1 at zero, and that of the bins and of the
+    difference in place of the derivative is divided out. MitsimError for an image without an edge from left to right.
     """
     rows, columns = image.shape
     centres: FloatArray = np.arange(columns, dtype=np.float64) + 0.5

@@ -27,7 +27,7 @@ class Procedure(Lit, Seeded):
 
     @property
     def stated(self) -> dict[str, float]:
-        """What JSON states of the procedure."""
+        """Entries of the procedure in JSON."""
         sizes = {name: getattr(self, name) for name in ("pixels", "steps", "frames", "seed")}
         return {**sizes, "wavelength_nm": self.wavelength}
 
