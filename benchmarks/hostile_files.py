@@ -26,8 +26,8 @@ from mitsim.core.environment import versions
 from mitsim.core.exr import write_frame
 from mitsim.core.files import stderr_silenced
 from mitsim.exchange.formats import export
+from mitsim.studies.framework.campaign import Store
 from mitsim.studies.framework.experiment import Found, Point, Scope, Setup
-from mitsim.studies.framework.run import Store
 from tests.exchanged import made
 from tests.hard.fuzz import bytes_changed
 from tests.real_session import RealSession

@@ -74,8 +74,8 @@ if TYPE_CHECKING:
     from mitsim.studies.characterise import Characterisation
     from mitsim.studies.demo import DemoResult
     from mitsim.studies.emva_options import ProcedureKeys
+    from mitsim.studies.framework.campaign import StudyResult
     from mitsim.studies.framework.experiment import Scope
-    from mitsim.studies.framework.run import StudyResult
 
 
 # ---- this machine, and what is shipped -------------------------------------------------------------------------------
@@ -233,7 +233,7 @@ def demo(
         for files that cannot be used, patterns that do not fit, a camera without a full well, a scene without light, an
         output that cannot be written or holds something else, or work beyond the job's limits.
     """
-    from mitsim.studies.framework.run import check_study_folder
+    from mitsim.studies.framework.campaign import check_study_folder
 
     asked, job = DemoRequest(**options), job or Job()
     request = Request(patterns=asked.patterns, accuracy=asked.accuracy, seed=asked.seed)
@@ -265,7 +265,7 @@ class StudyOptions(Opening, Seeded):
 
     patterns: Annotated[str, validated_by(family_of)] | None = option(None, pattern_names(), metavar="PATTERNS")
     recipe: FilePath | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
-    data: FilePath | None = option(None, "of twin and transfer: folder of real captures", metavar="DIR")
+    data: FilePath | None = option(None, "of twin and learned: folder of real captures", metavar="DIR")
     experiment: str | None = option(None, "of merge: the module, where the study is one of your own", metavar="MODULE")
     quick: bool = option(False, "a few points, for a first look", panel=QUALITY)
     shard: str = option(WHOLE, "measure part I of N of the points", metavar="I/N", panel=LIMITS)
@@ -401,9 +401,8 @@ def _study_of_points(
 ) -> Study:
     """Prepare a study of many points, on eight test images on the photograph's sheet (two if ``quick``) or on one
     scene."""
-    from mitsim.studies.framework.campaign import Where, run_experiment
+    from mitsim.studies.framework.campaign import Shard, Where, run_experiment
     from mitsim.studies.framework.experiment import QUICK_IMAGES, TEST_IMAGES, Scope, Setup
-    from mitsim.studies.framework.run import Shard
 
     camera = None if asked.camera is None else str(asked.camera)
     projector = None if asked.projector is None else str(asked.projector)
@@ -413,7 +412,7 @@ def _study_of_points(
     recipe = None if asked.recipe is None else str(asked.recipe)
     if recipe is not None:
         load_recipe(recipe)
-    data = None if _captures(name, scene, asked) is None else str(asked.data)
+    data = _captures(name, scene, asked)
     scope = Scope(setup, pictures, seeds=(asked.seed,), quick=asked.quick, recipe=recipe, data=data)
     scope = scope_of(name, scope, request.patterns, asked.varied, asked.measure)
     if name not in ("accuracy", "sweep", "drift"):
@@ -425,13 +424,14 @@ def _study_of_points(
     return partial(run_experiment, name, scope, output, job, where)
 
 
-def _captures(name: str, scene: str | None, asked: StudyOptions) -> TwinFiles | None:
-    """Return the real captures that a study is of, if any; MitsimError for a study of no scene that is given one."""
-    if name in OF_NO_SCENE:
+def _captures(name: str, scene: str | None, asked: StudyOptions) -> str | None:
+    """Return the folder of real captures that a study is of, if any; MitsimError for a scene beside them."""
+    if name in OF_NO_SCENE or asked.data is not None:
         if scene is not None:
             raise MitsimError(f"study {name} {scene}: it is of no scene; leave the scene out")
         asked.refuse(_OF_SCENES, f"on the study {name}, which is of no scene")
-    return TwinFiles.find(None if asked.data is None else Path(asked.data), name) if name in OF_CAPTURES else None
+        TwinFiles.find(None if asked.data is None else Path(asked.data), name)
+    return None if asked.data is None else str(asked.data)
 
 
 def scope_of(
@@ -493,19 +493,13 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
 def _study_of_a_bench(
     name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions
 ) -> Study:
-    from mitsim.studies.framework.run import check_study_folder, find_study
+    from mitsim.studies.framework.campaign import check_study_folder, find_study
 
-    files = _captures(name, scene, asked)
     settings: dict[str, Any] = {} if asked.recipe is None else {"recipe": load_recipe(asked.recipe)}
-    if files is not None:
-        settings = {"files": files}
     run_study = find_study(name, **settings)
     if asked.over or asked.measure != "psnr" or asked.shard != WHOLE or asked.jobs or asked.scheduler:
         raise MitsimError(f"study {name}: is measured whole, here; leave out over, measure, shard, jobs and scheduler")
     asked.refuse(["quick"], f"on the study {name}, which has no points to leave out")
-    if name in OF_NO_SCENE:
-        check_study_folder(output, name)
-        return partial(run_study, None, output, request, job)
     check_study_folder(output, name)
     place = scene or "photograph"
     asked.check(place, request.patterns, request.timing if name in EXPOSED else None)
@@ -572,7 +566,7 @@ def characterise(
     >>> found = ms.characterise("imx249", pixels=64, steps=50, frames=16)  # doctest: +SKIP
     """
     from mitsim.devices.framelist import capacity_of, load_flats
-    from mitsim.studies.framework.run import check_study_folder
+    from mitsim.studies.framework.campaign import check_study_folder
 
     asked = Procedure(**options)
     if camera is None:

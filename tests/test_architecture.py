@@ -387,6 +387,7 @@ WITHOUT_NUMPY = (
     "study drift -o s --camera endless.toml",
     "study calibration photograph -o s --camera endless.toml",
     "study transfer -o s",
+    "study learned photograph --data none -o s",
     "study twin -o s",
     "study twin --data none -o s",
     "study merge bad -o s",

@@ -287,6 +287,7 @@ class _Found:
             "variant": None if setup.variant == DEFAULT_VARIANT else setup.variant,
             "allow_outside_files": setup.outside or None,
             "recipe": scope.recipe,
+            "data": scope.data,
             "parameters": dict(setup.parameters) or None,
             "measure": ",".join(scope.measures) or None,
             "over": {knob: [*values] for knob, values in scope.sweep} or None,

@@ -5,12 +5,12 @@ This file has their names alone. The study NAME is the module ``mitsim.studies.N
 
 from __future__ import annotations
 
-STUDIES = ("calibration", "transfer")
+STUDIES = ("calibration",)
 """Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
-:class:`mitsim.studies.framework.run.Findings`."""
-OF_NO_SCENE = ("transfer", "twin")
+:class:`mitsim.studies.framework.campaign.Findings`."""
+OF_NO_SCENE = ("twin",)
 """Those whose bench is None."""
-OF_CAPTURES = ("transfer", "twin")
+OF_CAPTURES = ("learned", "twin")
 """Those of real captures (`--data`)."""
 EXPOSED = ("calibration",)
 """Those whose frames fill a part of the camera's full well."""
@@ -42,6 +42,7 @@ GONE = {
     **dict.fromkeys(("diffraction", "models"), "calibration SCENE"),
     "regularisation": "sweep SCENE --over method=tikhonov,tv",
     "separation": "reflectivity",
+    "transfer": "learned --data DIR",
 }
 """Names of studies that became part of others, and the arguments of `mitsim study` that replace them."""
 ALL = "all"

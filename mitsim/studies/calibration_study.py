@@ -52,8 +52,8 @@ from mitsim.studies import error_budget
 from mitsim.studies.causes import ablations, reform
 from mitsim.studies.drift_study import SESSION, DriftStand, squared_error
 from mitsim.studies.error_budget import LossRow
-from mitsim.studies.framework.page import Part
-from mitsim.studies.framework.run import Findings
+from mitsim.studies.framework.campaign import Findings
+from mitsim.studies.framework.panels import Part
 
 AnyBench = TypeVar("AnyBench", bound=Apparatus)
 OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}

@@ -29,8 +29,8 @@ from mitsim.sensor.chain import mean_dark_current
 from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, QUANTISATION, SPLIT, Alike, Session, figures
 from mitsim.studies.camera_frames import Frames, draw_sessions, mean_image, read_again, read_sets, remarks
 from mitsim.studies.emva_options import Procedure
-from mitsim.studies.framework.page import Part, build_findings, text_table
-from mitsim.studies.framework.run import study_folder, write_figures
+from mitsim.studies.framework.campaign import study_folder, write_figures
+from mitsim.studies.framework.panels import Part, build_findings, text_table
 
 CAMERA_FILE = "camera.toml"
 MOST_OFF = 5.0

@@ -1,520 +1,411 @@
-"""Colours of a ColorChecker: Delta E 2000 of each patch to its spectrum in daylight, by patterns and by ways to see it.
+"""Colours of a ColorChecker: Delta E 2000 of each patch to its spectrum in D65, by patterns and ways to see colour.
 
-*Floor*: no camera, but the matrix from reflectances at the projector's lines to XYZ; what three lines cannot tell.
-*Rendered*: frames of every line with the sensor's noise, a calibration and a solve for each. *One calibration for all*:
-the middle line's factors serve all lines. *D65*: a lamp of daylight shines on the chart, its frame taken off. *Mosaic*:
-all lines at once behind colour filters (:mod:`mitsim.studies.lit_lines`).
+The *floor* needs no camera: it is the error of the matrix from reflectances at the projector's lines to XYZ. Frames are
+rendered, with the sensor's noise, a calibration and a solve for each line. *One calibration for all*: the middle line's
+factors serve all lines. *D65*: a lamp of daylight shines on the chart, and its frame is subtracted. *Mosaic*: all lines
+are shown at once, behind colour filters, and images are solved with the best lambda of each way
+(:mod:`mitsim.report.reconstruct_run`).
 
-Daylight of any illuminance is measured by two ways to solve the same frames, beside the least that any linear image
-without bias comes to, from which follows what keeps the goal in more light: repeats, or laser power. Frames of k times
-the power in k times the daylight are the same at a k-th of the exposure, so that power counts as less daylight does.
+Each line has a bench of its own, with the line's power, diffraction, photons and factors; the light of all lines is
+traced on the same paths (:mod:`mitsim.acquire.spectral`). Beside daylight, the brightest pixel fills the well in every
+frame, by daylight too. The noise of the frame that is subtracted is common to all frames, so that it adds up in the
+mean over a region; it is therefore the mean of as many shots as there are patterns. Signed patterns need none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from itertools import pairwise, product
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mitsim.acquire.capture import expose
-from mitsim.acquire.exposure import ambient_shots
+from mitsim.acquire.exposure import Exposer
+from mitsim.acquire.spectral import SpectralBench, plan_request
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.request import Exposure, Request, SessionRequest, Task
+from mitsim.calibrate.calibrate import calibrate_lines
 from mitsim.core.arrays import FloatArray
-from mitsim.core.images import lightness
-from mitsim.devices.framelist import ChartPlace, load_chart
+from mitsim.core.configuration import CAMERA, load_model, locate
+from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import DEMOSAIC, HALF, JOINT, RUN, installed_ways
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer
+from mitsim.devices.framelist import load_chart
+from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.sensor import SensorModel
+from mitsim.light.light import trace_lines
 from mitsim.metrics import psnr
-from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
+from mitsim.reconstruct.colour import ColourModel, behind, chart, daylight, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.reconstruct.solution import Solution
-from mitsim.report import label
-from mitsim.report.pages import Mean, Table, Value
-from mitsim.report.plots import (
-    BLUE,
-    FONT,
-    GREEN,
-    VERMILION,
-    WIDTH,
-    curves,
-    figure_of,
-    grouped_bars,
-    image_grid,
-    label_axes,
-)
-from mitsim.studies import lit_lines
-from mitsim.studies.framework.claims import every, verdict, within
-from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope, Setup
-from mitsim.studies.framework.legacy import Experiment, difference, sample_mean
-from mitsim.studies.framework.page import Part
-from mitsim.studies.framework.studio import Studio, flags_of
+from mitsim.reconstruct.solver import prepare
+from mitsim.report import RENDERED
+from mitsim.report.lit_scene import LAMBDAS, LitScene
+from mitsim.report.reconstruct_run import LineImages, MosaicCamera, Solver
+from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.studies.framework.claims import Gain
+from mitsim.studies.framework.experiment import IMAGE, TRUTH, Axes, Found, Point, Setup, Study
+from mitsim.studies.framework.panels import Bars, Images, Lines
+from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 
-# -------- Beside daylight of any brightness
+# -------- A scene in the light of each line
 
-GOAL = 0.5
-"""Most that 49 dots may add to the floor's mean Delta E."""
-BY_LUX = "D65, by its illuminance"
-"""Rows of the mean Delta E under :data:`LADDER_LX`, by ``method``; they have no patches."""
-LADDER_LX, DRAWS = (0.0, 5.0, 10.0, 20.0, 60.0, 200.0, 600.0), 3
-"""Illuminances of daylight [lx], dark, dusk, a dim room, a bright office; and exposures at each."""
-LEAST = "least without bias"
-METHODS = TIKHONOV, MARKOV, LEAST
-"""Of the column ``method``: two ways to solve the same frames, and what no linear image without bias is below."""
-_FEW_LX, _ASKED_LX = (0.0, 60.0), (60.0, 600.0)
-"""Of a quick look: the dark, and where the goal is near its end; and those for which the page says what they take."""
-_LADDER_FAMILIES = ("dots:7", "hadamard:8")
-_BETWEEN_LX, _VARIANCES = (1e-2, 1e5), (1e-6, 1.0)
-"""Where the illuminance that keeps the goal, and the part of one exposure's variance that does, are looked for."""
+_SPECTRUM = re.compile(r'value="(\s*[\d.]+\s*:[^"]*)"')
+"""Wavelengths and values, nm:value, as Mitsuba reads them."""
+_LAMP = """
+    <shape type="rectangle" id="daylight">
+        <transform name="to_world">
+            <scale x="200" y="80" z="1"/> <rotate x="1" angle="90"/> <translate x="0" y="600" z="300"/>
+        </transform>
+        <emitter type="area"> <spectrum name="radiance" value="{radiance:g}"/> </emitter>
+        <bsdf type="diffuse"> <spectrum name="reflectance" value="0"/> </bsdf>
+    </shape>
+</scene>"""
+"""Lamp of scenes/lamp_bench."""
+DAYLIGHT_RADIANCE = 117.0
+"""Radiance of the lamp [W m^-2 sr^-1], with which it lights the sheet as the projector's white does."""
+FULL_LX = 2.97 * 205.0
+"""Illuminance of that light: 2.97 W/m^2 at the chart's middle, and 205 lm/W of D65 from 380 to 780 nm."""
+FILTERS, ARRAY = "ov5647", "RGGB"
+"""Camera file whose measured curves the filters have, and their array."""
+_COARSE = tuple(float(relative) for relative in np.logspace(-9, -3, 7))
+"""Lambdas of the joint solve, of its largest eigenvalue; the best of them is refined by half a decade."""
+Shots = Sequence[tuple[FloatArray, int, int]]
+"""Measured frames (m, m') [electrons/s], with the row and the column of their pattern."""
 
 
-def ladder_points(scope: Scope, setup: Setup) -> list[Point]:
-    """A point for each family: all of its exposures share its frames.
+@dataclass(frozen=True, eq=False)
+class LitLine:
+    """A scene in the light of the line ``name``, ``lit``, and the camera's ``factors`` at this wavelength [nm]."""
 
-    Parameters
-    ----------
-    scope, setup
-        how much is wanted, and of what.
+    name: str
+    wavelength_nm: float
+    lit: LitScene
+    factors: Factors
+
+    def seed(self, seed: int) -> int:
+        """Return a seed of this line's own, from the ``seed`` of all lines."""
+        return integer(seed, "line", self.name)
+
+
+def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
+    """Light a scene with each line of its projector, and calibrate its camera in each.
+
+    MitsimError as :meth:`mitsim.bench.apparatus.Bench.capture_lines`.
     """
-    ladder, draws = (_FEW_LX, 2) if scope.quick else (LADDER_LX, DRAWS)
-    lux = " ".join(f"{each:g}" for each in ladder)
-    return [
-        Point.of(setup, way=BY_LUX, patterns=patterns, seed=scope.seeds[0], ladder=lux, draws=draws)
-        for patterns in scope.choose(_LADDER_FAMILIES, _LADDER_FAMILIES[:1])
-    ]
+    colours = SpectralBench.of(_open(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
+    request = Request.of(accuracy=setup.accuracy, seed=seed)
+    plan = plan_request(colours.whole, request)
+    lighting = colours.whole.family(request.patterns, seed).lighting
+    lights = trace_lines(colours.whole, colours.benches, plan, lighting, seed)
+    factors = calibrate_lines(colours.whole, SessionRequest(seed=seed, accuracy=setup.accuracy), Task())
+    return tuple(
+        LitLine(name, light.bench.projector.effective_wavelength_nm, LitScene(light), factors[name])
+        for name, light in zip(colours.names, lights, strict=True)
+    )
 
 
-def measure_ladder(
-    lines: Sequence[lit_lines.LitLine], light: tuple[FloatArray, float], point: Point, place: ChartPlace
-) -> Found:
-    """A row for every exposure and method, and one of the least for every illuminance.
+def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
+    """Return the irradiance (m, m') [W m^-2] of a scene in a lamp's daylight (D65), and the wavelength [nm] of photons
+    that carry as much energy as its own.
 
-    Parameters
-    ----------
-    lines
-        the scene in each line's light.
-    light
-        daylight as bright as the projector: irradiance (m, m') [W m^-2], and wavelength [nm] of its photons.
-    point
-        of :func:`ladder_points`.
-    place
-        of the chart's patches.
+    The scene's spectra count as D65's photons do, 380 to 780 nm, in a camera of equal efficiency for all of them; scene
+    files are written to a ``folder``.
     """
-    ladder = [float(lux) for lux in str(point["ladder"]).split()]
-    model, known = ColourModel.of_lines([line.wavelength_nm for line in lines]), chart()
-    board = lines[0].factors.manifest.board_reflectance or 1.0
 
-    def judge(means: FloatArray) -> FloatArray:
-        return delta_e(model.xyz(means * board), known.xyz)
+    def weigh(at: FloatArray, values: FloatArray) -> float:
+        photons = daylight(at) * at
+        return float((values * photons).sum() / photons.sum())
 
-    lit = [lit_lines.DaylitLine.of(line, light, str(point["patterns"]), int(point["seed"])) for line in lines]
-    draws = list(product(ladder, range(int(point["draws"]))))
-    exposures = [(lux / lit_lines.FULL_LX, draw) for lux, draw in draws]
-    images = [each.images(exposures, [each.model, each.model.with_correlation()], each.shots) for each in lit]
-    truth = place.means(np.stack([line.lit.truth for line in lines], axis=-1))
-    goal = float(delta_e(model.xyz(known.at(model.wavelengths_nm)), known.xyz).mean()) + GOAL
+    scene = replace_spectra(setup.scene, folder / "daylight", weigh)
+    text = scene.read_text(encoding="utf-8")
+    end = text.rindex("</scene>")
+    scene.write_text(text[:end] + _LAMP.format(radiance=DAYLIGHT_RADIANCE), encoding="utf-8")
+    wavelengths = np.arange(380.0, 781.0, 5.0)
+    mean = float((daylight(wavelengths) * wavelengths).sum() / daylight(wavelengths).sum())
+    bench = _open(setup, scene)
+    bench = replace(bench, devices=replace(bench.devices, projector=bench.projector.at(mean)))
+    light = bench.light("uniform", accuracy=setup.accuracy)
+    return light.merge().frames(bench.family("uniform").lighting, light.seed).projector_off.irradiance, mean
 
-    def least(lux: float, repeats: float = 1.0) -> float:
-        variances = [each.least_variance(lux / lit_lines.FULL_LX, place) / repeats for each in lit]
-        return lit_lines.expected_delta_e(truth, np.stack(variances, axis=-1), judge)
 
-    def repeats(lux: float) -> float | None:
-        part = lit_lines.most(lambda part: least(lux, 1 / part) <= goal, *_VARIANCES)
-        return float(np.ceil(1 / part)) if part else None
+def replace_spectra(scene: str, folder: Path, weigh: Callable[[FloatArray, FloatArray], float]) -> Path:
+    """Copy a scene to a new ``folder``, each spectrum replaced by one number, and return the copy's XML.
 
-    kept = lit_lines.most(lambda lux: least(lux) <= goal, *_BETWEEN_LX)
-    rows = [
-        point.row(
-            lux=lux,
-            draw=draw,
-            method=method,
-            mean_delta_e=float(judge(place.means(_stacked(found))).mean()),
-            **flags_of(*(line.status for line in found)),
+    ``weigh`` returns the number from wavelengths [nm] and values. MitsimError for a scene without spectra.
+    """
+    own = locate(scene, "scenes", "scene.xml")
+    shutil.copytree(own.parent, folder)
+    found = 0
+
+    def number(match: re.Match[str]) -> str:
+        pairs = np.array([[float(part) for part in pair.split(":")] for pair in re.split(r"[,\s]+", match[1].strip())])
+        return f'value="{weigh(pairs[:, 0], pairs[:, 1]):.9g}"'
+
+    for file in folder.glob("*.xml"):
+        text, count = _SPECTRUM.subn(number, file.read_text(encoding="utf-8"))
+        file.write_text(text, encoding="utf-8")
+        found += count
+    if not found:
+        raise MitsimError(
+            f"scene {scene}: has no spectra (nm:value), so it looks alike in all lines; give one such as colour_checker"
         )
-        for (lux, draw), by_line in zip(draws, zip(*images, strict=True), strict=True)
-        for method, found in zip((TIKHONOV, MARKOV), zip(*by_line, strict=True), strict=True)
+    return folder / own.name
+
+
+def serving(line: LitLine, other: LitLine) -> Factors:
+    """Return the factors of an ``other`` line as those of a ``line``, with the gain that is nearest to its own."""
+    own, model = line.factors, other.factors
+    gain = 1.0
+    for mine, theirs in ((own.left, model.left), (own.right, model.right)):
+        gain *= float(np.vdot(mine, theirs) / np.vdot(theirs, theirs))
+    root = np.sqrt(gain)
+    manifest = model.manifest.model_copy(update={"camera": own.manifest.camera})
+    return replace(model, left=root * model.left, right=root * model.right, manifest=manifest, lacking=())
+
+
+def _open(setup: Setup, scene: Path) -> Bench:
+    parameters: dict[str, Any] = dict(setup.parameters)
+    variant = f"{setup.variant.rpartition('_')[0]}_spectral"
+    return open_bench(scene, variant, setup.camera, setup.projector, setup.outside, **parameters)
+
+
+# -------- Filters over the sensor's pixels, and daylight beside the projector
+
+
+def mosaic_shots(lines: Sequence[LitLine], family: PatternFamily, seed: int) -> Shots:
+    """Expose all lines at once, at equal peak, behind filters; ``seed`` is of the noise.
+
+    MitsimError for a line that the filters' curves do not cover.
+    """
+    devices, weights = lines[0].lit.bench.devices, filter_weights(lines)
+    # Light and noise of a shot are in electrons, so that any time and wavelength may lie between them.
+    one_second = [Exposer(line.lit.bench.devices, 1.0, 0) for line in lines]
+    expected = [line.lit.expected_frames(RENDERED, family) for line in lines]
+    passed = behind(weights, devices.camera.frame_shape)
+    rates = [
+        np.einsum("lij,lij->ij", passed, [unit.electrons(frame) for unit, frame in zip(one_second, shot, strict=True)])
+        for shot in zip(*expected, strict=True)
     ]
-    for lux in ladder:
-        power = lux / kept if kept else None
-        needed = {"kept_lx": kept, "repeats": repeats(lux), "power": power}
-        rows.append(point.row(lux=lux, method=LEAST, mean_delta_e=least(lux), **needed))
-    return Found(tuple({**row, "goal_delta_e": goal} for row in rows))
+    exposer = Exposer(devices, _peak_seconds(devices.sensor, rates), integer(seed, "mosaic"))
+    return tuple(_measured(exposer, family, rates))
 
 
-def ladder_claim(rows: Table, patterns: str) -> Claim:
-    """Up to which illuminance a family keeps the goal.
+def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, shots: Shots, way: str) -> LineImages:
+    """Solve the images of all lines by one of :data:`mitsim.core.manifests.WAYS`, with the lambda that is best for the
+    truth. MitsimError for demosaicing without colour-demosaicing."""
+    factors = [(line.factors.left, line.factors.right) for line in lines]
+    camera = MosaicCamera.of(factors, filter_weights(lines), ARRAY)
+    flat = np.stack([line.lit.truth for line in lines]).reshape(len(lines), -1)
+    solved: dict[float, LineImages] = {}
+    with single_threaded_blas():
+        solver = Solver(way, camera, (family.left.astype(np.float64), family.right.astype(np.float64)))
+        for each in shots:
+            solver.add(*each)
+
+        def quality(lam: float) -> float:
+            if lam not in solved:
+                solved[lam] = solver.images(lam, relative=True)
+            return psnr(solved[lam].images.reshape(flat.shape), flat)
+
+        best = max(_COARSE if way == JOINT else LAMBDAS, key=quality)
+        if way == JOINT:
+            best = max((best, best * 10**0.5, best / 10**0.5), key=quality)
+    return solved[best]
+
+
+def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
+    """Return (4, lines) electrons behind each filter of :data:`ARRAY` over those of the camera without filters."""
+    curves = load_model(locate(FILTERS, "calibration", ".toml", CAMERA), SensorModel)
+    sensor = lines[0].lit.bench.sensor
+    return np.array(
+        [
+            [curves.efficiency(line.wavelength_nm, plane) / sensor.efficiency(line.wavelength_nm) for line in lines]
+            for plane in ("R", "G", "G", "B")
+        ]
+    )
+
+
+@single_threaded_blas()
+def daylit_images(
+    line: LitLine, light: tuple[FloatArray, float], lux: float, patterns: str, seed: int
+) -> list[Solution]:
+    """Solve one exposure of a line beside daylight of so many ``lux``, by Tikhonov's and by Markov's regularisation.
 
     Parameters
     ----------
-    rows, patterns
-        those of :data:`BY_LUX`, and the family.
+    line, patterns, seed
+        Scene and camera, pattern family, and seed of the noise.
+    light
+        Irradiance of the lamp and its photons' wavelength, of :func:`daylight_frame`.
     """
-    own = rows.where(patterns=patterns)
-    by_lux, goal = own.where(method=MARKOV).means("mean_delta_e", "lux"), own.mean("goal_delta_e").value
-    kept, last = kept_lx(by_lux, goal), max(by_lux)
-    limit = f"the brightest tried, {last:g} lx" if kept == last else f"{_digits(kept)} lx"
-    least = own.mean("kept_lx", method=LEAST).value
-    holds = within(by_lux[last if kept == last else min(by_lux)], high=goal) if kept in (0, last) else True
-    return Claim(
-        f"{label(patterns)} add at most {GOAL:g} to the floor's mean Delta E 2000 beside D65 ({MARKOV})", "", "",
-        f"kept up to {limit}; without bias at best up to {_digits(least)} lx",
-        verdict(holds) if kept in (0, last) else f"confirmed only if D65 has at most {_digits(kept)} lx",
-    )  # fmt: skip
+    bench, family = line.lit.bench, line.lit.bench.family(patterns, seed)
+    lamp = lux / FULL_LX * electrons_from_irradiance(light[0], 1.0, bench.sensor, light[1])
+    unit = Exposer(bench.devices, 1.0, 0)
+    rates = [unit.electrons(frame) + lamp for frame in line.lit.expected_frames(RENDERED, family)]
+    exposer = Exposer(bench.devices, _peak_seconds(bench.sensor, rates), line.seed(seed))
+    off, count = np.zeros(()), 0 if family.signed else len(family.shots)
+    for shot in range(count):
+        off = off + exposer.rate(exposer.digital(lamp * exposer.exposure_s, "ambient", shot)) / count
+    model = prepare(*line.factors.sides, family.left, family.right, centre=line.factors.manifest.centre)
+    models = (model, model.with_correlation())
+    sums = [each.accumulator() for each in models]
+    for frame, row, column in _measured(exposer, family, rates):
+        for each in sums:
+            each.add(frame if family.signed else frame - off, row, column)
+    return [each.solve(own, "auto") for each, own in zip(models, sums, strict=True)]
 
 
-def kept_lx(by_lux: Mapping[float, Mean], goal: float) -> float:
-    """Illuminance [lx] up to which a mean Delta E is at most a goal; 0 where it never is.
-
-    Parameters
-    ----------
-    by_lux
-        by illuminance [lx]; straight between two over the logarithm, from the dark on over the illuminance itself.
-    goal
-        the most.
-    """
-    order = sorted(by_lux)
-    if by_lux[order[0]].value > goal:
-        return 0.0
-    for low, high in pairwise(order):
-        first, second = by_lux[low].value, by_lux[high].value
-        if second > goal:
-            share = (goal - first) / (second - first)
-            return float(low * (high / low) ** share if low else high * share)
-    return order[-1]
+def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
+    """Return the exposure time [s] at which the brightest pixel of expected ``rates`` [electrons/s], with its dark
+    current, fills the default part of the full well."""
+    brightest = max(float(rate.max()) for rate in rates) + sensor.superpixel_dark_current_e_per_s
+    return float(Exposure().fraction * sensor.superpixel_full_well_e / brightest)
 
 
-def _digits(value: float) -> str:
-    """A ``value`` to two digits, without a power of ten."""
-    return f"{float(f'{value:.2g}'):g}"
+def _measured(
+    exposer: Exposer, family: PatternFamily, rates: Sequence[FloatArray]
+) -> Iterator[tuple[FloatArray, int, int]]:
+    """Expose expected ``rates``, and yield the measurement of each pattern, of a signed one the difference of two."""
+    positive: FloatArray | None = None
+    for shot, rate in zip(family.shots, rates, strict=True):
+        noisy = exposer.rate(exposer.digital(rate * exposer.exposure_s, *shot.names))
+        if shot.sign == 1:
+            positive = noisy
+            continue
+        yield noisy if positive is None else positive - noisy, shot.row, shot.column
+        positive = None
 
 
-def ladder_figure(rows: Table) -> Figure:
-    """Mean Delta E by the illuminance of daylight, measured and least, and what is allowed; ``rows`` of
-    :data:`BY_LUX`."""
-    panels = {}
-    for patterns in rows.distinct("patterns"):
-        own = rows.where(patterns=patterns)
-        shown = {method: own.where(method=method).means("mean_delta_e", "lux") for method in METHODS}
-        shown[f"floor + {GOAL:g}"] = own.means("goal_delta_e", "lux")
-        panels[label(patterns)] = {
-            name: {lux: mean for lux, mean in curve.items() if lux} for name, curve in shown.items()
-        }
-    return curves(panels, "D65 on the chart [lx]", "mean Delta E 2000 of 24 patches [1]", log=True)
+# -------- The study
 
-
-def ladder_tables(rows: Table) -> tuple[Part, Part]:
-    """Mean Delta E by illuminance, and what keeps the goal; ``rows`` of :data:`BY_LUX`."""
-    families = [str(patterns) for patterns in rows.distinct("patterns")]
-    pairs = list(product(families, METHODS))
-    chosen = [lux for lux in rows.distinct("lux") if lux in _ASKED_LX]
-
-    def cell(lux: float, family: str, method: str) -> str:
-        mean = rows.mean("mean_delta_e", lux=lux, patterns=family, method=method)
-        return f"{mean.value:.2f}" if mean.of == 1 else f"{mean.value:.2f} \N{PLUS-MINUS SIGN} {mean.error:.2f}"
-
-    def needs(family: str) -> tuple[str, ...]:
-        least = rows.where(patterns=family, method=LEAST)
-        by_lux = rows.where(patterns=family, method=MARKOV).means("mean_delta_e", "lux")
-        kept = kept_lx(by_lux, least.mean("goal_delta_e").value), least.mean("kept_lx").value
-        needed = [(least.numbers("repeats", lux=lux), least.numbers("power", lux=lux)) for lux in chosen]
-        return (
-            label(family), *map(_digits, kept),
-            *(f"{count[0]:g}; {_digits(max(power[0], 1))}" if count and power else "never" for count, power in needed),
-        )  # fmt: skip
-
-    count = len(rows.where(method=MARKOV).distinct("draw"))
-    return (
-        Part(
-            "Mean Delta E 2000 of 24 patches by the illuminance of D65 on the chart: mean and standard error of "
-            f"{count} exposures, less a frame of as many shots as patterns", "",
-            ("D65 [lx]", *(f"{label(family)}, {method}" for family, method in pairs)),
-            tuple((f"{lux:g}", *(cell(lux, *pair) for pair in pairs)) for lux in rows.distinct("lux")),
-        ),
-        Part(
-            f"What keeps the mean Delta E at most {GOAL:g} above the floor: D65 [lx] with one exposure a pattern; in "
-            "more light repeats of all exposures, or times the laser power (the same as a filter that lets through "
-            "one over that part of D65), by the least noise without bias", "",
-            ("Patterns", f"Most [lx], {MARKOV}", f"Most [lx], {LEAST}",
-             *(f"{lux:g} lx: repeats; power" for lux in chosen)),
-            tuple(map(needs, families)),
-        ),
-    )  # fmt: skip
-
-
-# -------- Every way to see the colours of the chart
-
-FAMILIES = ("uniform", "dots:7", "hadamard:8")
-OWN, ONE = "one line at a time", "one calibration for all lines"
-DAYLIGHT = {"D65 a tenth as bright as the projector": 0.1, "D65 as bright as the projector": 1.0}
-"""Irradiance of daylight on the chart's middle over that of the projector's white light: some 60 and 600 lx, a dim room
-and a bright office (:data:`mitsim.studies.lit_lines.FULL_LX`)."""
-_IMAGE = "xyz"
+OWN, ONE, D65, MOSAIC = "one line at a time", "one calibration for all lines", "beside D65", "mosaic, "
+GOAL = 0.5
+"""Delta E that 49 dots may add to the floor's mean."""
 _SHOWN = "dots:7"
-
-
-def _points(scope: Scope) -> Sequence[Point]:
-    setup = scope.setup if scope.pictures == (None,) else replace(scope.setup, scene="colour_checker")
-    seen = {
-        OWN: FAMILIES,
-        ONE: scope.choose(FAMILIES, (_SHOWN,)),
-        **{way: scope.choose(FAMILIES, (_SHOWN,)) for way in DAYLIGHT},
-        **{f"mosaic, {way}": scope.choose((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in lit_lines.available_ways()},
-    }
-    points = [
-        Point.of(setup, way=way, patterns=patterns, seed=seed)
-        for seed in scope.repeats
-        for way, families in seen.items()
-        for patterns in (families if seed in scope.seeds else (_SHOWN,))
-    ]
-    return points + ladder_points(scope, setup)
 
 
 def _measure(studio: Studio, point: Point) -> Found:
     setup, way, patterns, seed = point.setup, str(point["way"]), str(point["patterns"]), int(point["seed"])
-    lines = studio.once("lines", 1, (setup, seed), lambda: lit_lines.light_lines(setup, seed))
-    if way.startswith("mosaic"):
-        shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: lit_lines.mosaic_shots(lines, patterns, seed))
-        found = shots.images(way.removeprefix("mosaic, "))
-        images, flags = np.moveaxis(found.images, 0, -1), flags_of(found.joint.status) if found.joint else {}
-    elif way in (*DAYLIGHT, BY_LUX):
-        light = studio.once("daylight", 1, setup, lambda: lit_lines.daylight_frame(setup, studio.folder("daylight")))
-        if way == BY_LUX:
-            return measure_ladder(lines, light, point, _place(setup.scene))
-        solved = _under_daylight(lines, light, DAYLIGHT[way], patterns, seed)
-        images, flags = _stacked(solved), flags_of(*(each.status for each in solved))
+    lines = studio.once("lines", 1, (setup, seed), lambda: light_lines(setup, seed))
+    found: list[tuple[FloatArray, dict[str, Any]]] = []
+    if way.startswith(MOSAIC):
+        family = lines[0].lit.bench.family(patterns, seed)
+        shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: mosaic_shots(lines, family, seed))
+        solved = mosaic_images(lines, family, shots, way.removeprefix(MOSAIC))
+        found = [(np.moveaxis(solved.images, 0, -1), flags_of(solved.joint.status) if solved.joint else {})]
+    elif way == D65:
+        light = studio.once("daylight", 1, setup, lambda: daylight_frame(setup, studio.folder("daylight")))
+        by_line = [daylit_images(line, light, point["lux"], patterns, seed) for line in lines]
+        for method, images in zip((TIKHONOV, MARKOV), zip(*by_line, strict=True), strict=True):
+            found.append((_stacked(images), {"method": method, **flags_of(*(each.status for each in images))}))
     else:
-        middle = lines[len(lines) // 2]
-        factors = [line.factors if way == OWN else lit_lines.serving(line, middle) for line in lines]
-        solved = [_solve(*pair, patterns, seed) for pair in zip(lines, factors, strict=True)]
-        images, flags = _stacked(solved), flags_of(*(each.status for each in solved))
+        factors = [line.factors if way == OWN else serving(line, lines[len(lines) // 2]) for line in lines]
+        shown = [
+            reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), own)
+            for line, own in zip(lines, factors, strict=True)
+        ]
+        found = [(_stacked(shown), flags_of(*(each.status for each in shown)))]
     truth = np.stack([line.lit.truth for line in lines], axis=-1)
     board = lines[0].factors.manifest.board_reflectance or 1.0
-    return _judge(point, [line.wavelength_nm for line in lines], images * board, truth * board, flags)
-
-
-def _solve(line: lit_lines.LitLine, factors: Factors, patterns: str, seed: int) -> Solution:
-    return reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), factors)
+    wavelengths = [line.wavelength_nm for line in lines]
+    judged = [judge_colours(point, wavelengths, images * board, truth * board, named) for images, named in found]
+    return Found(tuple(row for each in judged for row in each.rows), judged[0].arrays)
 
 
 def _stacked(solved: Sequence[Solution]) -> FloatArray:
-    """Return the images of all lines, (n, n, lines)."""
     return np.stack([each.image for each in solved], axis=-1)
 
 
-def _under_daylight(
-    lines: Sequence[lit_lines.LitLine], light: tuple[FloatArray, float], part: float, patterns: str, seed: int
-) -> list[Solution]:
-    """Solve frames of each line beside a ``part`` of a lamp's ``light`` (irradiance and wavelength), less it."""
-    images = []
-    for line in lines:
-        lit = lit_lines.DaylitLine.of(line, light, patterns, seed)
-        shots = 0 if lit.family.signed else ambient_shots(lit.family)
-        images += lit.images([(part, seed)], [lit.model], shots)[0]
-    return images
-
-
-def _judge(
-    point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray, flags: Mapping[str, Any]
+def judge_colours(
+    point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray, named: Mapping[str, Any]
 ) -> Found:
-    """Rows of all patches of the chart in ``images`` (n, n, lines), and its colours."""
-    place, known, fixed = _place(point.setup.scene), chart(), ColourModel.of_lines(wavelengths)
-    means = place.means(images)
-    seen, fitted = fixed.xyz(means), ColourModel.fit(wavelengths, means, "").xyz(means)
+    """Return a row for each patch of the point's chart, with ``named`` columns, and the colours of both images.
+
+    ``images`` and ``truth`` (n, n, lines) are reflectances at lines of some ``wavelengths`` [nm].
+    """
+    path = Path(point.setup.scene)
+    place = load_chart(path.with_name("chart.json") if path.suffix == ".xml" else point.setup.scene)
+    known, fixed = chart(), ColourModel.of_lines(wavelengths)
+    means, true = place.means(images), place.means(truth)
+    seen = fixed.xyz(means)
     columns: dict[str, Any] = {
         "floor": delta_e(fixed.xyz(known.at(wavelengths)), known.xyz),
         "delta_e": delta_e(seen, known.xyz),
-        "delta_e_fitted": delta_e(fitted, known.xyz),
+        "delta_e_fitted": delta_e(ColourModel.fit(wavelengths, means, "").xyz(means), known.xyz),
         "delta_e_pixel": [
             float(delta_e(fixed.xyz(block), xyz).mean())
             for block, xyz in zip(place.blocks(images), known.xyz, strict=True)
         ],
-        "delta_e_truth": delta_e(fixed.xyz(place.means(truth)), known.xyz),
-        "delta_e_to_noise_free": delta_e(seen, fixed.xyz(place.means(truth))),
+        "delta_e_truth": delta_e(fixed.xyz(true), known.xyz),
+        "delta_e_to_noise_free": delta_e(seen, fixed.xyz(true)),
+        **{f"truth_{axis}": known.xyz[:, index] for index, axis in enumerate("XYZ")},
+        **{axis: seen[:, index] for index, axis in enumerate("XYZ")},
     }
-    lines, n = len(wavelengths), images.shape[0]
-    quality = psnr(images.reshape(n, -1), truth.reshape(n, -1))
-    by_line = {
-        f"psnr_{wave:g}nm": psnr(images[..., index], truth[..., index]) for index, wave in enumerate(wavelengths)
-    }
+    n = images.shape[0]
+    shared = {"lines": len(wavelengths), "psnr_db": psnr(images.reshape(n, -1), truth.reshape(n, -1)), **named}
+    shared |= {f"psnr_{wave:g}nm": psnr(images[..., k], truth[..., k]) for k, wave in enumerate(wavelengths)}
     rows = [
-        point.row(
-            number=number, patch=name, lines=lines, psnr_db=quality, **by_line, **flags,
-            **{column: float(values[number]) for column, values in columns.items()},
-            **{f"truth_{axis}": float(value) for axis, value in zip("XYZ", known.xyz[number], strict=True)},
-            **{axis: float(value) for axis, value in zip("XYZ", seen[number], strict=True)},
-        )
+        point.row(number=number, patch=name, **shared, **{key: float(all_[number]) for key, all_ in columns.items()})
         for number, name in enumerate(known.names)
-    ]  # fmt: skip
-    return Found(tuple(rows), {_IMAGE: fixed.xyz(images).astype(np.float32)})
+    ]
+    colours = {IMAGE: linear_srgb(fixed.xyz(images)), TRUTH: linear_srgb(fixed.xyz(truth))}
+    return Found(tuple(rows), single_precision(colours))
 
 
-def _place(scene: str) -> ChartPlace:
-    path = Path(scene)
-    return load_chart(path.with_name("chart.json") if path.suffix == ".xml" else scene)
+def _added(claim: str, **where: Any) -> Gain:
+    """Return the claim that patches' Delta E exceed the floor by at most :data:`GOAL`."""
+    return Gain(f"{claim} at most {GOAL:g} to the floor's mean Delta E 2000", {}, {}, where=where, column="delta_e",
+                other_column="floor", unit="", at_least=-np.inf, at_most=GOAL)  # fmt: skip
 
 
-def _claims(results: Results) -> Sequence[Claim]:
-    table = results.table
-
-    def reported(way: str) -> Claim:
-        rows = table.where(way=way, patterns=_SHOWN)
-        floor, mean = rows.mean("floor").value, sample_mean(rows, "delta_e")
-        return Claim(
-            f"49 dots add at most {GOAL:g} to the floor's mean Delta E 2000 ({way})",
-            "", "", f"mean Delta E {mean}, floor {floor:.2f}", verdict(within(mean, high=floor + GOAL)),
-        )  # fmt: skip
-
-    beside = table.where(way=BY_LUX)
-    own, one = (table.where(way=way, patterns=_SHOWN) for way in (OWN, ONE))
-    loss, more = difference(own, one, "psnr_db"), difference(one, own, "delta_e")
-    mosaics = [way for way in table.distinct("way") if str(way).startswith("mosaic")]
-    found = {way: table.where(way=way, patterns=_SHOWN) for way in mosaics}
-    *others, joint = found.values()
-    return [
-        reported(OWN),
-        *(ladder_claim(beside, patterns) for patterns in beside.distinct("patterns")),
-        Claim(
-            "Each line needs a calibration of its own (49 dots)", "", "",
-            f"one for all: {loss} dB less, mean Delta E {more:+}", verdict(within(loss, low=0)),
-        ),
-        Claim(
-            f"Behind a mosaic, the joint solve has the most PSNR of {len(found)} (49 dots)", "", "",
-            "; ".join(
-                f"{way}: {sample_mean(rows, 'psnr_db')} dB, Delta E {sample_mean(rows, 'delta_e')}"
-                for way, rows in found.items()
-            ),
-            verdict(every(*(within(difference(joint, other, "psnr_db"), low=0) for other in others))),
-        ),
-    ]  # fmt: skip
+def _is_point(values: Mapping[str, Any]) -> bool:
+    seen = values["patterns"] != "uniform" or values["way"] == OWN
+    return bool(seen) and (values["lux"] is not None) == (values["way"] == D65)
 
 
-def _figures(results: Results) -> Mapping[str, Figure]:
-    table = results.table
-    drawn = {"delta_e.png": _by_patch(table.where(way=OWN)), "ways.png": _by_way(table)}
-    rows = table.where(way=OWN, patterns=_SHOWN).rows
-    drawn["chart.png"] = _patches(rows[: len(chart().names)])
-    drawn["images.png"] = _images(results)
-    drawn["daylight.png"] = ladder_figure(table.where(way=BY_LUX))
-    return drawn
-
-
-_TILE = 24
-"""Pixels a side of a patch in the picture of the chart."""
-_BAR = "#c7d2de"
-"""What is below every marker: lighter than these."""
-
-
-def _by_patch(table: Table) -> Figure:
-    """Delta E of each patch by family, above the floor."""
-    names = [str(name) for name in table.distinct("patch")]
-    found = {
-        label(family): [table.mean("delta_e", patch=name, patterns=family).value for name in names]
-        for family in FAMILIES
-    }
-    figure, axes = figure_of(4.4)
-    place = np.arange(len(names))
-    floor = [table.mean("floor", patch=name).value for name in names]
-    axes.bar(place, floor, 0.8, color=_BAR, label="floor: no camera, these lines alone")
-    for (title, values), colour, marker in zip(found.items(), (VERMILION, BLUE, GREEN), ("s", "o", "^"), strict=False):
-        axes.plot(place, values, marker, ms=5, color=colour, label=title)
-    axes.set_xticks(place, names, rotation=45, ha="right", rotation_mode="anchor", fontsize=FONT - 2)
-    axes.margins(x=0.01)
-    label_axes(axes, "", "Delta E 2000 to the spectrum in D65", grid="y")
-    axes.legend(fontsize=FONT - 1, frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0, 1.0))
-    return figure
-
-
-def _by_way(table: Table) -> Figure:
-    """Mean Delta E of each way to see colour, under 49 dots, above the floor."""
-    rows = table.where(patterns=_SHOWN)
-    means = {
-        f"{way}, {rows.mean('psnr_db', way=way).value:.1f} dB": rows.mean("delta_e", way=way)._replace(error=0.0)
-        for way in rows.distinct("way")
-        if way != BY_LUX
-    }
-    floor = {"floor, no camera": rows.mean("floor")._replace(error=0.0)}
-    groups = {
-        **{way: {"found": mean} for way, mean in means.items()},
-        **{way: {"floor": mean} for way, mean in floor.items()},
-    }
-    return grouped_bars(groups, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)} [1]", ordered=True)
-
-
-def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """The chart: left half of a patch its spectrum's colour, right half what the camera found."""
-    known, seen = (np.array([[row[f"{which}{axis}"] for axis in "XYZ"] for row in rows]) for which in ("truth_", ""))
-    truth, found = (lightness(linear_srgb(each)) for each in (known, seen))
-    figure, axes = figure_of(0.62 * WIDTH)
-    axes.set_facecolor("#3a3a3a")
-    for number, row in enumerate(rows):
-        top, left = divmod(number, 6)
-        tile = np.concatenate([np.tile(each[number], (_TILE, _TILE // 2, 1)) for each in (truth, found)], axis=1)
-        axes.imshow(tile, extent=(left + 0.06, left + 0.94, top + 0.78, top + 0.06), interpolation="none")
-        words = f"{row['patch']}  {row['delta_e']:.1f}"
-        axes.text(left + 0.5, top + 0.98, words, ha="center", va="bottom", color="white", fontsize=FONT - 3)
-    axes.set(xlim=(0, 6), ylim=(4.05, 0), xticks=[], yticks=[], aspect="auto")
-    axes.set_title(
-        f"Left half: the patch's spectrum in D65. Right half: {label(_SHOWN)}. Number: Delta E 2000", fontsize=FONT
-    )
-    return figure
-
-
-def _images(results: Results) -> Figure:
-    """What each family of patterns recovers, in colour."""
-    cells = []
-    for family in FAMILIES:
-        rows = results.table.where(way=OWN, patterns=family)
-        image = results.array(rows.rows[0], _IMAGE)
-        caption = f"{rows.rows[0]['psnr_db']:.1f} dB,\nmean Delta E {rows.mean('delta_e').value:.2f}"
-        cells += [(linear_srgb(image), caption)] if image is not None else []
-    return image_grid({OWN: cells}, [label(family) for family in FAMILIES])
-
-
-def _tables(results: Results) -> Sequence[Part]:
-    """Delta E of each patch by what found it, and its mean by way and patterns."""
-    table, own = results.table, results.table.where(way=OWN)
-    names = [str(name) for name in own.distinct("patch")]
-
-    def row(title: str, **chosen: str) -> tuple[str, ...]:
-        known = (own.mean(column, patterns=_SHOWN, **chosen) for column in ("floor", "delta_e_truth"))
-        found = (own.mean("delta_e", patterns=family, **chosen) for family in FAMILIES)
-        return (title, *(f"{mean.value:.2f}" for mean in (*known, *found)))
-
-    def cell(way: Value, family: str) -> str:
-        rows = table.where(way=way, patterns=family)
-        return f"{rows.mean('delta_e').value:.2f}, {rows.mean('psnr_db').value:.1f} dB" if rows.rows else "-"
-
-    labels = tuple(map(label, FAMILIES))
-    return (
-        Part(
-            "Mean Delta E 2000 of 24 patches, and PSNR of all lines, by the way to see colour",
-            "",
-            ("Way", *labels),
-            tuple(
-                (str(way), *(cell(way, family) for family in FAMILIES))
-                for way in table.distinct("way")
-                if way != BY_LUX
-            ),
-        ),
-        *ladder_tables(table.where(way=BY_LUX)),
-        Part(
-            f"Delta E 2000 of each patch to its spectrum in D65, {OWN}: the floor (no camera), the truth (no noise), "
-            "and what is reconstructed",
-            "",
-            ("Patch", "Floor", "Truth", *labels),
-            (row(f"mean of {len(names)}"), *(row(name, patch=name) for name in names)),
-        ),
-    )
-
-
-EXPERIMENT = Experiment(
+_DOTS = {"patterns": _SHOWN}
+STUDY = Study(
     "colour",
     "Colours of a ColorChecker",
     "How near are recovered colours to those of the patches' spectra, and what does each way to see colour cost?",
-    _points, _measure, _claims, _figures, _tables,
+    points=Axes(
+        {
+            "way": (OWN, ONE, *(f"{MOSAIC}{way}" for way in installed_ways()), D65),
+            "patterns": ("uniform", _SHOWN, "hadamard:8"),
+            "lux": (None, 0.0, 5.0, 20.0, 60.0, 200.0, 600.0),
+        },
+        quick={"patterns": (_SHOWN,), "lux": (None, 60.0)},
+        prints=(None,), repeats=True, default="colour_checker", kept=_is_point,
+    ),
+    measure=_measure,
+    claims=(
+        _added("49 dots add", way=OWN, patterns=_SHOWN),
+        replace(_added("Beside D65 of {lux} lx, 49 dots add (markov)", way=D65, method=MARKOV, lux=(60.0, 600.0),
+                       patterns=_SHOWN), each="lux"),
+        replace(_added("Beside D65 of {lux} lx, 64 Hadamard patterns add (markov)", way=D65, method=MARKOV,
+                       lux=(60.0, 600.0), patterns="hadamard:8"), each="lux", optional=True),
+        Gain("Each line needs a calibration of its own (49 dots)", {"way": OWN}, {"way": ONE}, where=_DOTS),
+        *(Gain(f"Behind a mosaic, the joint solve has more PSNR than {way} (49 dots)", {"way": f"{MOSAIC}{JOINT}"},
+               {"way": f"{MOSAIC}{way}"}, where=_DOTS) for way in (HALF, DEMOSAIC) if way in installed_ways()),
+    ),
+    panels=(
+        Bars("way", file="ways", title="Mean Delta E 2000 of 24 patches, 49 dots", where={**_DOTS, "lux": None},
+             colour={"delta_e": "found", "floor": "floor: no camera"}, x_label="mean Delta E 2000 [1]"),
+        Lines("lux", "D65 on the chart [lx]", file="daylight", y="delta_e", y_label="mean Delta E 2000 [1]", log=True,
+              colour="method", facet="patterns", where={"way": D65, "lux": lambda lux: lux > 0}),
+        Bars("patch", file="delta_e", title="Delta E 2000 of each patch, 49 dots, one line at a time",
+             where={**_DOTS, "way": OWN}, colour={"delta_e": "found", "floor": "floor: no camera"},
+             x_label="Delta E 2000 to the spectrum in D65 [1]"),
+        Images("patterns", down=("way",), where={"way": OWN}, title="Colours by patterns, PSNR of all lines"),
+    ),
     about="A chart of known spectra on rendered frames: light of each line traced with diffraction at the mask and "
     "falloff, and the sensor's noise, solved with factors that were calibrated from rendered frames.",
     heads=("", "", "Found"),

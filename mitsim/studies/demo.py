@@ -33,7 +33,7 @@ from mitsim.report import CONVENTIONS, EQUAL_PEAK, label
 from mitsim.report.demo_page import BudgetRow, FamilyResult, Recovery, ReportData, Trust, build_report, verdict
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.sensor.chain import Digital
-from mitsim.studies.framework.run import DEMO_FOLDERS, DEMO_PAGE, study_folder
+from mitsim.studies.framework.campaign import DEMO_FOLDERS, DEMO_PAGE, study_folder
 
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
 """Families before and after the main one in the report: the paper's, from the fewest frames to the most."""

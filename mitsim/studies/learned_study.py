@@ -1,69 +1,125 @@
-"""Learned methods, judged by rendered frames: what each gains over the best classical image, by what it was trained on
-and what it is tested on.
+"""Learned methods on rendered frames: their gain over the best classical image, by training set and test condition.
 
 Paper, section "Deep Network-based Denoising vs Reconstruction": on simulated frames learned methods look best; on real
 ones FlatNet fails under uniform light, a U-Net removes artefacts and resolves no more; under coded light all do well;
 "catastrophic results in case of any mismatch". It shows pictures. Here frames are rendered where the paper's are real.
 
-It takes torch, and hours. So it is no part of `mitsim study all`. Pairs, networks and frames are kept in the folder.
+A gain is of each print, over the classical image of the same frames with the highest PSNR. A claim on networks holds
+if it holds for every training.
+
+With `--data DIR`, the study is one of real captures of a FlatCam instead. Codes of its mask are learned from one
+capture and its authors' image (:mod:`mitsim.studies.twin_study`), and their factors are a twin: frames of drawn
+pictures through them, with white noise, teach networks, and no real frame does. The other capture is then
+reconstructed, and compared with the authors' image, because no truth is known.
+
+The study needs torch, and hours, so that it is no part of `mitsim study all`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.learn.requests import PREPROCESSED
+from mitsim.core.seeds import stream
+from mitsim.learn.pair_store import WHITE
+from mitsim.learn.pairs import DrawnPictures
+from mitsim.learn.requests import FLATNET, PLUG_AND_PLAY, PREPROCESSED, REFINED, UNROLLED, Training
 from mitsim.learn.verbs import check_torch
-from mitsim.report import RENDERED
+from mitsim.metrics import psnr, ssim
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.misfit import UNEXPLAINED
+from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV
+from mitsim.reconstruct.shifted_codes import TURNS
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
+from mitsim.reconstruct.solvers import solve_nonnegative, solve_tv
+from mitsim.report import IDEALISED, RENDERED
+from mitsim.report.lit_scene import LAMBDAS
 from mitsim.report.pages import Value
-from mitsim.studies.framework.experiment import QUICK_IMAGES, Found, Point, Scope
-from mitsim.studies.framework.legacy import Experiment
-from mitsim.studies.framework.studio import Studio, single_precision
-from mitsim.studies.learned_bench import DEPTH, PLACES, Shown
-from mitsim.studies.learned_cells import FULL, PICTURES, QUICK, Budget, Cell, School, cells
-from mitsim.studies.learned_claims import find_claims
-from mitsim.studies.learned_page import TRUTH, figures, tables
-from mitsim.studies.learned_scores import classical_rows, network_row
+from mitsim.studies.framework.claims import Gain, Level
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Found, Point, Results, Scope, Study
+from mitsim.studies.framework.panels import Bars, Images, Pivot
+from mitsim.studies.framework.studio import Studio, flags_of, single_precision
+from mitsim.studies.learned_bench import (
+    DEPTH,
+    ELSEWHERE,
+    FULL,
+    MISMATCHES,
+    PICTURES,
+    PLACES,
+    QUICK,
+    TRAININGS,
+    VARIED,
+    Budget,
+    Case,
+    Cell,
+    School,
+    case_of,
+)
+from mitsim.studies.twin_files import SOURCES, TwinFiles
+from mitsim.studies.twin_study import Learned, Measured, correlation, read_captures
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from mitsim.learn.learned_solver import LearnedSolver
+    from mitsim.learn.training import Sums
 
 FAMILIES = ("uniform", "dots:4", "dots:7")
-BARS = ("bars 0.12", "bars 0.16", "bars 0.24")
-"""0.225, 0.3 and 0.45 cycles a pixel: under uniform light least squares leaves nine tenths, two thirds and half of the
-contrast that they have."""
-TRAININGS = 3
-"""Trainings of a cell, from other first weights and orders of the pairs: their spread has a standard error."""
+_TRAININGS = 3
+"""Trainings of a network, from other first weights and orders of the pairs."""
+NONE, AUTOMATIC, BEST = "none", "automatic", "best"
+"""Training of classical images, and their weights: chosen by the frames, or that of the highest PSNR, which only a test
+with the truth can choose."""
+CLASSICAL = (TIKHONOV, MARKOV, TV, NONNEGATIVE)
+_AROUND = tuple(float(weight) for weight in np.logspace(-0.75, 2.0, 12))
+"""Weights of iterative methods over the automatic one, up to where the best lies under a mismatch."""
+_DETAIL_PIXELS = 1.5
+"""Deviation of the blur that separates detail, which is above an eighth of a cycle a pixel."""
+
+
+def cells(seeds: Sequence[int], families: Sequence[str], quick: bool) -> list[Cell]:
+    """Return all networks that are trained, the quickest first; two methods and sets if ``quick``."""
+    methods = (REFINED, UNROLLED) if quick else (REFINED, FLATNET, UNROLLED)
+    kinds = [*product(TRAININGS[:2] if quick else TRAININGS, families, methods)]
+    if not quick:
+        kinds += [*product((ELSEWHERE,), families, (REFINED,)), *product((PICTURES,), families, (PLUG_AND_PLAY,))]
+        # It reads frames: under many patterns a step takes as many times as long.
+        kinds += [*product(TRAININGS, families[:1], (PREPROCESSED,))]
+    order = (PLUG_AND_PLAY, REFINED, FLATNET, UNROLLED, PREPROCESSED)
+    return [Cell(*kind, seed) for seed in seeds for kind in sorted(kinds, key=lambda kind: order.index(kind[2]))]
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    """Classical images of every print at every place, which keep its frames; then all networks."""
+    """Return points of classical images, which keep the frames of a print at a place, and then of all networks."""
     check_torch()
+    seed, setup = scope.seeds[0], scope.setup
+    if scope.data is not None:
+        return [Point.of(setup, data=scope.data, held_out=name, seed=seed) for name in _captures(scope.data)]
     if scope.pictures == (None,):
         raise MitsimError("study learned: has a bench of its own, the middle of the photograph; leave the scene out")
     families, budget = scope.choose(FAMILIES, FAMILIES[:1]), QUICK if scope.quick else FULL
-    seed, places = scope.seeds[0], scope.choose(tuple(PLACES), (RENDERED, DEPTH))
-    bars = scope.choose(BARS, BARS[1:2])
-    prints = [(place, name) for place in places for name in _prints(scope.pictures, bars, place)]
-    shown = [
-        Point.of(scope.setup.with_print(name), place=place, families=" ".join(families), seed=seed)
-        for place, name in prints
-    ]
-    seeds = scope.choose(tuple(seed + more for more in range(TRAININGS)), (seed,))
+    places, prints = scope.choose(tuple(PLACES), (RENDERED, DEPTH)), ",".join(map(str, scope.pictures))
+    shared: dict[str, Value] = {"families": " ".join(families), "noise": seed}
+    shown = [Point.of(setup.with_print(name), place=place, **shared) for place, name in product(places, scope.pictures)]
+    seeds = scope.choose(tuple(seed + more for more in range(_TRAININGS)), (seed,))
     networks = [
-        Point.of(
-            scope.setup, **vars(cell), families=" ".join(families), places=" ".join(places),
-            prints=",".join(str(name) for name in scope.pictures), bars=",".join(bars), noise=seed, **vars(budget),
-        )
+        Point.of(setup, **vars(cell), **shared, places=" ".join(places), prints=prints, **vars(budget))
         for cell in cells(seeds, families, scope.quick)
-    ]  # fmt: skip
+    ]
     return [*shown, *networks]
-
-
-def _prints(pictures: Sequence[str | None], bars: Sequence[str], place: str) -> tuple[str, ...]:
-    """Prints at a ``place``: ``bars`` stand where nothing is amiss, ``pictures`` everywhere."""
-    return (*map(str, pictures), *(bars if place == RENDERED else ()))
 
 
 @single_threaded_blas()
@@ -71,56 +127,361 @@ def _measure(studio: Studio, point: Point) -> Found:
     import torch
 
     torch.set_num_threads(1)  # processes share the processors, and a training ends with the same bits at one number
-    values = dict(point.values)
-    return _classical(studio, point, values) if "place" in values else _networks(studio, point, values)
-
-
-def _classical(studio: Studio, point: Point, values: dict[str, Any]) -> Found:
-    picture = str(point.setup.picture)
-    shown = Shown(point.setup, values["place"], tuple(values["families"].split()), values["seed"])
+    values: dict[str, Any] = dict(point.values)
+    if "held_out" in values:
+        return transfer(values["data"], values["held_out"], values["seed"])
     rows: list[dict[str, Value]] = []
-    arrays = {}
-    for (condition, family), case in shown.cases(studio).items():
-        named = {"picture": picture, "condition": condition, "patterns": family, "seed": values["seed"]}
-        for row, image in classical_rows(case, picture):
-            rows.append({**named, **row})
+    arrays: dict[str, FloatArray] = {}
+    if "place" in values:
+        for condition, family in product(PLACES[values["place"]], values["families"].split()):
+            case = case_of(studio, point.setup, condition, family, values["noise"])
+            named = {"picture": point.setup.picture, "condition": condition, "patterns": family, "training": NONE}
+            arrays[f"{condition} {family} truth"] = case.truth
+            for row, image in classical_rows(case):
+                shown = f"{condition} {family} {row['method']} {row['weight']}"
+                rows.append({**named, "seed": values["noise"], "shown": shown, **row})
+                arrays[shown] = image
+        kept = point.setup.picture in QUICK_IMAGES
+    else:
+        cell = Cell(*(values[name] for name in ("training", "patterns", "method", "seed")))
+        school = School(
+            studio, point.setup, values["noise"], Budget(*(values[n] for n in ("pairs", "steps", "groups")))
+        )
+        model, seconds = school.network(cell)
+        conditions = [each for place in values["places"].split() for each in PLACES[place]]
+        for condition, picture in product(conditions, values["prints"].split(",")):
+            case = case_of(studio, point.setup.with_print(picture), condition, cell.patterns, values["noise"])
+            factors = school.factors_for(case)
+            own = replace(model, sides=factors.sides) if cell.training == PICTURES else model
+            row, image = network_row(own, factors, case)
+            named = {"picture": picture, "condition": condition, "shown": f"{condition} {picture}"}
+            rows.append({**vars(cell), **named, "train_s": seconds, **row})
             if picture in QUICK_IMAGES:
-                arrays[f"{condition} {family} {row['method']} {row['weight']}"] = image
-        if picture in QUICK_IMAGES:
-            arrays[f"{condition} {family} {TRUTH}"] = case.truth
-    return Found(tuple(rows), single_precision(arrays))
+                arrays[f"{condition} {picture}"] = image
+        kept = cell.seed == values["noise"]
+    return Found(tuple(rows), single_precision(arrays) if kept else {})
 
 
-def _networks(studio: Studio, point: Point, values: dict[str, Any]) -> Found:
-    cell = Cell(*(values[name] for name in ("training", "patterns", "method", "seed")))
-    families, noise = tuple(values["families"].split()), int(values["noise"])
-    budget = Budget(*(int(values[name]) for name in ("pairs", "steps", "groups")))
-    school = School(studio, point.setup, noise, budget)
-    model, seconds = school.network(cell)
-    named = {**vars(cell), "train_s": seconds}
+# -------- Images and their scores
+
+
+def scores(image: FloatArray, truth: FloatArray) -> dict[str, Value]:
+    """Return PSNR and SSIM of an image (n, n), and of its detail the correlation with the truth's and the relative rms.
+
+    Much detail that does not correlate is invented.
+    """
+    own, true = (each - gaussian_filter(each, _DETAIL_PIXELS) for each in (image, truth))
+    correlated = float(np.corrcoef(own.ravel(), true.ravel())[0, 1])
+    energy = float(own.std() / true.std())
+    return {"psnr_db": psnr(image, truth), "ssim": ssim(image, truth), "detail": correlated, "detail_energy": energy}
+
+
+def classical_rows(case: Case) -> Iterator[tuple[dict[str, Value], FloatArray]]:
+    """Yield scores and images of all classical methods at their automatic and best weight."""
+    from mitsim.learn.learned_solver import beyond_noise
+
+    prepared = case.prepare()
+    sums = case.sums(prepared)
+    problem, alike = prepared.problem(sums), _with_correlation(prepared, sums)
+    for method in CLASSICAL:
+        solve: Any = {
+            TIKHONOV: partial(prepared.solve, sums), MARKOV: partial(alike[0].solve, alike[1]),
+            TV: partial(solve_tv, prepared, sums), NONNEGATIVE: partial(solve_nonnegative, prepared, sums),
+        }[method]  # fmt: skip
+        started = time.process_time()
+        own = solve("auto")
+        seconds = time.process_time() - started
+        others = _AROUND if method in (TV, NONNEGATIVE) else [each * problem.scale / own.lam for each in LAMBDAS]
+        best = max(own, *(solve(own.lam * factor) for factor in others), key=lambda each: psnr(each.image, case.truth))
+        for weight, found in ((AUTOMATIC, own), (BEST, best)):
+            beyond = beyond_noise(prepared, problem, found.image)[1]
+            row: dict[str, Value] = {"method": method, "weight": weight, "beyond": beyond, "seconds": seconds}
+            yield row | _flags(found, case) | scores(found.image, case.truth), found.image
+
+
+def _with_correlation(prepared: Prepared, sums: Accumulator) -> tuple[Prepared, Accumulator]:
+    """Return the model for images whose neighbouring pixels are alike, and its sums, which are the others', rotated,
+    because both models have one range."""
+    other = prepared.with_correlation()
+    turns = []
+    for before, after in ((prepared.left, other.left), (prepared.right, other.right)):
+        turn = np.zeros((len(before.singular), len(after.singular)))
+        for index, (one, two) in enumerate(zip(before.slabs, after.slabs, strict=True)):
+            turn[before.columns(index)] += one.matrix.T @ two.matrix
+        turns.append(turn)
+    return other, Accumulator.of_sums(other, turns[0].T @ sums.quarters @ turns[1], sums.energy)
+
+
+def _flags(found: Solution, case: Case) -> dict[str, Value]:
+    unexplained = float(case.unexplained)
+    others = ("frames fit no image",) * (unexplained > UNEXPLAINED)
+    return {"unexplained": unexplained, **flags_of(found.status, others=others)}
+
+
+def network_row(model: LearnedSolver, factors: Factors, case: Case) -> tuple[dict[str, Value], FloatArray]:
+    """Return scores, flags and image of a network with a calibration's ``factors``.
+
+    It is flagged for frames that the image does not reproduce (``flag_image``), frames that no image gives
+    (``flag_frames``; ``misfit`` is 1 for either), another camera or calibration, and unknown noise.
+    """
+    from mitsim.learn.learned_solver import beyond_noise
+
+    prepared: Any = model.init(factors, (case.rows, case.columns))
+    sums, started = case.sums(prepared), time.process_time()
+    solution = model.compute(prepared, sums, "auto")
+    seconds = time.process_time() - started
+    beyond = beyond_noise(prepared, prepared.problem(sums), solution.image)[1]
+    image, camera = beyond > UNEXPLAINED, bool(prepared.doubts)
+    frames, noise = float(case.unexplained) > UNEXPLAINED, len(solution.status.flags) > image + camera
+    row: dict[str, Value] = {"beyond": beyond, "seconds": seconds, "flag_image": image, "flag_frames": frames}
+    row |= {"flag_camera": camera, "flag_noise": noise, "misfit": float(image or frames)}
+    return row | _flags(solution, case) | scores(solution.image, case.truth), solution.image
+
+
+# -------- Real captures, and a twin that teaches
+
+AUTHORS, REAL, SIMULATED = "authors' image", "real", "simulated"
+_TAUGHT = "gb"
+"""Plane whose factors networks learn by; those of the others differ by half a pixel and a gain."""
+_MARGIN = 1.5
+"""Factor by which noise is drawn beyond that of the known capture's planes, so that networks meet none unflagged."""
+_COLOURS = (("r",), ("gb", "gr"), ("b",))
+"""Planes that make the red, green and blue of an image."""
+_BACK = {"transposed, mirrored": "transposed, upside down", "transposed, upside down": "transposed, mirrored"}
+"""Orientations whose inverse is another one."""
+TEACHING = {"pairs": 192, "steps": 300, "batch": 2}
+"""Pictures, steps and batch of a training of 256 x 256 pixels, which takes minutes of a processor."""
+
+
+def _captures(data: str) -> Mapping[str, tuple[Path, Path]]:
+    captures = TwinFiles.find(Path(data), "learned").captures
+    if not captures:
+        raise MitsimError(f"study learned: needs captures of a FlatCam; give --data FOLDER with {SOURCES}")
+    return captures
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A capture's ``measured`` plane, with its scene as it lies before the mask, and the ``prepared`` factors of
+    ``sides`` by the codes of another capture."""
+
+    measured: Measured
+    sides: tuple[FloatArray, FloatArray]
+    prepared: Prepared
+
+    @classmethod
+    def of(cls, measured: Measured, learned: Learned) -> Camera:
+        """Return the camera of a ``measured`` plane with codes that were ``learned``."""
+        sides = learned.codes.factors(measured.offset, measured.plane)
+        rows, columns = (np.ones((side.shape[1], 1)) for side in sides)
+        return cls(learned.see(measured), sides, prepare(*sides, rows, columns, centre=True))
+
+
+def noise_range(planes: Sequence[Measured], learned: Learned) -> tuple[float, float]:
+    """Return the least and the largest standard deviation of white noise in the twin's frames [DN of the taught plane].
+
+    They reach from the noise of the known ``planes`` to everything that the codes do not explain of them, each over its
+    plane's gain, and a factor :data:`_MARGIN` beyond.
+    """
+    gains = learned.codes.gains
+    scales = [abs(gains[_TAUGHT] / gains[each.plane]) for each in planes]
+    noise = [scale * float(each.noise.std()) for scale, each in zip(scales, planes, strict=True)]
+    left = [scale * float(np.sqrt(each)) for scale, each in zip(scales, learned.codes.variances, strict=True)]
+    return min(noise) / _MARGIN, max(left) * _MARGIN
+
+
+def twin_sums(prepared: Prepared, noise: tuple[float, float], truths: FloatArray, seed: int) -> Sums:
+    """Return the sums of frames of pictures ``truths`` (N, n, n), 0 to 1: the idealised product, and white noise.
+
+    Logarithms of the ``noise`` of a datum [DN] are drawn evenly between two ends.
+    """
+    from mitsim.learn.training import Sums
+
+    weights, deviations = [], []
+    for number, truth in enumerate(truths):
+        draws = stream(seed, "transfer", number)
+        deviations.append(float(np.exp(draws.uniform(*np.log(noise)))))
+        sums = prepared.sigma * prepared.coefficients(truth)
+        weights.append((sums + deviations[-1] * draws.standard_normal(sums.shape)).astype(np.float32))
+    return Sums(truths, np.stack(weights), np.square(deviations), noise)
+
+
+def teach(method: str, prepared: Prepared, sums: Sums, seed: int) -> Any:
+    """Return a network that learned from a twin's frames."""
+    from mitsim.learn.training import Trainer, first_network
+
+    request = Training(method=method, steps=TEACHING["steps"], batch=TEACHING["batch"], seed=seed)
+    shape = prepared.left.scene_size, prepared.right.scene_size
+    trainer = Trainer(request, prepared, sums, first_network(request, shape))
+    trainer.choose()
+    while not trainer.is_over():
+        trainer.go_on(Job())
+    trainer.network.load_state_dict(trainer.best)
+    return trainer.network.eval()
+
+
+def _image(prepared: Prepared, frame: FloatArray, method: str, network: Any) -> tuple[FloatArray, float]:
+    """Return the (n, n) image of a frame [DN], and the part of the frame that it would not give beyond noise, rms."""
+    import torch
+
+    from mitsim.learn.learned_solver import beyond_noise, datum_variance
+    from mitsim.learn.methods import Data, Diagonal
+
+    sums = prepared.accumulator()
+    sums.add(frame, 0, 0)
+    problem = prepared.problem(sums)
+    if network is None:
+        found = solve_tv(prepared, sums).image if method == TV else prepared.solve(sums).image
+    else:
+        like = next(network.parameters())
+        data = Data.of(problem.projected[None], datum_variance(problem), like)
+        with torch.no_grad():
+            found = network.images(data, Diagonal.of(prepared, like))[0, 0].numpy().astype(np.float64)
+    return found, beyond_noise(prepared, problem, found)[1]
+
+
+def transfer(data: str, held_out: str, seed: int) -> Found:
+    """Return rows and images of a capture ``held_out``, by codes and networks of the others in the folder ``data``.
+
+    A row has the correlation with the authors' image and the part of the frame that the image does not explain, for a
+    plane's real frame, and for a simulated frame of the taught plane, which the authors' image and the real frame's
+    noise give. MitsimError for files that are no such captures.
+    """
+    planes = read_captures(_captures(data), seed)
+    known = [each for each in planes if each.capture != held_out]
+    learned = Learned.of(known)
+    cameras = {each.plane: Camera.of(each, learned) for each in planes if each.capture == held_out}
+    pictures, n = DrawnPictures(seed), len(planes[0].scene)
+    truths = np.stack([pictures.draw(number, n) / np.float32(WHITE) for number in range(TEACHING["pairs"])])
+    prepared = cameras[_TAUGHT].prepared
+    sums = twin_sums(prepared, noise_range(known, learned), truths, seed)
+    networks = {TIKHONOV: None, TV: None}
     rows: list[dict[str, Value]] = []
-    arrays = {}
-    pictures, bars = (tuple(values[name].split(",")) for name in ("prints", "bars"))
-    for place in values["places"].split():
-        for name in _prints(pictures, bars, place):
-            shown = Shown(point.setup.with_print(name), place, families, noise)
-            for (condition, family), case in shown.cases(studio).items():
-                if family != cell.patterns:
-                    continue
-                factors = school.factors_for(case)
-                own = replace(model, sides=factors.sides) if cell.training == PICTURES else model
-                row, image = network_row(own, factors, case, name)
-                rows.append({**named, "picture": name, "condition": condition, **row})
-                if name in QUICK_IMAGES and cell.seed == noise:
-                    arrays[f"{condition} {name}"] = image
+    images = {(AUTHORS, plane): camera.measured.scene for plane, camera in cameras.items()}
+    for method in (TIKHONOV, TV, REFINED, UNROLLED):
+        started = time.process_time()
+        network = None if method in networks else teach(method, prepared, sums, seed)
+        named = {"held_out": held_out, "method": method, "train_s": time.process_time() - started if network else None}
+        for plane, camera in cameras.items():
+            measured, (left, right) = camera.measured, camera.sides
+            frames = {REAL: measured.frame}
+            if plane == _TAUGHT:
+                frames[SIMULATED] = np.asarray(left @ measured.scene @ right.T + measured.noise)
+            for kind, frame in frames.items():
+                seen, beyond = _image(camera.prepared, frame, method, network)
+                like = correlation(np.maximum(seen, 0), measured.scene)
+                rows.append({**named, "picture": measured.name, "frame": kind, "correlation": like, "beyond": beyond})
+                if kind == REAL:
+                    images[method, plane] = seen
+    turn, arrays = TURNS[_BACK.get(learned.pose.orientation, learned.pose.orientation)], {}
+    for shown in dict.fromkeys(name for name, _ in images):
+        colours = [turn(np.mean([images[shown, plane] for plane in each], axis=0)) for each in _COLOURS]
+        arrays[shown] = np.stack(colours, axis=-1)
+        scale = np.vdot(arrays[shown], arrays[AUTHORS]) / np.vdot(arrays[shown], arrays[shown])
+        arrays[shown] = np.clip(float(scale) * arrays[shown], 0, 1)
     return Found(tuple(rows), single_precision(arrays))
 
 
-EXPERIMENT = Experiment(
+# -------- The study
+
+
+def compare(results: Results) -> Results:
+    """Add columns: PSNR and correlation of detail less those of the best classical image of the same frames
+    (``gain_db``, ``detail_gain``), PSNR less that of a calibrated bench where the condition is a mismatch
+    (``below_db``), and the ``network`` without its seed."""
+    rows = results.frame
+    if "weight" not in rows:
+        return results
+    same = ["picture", "patterns", "condition"]
+    best = rows[rows["weight"] == BEST].sort_values("psnr_db", key=lambda level: level.astype(float))
+    best = best.drop_duplicates(same, keep="last").set_index(same)[["psnr_db", "detail"]].astype(float)
+
+    def of_best(condition: Any) -> DataFrame:
+        return best.reindex([*zip(rows["picture"], rows["patterns"], condition, strict=True)]).set_axis(rows.index)
+
+    own = rows[["psnr_db", "detail"]].astype(float) - of_best(rows["condition"])
+    home = of_best(rows["condition"].where(~rows["condition"].isin(MISMATCHES), RENDERED))
+    below = rows["psnr_db"].astype(float) - home["psnr_db"]
+    network = rows["method"] + " " + rows["training"] + " " + rows["patterns"]
+    return results.with_columns(gain_db=own["psnr_db"], detail_gain=own["detail"], below_db=below, network=network)
+
+
+def _gains(
+    claim: str, training: str, condition: str, patterns: str, method: Any = (REFINED, FLATNET, UNROLLED), **more: Any
+) -> Level:
+    """Return the claim that the gain of every training lies in a range, for each of some methods; ``more`` are
+    attributes of :class:`Level`."""
+    where = {"training": training, "condition": condition, "patterns": patterns, "method": method}
+    return Level(
+        claim, **{"where": where, "column": "gain_db", "each": "method", "every": "seed", "optional": True, **more}
+    )
+
+
+_NETWORKS: dict[str, Any] = {"training": (*TRAININGS, ELSEWHERE, PICTURES)}
+_REAL: dict[str, Any] = {"frame": REAL}
+_BY_NETWORK = ("method", "training")
+STUDY = Study(
     "learned",
     "Learned methods",
     "What do networks gain over the best classical image, and what do they lose on another bench than they learned?",
-    _points, _measure, find_claims, figures, tables=tables, kept=True,
+    points=_points,
+    measure=_measure,
+    derive=compare,
+    claims=(
+        _gains("Trained and tested on idealised frames, {method} exceeds the best classical image (uniform light)",
+               IDEALISED, IDEALISED, "uniform", at_least=0, paper="best"),
+        _gains("{method} of idealised pairs fails on real frames under uniform light (by 3 dB)", IDEALISED, RENDERED,
+               "uniform", at_most=-3, paper="fails to recover", method=FLATNET),
+        _gains("A U-Net after least squares removes artefacts (uniform light)", RENDERED, RENDERED, "uniform",
+               at_least=0, method=REFINED),
+        _gains("A U-Net after least squares resolves no more: detail correlates by at most 0.05 more (uniform light)",
+               RENDERED, RENDERED, "uniform", at_most=0.05, paper="fails to improve the spatial resolution",
+               method=REFINED, column="detail_gain", unit=""),
+        _gains("{method} of idealised pairs is within 3 dB of the best classical image under 49 dots", IDEALISED,
+               RENDERED, "dots:7", at_least=-3, paper="similar to least squares"),
+        Level("No mismatch costs 10 dB against the best classical image ({condition})", paper="catastrophic",
+              where={**_NETWORKS, "condition": MISMATCHES}, column="gain_db", at_least=-10, each="condition",
+              every="network", optional=True),
+        _gains("{method} of rendered pairs is 1 dB over the best classical image under uniform light", RENDERED,
+               RENDERED, "uniform", at_least=1),
+        _gains("{method} of rendered pairs is no worse than the best classical image under 49 dots (by 0.5 dB)",
+               RENDERED, RENDERED, "dots:7", at_least=-0.5),
+        Gain("Benches that vary in training make networks bear a mismatch ({patterns})", {"training": VARIED},
+             {"training": RENDERED}, where={"condition": MISMATCHES, "method": (REFINED, FLATNET, UNROLLED)},
+             column="gain_db", each="patterns", every="method", optional=True),
+        Level("Misfit flags images 3 dB below the best classical image of a calibrated bench ({patterns}; 90 %)",
+              where={**_NETWORKS, "below_db": lambda below: below < -3}, column="misfit", unit="", at_least=0.9,
+              each="patterns", optional=True),
+        Level("Misfit flags few others ({patterns}; 10 %)", where={**_NETWORKS, "below_db": lambda below: below >= -3},
+              column="misfit", unit="", at_most=0.1, each="patterns", optional=True),
+        Gain("On real captures an unrolled network, taught by a twin, correlates as total variation does (0.01)",
+             {"method": UNROLLED}, {"method": TV}, where=_REAL, column="correlation", unit="", at_least=-0.01,
+             optional=True),
+    ),
+    panels=(
+        Bars(_BY_NETWORK, file="gain", x="gain_db", x_label="PSNR over the best classical image [dB]", where=_NETWORKS,
+             title="Gain of each network (training set)", colour="patterns", each="condition"),
+        Images(_BY_NETWORK, title="Uniform light, networks of rendered pairs", array="{shown}", each="condition",
+               before={"{condition} {patterns} truth": "truth"}, down=("picture",),
+               where={"patterns": "uniform", "training": (NONE, RENDERED), "weight": (BEST, None),
+                      "method": (TIKHONOV, TV, REFINED, FLATNET, UNROLLED)}),
+        Images("method", file="flatcam", title="Real captures, by networks of a simulated twin", array="{method}",
+               before={AUTHORS: AUTHORS}, down=("held_out",), caption="", where=_REAL),
+    ),
+    tables=(
+        Pivot(("method", "training", "weight"), columns="condition", value="psnr_db", each="patterns",
+              title="Mean PSNR [dB]"),
+        Pivot(_BY_NETWORK, columns="condition", value="gain_db", each="patterns", where=_NETWORKS,
+              title="Gain over the best classical image [dB]"),
+        Pivot(_BY_NETWORK, columns={"train_s": "training [s]", "seconds": "image [s]", "detail": "detail, correlation",
+              "detail_energy": "detail, rms over true"}, where={"condition": RENDERED}, each="patterns",
+              title="Processor time, and detail on rendered frames"),
+        Pivot(("picture", "frame"), columns="method", value="correlation", where={"frame": (REAL, SIMULATED)},
+              title="Correlation with the authors' image"),
+        Pivot(("picture", "frame"), columns="method", value="beyond", where={"frame": (REAL, SIMULATED)},
+              title="Part of the frame that an image would not give, rms"),
+    ),
+    kept=True,
     note="The bench is the middle of the photograph: its camera, 64 x 64 projector pixels. Trained: on pairs of the "
     f"idealised model; rendered; rendered on {FULL.groups} varied benches (sheet 5 mm either way, mask 4 um either "
     "way, a tenth of the light to all of it); elsewhere: on a camera whose mask is at 1 mm, not 2; pictures: by "

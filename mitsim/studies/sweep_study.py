@@ -26,8 +26,7 @@ from mitsim.studies.framework.experiment import (
     group_by_setup,
     number_of,
 )
-from mitsim.studies.framework.page import Part
-from mitsim.studies.framework.panels import Images, Lines, Panel
+from mitsim.studies.framework.panels import Images, Lines, Panel, Part
 from mitsim.studies.framework.studio import measure_image
 
 if TYPE_CHECKING:
@@ -179,7 +178,7 @@ STUDY = Study(
     points=_points,
     measure=measure_image,
     panels=(_figures,),
-    tables=_tables,
+    tables=(_tables,),
     message=_message,
     about="Rendered frames with the sensor's noise, exposed at equal peak unless the exposure varies (the brightest "
     "pixel fills the same part of the full well), and the images that mitsim reconstruct makes of them, with "

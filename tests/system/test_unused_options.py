@@ -64,8 +64,8 @@ CASES = [
     ("study distance -o {out}", "--patterns dots:7"),
     ("study distance --scheduler tcp://a:1 -o {out}", "--jobs 1"),
     ("study calibration -o {out}", "--quick"),
-    ("study transfer -o {out}", "--camera imx249"),
-    ("study transfer -o {out}", "-D a=1"),
+    ("study twin -o {out}", "--camera imx249"),
+    ("study twin -o {out}", "-D a=1"),
 ]
 
 

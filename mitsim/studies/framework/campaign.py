@@ -1,52 +1,400 @@
-"""A study of many points, from its name and scope to a folder with its points, table, claims, figures and page.
+"""Studies from name and scope to a folder with points, table, claims, figures and page; and studies of one bench.
 
-Points are measured in processes of their own. A process keeps its studio from batch to batch. One that dies loses the
-point it was at, which another tries again.
+Points of a study are measured in processes of their own, which keep their studio from batch to batch. A process that
+dies loses the point that it was measuring, and another process tries it again.
 """
 
 from __future__ import annotations
 
+import importlib
+import json
 import multiprocessing
+import shutil
 import tempfile
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache, cached_property
+from fnmatch import fnmatch
+from functools import cache, partial
+from itertools import groupby
 from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 
 from mitsim.bench.apparatus import check_scene, open_apparatus
+from mitsim.bench.request import Request
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.files import read_json, sweep, write_json
+from mitsim.core.files import (
+    check_output,
+    check_plain,
+    output_folder,
+    read_json,
+    sweep,
+    whole_file,
+    write_json,
+    write_text,
+)  # fmt: skip
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
-from mitsim.studies import ALL, EXPERIMENTS, PAPER
-from mitsim.studies.framework.experiment import Found, Point, Scope, Setup, Study, find_experiment
-from mitsim.studies.framework.run import (
-    KEPT,
-    POINTS,
-    Shard,
-    Store,
-    StudyResult,
-    batches,
-    check_study_folder,
-    study_folder,
-    write_figures,
-    write_table,
-)
+from mitsim.studies import ALL, EXPERIMENTS, PAPER, STUDIES
+from mitsim.studies.framework.experiment import (
+    HEADS,
+    Claim,
+    Found,
+    Point,
+    Results,
+    Scope,
+    Setup,
+    Study,
+    find_experiment,
+    no_such_study,
+)  # fmt: skip
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from mitsim.api.bench import Bench
+    from mitsim.studies.framework.panels import Part, Section
     from mitsim.studies.framework.studio import Studio
 
-# -------- A study by its name and scope in, its folder out
+# -------- Results of studies
+
+
+class Findings:
+    """Findings of a study of one bench, as its folder and the command line show them."""
+
+    title: ClassVar[str] = ""
+    """Title of its page; without one it has none."""
+
+    def payload(self) -> dict[str, Any]:
+        """Return the findings as JSON has them."""
+        raise NotImplementedError
+
+    def lines(self) -> list[str]:
+        """Return the findings as text: the page's parts, unless the study has something shorter."""
+        return [line for part in self.parts() for line in part.lines()]
+
+    def figures(self) -> Mapping[str, Figure]:
+        """Return figures by file name."""
+        raise NotImplementedError
+
+    def tables(self) -> Mapping[str, Sequence[Mapping[str, Any]]]:
+        """Return rows of tables by file name."""
+        return {}
+
+    def parts(self) -> Sequence[Part]:
+        """Return the parts of the page."""
+        return ()
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return what was measured, a dictionary a row: the first table, or the first list of such in the JSON."""
+        for table in self.tables().values():
+            return [dict(row) for row in table]
+        lists = (value for value in self.payload().values() if isinstance(value, list | tuple))
+        found = ([dict(row) for row in each if isinstance(row, Mapping)] for each in lists)
+        return next((rows for rows in found if rows), [])
+
+    @property
+    def message(self) -> str:
+        """First sentence of the page; empty for its title alone."""
+        return ""
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Reasons why the findings may not be trusted, and what to do."""
+        return ()
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """Result of a study, for the command line, programs and notebooks.
+
+    Attributes
+    ----------
+    study, output
+        name, and the folder that holds the study.
+    rows
+        rows of its table.
+    warnings
+        reasons why it may not be trusted.
+    findings, scene, patterns
+        of a study of one bench: findings, and the scene and patterns that they are of; None: of none.
+    points, missing, seconds
+        of a study of many points: measured points, those of other parts that are missing, and the time of measuring.
+    claims, figures, section
+        of a whole study of many points: judged claims, files of figures, and its section of a page.
+    """
+
+    study: str
+    output: str
+    rows: tuple[Any, ...] = field(default=(), repr=False)
+    warnings: tuple[str, ...] = ()
+    findings: Findings | None = None
+    scene: str | None = None
+    patterns: str | None = None
+    points: int = 0
+    missing: int = 0
+    seconds: float = 0.0
+    claims: tuple[Claim, ...] = ()
+    figures: tuple[str, ...] = ()
+    section: Section | None = field(default=None, repr=False)
+
+    def payload(self) -> dict[str, Any]:
+        """Return the result as JSON has it."""
+        if self.findings is not None:
+            return {**self.findings.payload(), "scene": self.scene, "patterns": self.patterns, "output": self.output}
+        names = ("study", "output", "points", "missing", "seconds", "rows", "claims", "figures", "warnings")
+        return {name: getattr(self, name) for name in names} | {"claims": [asdict(claim) for claim in self.claims]}
+
+    def lines(self) -> list[str]:
+        """Return the result as text."""
+        if self.findings is not None:
+            return [f"JSON and plots: {self.output}", *self.findings.lines()]
+        if self.missing:
+            return [
+                f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
+                "Join all parts with: mitsim study merge PART... -o FOLDER",
+            ]
+        heads = self.section.heads if self.section else HEADS
+        lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
+        return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
+
+    def to_pandas(self) -> Any:
+        """Return the rows as a ``pandas.DataFrame``."""
+        import pandas
+
+        return pandas.DataFrame([*self.rows])
+
+    @property
+    def pictures(self) -> dict[str, Path]:
+        """Files of the figures, by name."""
+        return {path.name: path for path in sorted(Path(self.output).glob("*.png"))}
+
+    def _repr_html_(self) -> str:
+        from mitsim.core.images import card, data_uri
+
+        shown = (f'<img style="max-width:100%" src="{data_uri(each.read_bytes())}">' for each in self.pictures.values())
+        return card(f"Study in {self.output}", {}, self.lines()) + "".join(shown)
+
+
+def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figure]:
+    """Write the ``figures``, by file name, that show anything to a ``folder``, and return these.
+
+    MitsimError when one cannot be written.
+    """
+    from mitsim.report.plots import tells  # not in processes that measure
+
+    drawn = {file: figure for file, figure in figures.items() if tells(figure)}
+    for file, figure in drawn.items():
+        with whole_file(folder / file) as part:
+            figure.savefig(part, dpi=150, format="png")  # 1290 pixels wide, a page of text on a common screen
+    return drawn
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write ``rows`` to the CSV file ``path``, all or nothing; MitsimError when it cannot be written."""
+    from pandas import DataFrame
+
+    write_text(path, DataFrame([dict(row) for row in rows], dtype=object).to_csv(index=False))
+
+
+# -------- The folder of a study
+
+POINTS, KEPT = "points", "kept"
+"""Folders of measured points, and of objects that points share."""
+DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
+"""Contents of a folder of `mitsim demo`."""
+
+
+def check_study_folder(output: Path | str, name: str) -> None:
+    """Refuse an ``output`` that :func:`study_folder` of the study ``name`` would refuse, before slow imports."""
+    check_output(output, overwrite=_is_earlier(Path(output), name))
+
+
+@contextmanager
+def study_folder(output: Path | str, name: str) -> Iterator[Path]:
+    """Hold the folder ``output`` of the study ``name`` while the context lasts.
+
+    It is new or empty, or holds an earlier study of that name alone, of which nothing is removed. MitsimError when it
+    holds anything else, or cannot be written.
+    """
+    with output_folder(output, overwrite=_is_earlier(Path(output), name)) as folder:
+        yield folder
+
+
+def _is_earlier(place: Path, name: str) -> bool:
+    """Return True if a ``place`` holds an earlier study of a ``name``, whose NAME.json states it, and nothing else."""
+    head = place / f"{name}.json"
+    found = read_json(head) if head.is_file() else None
+    if not isinstance(found, dict) or found.get("kind") != name:
+        return False
+    written: tuple[str, ...] = {
+        ALL: (*PAPER, "*.html"),
+        "characterise": ("*.png", "camera.toml", "characterise.html"),
+        "demo": (*DEMO_FOLDERS, DEMO_PAGE),
+        **{study: ("*.png", "*.csv", f"{study}.html") for study in STUDIES},
+    }.get(name, ("*.png", "*.csv", "*.html", POINTS, KEPT))
+    return all(any(fnmatch(item.name, known) for known in (head.name, ".*", *written)) for item in place.iterdir())
+
+
+# -------- A study of one bench
+
+
+def run_study(
+    name: str,
+    measure: Callable[[Any, Request, Job], Findings],
+    bench: Bench | None,
+    output: Path | str,
+    request: Request | None = None,
+    job: Job | None = None,
+) -> StudyResult:
+    """Measure, and write NAME.json, and figures, tables and a page if there are any, to a folder.
+
+    MitsimError for an output that cannot be written or holds something else, and for anything that the study refuses.
+
+    Parameters
+    ----------
+    name, measure
+        name of the study, and its function.
+    bench, request, job
+        bench, or None for a study of no scene; patterns and seed; clock, progress and limits.
+    output
+        new or empty folder, or one with an earlier study of that name, which is replaced.
+    """
+    request = request or Request.of()
+    with study_folder(output, name) as folder:
+        findings = measure(bench, request, job or Job())
+        scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
+        warned = tuple(findings.warnings)
+        result = StudyResult(name, str(folder), tuple(findings.records()), warned, findings, scene, patterns)
+        provenance = {"kind": name, "seed": request.seed, "versions": versions()}
+        write_json(folder / f"{name}.json", {**result.payload(), **provenance})
+        figures = write_figures(folder, findings.figures())
+        if findings.title:
+            from mitsim.report.pages import page_figure
+            from mitsim.studies.framework.panels import build_findings
+
+            scene_name = f"Scene {bench.loaded.path.parent.name}, patterns {patterns}, seed" if bench else "Seed"
+            where, titles = f"{scene_name} {request.seed}.", (findings.title, findings.message)
+            pictures = {file: page_figure(figure) for file, figure in figures.items()}
+            write_text(folder / f"{name}.html", build_findings(name, titles, where, findings.parts(), pictures, warned))
+        for file, table in findings.tables().items():
+            write_table(folder / file, table)
+        return result
+
+
+def find_study(name: str, **settings: object) -> Callable[..., StudyResult]:
+    """Return the study ``name`` as a function of (bench, output, request, job); ``settings`` are further arguments.
+
+    MitsimError for another name, with the names of all studies. Nothing heavy is imported before the name is known and
+    the folder is free.
+    """
+    if name not in STUDIES:
+        raise no_such_study(name)
+
+    def measure(bench: Bench | None, request: Request, job: Job) -> Findings:
+        module: Any = importlib.import_module(f"mitsim.studies.{name}_study")
+        return cast(Findings, module.measure(bench, request, job, **settings))
+
+    return partial(run_study, name, measure)
+
+
+# -------- Points of a study on disk
+
+
+@dataclass(frozen=True)
+class Store:
+    """Findings of points in a ``folder``, which exists."""
+
+    folder: Path
+
+    def has(self, point: Point) -> bool:
+        """Return True if a ``point`` is measured."""
+        return self._file(point).is_file()
+
+    def save(self, point: Point, found: Found) -> None:
+        """Keep what was ``found`` at a ``point``; MitsimError when it cannot be written."""
+        import numpy as np
+
+        rows = np.frombuffer(json.dumps([dict(row) for row in found.rows]).encode(), dtype=np.uint8)
+        with whole_file(self._file(point)) as part, part.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **{"rows": rows, **found.arrays})  # type: ignore[arg-type]
+
+    def load(self, point: Point) -> Found:
+        """Return what was found at a ``point``; MitsimError when the file is damaged."""
+        from mitsim.core.arrays import read_npz
+
+        path = self._file(point)
+        try:
+            if not check_plain(path).st_size:
+                raise ValueError("it is empty: the disk was full, or the machine stopped")
+            with path.open("rb") as file:
+                arrays = read_npz(file, path)
+            rows = json.loads(arrays.pop("rows").tobytes())
+            if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+                raise ValueError("its rows are none")
+            return Found(tuple(rows), arrays)
+        except (OSError, ValueError, KeyError, RecursionError) as error:
+            raise MitsimError(
+                f"file {path}: cannot be read as a point of a study ({error}); remove it and run again"
+            ) from error
+
+    def take(self, other: Path) -> None:
+        """Copy the points in an ``other`` folder that this one lacks."""
+        for file in sorted(other.glob("*.npz")):
+            if not (self.folder / file.name).exists():
+                check_plain(file)
+                with whole_file(self.folder / file.name) as part:
+                    shutil.copyfile(file, part)
+
+    def results(self, points: Iterable[Point]) -> Results:
+        """Return everything found at ``points``, in their order."""
+        found = {point.key: self.load(point) for point in points}
+        rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
+        return Results(rows, {(key, name): array for key, each in found.items() for name, array in each.arrays.items()})
+
+    def _file(self, point: Point) -> Path:
+        return self.folder / f"{point.key}.npz"
+
+
+Batch = tuple[Point, ...]
+
+
+def batches(points: Sequence[Point], kept: bool = False) -> list[Batch]:
+    """Return the ``points`` in their order, those of one setup together, because they share its light; each alone if
+    what they share is ``kept`` in files."""
+    if kept:
+        return [(point,) for point in points]
+    return [tuple(group) for _, group in groupby(points, key=lambda point: point.setup)]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part ``number`` of ``count``, from 1 on, of a study that several jobs of a cluster share."""
+
+    number: int = 1
+    count: int = 1
+
+    @classmethod
+    def of(cls, text: str) -> Shard:
+        """Read a ``text`` such as 2/8; MitsimError for anything else."""
+        number, slash, count = text.partition("/")
+        if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+            raise MitsimError(f"--shard {text!r}: give I/N with I from 1 to N, such as 1/4")
+        return cls(int(number), int(count))
+
+    def part(self, points: Sequence[Point], kept: bool = False) -> list[Point]:
+        """Return the points of every ``count``-th of the :func:`batches`, because a batch's light is traced once."""
+        return [point for batch in batches(points, kept)[self.number - 1 :: self.count] for point in batch]
+
+
+# -------- A study of many points
 
 
 @dataclass(frozen=True)
@@ -63,66 +411,59 @@ class Where:
         if self.jobs is not None and self.jobs < 1:
             raise MitsimError(f"--jobs {self.jobs}: give 1 or more processes")
 
-    def measure(self, name: str, points: Sequence[Point], kept: bool = False) -> Iterable[tuple[Point, Found]]:
-        """What an experiment finds, in any order.
-
-        Parameters
-        ----------
-        name, points
-            of the experiment, and where it is measured.
-        kept
-            as :attr:`mitsim.studies.framework.experiment.Study.kept`.
-        """
-        if self.scheduler is not None:
-            return on_cluster(name, batches(points, kept), self.scheduler)
-        return in_processes(name, batches(points, kept), self.jobs or workers(), self.shared)
-
 
 def run_experiment(
     study: str, scope: Scope, output: Path | str, job: Job | None = None, where: Where | None = None
 ) -> StudyResult:
-    """Measure what is not measured yet, and put everything together.
+    """Measure the points that are not measured yet, and put everything together.
 
     Parameters
     ----------
     study
         name of an experiment; ``all`` for those of the paper, each in a folder of its own, on one page.
-    scope
-        of which scene, and how much.
+    scope, where
+        scene and amount, and where the points are measured; None: all of them here.
     output
-        new or empty folder, or that of an earlier run of the same study, which goes on.
+        new or empty folder, or that of an earlier run of the same study, which is resumed.
     job
         progress.
-    where
-        the points are measured; None: all of them here.
 
     Raises
     ------
     MitsimError
-        for another name, an output that holds something else, and whatever a point refuses.
+        for another name, an output that holds something else, and anything that a point refuses.
     """
+    job, where = job or Job(), where or Where()
     if study == ALL:
         with tempfile.TemporaryDirectory(prefix="mitsim-study-") as shared:
-            together = replace(where or Where(), shared=shared)
+            together = replace(where, shared=shared)
             return _all(scope, output, lambda name, folder: run_experiment(name, scope, folder, job, together))
-    campaign, job, where = _Campaign.of(study, scope, output), job or Job(), where or Where()
-    kept = campaign.experiment.kept
-    own, started = where.shard.part(campaign.points, kept), time.perf_counter()
+    if study in EXPERIMENTS:
+        check_study_folder(output, study)  # before the module of the study is imported
+    experiment, started = find_experiment(study), time.perf_counter()
+    points = experiment.points(scope)
+    own = where.shard.part(points, experiment.kept)
     # Before there is a folder.
     for setup in dict.fromkeys(point.setup for point in own):
         check_scene(setup.scene, dict(setup.parameters), setup.outside)
-    if campaign.experiment.solved:
+    if experiment.solved:
         _check_data(own)
-    with campaign.folder(output) as (folder, store):
+    with _campaign(study, experiment, scope, output) as (folder, store):
         todo = [point for point in own if not store.has(point)]
-        if kept:
+        if experiment.kept:
             (folder / KEPT).mkdir(exist_ok=True)
             where = replace(where, shared=str(folder / KEPT))
-        for done, (point, found) in enumerate(where.measure(study, todo, kept) if todo else (), start=1):
+        parts = batches(todo, experiment.kept)
+        if where.scheduler is not None and todo:
+            measured = on_cluster(study, parts, where.scheduler)
+        else:
+            measured = in_processes(study, parts, where.jobs or workers(), where.shared)
+        for done, (point, found) in enumerate(measured, start=1):
             store.save(point, found)
             left = (time.perf_counter() - started) / done * (len(todo) - done)
-            job.progress(f"{study}: {done} of {len(todo)} points, {_duration_text(left)} left", done / len(todo))
-        return campaign.finish(folder, store, time.perf_counter() - started)
+            text = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
+            job.progress(f"{study}: {done} of {len(todo)} points, {text} left", done / len(todo))
+        return _finish(study, experiment, scope, points, store, time.perf_counter() - started)
 
 
 def _check_data(points: Sequence[Point]) -> None:
@@ -135,24 +476,18 @@ def _check_data(points: Sequence[Point]) -> None:
     asked = {(replace(each.setup, picture=None, accuracy=Setup.accuracy), each["patterns"]) for each in points}
     for setup, patterns in sorted(asked, key=str):
         parameters: dict[str, Any] = dict(setup.parameters)
+        devices = setup.camera, setup.projector
         with warnings.catch_warnings(action="ignore"):  # whoever measures the point repeats them
-            bench = open_apparatus(
-                setup.scene, setup.variant, setup.camera, setup.projector, setup.outside, **parameters
-            )
+            bench = open_apparatus(setup.scene, setup.variant, *devices, setup.outside, **parameters)
         short = shortage(bench, bench.family(patterns))
         if short and short.lost == 1:
             raise MitsimError(f"study: {short.reason}; {short.remedy}")
 
 
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> StudyResult:
-    """One study of the points of several ``parts``, folders of the same study, in the folder ``output``.
+    """Join several ``parts``, folders of the same study, to one study in the folder ``output``.
 
-    Parameters
-    ----------
-    parts, output
-        folders of parts, and the one to make.
-    experiment
-        module of a study of the user's own; no module is imported because a file names it.
+    ``experiment`` is the module of a study of the user's own; no module is imported because a file names it.
 
     Raises
     ------
@@ -168,7 +503,14 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
             raise MitsimError(
                 f"study merge: {part} is of another study, scope or version than {parts[0]}; run it again"
             )
-    study, scope = _known_study(heads[0]["study"], parts[0], experiment), _scope(heads[0]["scope"], parts[0])
+    study, known = heads[0]["study"], (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)
+    if not isinstance(study, str) or study not in known:
+        instead = "none that ships" if experiment is None else f"not {experiment}"
+        raise MitsimError(
+            f"study merge: {parts[0]} is of the study {cut(str(study))!r}, {instead}; a study of your own is merged by "
+            "its name, --experiment MODULE"
+        )
+    scope = _scope(heads[0]["scope"], parts[0])
     if study == ALL:
         for part in parts:
             for name in PAPER:
@@ -181,23 +523,22 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
             f"study merge: {parts[0]} was measured by other versions ({cut(str(heads[0]['versions']))}), by which it "
             "can be merged"
         )
-    campaign = _Campaign.of(study, scope, output)
-    _ = campaign.points  # which a scope that is none refuses, before there is a folder
-    with campaign.folder(output) as (folder, store):
+    found = find_experiment(study)
+    points = found.points(scope)  # refuses an impossible scope before there is a folder
+    with _campaign(study, found, scope, output) as (_, store):
         for part in parts:
-            store.take(Store(Path(part) / POINTS))
-        return campaign.finish(folder, store, time.perf_counter() - started)
+            store.take(Path(part) / POINTS)
+        return _finish(study, found, scope, points, store, time.perf_counter() - started)
 
 
 def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResult]) -> StudyResult:
-    """Every experiment of the paper, made by ``each`` in a folder of its own, and one page of all claims."""
+    """Make every experiment of the paper by ``each`` in a folder of its own, and one page of all claims."""
     with study_folder(output, ALL) as folder:
-        head = {"kind": ALL, "study": ALL, "scope": asdict(scope), "versions": versions()}
-        write_json(folder / f"{ALL}.json", {**head, "status": "incomplete"})
+        _write_head(folder, ALL, ALL, scope, status="incomplete")
         found = [each(name, folder / name) for name in PAPER]
         sections = [one.section for one in found if one.section]
         if len(sections) == len(found):
-            from mitsim.studies.framework.page import build_page
+            from mitsim.studies.framework.panels import build_page
 
             build_page(sections, folder / f"{ALL}.html", "The paper's claims on rendered frames")
         result = StudyResult(
@@ -210,74 +551,56 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
             figures=tuple(f"{one.study}/{name}" for one in found for name in one.figures),
             warnings=tuple(f"{one.study}: {text}" for one in found for text in one.warnings),
         )
-        write_json(folder / f"{ALL}.json", {**head, **result.payload(), "status": "complete"})
+        _write_head(folder, ALL, ALL, scope, status="complete", **result.payload())
         return result
 
 
-@dataclass(frozen=True)
-class _Campaign:
-    """A study by its name, and its scope."""
+@contextmanager
+def _campaign(study: str, experiment: Study, scope: Scope, output: Path | str) -> Iterator[tuple[Path, Store]]:
+    """Hold the folder ``output`` of a study, and its store; an earlier run of the same code is resumed."""
+    name = experiment.name
+    with study_folder(output, name) as folder:
+        head = folder / f"{name}.json"
+        if head.exists() and (made := read_json(head).get("versions")) != versions():
+            raise MitsimError(
+                f"output {folder}: its points were measured by other versions ({made}); choose another folder"
+            )
+        (folder / POINTS).mkdir(exist_ok=True)
+        sweep(folder / POINTS)  # half-written files of killed processes
+        _write_head(folder, name, study, scope, status="incomplete")
+        yield folder, Store(folder / POINTS)
 
-    study: str
-    scope: Scope
 
-    @classmethod
-    def of(cls, study: str, scope: Scope, output: Path | str) -> _Campaign:
-        """Of a ``study`` and its ``scope``; MitsimError, before the module of a shipped one is imported, for an
-        ``output`` that it cannot be written to."""
-        if study in EXPERIMENTS:
-            check_study_folder(output, study)
-        return cls(study, scope)
+def _finish(
+    study: str, experiment: Study, scope: Scope, points: Sequence[Point], store: Store, seconds: float
+) -> StudyResult:
+    """Write table, claims, figures and page, where all points are there; measuring took so many ``seconds``."""
+    from mitsim.studies.framework.panels import Section, build_page
 
-    @cached_property
-    def experiment(self) -> Study:
-        return find_experiment(self.study)
-
-    @cached_property
-    def points(self) -> Sequence[Point]:
-        return self.experiment.points(self.scope)
-
-    @contextmanager
-    def folder(self, output: Path | str) -> Iterator[tuple[Path, Store]]:
-        """The folder ``output`` and its store, held; an earlier run of the same code goes on."""
-        name = self.experiment.name
-        with study_folder(output, name) as folder:
-            head = folder / f"{name}.json"
-            if head.exists() and (made := read_json(head).get("versions")) != versions():
-                raise MitsimError(
-                    f"output {folder}: its points were measured by other versions ({made}); choose another folder"
-                )
-            (folder / POINTS).mkdir(exist_ok=True)
-            store = Store(folder / POINTS)
-            sweep(folder / POINTS)  # what killed processes left half-written
-            self._write(folder, status="incomplete")
-            yield folder, store
-
-    def finish(self, folder: Path, store: Store, seconds: float) -> StudyResult:
-        """Table, claims, figures and page, where all points are there; measuring them took so many ``seconds``."""
-        from mitsim.studies.framework.page import Section, build_page
-
-        there, experiment = sum(store.has(point) for point in self.points), self.experiment
-        result = StudyResult(self.study, str(folder), points=there, missing=len(self.points) - there, seconds=seconds)
-        if result.missing:
-            return result
-        results = replace(store.results(self.points), scope=self.scope)
-        claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
-        write_table(folder / f"{experiment.name}.csv", results.rows)
-        section = Section.of(experiment, self.study, claims, figures, results)
-        build_page([section], folder / f"{experiment.name}.html", section.title)
-        rows, named = tuple(map(dict, results.rows)), tuple(figures)
-        result = replace(result, rows=rows, claims=claims, figures=named, section=section, warnings=section.warnings)
-        self._write(folder, status="complete", **result.payload())
+    folder, there, name = store.folder.parent, sum(map(store.has, points)), experiment.name
+    result = StudyResult(study, str(folder), points=there, missing=len(points) - there, seconds=seconds)
+    if result.missing:
         return result
+    results = replace(store.results(points), scope=scope)
+    claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
+    write_table(folder / f"{name}.csv", results.rows)
+    section = Section.of(experiment, study, claims, figures, results)
+    build_page([section], folder / f"{name}.html", section.title)
+    rows = tuple(map(dict, results.rows))
+    result = replace(
+        result, rows=rows, claims=claims, figures=tuple(figures), section=section, warnings=section.warnings
+    )
+    _write_head(folder, name, study, scope, status="complete", **result.payload())
+    return result
 
-    def _write(self, folder: Path, **more: Any) -> None:
-        head = {"kind": self.experiment.name, "study": self.study, "scope": asdict(self.scope), "versions": versions()}
-        write_json(folder / f"{self.experiment.name}.json", {**head, **more})
+
+def _write_head(folder: Path, name: str, study: str, scope: Scope, /, **more: Any) -> None:
+    head = {"kind": name, "study": study, "scope": asdict(scope), "versions": versions()}
+    write_json(folder / f"{name}.json", {**head, **more})
 
 
 def _head(folder: Path) -> dict[str, Any]:
-    """What the study in a ``folder`` says of itself."""
+    """Return the study's JSON in a ``folder``."""
     for file in sorted(folder.glob("*.json")):
         head = read_json(file)
         whole = isinstance(head, dict) and {"study", "scope", "versions"} <= head.keys()
@@ -287,7 +610,7 @@ def _head(folder: Path) -> dict[str, Any]:
 
 
 def read_scope(folder: Path) -> tuple[str, Scope]:
-    """Name and scope of the study of many points in a ``folder``; MitsimError for one that holds none."""
+    """Return name and scope of the study of many points in a ``folder``; MitsimError for one that holds none."""
     for file in sorted(folder.glob("*.json")) if folder.is_dir() else ():
         head = read_json(file)
         if isinstance(head, dict) and isinstance(head.get("study"), str) and "scope" in head:
@@ -298,18 +621,6 @@ def read_scope(folder: Path) -> tuple[str, Scope]:
     )
 
 
-def _known_study(study: Any, part: Path | str, experiment: str | None) -> str:
-    """The name of a ``study`` as the file of a ``part`` has it, where it ships or was named as ``experiment`` too."""
-    known = (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)
-    if not isinstance(study, str) or study not in known:
-        instead = "none that ships" if experiment is None else f"not {experiment}"
-        raise MitsimError(
-            f"study merge: {part} is of the study {cut(str(study))!r}, {instead}; a study of your own is merged by its "
-            "name, --experiment MODULE"
-        )
-    return study
-
-
 def _scope(found: Any, part: Path | str) -> Scope:
     try:
         return TypeAdapter(Scope).validate_python(found)
@@ -317,25 +628,10 @@ def _scope(found: Any, part: Path | str) -> Scope:
         raise MitsimError(f"study merge: {part}: its scope cannot be read ({error.errors()[0]['msg']})") from error
 
 
-def _duration_text(seconds: float) -> str:
-    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
-
-
 # -------- Batches of points in, measured in processes of their own; findings out as they come
 
-Batch = tuple[Point, ...]
 _TRIES = 2
 """Times that a point is begun: what ended two processes would end the third."""
-
-
-@dataclass(frozen=True)
-class _Studio:
-    """This process's own studio, opened when it is first asked for something: to load the renderer takes seconds."""
-
-    shared: str | None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(_open(self.shared), name)
 
 
 @cache
@@ -345,85 +641,112 @@ def _open(shared: str | None) -> Any:
     return Studio(shared)
 
 
-def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
-    """What an experiment finds at a point, in this process's studio.
+@dataclass(frozen=True)
+class _LazyStudio:
+    """Studio of this process, opened at its first use, because loading the renderer takes seconds."""
 
-    Parameters
-    ----------
-    name, point
-        of the experiment, and where it is measured.
-    shared
-        folder of plans and calibrations that processes share; None: this process keeps its own.
+    shared: str | None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_open(self.shared), name)
+
+
+def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
+    """Measure a ``point`` of the experiment ``name`` in this process's studio.
+
+    ``shared`` is a folder of plans and calibrations that processes share; None: this process keeps its own.
     """
-    return find_experiment(name).measure(cast("Studio", _Studio(shared)), point)
+    return find_experiment(name).measure(cast("Studio", _LazyStudio(shared)), point)
 
 
 def in_processes(
     name: str, batches: Sequence[Batch], jobs: int, shared: str | None = None
 ) -> Iterator[tuple[Point, Found]]:
-    """Findings of all points, in any order.
+    """Yield the findings of all points of the experiment ``name``, in any order, from so many processes (``jobs``).
 
-    MitsimError for what a point refuses, and for one that ended two processes.
-
-    Parameters
-    ----------
-    name
-        of the experiment.
-    batches
-        points, those of a batch by one process one after the other.
-    jobs
-        processes at a time.
-    shared
-        folder of plans and calibrations that they share with others; None: with each other alone.
+    A process measures the points of a batch one after the other. ``shared`` is a folder of plans and calibrations that
+    the processes share with others; None: with each other alone. MitsimError for anything that a point refuses, and
+    for a point that ended two processes.
     """
     waiting, tries = deque(batches), dict[Point, int]()
-    # Processes are ended, not asked to end: what they leave in their temporary folder goes with it.
-    scratch = tempfile.TemporaryDirectory(prefix="mitsim-study-")
-    folders = scratch.name, shared or scratch.name
-    crew = [_Worker.start(name, folders) for _ in range(min(jobs, len(batches)))]
-    try:
-        while True:
-            for worker in crew:
-                if not worker.left and waiting:
-                    worker.give(waiting.popleft())
-            busy = [worker for worker in crew if worker.left]
-            if not busy:
-                return
-            ready = wait([worker.pipe for worker in busy])
-            for worker in busy:
-                if worker.pipe not in ready:
-                    continue
-                point = worker.left[0]
-                answer = worker.answer()
-                if answer is None:
-                    tries[point] = tries.get(point, 0) + 1
-                    if tries[point] == _TRIES:
-                        raise MitsimError(
-                            f"study {name}: {_TRIES} processes ended at one point ({_point_text(point)}), the last "
-                            f"with exit code {worker.process.exitcode}; finished points are kept. Is memory short? Try "
-                            "--jobs 1"
-                        )
-                    waiting.appendleft(tuple(worker.left))
-                    crew[crew.index(worker)] = _Worker.start(name, folders)
-                else:
+    # Processes are ended, not asked to end: the files in their temporary folder go with it.
+    with tempfile.TemporaryDirectory(prefix="mitsim-study-") as scratch:
+        crew = [_Worker(name, (scratch, shared or scratch)) for _ in range(min(jobs, len(batches)))]
+        try:
+            while True:
+                for worker in crew:
+                    if not worker.left and waiting:
+                        worker.give(waiting.popleft())
+                busy = [worker for worker in crew if worker.left]
+                if not busy:
+                    return
+                ready = wait([worker.pipe for worker in busy])
+                for worker in (worker for worker in busy if worker.pipe in ready):
+                    point = worker.left[0]
+                    try:
+                        answer = worker.pipe.recv()
+                    except (EOFError, OSError):  # the process died
+                        worker.process.join()
+                        tries[point] = tries.get(point, 0) + 1
+                        if tries[point] == _TRIES:
+                            values = {**dict(point.setup.parameters), **point.row()}
+                            text = ", ".join(f"{key} = {value}" for key, value in values.items() if value is not None)
+                            raise MitsimError(
+                                f"study {name}: {_TRIES} processes ended at one point ({text}), the last with exit "
+                                f"code {worker.process.exitcode}; finished points are kept. Is memory short? Try "
+                                "--jobs 1"
+                            ) from None
+                        waiting.appendleft(tuple(worker.left))
+                        crew[crew.index(worker)] = _Worker(name, worker.folders)
+                        continue
+                    if isinstance(answer, str):
+                        raise MitsimError(answer)
                     yield worker.left.popleft(), answer
-    finally:
-        for worker in crew:
-            worker.end()
-        scratch.cleanup()
+        finally:
+            for worker in crew:
+                worker.pipe.close()
+                worker.process.terminate()
+                worker.process.join()
+
+
+class _Worker:
+    """A process, the pipe to it, and the points that it has not answered."""
+
+    def __init__(self, name: str, folders: tuple[str, str]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.folders, self.left = folders, deque[Point]()
+        self.process = context.Process(target=_serve, args=(name, folders, theirs), daemon=True)
+        self.process.start()
+        theirs.close()  # so that its death ends the pipe
+
+    def give(self, batch: Batch) -> None:
+        self.left = deque(batch)
+        with suppress(OSError):  # it died, which is noticed when its answer is read
+            self.pipe.send(batch)
+
+
+def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
+    """Measure every batch that comes, point by point, until the parent is gone.
+
+    ``folders`` are for temporary files and for calibrations that are shared.
+    """
+    tempfile.tempdir, shared = folders
+    warnings.showwarning = lambda message, *_: say_note(str(message))
+    with suppress(EOFError, OSError, KeyboardInterrupt):
+        while True:
+            for point in pipe.recv():
+                try:
+                    pipe.send(measure_point(name, point, shared))
+                except MitsimError as error:
+                    pipe.send(str(error))
+                    break
 
 
 def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tuple[Point, Found]]:
-    """The same by workers of a Dask cluster, a batch a task.
+    """Yield the findings of all points, measured by workers of the Dask cluster at an ``address``, a batch a task.
 
     MitsimError without the package ``distributed``, without a scheduler there, and as :func:`in_processes`.
-
-    Parameters
-    ----------
-    name, batches
-        as for :func:`in_processes`.
-    address
-        of the scheduler.
     """
     try:
         from distributed import Client, as_completed
@@ -443,7 +766,7 @@ def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tu
 
 
 def _batch(name: str, batch: Batch) -> tuple[list[Found], str]:
-    """Findings of a whole batch, and what refused it."""
+    """Measure a batch; return its findings, and the reason why it ended early."""
     found = []
     for point in batch:
         try:
@@ -451,63 +774,3 @@ def _batch(name: str, batch: Batch) -> tuple[list[Found], str]:
         except MitsimError as error:
             return found, str(error)
     return found, ""
-
-
-@dataclass(eq=False)
-class _Worker:
-    """A process, the pipe to it, and the points that it has not answered."""
-
-    process: BaseProcess
-    pipe: Connection
-    left: deque[Point] = field(default_factory=deque)
-
-    @classmethod
-    def start(cls, name: str, folders: tuple[str, str]) -> _Worker:
-        context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(name, folders, theirs), daemon=True)
-        process.start()
-        theirs.close()  # so that its death ends the pipe
-        return cls(process, ours)
-
-    def give(self, batch: Batch) -> None:
-        self.left = deque(batch)
-        with suppress(OSError):  # it died; its answer says so
-            self.pipe.send(batch)
-
-    def answer(self) -> Found | None:
-        """The next; None of a process that died. MitsimError for what the point refuses."""
-        try:
-            answer = self.pipe.recv()
-        except (EOFError, OSError):
-            self.process.join()
-            return None
-        if isinstance(answer, str):
-            raise MitsimError(answer)
-        assert isinstance(answer, Found)
-        return answer
-
-    def end(self) -> None:
-        self.pipe.close()
-        self.process.terminate()
-        self.process.join()
-
-
-def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
-    """Measure every batch that comes, point by point, until the parent is gone; ``folders`` are for temporary files and
-    for calibrations that are shared."""
-    tempfile.tempdir, shared = folders
-    warnings.showwarning = lambda message, *_: say_note(str(message))
-    with suppress(EOFError, OSError, KeyboardInterrupt):
-        while True:
-            for point in pipe.recv():
-                try:
-                    pipe.send(measure_point(name, point, shared))
-                except MitsimError as error:
-                    pipe.send(str(error))
-                    break
-
-
-def _point_text(point: Point) -> str:
-    values = {**dict(point.setup.parameters), "picture": point.setup.picture, **dict(point.values)}
-    return ", ".join(f"{name} = {value}" for name, value in values.items() if value is not None)

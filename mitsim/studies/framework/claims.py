@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
 CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"
-CONFIDENCE = 0.95
-"""Confidence of an interval, as for the stated uncertainty of images."""
+_CONFIDENCE = 0.95
 Holds = bool | None
 """True, False, or None for a claim that is not decided."""
 Where = Mapping[str, Any] | str
@@ -45,7 +44,8 @@ def choose_rows(rows: DataFrame, where: Where) -> DataFrame:
         if callable(value):
             kept = column.map(lambda each, accept=value: bool(accept(each)))
         elif isinstance(value, (list, tuple, set, frozenset)):
-            kept = column.isin(list(value))
+            kept = column.isin([each for each in value if each is not None])
+            kept = kept | column.isna() if None in value else kept
         else:
             kept = column.isna() if value is None else column == value
         rows = rows[kept.astype(bool)]
@@ -90,55 +90,42 @@ def mean_of(
     MitsimError
         if the rows, or the rows of both tables together, have no print (or seed) with a number.
     """
-    tables = [rows] if minus is None else [rows, minus]
-    prints = {key for each in tables for key in _keys(each, "picture")}
+    from pandas import Series, to_numeric
+
+    def keys(table: DataFrame, by: str) -> Series[Any]:
+        """Return a column with "" for None, because pandas does not group by None."""
+        return table[by].where(table[by].notna(), "") if by in table else table.index.to_series().map(lambda _: "")
+
+    def level(table: DataFrame, name: str) -> Series[float]:
+        if name not in table or table.empty:
+            return Series(dtype=float)
+        return to_numeric(table[name], errors="coerce").groupby(keys(table, by), sort=False).mean().dropna()
+
+    prints = {key for each in (rows, minus) if each is not None for key in keys(each, "picture")}
     by = "picture" if len(prints) > 1 else "seed"
-    level = _means_by(rows, by, column)
+    means = level(rows, column)
     if minus is not None:
-        level = (level - _means_by(minus, by, minus_column or column)).dropna()
-    mean = Mean.of_numbers(level.tolist(), column)
+        means = (means - level(minus, minus_column or column)).dropna()
+    mean = Mean.of_numbers(means.tolist(), column)
     if not error_column:
         return mean
     own = 0.0 if math.isnan(mean.error) else mean.error
     return mean._replace(error=math.hypot(own, mean_of(rows, error_column).value))
 
 
-def _keys(rows: DataFrame, by: str) -> Series[Any]:
-    """Return the values of the column ``by`` with "" for None, because pandas does not group by None."""
-    if by not in rows:
-        return rows.index.to_series().map(lambda _: "")
-    return rows[by].where(rows[by].notna(), "")
-
-
-def _means_by(rows: DataFrame, by: str, column: str) -> Series[float]:
-    from pandas import Series, to_numeric
-
-    if column not in rows or rows.empty:
-        return Series(dtype=float)
-    return to_numeric(rows[column], errors="coerce").groupby(_keys(rows, by), sort=False).mean().dropna()
-
-
 # -------- A mean and a range in, the verdict out
 
 
-def within(quantity: Mean, low: float = -math.inf, high: float = math.inf, among: int = 1) -> Holds:
-    """Return whether a quantity lies in a range, by Student's interval; a single value decides nothing.
+def within(quantity: Mean, low: float = -math.inf, high: float = math.inf) -> Holds:
+    """Return whether a quantity lies in a range from ``low`` to ``high``, by Student's interval.
 
-    Parameters
-    ----------
-    quantity
-        mean of independent values; the degrees of freedom are their number less one.
-    low, high
-        ends of the range.
-    among
-        number of quantities of which this one was chosen by its value. The intervals of all of them hold together with
-        the usual confidence (Bonferroni), and therefore that of the chosen one.
+    The degrees of freedom are the number of values less one; a single value decides nothing.
     """
     if quantity.of < 2:
         return None
     from scipy.special import stdtrit
 
-    reach = float(stdtrit(quantity.of - 1, 1 - (1 - CONFIDENCE) / 2 / among)) * quantity.error
+    reach = float(stdtrit(quantity.of - 1, 1 - (1 - _CONFIDENCE) / 2)) * quantity.error
     if low < quantity.value - reach and quantity.value + reach < high:
         return True
     return False if quantity.value + reach < low or quantity.value - reach > high else None
@@ -172,6 +159,14 @@ def value_name(column: str, value: Any) -> str:
     if column == "patterns" and str(value).partition(":")[0] in FAMILIES:
         return in_text(str(value))
     return f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
+
+
+def with_unit(mean: Mean, unit: str, sign: str = "") -> str:
+    """Return a mean with its error and ``unit``: other units than decibels to two digits of the error."""
+    if unit == "dB":
+        return f"{mean:{sign}} dB"
+    error = "" if math.isnan(mean.error) else f" \N{PLUS-MINUS SIGN} {round_to_error(mean.error, mean.error)}"
+    return f"{'+' if sign and mean.value >= 0 else ''}{round_to_error(mean.value, mean.error)}{error} {unit}".rstrip()
 
 
 # -------- Declared claims
@@ -223,9 +218,11 @@ class Statement:
         if not self.each:
             return [self._judge(rows, self.claim)]
         return [
-            self._judge(choose_rows(rows, {self.each: value}), self.claim.format(**{self.each: shown}))
+            self._judge(
+                choose_rows(rows, {self.each: value}),
+                self.claim.format(**{self.each: value_name(self.each, value)}),
+            )
             for value in distinct(rows, self.each)
-            for shown in (value_name(self.each, value),)
         ]
 
     @property
@@ -242,13 +239,11 @@ class Statement:
             own = choose_rows(rows, {column: model} if model in known else {})
             for each in exposures:
                 found[model, each] = self._found(own if each is None else choose_rows(own, {"exposure": each}))
-        figures = dict.fromkeys(both, "") | {
-            model: "; ".join(
-                found[model, each][0] if len(exposures) == 1 else f"{each}: {found[model, each][0]}"
-                for each in exposures
-            )
-            for model in models
-        }
+        figures = dict.fromkeys(both, "")
+        for model in models:
+            texts = (found[model, each][0] if len(exposures) == 1 else f"{each}: {found[model, each][0]}"
+                     for each in exposures)  # fmt: skip
+            figures[model] = "; ".join(texts)
         decided = verdict_at({str(each): every(*(found[model, each][1] for model in models)) for each in exposures})
         if decided in (NOT_CONFIRMED, UNDECIDED) and len(models) > 1:
             by_model = {model: every(*(found[model, each][1] for each in exposures)) for model in models}
@@ -261,11 +256,10 @@ class Statement:
     def _found(self, rows: DataFrame) -> tuple[str, Holds]:
         if not self.every:
             return self.found(rows)[:2]
-        found = {
-            value: self.found(choose_rows(rows, {self.every: value})) for value in sorted(distinct(rows, self.every))
-        }
-        if not found:
+        values = sorted(distinct(rows, self.every))
+        if not values:
             raise MitsimError(f"study: nothing was measured of the claim {self.claim!r}")
+        found = {value: self.found(choose_rows(rows, {self.every: value})) for value in values}
         worst = min(found, key=lambda value: found[value][2])
         shown = found if len(found) <= _SHOWN else {worst: found[worst]}
         text = ", ".join(f"{value_name(self.every, value)}: {found[value][0]}" for value in shown)
@@ -274,16 +268,8 @@ class Statement:
 
 
 @dataclass(frozen=True)
-class Level(Statement):
-    """A claim that the mean of a column lies in a range.
-
-    Attributes
-    ----------
-    column, unit
-        what is averaged, and its unit.
-    at_least, at_most
-        ends of the range.
-    """
+class _Range(Statement):
+    """A claim that a quantity of a ``column`` lies in a range ``at_least`` to ``at_most``, in a ``unit``."""
 
     _: KW_ONLY
     column: str = "psnr_db"
@@ -291,15 +277,23 @@ class Level(Statement):
     at_least: float = -math.inf
     at_most: float = math.inf
 
-    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        """Return the mean, whether it lies in the range, and its margin."""
-        mean = mean_of(rows, self.column)
-        text = with_unit(mean, self.unit)
-        return text, within(mean, self.at_least, self.at_most), _margin(mean, self.at_least, self.at_most)
+    def _decide(self, text: str, mean: Mean) -> tuple[str, Holds, float]:
+        margin = min(mean.value - self.at_least, self.at_most - mean.value)
+        return text, within(mean, self.at_least, self.at_most), margin
 
 
 @dataclass(frozen=True)
-class Gain(Statement):
+class Level(_Range):
+    """A claim that the mean of a ``column`` lies in a range from ``at_least`` to ``at_most`` [``unit``]."""
+
+    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
+        """Return the mean, whether it lies in the range, and its margin."""
+        mean = mean_of(rows, self.column)
+        return self._decide(with_unit(mean, self.unit), mean)
+
+
+@dataclass(frozen=True)
+class Gain(_Range):
     """A claim that some images exceed others by an amount in a range, compared print by print.
 
     Attributes
@@ -318,11 +312,8 @@ class Gain(Statement):
     one: Where
     other: Where
     _: KW_ONLY
-    column: str = "psnr_db"
     other_column: str = ""
-    unit: str = "dB"
     at_least: float = 0.0
-    at_most: float = math.inf
     apart: bool = False
     other_error: str = ""
 
@@ -330,24 +321,24 @@ class Gain(Statement):
     def _compared(self) -> frozenset[str]:
         return frozenset({*_chosen(self.one), *_chosen(self.other)})
 
+    def _parts(self, rows: DataFrame) -> tuple[DataFrame, DataFrame, str]:
+        return choose_rows(rows, self.one), choose_rows(rows, self.other), self.other_column or self.column
+
     def _judge(self, rows: DataFrame, claim: str) -> Claim:
         judged = super()._judge(rows, claim)
         if not self.apart:
             return judged
-        one, other = choose_rows(rows, self.one), choose_rows(rows, self.other)
-        before = mean_of(other, self.other_column or self.column, error_column=self.other_error)
-        return replace(
-            judged, idealised=with_unit(before, self.unit), rendered=with_unit(mean_of(one, self.column), self.unit)
-        )
+        one, other, other_column = self._parts(rows)
+        before = mean_of(other, other_column, error_column=self.other_error)
+        after = with_unit(mean_of(one, self.column), self.unit)
+        return replace(judged, idealised=with_unit(before, self.unit), rendered=after)
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
         """Return both means and the gain, whether it lies in the range, and its margin."""
-        one, other = choose_rows(rows, self.one), choose_rows(rows, self.other)
-        other_column = self.other_column or self.column
+        one, other, other_column = self._parts(rows)
         gain = mean_of(one, self.column, other, other_column)
         means = with_unit(mean_of(one, self.column), self.unit), with_unit(mean_of(other, other_column), self.unit)
-        text = f"{' against '.join(means)}, {with_unit(gain, self.unit, '+')}"
-        return text, within(gain, self.at_least, self.at_most), _margin(gain, self.at_least, self.at_most)
+        return self._decide(f"{' against '.join(means)}, {with_unit(gain, self.unit, '+')}", gain)
 
 
 @dataclass(frozen=True)
@@ -367,26 +358,7 @@ TOLERANCE_DB = 2.0
 
 
 def stated(claim: str, low: float, high: float, **where: Any) -> Level:
-    """Return the claim of a mean PSNR in a range that the paper states, within :data:`TOLERANCE_DB`.
-
-    Parameters
-    ----------
-    claim, low, high
-        sentence, and the paper's range [dB].
-    **where
-        rows that the claim is about.
-    """
+    """Return the claim of a mean PSNR in a range of the paper, from ``low`` to ``high`` [dB], within
+    :data:`TOLERANCE_DB`; ``where`` chooses its rows."""
     paper = f"{low:g} to {high:g} dB"
     return Level(claim, paper=paper, where=where, at_least=low - TOLERANCE_DB, at_most=high + TOLERANCE_DB)
-
-
-def with_unit(mean: Mean, unit: str, sign: str = "") -> str:
-    """Return a mean with its error and ``unit``: other units than decibels to two digits of the error."""
-    if unit == "dB":
-        return f"{mean:{sign}} dB"
-    error = "" if math.isnan(mean.error) else f" \N{PLUS-MINUS SIGN} {round_to_error(mean.error, mean.error)}"
-    return f"{'+' if sign and mean.value >= 0 else ''}{round_to_error(mean.value, mean.error)}{error} {unit}".rstrip()
-
-
-def _margin(mean: Mean, low: float, high: float) -> float:
-    return min(mean.value - low, high - mean.value)

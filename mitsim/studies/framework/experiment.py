@@ -17,7 +17,7 @@ from functools import cache, cached_property
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.request import Request
 from mitsim.core.environment import DEFAULT_VARIANT
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from mitsim.core.arrays import FloatArray
-    from mitsim.report.pages import Table, Value
+    from mitsim.report.pages import Value
 
 # -------- Where a study measures: setups, points, axes
 
@@ -193,7 +193,7 @@ class Axes:
     values: Mapping[str, Sequence[Value]]
     scene: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     quick: Mapping[str, Sequence[Any]] = field(default_factory=dict)
-    prints: Sequence[str] | None = None
+    prints: Sequence[str | None] | None = None
     quick_prints: int | None = None
     repeats: bool = False
     default: str | None = None
@@ -251,9 +251,6 @@ class Results:
     arrays: Mapping[tuple[str, str], FloatArray] = field(default_factory=dict)
     scope: Scope = field(default_factory=lambda: Scope(Setup(), (None,)))
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "rows", tuple(getattr(self.rows, "rows", self.rows)))
-
     @cached_property
     def frame(self) -> DataFrame:
         """The rows as a table, one measurement a row; the values keep the types that they have in JSON."""
@@ -261,12 +258,9 @@ class Results:
 
         return DataFrame([dict(row) for row in self.rows], dtype=object)
 
-    @property
-    def table(self) -> Table:
-        """The rows for studies that are not yet on the engine."""
-        from mitsim.report.pages import Table
-
-        return Table(tuple(self.rows))
+    def with_columns(self, **columns: Any) -> Results:
+        """Return results with more ``columns`` of the table, each a pandas Series."""
+        return replace(self, rows=tuple(self.frame.assign(**columns).to_dict("records")))
 
     def array(self, row: Mapping[str, Value], name: str = IMAGE) -> FloatArray | None:
         """Return the array ``name`` that was kept with a ``row``."""
@@ -303,20 +297,6 @@ class Claim:
         return ", ".join(f"{head.lower()} {figure}" for figure, head in figures if figure)
 
 
-class Judges(Protocol):
-    """A claim as a study declares it (:mod:`mitsim.studies.framework.claims`)."""
-
-    def judge(self, results: Results) -> list[Claim]:
-        """Return the judged claims."""
-
-
-class Draws(Protocol):
-    """A figure as a study declares it (:mod:`mitsim.studies.framework.panels`)."""
-
-    def draw(self, results: Results) -> dict[str, Figure]:
-        """Return figures by file name."""
-
-
 @dataclass(frozen=True)
 class Study:
     """A study of many points.
@@ -336,7 +316,7 @@ class Study:
     derive
         from all results to results with more columns, for columns that need more than one point; None adds none.
     tables
-        from all results to parts of the page (:class:`mitsim.studies.framework.page.Part`).
+        tables of the page (:class:`mitsim.studies.framework.panels.Pivot`), or functions from all results to its parts.
     message
         from all results to the page's first sentence; an empty one is replaced by the number of claims that hold.
     about
@@ -360,10 +340,10 @@ class Study:
     question: str
     points: Callable[[Scope], Sequence[Point]]
     measure: Callable[[Any, Point], Found]
-    claims: Sequence[Judges | Callable[[Results], Sequence[Claim]]] = ()
-    panels: Sequence[Draws | Callable[[Results], Mapping[str, Figure]]] = ()
+    claims: Sequence[Any] = ()
+    panels: Sequence[Any] = ()
     derive: Callable[[Results], Results] | None = None
-    tables: Callable[[Results], Sequence[Any]] = lambda results: ()
+    tables: Sequence[Any] = ()
     message: Callable[[Results], str] = lambda results: ""
     about: str = ""
     heads: tuple[str, str, str] = HEADS
@@ -374,16 +354,22 @@ class Study:
 
     def judge(self, results: Results) -> list[Claim]:
         """Return all claims with their figures and verdicts."""
-        results = self.derive(results) if self.derive else results
+        results = self._derived(results)
         return [claim for each in self.claims for claim in (each(results) if callable(each) else each.judge(results))]
 
     def draw(self, results: Results) -> dict[str, Figure]:
         """Return all figures by file name."""
-        results = self.derive(results) if self.derive else results
-        drawn: dict[str, Figure] = {}
-        for each in self.panels:
-            drawn |= each(results) if callable(each) else each.draw(results)
-        return drawn
+        results = self._derived(results)
+        drawn = [each(results) if callable(each) else each.draw(results) for each in self.panels]
+        return {file: figure for figures in drawn for file, figure in figures.items()}
+
+    def parts(self, results: Results) -> list[Any]:
+        """Return the tables of the page."""
+        results = self._derived(results)
+        return [part for each in self.tables for part in (each(results) if callable(each) else each.parts_of(results))]
+
+    def _derived(self, results: Results) -> Results:
+        return self.derive(results) if self.derive else results
 
 
 def group_by_setup(points: Sequence[Point]) -> list[Point]:
@@ -402,7 +388,7 @@ def find_experiment(name: str) -> Study:
     module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
     try:
         loaded = _load_file(module) if module.endswith(_PYTHON) else importlib.import_module(module)
-        found: Study = _declared(loaded)[name] if name in SHARED else _declared(loaded)
+        found: Study = loaded.STUDIES[name] if name in SHARED else loaded.STUDY
     except (ImportError, AttributeError, OSError, SyntaxError) as error:
         raise MitsimError(
             f"study {name}: the module {module} cannot be used ({error}); it needs a STUDY, as "
@@ -416,12 +402,6 @@ def no_such_study(name: str) -> MitsimError:
     if name in GONE:
         return MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
     return MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
-
-
-def _declared(module: Any) -> Any:
-    """Return the STUDY or the STUDIES of a ``module``, or their equivalents in studies that are not on the engine."""
-    names = [name for name in ("STUDY", "STUDIES", "EXPERIMENT", "EXPERIMENTS") if hasattr(module, name)]
-    return getattr(module, names[0] if names else "STUDY")
 
 
 @cache
@@ -451,17 +431,11 @@ MEASURES = {
     "lambda": ("lambda", "lambda, weight of the regularisation [(electrons/s)²]"),
     "seconds": ("seconds", "time of the solution [s]"),
 }
-"""Column of the table and axis, by what people ask for."""
+"""Column of the table and axis, by the names on the command line."""
 NO_SCENE = ("patterns", "exposure", "seed", "accuracy", "method")
-"""What a sweep may vary besides parameters of the scene."""
-OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason", "lambda", "psnr_db", "ssim"} | {
-    column for column, _ in MEASURES.values()
-}
+"""Knobs of a sweep that are no parameters of the scene."""
+OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason", *(c for c, _ in MEASURES.values())}
 """Columns of every study's table, which are no knob."""
-_NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
-"""As Python and Mitsuba read them."""
-_LISTED = ("patterns", "exposure", "seed", "method")
-"""Knobs whose values are a list, whatever stands between its commas."""
 _MOST = 10_000
 """Points of one sweep: more are a typing error."""
 Sweep = Sequence[tuple[str, Sequence[str]]]
@@ -469,7 +443,7 @@ Sweep = Sequence[tuple[str, Sequence[str]]]
 
 
 def values_of(text: str) -> tuple[str, tuple[str, ...]]:
-    """Name and values of a knob in ``text``: NAME=FIRST:LAST:COUNT, evenly spaced, or NAME=VALUE,VALUE,...
+    """Return name and values of a knob in ``text``: NAME=FIRST:LAST:COUNT, evenly spaced, or NAME=VALUE,VALUE,...
 
     MitsimError for anything else.
     """
@@ -477,7 +451,7 @@ def values_of(text: str) -> tuple[str, tuple[str, ...]]:
     ends = given.split(":")
     if not (name and equals and given):
         raise MitsimError(f"--over {text!r}: give NAME=FIRST:LAST:COUNT or NAME=VALUE,VALUE")
-    if name in _LISTED or len(ends) != 3:
+    if name in ("patterns", "exposure", "seed", "method") or len(ends) != 3:
         return name, tuple(given.split(","))
     try:
         first, last, count = float(ends[0]), float(ends[1]), int(ends[2])
@@ -489,17 +463,16 @@ def values_of(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def measures_of(text: str) -> tuple[str, ...]:
-    """Measures named in ``text``, separated by commas; MitsimError for one that there is not."""
+    """Return the measures named in ``text``, separated by commas; MitsimError for an unknown one."""
     names = tuple(text.split(","))
-    for name in names:
-        if name not in MEASURES:
-            raise MitsimError(f"--measure {name!r}: use {', '.join(MEASURES)}")
+    if unknown := [name for name in names if name not in MEASURES]:
+        raise MitsimError(f"--measure {unknown[0]!r}: use {', '.join(MEASURES)}")
     return names
 
 
 def check_sweep(sweep: Sweep, pictures: int) -> None:
-    """MitsimError for a ``sweep`` over so many ``pictures`` that varies nothing, or what it cannot."""
-    knobs = dict(sweep)
+    """Raise MitsimError for a ``sweep`` over so many ``pictures`` that varies nothing, or what cannot be varied."""
+    knobs, allowed = dict(sweep), {"exposure": CONVENTIONS, "method": METHODS}
     if not knobs:
         raise MitsimError(
             "study sweep: nothing is varied; give --over NAME=FIRST:LAST:COUNT, such as roughness=0.1:0.5:5"
@@ -509,23 +482,18 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
     if (points := pictures * prod(len(values) for values in knobs.values())) > _MOST:
         raise MitsimError(f"study sweep: {points} points; give at most {_MOST}")
     for name, text in ((name, text) for name, texts in knobs.items() for text in texts):
-        if _NOT_FINITE.fullmatch(text):
+        if re.fullmatch(r"\s*[+-]?(nan|inf|infinity)\s*", text, re.IGNORECASE):  # as Python and Mitsuba read them
             raise MitsimError(f"--over {name}={text}: give finite numbers")
-    for text in knobs.get("exposure", ()):
-        if text not in CONVENTIONS:
-            raise MitsimError(f"--over exposure={text}: use {', '.join(CONVENTIONS)}")
-    for text in knobs.get("patterns", ()):
-        read_name(text)
-    for text in knobs.get("method", ()):
-        if text not in METHODS:
-            raise MitsimError(f"--over method={text}: use {', '.join(METHODS)}")
-    for name, kind in (("seed", int), ("accuracy", float)):
-        for text in knobs.get(name, ()):
-            Request.of(**{name: number_of(name, text, kind)})
+        if text not in allowed.get(name, (text,)):
+            raise MitsimError(f"--over {name}={text}: use {', '.join(allowed[name])}")
+        if name == "patterns":
+            read_name(text)
+        elif name in ("seed", "accuracy"):
+            Request.of(**{name: number_of(name, text, int if name == "seed" else float)})
 
 
 def check_drifts(sweep: Sweep) -> None:
-    """MitsimError for a ``sweep`` of anything but kinds of drift and their amounts."""
+    """Raise MitsimError for a ``sweep`` of anything but kinds of drift and their amounts."""
     still = Drift(power_ripple_hz=1.0, lamp_ripple_hz=1.0)  # a recipe states them, which is not read yet
     for kind, texts in sweep:
         for text in texts:
@@ -533,20 +501,7 @@ def check_drifts(sweep: Sweep) -> None:
 
 
 def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> float:
-    """A value of a knob.
-
-    Parameters
-    ----------
-    knob, text
-        its name and the value, as they were given.
-    kind
-        of number.
-
-    Raises
-    ------
-    MitsimError
-        for what is no such number.
-    """
+    """Return the value of a ``knob`` in a ``text`` as a number of a ``kind``; MitsimError for anything else."""
     try:
         return kind(text)
     except ValueError:
@@ -562,61 +517,38 @@ QUICK_IMAGES = ("chelsea", "page")
 """For a first look: fur and letters."""
 PRINT_MM = 128.0
 """Width of the photograph's sheet, which they are printed on."""
-EDGE_DEGREES = 5.0
-"""Of the slanted edge, as ISO 12233 has it."""
 SIDE = 512
 """Pixels a side: four of each of 128 projector pixels."""
-_INK, _PAPER = 0.05, 0.90
-"""Reflectances of black and white print, as on the shipped scenes."""
 
 
 def picture(name: str) -> npt.NDArray[np.uint8]:
-    """(512, 512) eight-bit reflectance of the test image ``name``: the middle square of it, grey.
+    """Return the (512, 512) eight-bit reflectance of the test image ``name``: its middle square, grey.
 
-    Besides, ``bars 0.26`` are bars of so many line pairs a mm of the print, upright on the left, lying on the right,
-    and ``edge`` is one edge 5 degrees off the upright. MitsimError for another name.
+    ``bars 0.26`` are bars of so many line pairs a mm of the print, upright on the left, lying on the right, and
+    ``edge`` is one edge 5 degrees off the upright, as in ISO 12233. MitsimError for another name.
     """
     import numpy as np
     from skimage import data
     from skimage.transform import resize
 
     kind, _, frequency = name.partition(" ")
-    if kind == "bars" and frequency:
-        return _reflectance(_bars(float(frequency)))
-    if name == "edge":
-        return _reflectance(_edge())
-    if name not in TEST_IMAGES:
+    if kind == "bars" and frequency:  # each texel is the mean of the bars over it
+        edges = np.arange(SIDE + 1) * PRINT_MM / SIDE * float(frequency)
+        white = np.floor(edges) / 2 + np.minimum(edges % 1, 0.5)  # integral of the bars, in periods
+        across = np.broadcast_to(np.diff(white) / np.diff(edges), (SIDE, SIDE))
+        grey = np.concatenate([across[:, : SIDE // 2], across.T[:, SIDE // 2 :]], axis=1)
+    elif name == "edge":  # black to white, each texel the part of it that is right of the edge, by 8 points a row of it
+        rows, columns = ((np.arange(8 * SIDE) + 0.5) / 8, np.arange(SIDE))
+        place = SIDE / 2 + (rows - SIDE / 2) * np.tan(np.radians(5.0))
+        grey = np.clip(columns + 1 - place[:, None], 0, 1).reshape(SIDE, 8, SIDE).mean(axis=1)
+    elif name in TEST_IMAGES:
+        image = np.asarray(getattr(data, name)(), dtype=np.float64)
+        grey = image.mean(axis=2) if image.ndim == 3 else image
+        side = min(grey.shape)
+        top, left = ((size - side) // 2 for size in grey.shape)
+        square = resize(grey[top : top + side, left : left + side], (SIDE, SIDE), anti_aliasing=True)
+        grey = (square - square.min()) / (square.max() - square.min())
+    else:
         raise MitsimError(f"picture {name!r}: use {', '.join((*TEST_IMAGES, 'edge', 'bars PAIRS_A_MM'))}")
-    image = np.asarray(getattr(data, name)(), dtype=np.float64)
-    grey = image.mean(axis=2) if image.ndim == 3 else image
-    side = min(grey.shape)
-    top, left = ((size - side) // 2 for size in grey.shape)
-    square = resize(grey[top : top + side, left : left + side], (SIDE, SIDE), anti_aliasing=True)
-    return _reflectance((square - square.min()) / (square.max() - square.min()))
-
-
-def _reflectance(grey: FloatArray) -> npt.NDArray[np.uint8]:
-    """Eight-bit reflectance of ``grey``, 0 black to 1 white."""
-    import numpy as np
-
-    return np.asarray(np.rint(255 * (_INK + (_PAPER - _INK) * grey)), dtype=np.uint8)
-
-
-def _bars(frequency: float) -> FloatArray:
-    """(512, 512) bars of so many pairs a mm, each texel the mean of the bars over it."""
-    import numpy as np
-
-    edges = np.arange(SIDE + 1) * PRINT_MM / SIDE * frequency
-    white = np.floor(edges) / 2 + np.minimum(edges % 1, 0.5)  # integral of the bars, in periods
-    profile = np.diff(white) / np.diff(edges)
-    across = np.broadcast_to(profile, (SIDE, SIDE))
-    return np.concatenate([across[:, : SIDE // 2], across.T[:, SIDE // 2 :]], axis=1)
-
-
-def _edge() -> FloatArray:
-    """(512, 512) black to white, each texel the part of it that is right of the edge, by 8 points a row of it."""
-    import numpy as np
-
-    rows, columns = ((np.arange(8 * SIDE) + 0.5) / 8, np.arange(SIDE))
-    place = SIDE / 2 + (rows - SIDE / 2) * np.tan(np.radians(EDGE_DEGREES))
-    return np.asarray(np.clip(columns + 1 - place[:, None], 0, 1).reshape(SIDE, 8, SIDE).mean(axis=1))
+    # Reflectances of black and white print, as on the shipped scenes.
+    return np.asarray(np.rint(255 * (0.05 + (0.90 - 0.05) * grey)), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Figures of a study: declared as lines, bars or images over columns of the table, and drawn by one plotter.
+"""Figures and tables of a study, declared over columns of its table and drawn by one plotter; and the study's page.
 
 A panel names the columns along its axes; every other column that varies is averaged over. All means and standard errors
 come from :func:`mitsim.studies.framework.claims.mean_of`.
@@ -6,20 +6,47 @@ come from :func:`mitsim.studies.framework.claims.mean_of`.
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import pairwise, product
+from pathlib import Path
 from string import Formatter
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import versions
+from mitsim.core.files import write_text
 from mitsim.devices.patterns import FAMILIES
 from mitsim.report import label
-from mitsim.report.pages import Mean
-from mitsim.studies.framework.claims import Where, choose_rows, distinct, mean_of, measured, value_name
-from mitsim.studies.framework.experiment import IMAGE, TRUTH, Results
+from mitsim.report.pages import DASH, Mean, page_figure, render_page
+from mitsim.studies.framework.claims import (
+    CONFIRMED,
+    NOT_CONFIRMED,
+    Where,
+    choose_rows,
+    distinct,
+    mean_of,
+    measured,
+    value_name,
+    with_unit,
+)  # fmt: skip
+from mitsim.studies.framework.experiment import (
+    HEADS,
+    IMAGE,
+    KNOBS,
+    TEST_IMAGES,
+    TRUTH,
+    Claim,
+    Results,
+    Scope,
+    Setup,
+    Study,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,6 +58,9 @@ beside each other."""
 Names = Mapping[Any, str] | str
 """Names by value, or by (column, value); or a template for numbers such as "{} mm"."""
 PSNR = "PSNR [dB]"
+
+
+# -------- Figures and tables
 
 
 @dataclass(frozen=True)
@@ -66,17 +96,16 @@ class Panel:
         for value in distinct(rows, self.each) if self.each else [""]:
             shown = f"exposure {value}" if self.each == "exposure" else self.name(self.each, value)
             one = replace(self, title=", ".join(filter(None, (self.title, shown))))
-            name = (
-                "_".join(filter(None, (self.file or self.default_file, str(value)))).replace(" ", "_").replace(":", "")
-            )
+            name = "_".join(filter(None, (self.file or self._file, str(value)))).replace(" ", "_").replace(":", "")
             own = choose_rows(rows, {self.each: value} if self.each else {})
             drawn[f"{name}.png"] = one.figure(results, own)
         return {name: figure for name, figure in drawn.items() if figure is not None}
 
     @property
-    def default_file(self) -> str:
-        """Name of the file of a panel that states none."""
-        return "images"
+    def _file(self) -> str:
+        """Name of the file of a panel that states none: the column that is shown."""
+        shown = getattr(self, "y", getattr(self, "x", ""))
+        return str(shown).removesuffix("_db") or "images"
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         """Return one figure of some ``rows``; None if they have nothing to show."""
@@ -98,7 +127,8 @@ class Panel:
     def combinations(self, rows: DataFrame, by: Columns) -> list[dict[str, Any]]:
         """Return the combinations of the values of some columns that ``rows`` have, in the order of the table."""
         columns = [by] if isinstance(by, str) else list(by)
-        values = [[*distinct(rows, each), *([None] if _lacks(rows, each) else [])] for each in columns]
+        lacking = [each not in rows or bool(rows[each].isna().any()) for each in columns]
+        values = [[*distinct(rows, each), *([None] if no else [])] for each, no in zip(columns, lacking, strict=True)]
         found = [dict(zip(columns, chosen, strict=True)) for chosen in product(*values)]
         return [each for each in found if len(choose_rows(rows, each))]
 
@@ -112,10 +142,6 @@ class Panel:
     def joined(self, values: Mapping[str, Any]) -> str:
         """Return the names of some ``values`` by column, separated by commas."""
         return ", ".join(filter(None, (self.name(*item) for item in values.items())))
-
-
-def _lacks(rows: DataFrame, column: str) -> bool:
-    return column not in rows or bool(rows[column].isna().any())
 
 
 def _is_number(value: Any) -> bool:
@@ -154,11 +180,6 @@ class Lines(Panel):
     shared: Where | None = None
     log: bool = False
     ticks: bool = True
-
-    @property
-    def default_file(self) -> str:
-        """Name of the measure."""
-        return self.y.removesuffix("_db")
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         """Return the figure; None without rows."""
@@ -209,11 +230,6 @@ class Bars(Panel):
     x_label: str = PSNR
     ordered: bool = False
 
-    @property
-    def default_file(self) -> str:
-        """Name of the measure."""
-        return self.x.removesuffix("_db")
-
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         """Return the figure; None without rows."""
         from mitsim.report.plots import grouped_bars
@@ -234,6 +250,45 @@ class Bars(Panel):
         if self.ordered:
             groups = dict(sorted(groups.items(), key=lambda item: -next(iter(item[1].values())).value))
         return grouped_bars(groups, self.x_label, self.title) if groups else None
+
+
+@dataclass(frozen=True)
+class Pivot(Panel):
+    """A table of the page: means of a column by the values of two others.
+
+    Attributes
+    ----------
+    rows, columns
+        columns whose combinations are the table's rows and columns; a mapping shows several columns of numbers.
+    value
+        column that is averaged.
+    """
+
+    rows: Columns
+    _: KW_ONLY
+    columns: Columns
+    value: str = "psnr_db"
+
+    def parts_of(self, results: Results) -> list[Part]:
+        """Return the tables of the page, one for each value of ``each``."""
+        chosen, found = choose_rows(results.frame, self.where), []
+        for value in distinct(chosen, self.each) if self.each else [None]:
+            own = choose_rows(chosen, {} if value is None else {self.each: value})
+            heads = list(self.parts(own, self.columns))
+            lines = []
+            for name, (line, _) in self.parts(own, self.rows).items():
+                cells = self.parts(line, self.columns)
+                shown = ((cells[head][0], cells[head][1] or self.value) if head in cells else None for head in heads)
+                lines.append((name, *(_mean_text(*each) if each else DASH for each in shown)))
+            title = ", ".join(filter(None, (self.title, "" if value is None else self.name(self.each, value))))
+            found += [Part(title, "", ("", *heads), tuple(lines))] if lines else []
+        return found
+
+
+def _mean_text(rows: DataFrame, column: str) -> str:
+    if column not in rows or rows[column].isna().all():
+        return DASH
+    return with_unit(mean_of(rows, column), "dB" if column.endswith("_db") else "").removesuffix(" dB")
 
 
 _MOST_SHOWN = 6
@@ -344,3 +399,191 @@ def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], 
             rows[f"truth, {name}" if name and several else "truth"] = [(truth, "") for truth in truths[name]]
         rows[name or "image"], before = cells, truths[name]
     return image_grid(rows, titles, title)
+
+
+# -------- The page of a study
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a page: a ``title``, a ``lead``, ``figures`` by file name, a table of ``rows`` of words under its
+    ``head``, and ``notes`` on how to read them."""
+
+    title: str
+    lead: str = ""
+    head: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    figures: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """True for each column whose cells all begin with a number, which are set to the right."""
+        columns = zip(*self.rows, strict=True)
+        begins = re.compile(r"[+-]?\d|nothing$")
+        return tuple(any(cells) and all(not cell or begins.match(cell) for cell in cells) for cells in columns)
+
+    def lines(self) -> list[str]:
+        """Return title, lead and table as text."""
+        return [f"{self.title}:", *wrap(self.lead, 100), *text_table(self.head, self.rows)]
+
+
+def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table of ``rows`` under their ``head``; none without rows."""
+    table = [head, *rows] if rows else []
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    sides = [">" if right else "<" for right in Part("", rows=tuple(map(tuple, rows))).numeric]
+    return ["  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)).rstrip()
+            for row in table]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Section:
+    """One study on a page.
+
+    Attributes
+    ----------
+    name, title, message, detail
+        study, heading, first sentence, and the question or the scene that it is about.
+    pictures
+        figures by file name: the data URI of each, and its width [pixels].
+    parts, claims, heads
+        tables with their figures; judged claims and the heads of their figures.
+    warnings
+        reasons why the findings may not be trusted.
+    note, about, count, command
+        remarks on the figures; how the study was measured; the number of measurements; the command that repeats them.
+    quick, prints
+        True for a few points alone; number of test images that means are taken over.
+    """
+
+    name: str
+    title: str
+    message: str
+    detail: str
+    pictures: Mapping[str, tuple[str, int]]
+    parts: tuple[Part, ...] = ()
+    claims: tuple[Claim, ...] = ()
+    heads: tuple[str, str, str] = HEADS
+    warnings: tuple[str, ...] = ()
+    note: str = ""
+    about: str = ""
+    count: str = ""
+    command: str = ""
+    quick: bool = False
+    prints: int = 0
+
+    @classmethod
+    def of(
+        cls, study: Study, name: str, claims: Sequence[Claim], figures: Mapping[str, Figure], results: Results
+    ) -> Section:
+        """Return the section of a study of many points.
+
+        Parameters
+        ----------
+        study, name
+            study, and its name on the command line.
+        claims, figures, results
+            judged claims, figures by file name, and all results.
+        """
+        scope = results.scope
+        prints = sorted({str(row.get("picture")) for row in results.rows} & set(TEST_IMAGES))
+        of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
+        command = ["mitsim study", name, *([] if any(scope.pictures) else [scope.setup.scene]), *_options(scope)]
+        accuracies = sorted({point.setup.accuracy for point in study.points(scope)} if study.traced else ())
+        named = " or ".join(f"{each:g}" for each in accuracies)
+        images_first = sorted(figures, key=lambda file: not file.startswith("images"))
+        good = f"; frames before noise asked to be good to {named} (relative rms)" if accuracies else ""
+        return cls(
+            study.name,
+            title=study.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
+            message=study.message(results) or tally(claims),
+            detail=study.question,
+            pictures={file: page_figure(figures[file]) for file in images_first},
+            parts=tuple(study.parts(results)),
+            claims=tuple(claims),
+            heads=study.heads,
+            warnings=flag_warnings(study.name, results),
+            note=study.note,
+            about=study.about,
+            count=f"{len(results.rows)} measurements{of}{good}",
+            command=" ".join(command),
+            quick=scope.quick,
+            prints=len(prints),
+        )
+
+
+def tally(claims: Sequence[Claim]) -> str:
+    """Return how many ``claims`` hold; an empty text without claims."""
+    part, open_ = "confirmed in part", "not decided"
+    counts = Counter(
+        each if each in (CONFIRMED, NOT_CONFIRMED) else part if each.startswith(CONFIRMED) else open_
+        for each in (claim.verdict for claim in claims)
+    )
+    kinds = [f"{counts[kind]} {kind}" for kind in (CONFIRMED, part, NOT_CONFIRMED, open_) if counts[kind]]
+    return f"{len(claims)} claim{'s' * (len(claims) > 1)}: {', '.join(kinds)}" if claims else ""
+
+
+_IMAGE = "point", "psnr_db", "exposure", "model", "picture", "condition", "method", "weight"
+"""Columns whose values together are of one image."""
+
+
+def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
+    """Return a warning of how many images of the study ``name`` are flagged, and why; nothing if none is."""
+    # An image may have many rows, such as a transfer function's.
+    rows = {tuple(map(row.get, _IMAGE)): row for row in results.rows if row.get("flagged") is not None}
+    found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]
+    if not found:
+        return ()
+    reasons = Counter(reason for each in found for reason in each.split("; ") if reason)
+    counts = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
+    return (
+        f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, but "
+        f"included in the means (column flagged of {name}.csv){': ' if counts else ''}{counts}.",
+    )
+
+
+def page_of(sections: Sequence[Section], title: str) -> str:
+    """Return the page of some ``sections`` under a ``title`` as HTML."""
+    message = sections[0].message if len(sections) == 1 else tally([claim for one in sections for claim in one.claims])
+    return render_page("study.html", title=title, message=message or title, sections=sections, versions=versions())
+
+
+def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
+    """Write the page of some ``sections`` under a ``title`` to ``path``, all or nothing, and return the path.
+
+    MitsimError when it cannot be written.
+    """
+    write_text(path, page_of(sections, title))
+    return path
+
+
+def build_findings(
+    name: str, titles: tuple[str, str], where: str, parts: Sequence[Part], pictures: Mapping[str, tuple[str, int]],
+    warnings: Sequence[str] = (),
+) -> str:  # fmt: skip
+    """Return the page of a study of one bench as HTML.
+
+    Parameters
+    ----------
+    name, titles
+        study, and the page's title and message, which may be empty.
+    where, parts, pictures, warnings
+        scene and patterns, and attributes of :class:`Section`.
+    """
+    return page_of([Section(name, *titles, where, pictures, tuple(parts), warnings=tuple(warnings))], titles[0])
+
+
+def _options(scope: Scope) -> list[str]:
+    setup = scope.setup
+    given: list[tuple[str, Any]] = [
+        ("--camera", setup.camera), ("--projector", setup.projector),
+        *(("-D", f"{name}={value}") for name, value in setup.parameters),
+        *(("--over", f"{name}={','.join(values)}") for name, values in scope.sweep),
+        ("--measure", ",".join(scope.measures)),
+        ("--patterns", scope.patterns if scope.patterns != Scope.patterns else None),
+        ("--recipe", scope.recipe), ("--data", scope.data), ("--seed", scope.seeds[0]),
+        ("--variant", setup.variant if setup.variant != Setup.variant else None),
+    ]  # fmt: skip
+    flags = {"--allow-outside-files": setup.outside, "--quick": scope.quick}
+    return [f"{option} {value}" for option, value in given if value] + [flag for flag, on in flags.items() if on]

@@ -98,7 +98,7 @@ def test_without_xarray_it_is_said_in_a_line(monkeypatch: pytest.MonkeyPatch, sh
 
 def test_a_studys_rows_are_a_table(tmp_path: Path) -> None:
     """(Planted: a table of the first row alone.)"""
-    from mitsim.studies.framework.run import StudyResult
+    from mitsim.studies.framework.campaign import StudyResult
 
     class Toy:
         """Findings."""

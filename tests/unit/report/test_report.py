@@ -19,7 +19,7 @@ from mitsim.report import demo_page as R
 from mitsim.report.demo_page import Trust
 from mitsim.report.pages import page_figure, stages_of
 from mitsim.studies.demo import doubts
-from mitsim.studies.framework.page import Part, build_findings
+from mitsim.studies.framework.panels import Part, build_findings
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 N = 32

@@ -18,10 +18,9 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.studies.framework import campaign
-from mitsim.studies.framework.campaign import Where, merge, run_experiment
+from mitsim.studies.framework.campaign import Shard, StudyResult, Where, merge, run_experiment
 from mitsim.studies.framework.experiment import Scope, Setup
-from mitsim.studies.framework.page import build_page
-from mitsim.studies.framework.run import Shard, StudyResult
+from mitsim.studies.framework.panels import build_page
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 

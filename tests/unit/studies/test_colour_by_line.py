@@ -17,7 +17,7 @@ from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
-from mitsim.studies.lit_lines import LitLine, serving
+from mitsim.studies.colour_study import LitLine, serving
 from tests.coloured import LINES, PLACE, folders
 
 pytestmark = pytest.mark.usefixtures("draft_figures")

@@ -13,7 +13,7 @@ from mitsim.core.images import lightness
 from mitsim.report import MODELS, label
 from mitsim.report.pages import Value
 from mitsim.studies import EXPERIMENTS, PAPER
-from mitsim.studies.framework.campaign import Where, run_experiment
+from mitsim.studies.framework.campaign import Where, batches, run_experiment
 from mitsim.studies.framework.claims import UNDECIDED, Judged, Statement, stated
 from mitsim.studies.framework.experiment import (
     IMAGE,
@@ -26,9 +26,7 @@ from mitsim.studies.framework.experiment import (
     measures_of,
     values_of,
 )
-from mitsim.studies.framework.page import Section, build_page, flag_warnings
-from mitsim.studies.framework.panels import Images
-from mitsim.studies.framework.run import batches
+from mitsim.studies.framework.panels import Images, Section, build_page, flag_warnings
 from mitsim.studies.light_studies import DEPTHS, ERROR_SOURCES, EXPOSURES, GLOSS_FAMILIES
 
 TIMES = "\N{MULTIPLICATION SIGN}"

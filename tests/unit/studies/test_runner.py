@@ -16,7 +16,7 @@ from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.report import plots
 from mitsim.studies import STUDIES
-from mitsim.studies.framework.run import Findings, StudyResult, find_study, run_study, study_folder
+from mitsim.studies.framework.campaign import Findings, StudyResult, find_study, run_study, study_folder
 from tests.unit.studies.test_colour_by_line import main
 
 BENCH: Any = SimpleNamespace(loaded=SimpleNamespace(path=Path("scene.xml")))
@@ -66,7 +66,7 @@ def test_findings_that_may_not_be_trusted_end_with_1(
     monkeypatch.setattr("mitsim.verbs.open_as", lambda *_: BENCH)
     for number, (toy, status) in enumerate(((Toy, 0), (Doubtful, 1))):
         measure = partial(run_study, "calibration", lambda bench, request, job, toy=toy: toy(1.0))
-        monkeypatch.setattr("mitsim.studies.framework.run.find_study", lambda *_, measure=measure: measure)
+        monkeypatch.setattr("mitsim.studies.framework.campaign.find_study", lambda *_, measure=measure: measure)
         assert main(["study", "calibration", "-o", str(tmp_path / f"{number}")]) == status
         assert ("mitsim: warning: a cause is missing" in capsys.readouterr().err) == bool(status)
 
@@ -106,5 +106,5 @@ def test_every_study_can_be_found(name: str) -> None:
 
 
 def test_another_name_is_refused_with_the_studies() -> None:
-    with pytest.raises(MitsimError, match=r"'weather'.*calibration, transfer"):
+    with pytest.raises(MitsimError, match=r"'weather'.*calibration, patterns"):
         find_study("weather")

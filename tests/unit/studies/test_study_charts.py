@@ -17,7 +17,7 @@ from mitsim.report.pages import Value
 from mitsim.report.plots import curves, spans_decades, tells
 from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Claim, Point, Results, Scope, Setup
 from mitsim.studies.framework.experiment import find_experiment as find
-from mitsim.studies.framework.page import Section, build_page, tally
+from mitsim.studies.framework.panels import Section, build_page, tally
 from mitsim.studies.sweep_study import axis_of
 from tests.unit.report.test_charts import curve
 

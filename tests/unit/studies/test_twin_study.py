@@ -20,7 +20,7 @@ from mitsim.reconstruct.shifted_codes import Codes, Pose, Side, plane_offsets
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.studies import twin_study
 from mitsim.studies.framework.experiment import Point, Results, Scope, Setup
-from mitsim.studies.framework.page import flag_warnings
+from mitsim.studies.framework.panels import flag_warnings
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.twin_files import TwinFiles
 from mitsim.studies.twin_study import (
