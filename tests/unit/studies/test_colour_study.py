@@ -103,7 +103,7 @@ def test_verdicts_are_on_what_is_added_to_the_floor() -> None:
 def test_every_figure_is_drawn() -> None:
     drawn = STUDY.draw(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
     assert set(drawn) == {"delta_e.png", "ways.png", "images.png", "daylight.png"}
-    assert [text.get_text() for text in drawn["ways.png"].axes[0].get_yticklabels()][::-1] == [
+    assert [text.get_text() for text in drawn["ways.png"].axes[0].get_yticklabels()] == [
         OWN,
         ONE,
         "mosaic, joint",

@@ -231,7 +231,7 @@ def test_the_figures_have_a_bar_for_each_effect_that_is_called_for() -> None:
     drawn = STUDY.draw(invented())
     assert set(drawn) == {"waterfall_assumed.png", "waterfall_calibrated.png", "images.png"}
     axes = drawn["waterfall_assumed.png"].axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()][::-1] == list(EFFECTS[:-1])
+    assert [label.get_text() for label in axes.get_yticklabels()] == list(EFFECTS[:-1])
     assert {bar.get_width() for bar in axes.patches} == {-1.0} and len(axes.patches) == 2 * (len(EFFECTS) - 1)
     captions = [axes.get_xlabel() for axes in drawn["images.png"].axes]
     assert captions == ["", "50.0 dB", "", "33.0 dB"]
