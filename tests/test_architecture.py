@@ -568,13 +568,13 @@ SIZES = {
     "optics": (10, 1944),
     "planner": (6, 1948),
     "reconstruct": (23, 7035),
-    "report": (9, 2383),
+    "report": (9, 2355),
     "scene": (8, 1788),
     "sensor": (5, 1210),
-    "sessions": (4, 1019),
-    "studies": (37, 8402),
+    "sessions": (4, 1020),
+    "studies": (28, 7400),
     "transport": (21, 4579),
-    "verbs": (1, 375),
+    "verbs": (1, 369),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
