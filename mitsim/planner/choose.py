@@ -8,7 +8,8 @@ combination that fits is chosen.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from bisect import bisect_left
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, combinations, product
@@ -449,31 +450,13 @@ def accuracies(finest: float) -> list[float]:
 
 def accuracy_for_time(candidates: Candidates, seconds: float, finest: float, kept: bool = True) -> AccuracyForTime:
     """Return the finest accuracy whose light, frames and truth take at most ``seconds``, or the loosest."""
-
-    def try_accuracy(accuracy: float) -> AccuracyForTime:
-        taken, keeps = candidates.seconds(accuracy)
-        return AccuracyForTime(accuracy, taken, taken <= seconds and (keeps or not kept))
-
     grid = accuracies(finest)
-    best, too_fine = try_accuracy(grid[0]), len(grid)
-    if not best.fits:
-        # What keeps no accuracy at all is for the plan to say; here only time counts.
-        return AccuracyForTime(best.accuracy, best.seconds, best.seconds <= seconds)
-    coarse = 0
-    while too_fine - coarse > 1:
-        middle = (coarse + too_fine) // 2
-        found = try_accuracy(grid[middle])
-        if found.fits:
-            best, coarse = found, middle
-        else:
-            too_fine = middle
-    return best
 
+    def fails(place: int) -> bool:
+        taken, keeps = candidates.seconds(grid[place])
+        return taken > seconds or (kept and not keeps)
 
-def time_warnings(found: AccuracyForTime, seconds: float, around: float) -> Iterator[str]:
-    """Yield a warning if the run needs more than ``seconds``, of which ``around`` are for other stages."""
-    if not found.fits:
-        yield (
-            f"{seconds:g} seconds are too few: even accuracy {found.accuracy:g}, which was taken, is predicted to take "
-            f"{found.seconds + around:.1f} s from start to finish; give more"
-        )
+    place = bisect_left(range(len(grid)), True, key=fails) - 1
+    taken, _ = candidates.seconds(grid[max(place, 0)])
+    # If no accuracy at all is kept, the plan is flagged; here only time counts.
+    return AccuracyForTime(grid[max(place, 0)], taken, taken <= seconds)

@@ -61,7 +61,6 @@ from mitsim.planner.choose import (
     costly_effects,
     counts_of,
     predicted_candidate,
-    time_warnings,
     unit_costs_of,
     value_of_refining,
 )
@@ -177,7 +176,14 @@ def plan_within(
         if finer.fits and finer.accuracy <= found.accuracy:
             runs, candidates, found = closer, others, finer
     plan = _decide(runs, found.accuracy, candidates).taking(plan=time.perf_counter() - started)
-    return replace(plan, asked_seconds=seconds, warnings=(*time_warnings(found, seconds, around), *plan.warnings))
+    warnings = plan.warnings
+    if not found.fits:
+        warnings = (
+            f"{seconds:g} seconds are too few: even accuracy {found.accuracy:g}, which was taken, is predicted to take "
+            f"{found.seconds + around:.1f} s from start to finish; give more",
+            *warnings,
+        )
+    return replace(plan, asked_seconds=seconds, warnings=warnings)
 
 
 def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:

@@ -55,6 +55,7 @@ _THIN, _MANY = 0.25, 8.0
 _STRAIGHT = 0.1
 _SHARES = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
 _MARGIN = 0.02
+_ARRAYS = ("pixel", "flux", "sensor", "tangent", "throughput")
 
 
 @keep_scenes()
@@ -204,13 +205,14 @@ def _refine(
         unknown = (half <= finest * _DEEPER) & (spread[:, 0] > pitch)
         lost = ~done & (edge | unknown | (half == finest) | (len(row) > _MOST))
         flux, pixel = stands_for * _fluxes(tracer, row, column, size, n), _pixel(row, column, n)
-        points = _points(nodes.take(lost), flux[lost], pixel[lost], geometry)
+        points, number = _points(nodes.take(lost), flux[lost], pixel[lost], geometry)
         if len(row) <= _MOST:
-            kept = ~unknown[lost][points.number]
-            unresolved += float(points.beams.flux[~kept].sum())
-            points = points.take(kept)
-        parts.append(points.beams)
-        variance += points.variance
+            kept = ~unknown[lost][number]
+            unresolved += float(points.flux[~kept].sum())
+            points = replace(points, **{name: getattr(points, name)[kept] for name in _ARRAYS})
+            number = number[kept]
+        parts.append(points)
+        variance += float(np.square(np.bincount(number, points.flux)).sum()) if len(number) else 0.0
         thin, way = _thinness(nodes)
         for i, j in np.ndindex(2, 2):
             corners = _stretch(nodes.quarter(i, j).take(done), way[done], stands_for[done])
@@ -265,25 +267,11 @@ def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
     return corners
 
 
-@dataclass(frozen=True, eq=False)
-class _Points:
-    beams: Beams
-    number: IntArray
-
-    @property
-    def variance(self) -> float:
-        return float(np.square(np.bincount(self.number, self.beams.flux)).sum()) if len(self.number) else 0.0
-
-    def take(self, chosen: Mask) -> _Points:
-        names = ("pixel", "flux", "sensor", "tangent", "throughput")
-        arrays = {name: getattr(self.beams, name)[chosen] for name in names}
-        return _Points(replace(self.beams, **arrays), self.number[chosen])
-
-
-def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> _Points:
+def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> tuple[Beams, IntArray]:
     """Convert undivided squares to beams without extent, one at each node (q, 3, 3) that meets the sensor.
 
-    A node represents its part of the square's flux (q,): for squares of an edge that is right in the mean.
+    A node represents its part of the square's flux (q,): for squares of an edge that is right in the mean. The numbers
+    of the beams' squares are returned beside.
     """
     seen = nodes.valid & (np.abs(nodes.sensor) < geometry.half_width).all(axis=-1)
     seen &= (np.abs(nodes.tangent) <= geometry.tan_half_fov).all(axis=-1)
@@ -293,7 +281,7 @@ def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGe
         np.broadcast_to(v[square, i, j][:, None, None], (len(square), 2, 2, 2)) for v in (nodes.sensor, nodes.tangent)
     )
     whole = np.ones((len(square), 2, 2))
-    return _Points(Beams(pixel[square], light[square, i, j], sensor, tangent, whole, 0.0), square)
+    return Beams(pixel[square], light[square, i, j], sensor, tangent, whole, 0.0), square
 
 
 def _box(valid: Mask, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -350,8 +338,7 @@ def _pixel(row: IntArray, column: IntArray, n: int) -> IntArray:
 def _join(parts: list[Beams], left: FloatArray) -> Beams:
     pair = np.zeros((0, 2, 2, 2))
     none = Beams(np.zeros(0, np.int64), np.zeros(0), pair, pair, np.zeros((0, 2, 2)), 0.0)
-    names = ("pixel", "flux", "sensor", "tangent", "throughput")
-    arrays = {name: np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names}
+    arrays = {name: np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in _ARRAYS}
     return Beams(**arrays, unresolved=float(left[0]), error=math.sqrt(left[1]))
 
 
