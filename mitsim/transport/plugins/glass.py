@@ -167,19 +167,14 @@ def plugin_class() -> type:
             dr.make_opaque(self.wavelength)
 
         def sample(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            sample1: mi.Float,
-            sample2: mi.Point2f,
-            active: mi.Bool = True,
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
         ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
             wavelength = si.wavelengths[0] if mi.is_spectral else self.wavelength
             part, cosine, eta_it, eta_ti = mi.fresnel(si.wi.z, dr.sqrt(self.model.index_squared(wavelength)))
             kinds = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
             may = [ctx.is_enabled(kind, component) for component, kind in enumerate(kinds)]
             # Where both may be, chance decides and the weight is 1; else the weight is the part.
-            reflected = sample1 < part if all(may) else mi.Bool(may[0])
+            reflected = s1 < part if all(may) else mi.Bool(may[0])
             chosen = dr.select(reflected, part, 1 - part)
             active = active & (si.wi.z != 0) & any(may)
             bs = dr.zeros(mi.BSDFSample3f)

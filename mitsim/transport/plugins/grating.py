@@ -245,14 +245,9 @@ def plugin_class() -> type:
             return mi.depolarizer(dr.select(active, self.reflectance * density, 0)), pdf
 
         def sample(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            sample1: mi.Float,
-            sample2: mi.Point2f,
-            active: mi.Bool = True,
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
         ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-            chosen = sample1 * self._total()
+            chosen = s1 * self._total()
             reached = mi.Float(self.diffuse)
             lambertian = chosen < reached
             shift = mi.Float(0)
@@ -261,11 +256,11 @@ def plugin_class() -> type:
                     shift = dr.select(chosen >= reached, shifts[channel], shift)
                     reached += part / len(shifts)
             g = self._grating_vector(si)
-            normal = mi.warp.square_to_std_normal(sample2)
+            normal = mi.warp.square_to_std_normal(s2)
             across, along = shift + self.sigma * normal.x, self.sigma_groove * normal.y
             lobe = mi.Vector2f(across * g.x - along * g.y, across * g.y + along * g.x)
             lobe -= mi.Vector2f(si.wi.x, si.wi.y)
-            flat = dr.select(lambertian, mi.warp.square_to_uniform_disk_concentric(sample2), lobe)
+            flat = dr.select(lambertian, mi.warp.square_to_uniform_disk_concentric(s2), lobe)
             squared = dr.squared_norm(flat)
             bs = dr.zeros(mi.BSDFSample3f)
             bs.wo = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1 - squared))

@@ -89,23 +89,18 @@ def plugin_classes() -> dict[str, type]:
             return 1 - second, second
 
         def sample(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            one: mi.Float,
-            two: mi.Point2f,
-            active: mi.Bool = True,
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
         ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
             shares, count = self._shares(si, active), self.parts[0].component_count()
             if ctx.component != _ANY:
                 which = int(ctx.component >= count)
                 alone = mi.BSDFContext(ctx.mode, ctx.type_mask, ctx.component - which * count)
-                bs, value = self.parts[which].sample(alone, si, one, two, active)
+                bs, value = self.parts[which].sample(alone, si, s1, s2, active)
                 return bs, value * shares[which]
-            chosen = one < shares[1]
-            rest = (one - shares[1]) / shares[0]
-            bs, value = self.parts[0].sample(ctx, si, rest, two, active & ~chosen)
-            other, its_value = self.parts[1].sample(ctx, si, one / shares[1], two, active & chosen)
+            chosen = s1 < shares[1]
+            rest = (s1 - shares[1]) / shares[0]
+            bs, value = self.parts[0].sample(ctx, si, rest, s2, active & ~chosen)
+            other, its_value = self.parts[1].sample(ctx, si, s1 / shares[1], s2, active & chosen)
             other.sampled_component += count
             bs, value = dr.select(chosen, other, bs), dr.select(chosen, its_value, value)
             single = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -136,14 +131,9 @@ def plugin_classes() -> dict[str, type]:
                 self.white = make(own)
 
         def sample(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            one: mi.Float,
-            two: mi.Point2f,
-            active: mi.Bool = True,
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
         ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-            bs, value = self.parts[0].sample(ctx, si, one, two, active)
+            bs, value = self.parts[0].sample(ctx, si, s1, s2, active)
             if ctx.mode == mi.TransportMode.Radiance:
                 return bs, value
             single = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
