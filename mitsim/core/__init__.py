@@ -1,1 +1,1 @@
-"""What every stage shares: errors, units, named random streams, frames on disk, manifests, this machine."""
+"""Basics that every stage shares: errors, units, named random streams, frames on disk, manifests, the machine."""

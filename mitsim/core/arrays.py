@@ -1,7 +1,7 @@
 """Arrays that several rooms exchange, and files of them: NPY, NPZ and MATLAB files in, HDF5 and MATLAB files out.
 
-NumPy maps an NPY file into memory, where a file that is cut short meanwhile ends the process, and allocates what the
-header of one in an NPZ claims. Here what a header claims is held against the file first, and numbers are copied.
+NumPy maps an NPY file into memory, where a file that is cut short meanwhile ends the process, and allocates as much
+as the header of one in an NPZ claims. Here a header's claims are held against the file first, and numbers are copied.
 
 HDF5's own writer cannot close a file on a disk that is full: it says so many times on stderr, and once more when the
 program ends, or ends it. Here it writes through Python, which keeps the error until the file is closed.
@@ -47,7 +47,7 @@ def sum_of_squares(values: FloatArray) -> float:
 
 
 def mean_of_neighbours(values: FloatArray) -> FloatArray:
-    """(rows, columns) mean over the 3 x 3 neighbours of each of the ``values``; beyond an edge, what stands there.
+    """Return the mean over the 3 x 3 neighbours of each of the ``values`` (rows, columns), edges repeated.
 
     scipy.ndimage has the same, and takes 50 ms to import.
     """
@@ -91,7 +91,7 @@ _AGAIN = 2
 
 @dataclass(frozen=True)
 class Npy:
-    """What an NPY file's header says: shape and type of its array, whether columns come first, and where it begins."""
+    """The header of an NPY file: shape and type of its array, whether columns come first, and where it begins."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -122,7 +122,7 @@ class Npy:
 
     @property
     def bytes(self) -> int:
-        """Of its numbers."""
+        """Bytes of its numbers."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     def part(self, file: BinaryIO, index: int | None = None) -> npt.NDArray[Any]:
@@ -207,8 +207,8 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
 def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] | None = None) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading after all that it holds was checked; every HDF5 input is opened here.
 
-    HDF5 follows links to other files, unpacks what claims to be a thousand times larger (a million times by two
-    filters), and reads what was never stored as zeros of any size.
+    HDF5 follows links to other files, unpacks data that claim to be a thousand times larger (a million times by two
+    filters), and reads data that were never stored as zeros of any size.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def hdf5_errors(path: Path) -> Iterator[None]:
 
 
 class _FirstErrorFile:
-    """A file whose first error in writing is kept as ``error``: what follows is dropped, as if it were written."""
+    """A file whose first error in writing is kept as ``error``; later data are dropped, as if they were written."""
 
     def __init__(self, disk: FileIO) -> None:
         self._disk = disk
@@ -400,7 +400,7 @@ def read_variables(path: Path) -> dict[str, Any]:
 def _arrays_in(file: BinaryIO) -> dict[str, int]:
     """Return the bytes that each array of real numbers and each text of an open MATLAB ``file`` takes, by name.
 
-    SciPy's readers allocate what a file claims, and call themselves for each cell within a cell until the process
+    SciPy's readers allocate as much as a file claims, and call themselves for each cell within a cell until the process
     ends. Here no more than the beginning of each variable is unpacked, after "MAT-File Format" (MathWorks).
     """
     head = file.read(_HEAD)

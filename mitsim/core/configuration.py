@@ -104,7 +104,7 @@ _NAMED = re.compile(r"\s*(?:(\[\[?)([^\]]+)\]|([\w\"' .-]+?)\s*=)")
 
 
 def mistakes(model: type[BaseModel], data: Table) -> list[Mistake]:
-    """Return what is wrong with ``data`` that is to be a ``model``; an empty list if nothing is."""
+    """Return the mistakes in ``data`` that is to be a ``model``; an empty list if there are none."""
     try:
         model.model_validate(data)
     except ValidationError as error:
@@ -259,18 +259,18 @@ def validate(model: type[Model], data: dict[str, Any], where: str, context: obje
     Parameters
     ----------
     model
-        what to make of it.
+        class of the result.
     data
         names and values, as read from a file.
     where
-        what the message begins with.
+        beginning of the message.
     context
         passed on to the model's validators.
 
     Raises
     ------
     MitsimError
-        for fields that break a rule: value, rule, and what to do. Of a :class:`Table` all of them, each on a line; of
+        for fields that break a rule: value, rule, and remedy. Of a :class:`Table` all of them, each on a line; of
         other data, which programs write, the first.
     """
     try:
@@ -294,7 +294,7 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"]
     shelf
         where shipped ones lie.
     ending
-        what follows the name: a file in the folder ``name``, or a suffix.
+        end of the path: a file in the folder ``name``, or a suffix.
     field
         which all files have that a message may offer, as :func:`shipped_files` takes it.
 
@@ -533,7 +533,7 @@ def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]
     Parameters
     ----------
     models
-        What the function makes of its ``**options``.
+        Models of the function's ``**options``.
     without
         Fields that the function does not take by keyword, with spaces between.
     """

@@ -68,7 +68,7 @@ figure.savefig(io.BytesIO(), format="png")
 
 @dataclass(frozen=True)
 class Check:
-    """One thing the doctor looked at: ``ok`` or not, what was seen, and the one command that mends it."""
+    """One finding of the doctor: ``ok`` or not, a detail, and the one command that mends it."""
 
     name: str
     ok: bool
@@ -167,7 +167,7 @@ def _without_gpu(variant: str) -> MitsimError:
 
 
 def has_gpu() -> bool:
-    """Whether Dr.Jit finds a GPU for the cuda_ variants; never raises for the lack of one.
+    """Return True if Dr.Jit finds a GPU for the cuda_ variants; never raise for the lack of one.
 
     It imports Dr.Jit, which reads the path of its LLVM then: not to be asked before an LLVM is chosen.
     """
@@ -177,7 +177,7 @@ def has_gpu() -> bool:
 
 
 def doctor() -> list[Check]:
-    """Return all checks in order. What can crash or hang runs in child processes; they take some ten seconds."""
+    """Return all checks in order. Checks that can crash or hang run in child processes; all take some ten seconds."""
 
     def check_openexr() -> str:
         # Imported here: a broken OpenEXR must be a finding, not the end of the doctor.
@@ -298,7 +298,7 @@ assert abs(float(total[0]) - 165.0) < 1e-3, total
 
 @dataclass(frozen=True)
 class Probe:
-    """Whether a child process did what it should, and what was seen."""
+    """The outcome of a child process: ``ok`` or not, and a detail."""
 
     ok: bool
     detail: str
@@ -313,7 +313,7 @@ def install_command() -> str:
 
 
 def version(path: Path | str) -> int | None:
-    """LLVM's major version as the library's file name at ``path`` (links followed) tells it, None if it does not."""
+    """Return LLVM's major version by the library's file name at ``path`` (links followed); None if it has none."""
     for name in (Path(path).name, Path(os.path.realpath(path)).name):
         match = re.search(r"libLLVM(?:-|\.so\.)(\d+)", name)
         if match:

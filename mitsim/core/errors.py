@@ -1,4 +1,4 @@
-"""The exception for what a user can cause and mend, and the check of arguments of public functions.
+"""The exception for faults that a user can cause and mend, and the check of arguments of public functions.
 
 Arguments of another kind than their annotation says are refused by it in a line.
 """
@@ -22,9 +22,9 @@ _LONGEST = 1500
 class MitsimError(Exception):
     """A request that cannot be served; the command line prints it on one line and exits with status 2.
 
-    The ``message`` is one line: what is wrong, where, the value received, what is allowed, and what to do. Of several
-    ``mistakes`` in one file each has a line of its own under it. Whatever a hostile file brought into them, they are
-    printable and not long.
+    The ``message`` is one line: the fault, its place, the value received, the values allowed, and the remedy. Each of
+    several ``mistakes`` in one file has a line of its own under it. They are printable and not long, even if they quote
+    a hostile file.
     """
 
     def __init__(self, message: str, *mistakes: str) -> None:
@@ -44,7 +44,7 @@ class ArgumentError(MitsimError):
         self.others: tuple[ArgumentError, ...] = ()
 
     def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, str]]:
-        """As a process that works for a study hands it back."""
+        """Pickle the refusal by its own arguments, because a process that works for a study hands it back."""
         return ArgumentError, (self.argument, self._message)
 
 
@@ -144,7 +144,7 @@ def checked_fields(made: C) -> C:
 
 
 def _kinds(annotation: object, function: Callable[..., object]) -> list[Kind]:
-    """Return what an ``annotation`` such as ``float | Literal["auto"] | None`` allows; empty: anything."""
+    """Return the kinds that an ``annotation`` such as ``float | Literal["auto"] | None`` allows; empty: any."""
     if not isinstance(annotation, str) or annotation.startswith("Unpack"):
         return []
     found: list[Kind] = []

@@ -4,10 +4,10 @@ Channels are float32 (expected electrons, variances) or uint32 (digital numbers)
 metadata entry is a header attribute `mitsim.<key>` holding JSON text: EXR's own numbers are 32-bit and would
 cut seeds and exposure times short.
 
-OpenEXR's own reader takes the header: it allocates nothing by what that claims, and damaged ones raise. Three things
+OpenEXR's own reader takes the header: it allocates nothing by its claims, and damaged ones raise. Three things
 are left to check here. It compares the names of channels with each other, which takes 18 s for a list of 100 000, so it
 is given the beginning of the file alone. It passes over an attribute that claims 2 GB, for which the older reader in
-Mitsuba allocates them. And reading the pixels allocates what a header claims, 4 GiB for a file of 300 bytes.
+Mitsuba allocates them. And reading the pixels allocates as much as a header claims, 4 GiB for a file of 300 bytes.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -
     checksums
         SHA-256 by name.
     remedy
-        what to do where they differ.
+        advice where they differ.
 
     Raises
     ------

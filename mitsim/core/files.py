@@ -78,7 +78,7 @@ PAGE, PICTURES = "report.html", "pictures"
 
 
 def remove_page(folder: Path) -> None:
-    """Remove the page of a ``folder`` and its pictures: what it shows is about to change."""
+    """Remove the page of a ``folder`` and its pictures, because the content that it shows is about to change."""
     (folder / PAGE).unlink(missing_ok=True)
     for picture in (folder / PICTURES).glob("*.png"):
         picture.unlink()
@@ -93,7 +93,7 @@ _UNFINISHED = ".mitsim.part"
 
 
 def sweep(folder: Path) -> None:
-    """Remove what killed processes left half-written in a ``folder`` that this one holds, and among its pictures."""
+    """Remove half-written files of killed processes from a ``folder`` that this one holds, and from its pictures."""
     for part in (*folder.glob(_PART), *(folder / PICTURES).glob(_PART)):
         part.unlink(missing_ok=True)
 
@@ -158,7 +158,7 @@ def _check_name(path: Path) -> None:
 
 
 def check_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> None:
-    """Refuse a place that :func:`prepare_output` would refuse, before what is slow to import; nothing is left behind.
+    """Refuse a place that :func:`prepare_output` would refuse, before slow imports; nothing is left behind.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
 
 
 def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
-    """Refuse to replace what a work reads.
+    """Refuse to replace a file that a work reads.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ def _lock(path: Path, name: Path) -> Iterator[None]:
 
 
 def _unfinished_work(folder: Path) -> str:
-    """Return what a killed work left in the folder, and how to go on; nothing when there is none."""
+    """Return the number of files that a killed work finished, and how to go on; nothing when there are none."""
     try:
         name = PAIRS if (folder / PAIRS).is_file() else "manifest.json"
         manifest = json.loads(read_text(folder / name, _LONGEST_HEAD))
@@ -403,7 +403,7 @@ FRAME_LIMITS = f"at most {MOST_SIDE} pixels a side and {MOST_PIXELS} in all"
 
 
 def fits_a_frame(shape: Sequence[int]) -> bool:
-    """Whether a picture of this ``shape`` (rows, columns) is no larger than a frame may be."""
+    """Return True if a picture of this ``shape`` (rows, columns) is no larger than a frame may be."""
     return max(shape, default=0) <= MOST_SIDE and math.prod(shape) <= MOST_PIXELS
 
 
@@ -435,7 +435,7 @@ def resolve(path: Path | str) -> Path:
 
 @contextmanager
 def stderr_silenced() -> Iterator[None]:
-    """Drop what native code writes to stderr about a damaged file, past Python, because it raises too.
+    """Drop lines that native code writes to stderr about a damaged file, past Python, because it raises too.
 
     One thread at a time, so that two do not restore each other's stream.
 

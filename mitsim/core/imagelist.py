@@ -2,8 +2,8 @@
 
 Files of a folder are in the order of their numbers.
 
-None is opened here, and numpy is not imported, so that a mistake is told at once. `mitsim.core.images` reads numbers,
-`mitsim.core.prepare` makes frames of them.
+None is opened here, and numpy is not imported, so that a mistake is reported at once. `mitsim.core.images` reads
+numbers, `mitsim.core.prepare` makes frames of them.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Raw(Configuration):
 
     @classmethod
     def of(cls, shape: str, bits: int | None, byte_order: str) -> Raw:
-        """From what the command line says; MitsimError for what is none.
+        """Make one of words of the command line; MitsimError for words that are none.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Crop(Configuration):
 
     @classmethod
     def of(cls, text: str) -> Crop:
-        """From the ``text`` ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS of a command line; MitsimError for another."""
+        """Make one of the ``text`` ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS of a command line; MitsimError for another."""
         numbers = re.fullmatch(r"([0-9]{1,5}),([0-9]{1,5})(?:,([0-9]{1,5}),([0-9]{1,5}))?", text)
         if not numbers:
             raise ArgumentError("crop", f"{text!r}: give ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS [pixels]")
@@ -115,7 +115,7 @@ class Crop(Configuration):
 
 
 class Preparation(Configuration):
-    """What is done to the numbers of a file before they are a frame, in the order of these fields."""
+    """Steps that make a frame of a file's numbers, in the order of these fields."""
 
     divide_by: int | None = Field(default=None, ge=1, le=_LARGEST_FACTOR)
     """Factor that all numbers have; none: found, where a camera's numbers were shifted to the high bits."""
@@ -171,7 +171,7 @@ def check_channel(name: str) -> str:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What pictures are of, and which of them are read.
+    """The kind of pictures, and the files that are read.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class Wanted:
     raw
         how files without a header are read; None: such files are refused.
     orientation
-        what pictures that are to be shown turned are: None: refused; `file`: turned so; a number: as they are stored.
+        of pictures that are to be shown turned: None: they are refused; `file`: turned so; a number: read as stored.
     mosaic
         colour filters that the frames are behind; None: nobody says. A file that states others is refused.
     """
@@ -205,7 +205,7 @@ class Wanted:
         return cls(raw=raw, orientation=how.orientation, mosaic=how.mosaic)
 
     def refusal(self, path: Path, reason: str) -> MitsimError:
-        """Return a line that states for what ``reason`` the file ``path`` is not read."""
+        """Return a line with the ``reason`` why the file ``path`` is not read."""
         return MitsimError(f"{self.what} {path}: {reason}")
 
 

@@ -3,8 +3,8 @@
 PNG, TIFF, NPY, OpenEXR, DNG and bare numbers are read. People get PNG bytes and the text that shows them in a notebook.
 
 Nothing is scaled, inverted or made grey, and turned only where that is asked for: a file whose numbers its reader would
-change is refused. What a header
-claims is bounded before pixels are read, and files are copied, not mapped: one that is cut short meanwhile is refused.
+change is refused. A header's claims
+are bounded before pixels are read, and files are copied, not mapped: one that is cut short meanwhile is refused.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
     path
         of the file.
     wanted
-        what is read.
+        kind of picture, and files that are read.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def own_end(values: Numbers) -> float | None:
 
 
 def _read_header(path: Path, wanted: Wanted) -> tuple[tuple[int, tuple[int, int], float], Iterator[Numbers]]:
-    """Return what the header of a file says and an iterator over its pages: what it claims is allocated."""
+    """Return pages, size and memory of a pixel by the header of a file, and an iterator over its pages."""
     check_plain(path, wanted.what)
     ending = path.suffix.lower()
     if ending not in _READERS:

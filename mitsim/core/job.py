@@ -1,4 +1,4 @@
-"""What goes with long work besides its inputs: a clock, progress, limits, and what this machine has left.
+"""Companions of long work: a clock, progress, limits, and the memory and disk that this machine has left.
 
 Work that would take more than that is refused.
 """
@@ -42,7 +42,7 @@ class CompiledKernels:
     seconds: float = 0.0
 
     def since(self, earlier: CompiledKernels) -> CompiledKernels:
-        """Those of them that were compiled after ``earlier``."""
+        """Return those that were compiled after ``earlier``."""
         return CompiledKernels(self.number - earlier.number, self.seconds - earlier.seconds)
 
 
@@ -69,7 +69,7 @@ def compiled_kernels() -> CompiledKernels:
 
 
 class Watch:
-    """Who is told what work is at, as the rows on a terminal are. This one ignores it all."""
+    """A receiver of progress, such as the rows on a terminal. This one ignores it all."""
 
     def begin(self, stage: str) -> None:
         """Note that the ``stage`` goes on from here."""
@@ -93,7 +93,7 @@ class Clock:
     start
         seconds that the program has run already, which count as a stage of that name.
     watch
-        who is told of stages.
+        receiver of progress.
     prefix
         before their names, there.
     """
@@ -117,7 +117,7 @@ class Clock:
 
     @check_arguments
     def predict(self, stages: Mapping[str, float]) -> None:
-        """Tell who watches what ``stages`` [s] are predicted to take; those that have begun are left out."""
+        """Report the predicted seconds of ``stages``; those that have begun are left out."""
         self._watch.predict({self._prefix + name: own for name, own in stages.items() if name not in self._stages})
 
     def apart(self, prefix: str) -> Clock:
@@ -157,7 +157,7 @@ class Clock:
 @checked_fields
 @dataclass(frozen=True)
 class Limits:
-    """What one command may take: wall seconds, and bytes of memory (None: nine tenths of what is free)."""
+    """Limits of one command: wall seconds, and bytes of memory (None: nine tenths of what is free)."""
 
     seconds: float = 86400.0
     memory_bytes: float | None = None
@@ -171,7 +171,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a work is estimated to take: wall seconds, bytes of memory beyond those in use now, bytes of disk."""
+    """Estimated cost of a work: wall seconds, bytes of memory beyond those in use now, bytes of disk."""
 
     seconds: float = 0.0
     memory_bytes: float = 0.0
@@ -226,7 +226,7 @@ class Job:
     clock
         takes the seconds of each stage.
     progress
-        is told each stage and its finished part.
+        function that gets each stage and its finished part.
     limits
         beyond which the work is refused before it begins.
     command
@@ -253,7 +253,7 @@ class Job:
         what
             the work, for the message.
         least
-            what is known before a plan; None: nothing.
+            least cost that is known before a plan; None: not known.
 
         Raises
         ------
@@ -369,7 +369,7 @@ def memory_since(held: float) -> float:
 
 
 def running_seconds() -> float:
-    """Seconds since this process began: what its start took, when asked for at the beginning of work."""
+    """Return the seconds since this process began, which its start took when work begins."""
     try:
         # proc(5): in ticks since boot. psutil adds the time of boot to it, which Linux tells in whole seconds.
         began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")

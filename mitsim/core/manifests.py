@@ -1,6 +1,6 @@
-"""What manifest.json of a RUN and of a CAL folder says: plain data in, a checked and frozen model out, and back.
+"""Content of manifest.json of RUN and CAL folders: plain data in, a checked and frozen model out, and back.
 
-Writers and readers use these models, so each field stands once; docs/formats.md shows them as tables.
+Writers and readers use these models, so each field is declared once; docs/formats.md shows them as tables.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class _Part(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _of_0_3_0(cls, data: Any, info: pydantic.ValidationInfo) -> Any:
-        """Where no format was stated, as in version 0.3.0, unknown fields are others' and left alone."""
+        """Drop unknown fields where no format was stated, as in version 0.3.0, because they are others'."""
         if info.context == _UNVERSIONED and isinstance(data, dict):
             return {name: value for name, value in data.items() if name in cls.model_fields}
         return data
@@ -104,7 +104,7 @@ class Digital(_Part):
 
     @property
     def noise_is_stated(self) -> bool:
-        """Whether all of a frame's noise is known, and not only what its light makes."""
+        """True if all of a frame's noise is known, and not only that of its light."""
         return self.read_noise_e is not None
 
     def rate(self, dn: npt.NDArray[Any]) -> FloatArray:
@@ -119,7 +119,7 @@ class Digital(_Part):
     def variance(self, light: FloatArray | float, shots: int = 1) -> FloatArray:
         """Return the noise variance [(electrons / s)^2] of a sum or difference of shots, after EMVA 1288.
 
-        It counts shot noise of light and dark current, read noise and rounding; what is not stated counts as 0.
+        It counts shot noise of light and dark current, read noise and rounding; parts that are not stated count as 0.
 
         Parameters
         ----------
@@ -244,7 +244,7 @@ class _Head(_Part):
 
 
 class AmbientFile(_Part):
-    """The ambient frame: what a camera sees with the projector off, taken off frames that are not one of a pair."""
+    """The ambient frame, seen with the projector off, which is taken off frames that are not one of a pair."""
 
     file: FileName
     """Name of the frame in the run's folder, without a path."""
@@ -272,7 +272,7 @@ class ClosingFile(_Part):
 
 
 class RunHead(_Head):
-    """What an unfinished run's manifest says, and a finished one's begins with."""
+    """The manifest of an unfinished run, with which that of a finished one begins."""
 
     kind: Literal["capture"] = "capture"
     """What the folder is."""
@@ -287,7 +287,7 @@ class RunHead(_Head):
 
 
 class RunManifest(RunHead):
-    """A capture: how its frames are read, and what was projected."""
+    """A capture: how its frames are read, and which patterns were projected."""
 
     camera: Plain
     """Identity that a calibration must share; anything, as long as both are equal."""
@@ -421,7 +421,7 @@ class FittedNumber(_Part):
 
 
 class ModelledFactors(_Part):
-    """What modelled factors were fitted by."""
+    """The fit of modelled factors."""
 
     model: Literal["geometric", "wave"]
     """Of the mask's shadow."""

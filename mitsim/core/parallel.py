@@ -36,8 +36,8 @@ _BRING_BLAS = "scipy.linalg", "scipy.special"
 def single_threaded_blas() -> Iterator[None]:
     """Keep BLAS to one thread inside the context.
 
-    Their number is the process's, and contexts of several threads overlap by chance. So what was found is put back when
-    the last of all is left: at the first one's end BLAS had its threads again while another thread worked.
+    The number of threads is the process's, and contexts of several threads overlap by chance. So earlier numbers are
+    put back when the last context is left: at the first one's end BLAS had its threads again while another worked.
     """
     global _inside_blas
     with _counting:
@@ -112,13 +112,13 @@ os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not live on 
 class Behind(Generic[Item]):
     """Work on items in threads while the next ones are made; a context, which is left when all of it is done.
 
-    Two lots of items are held: the one that is worked on, and the one that is made meanwhile. What fails is raised
+    Two lots of items are held: the one that is worked on, and the one that is made meanwhile. Errors are raised
     where the work is waited for. When the context is left by an error or Control-C, items that nobody has begun are
     left out, and those that somebody has are finished.
     """
 
     def __init__(self, function: Callable[[Item], Any]) -> None:
-        """Nothing is done yet; ``function`` is what is done to each item."""
+        """Make a context that does ``function`` to each item."""
         self._function, self._pool = function, ThreadPoolExecutor(workers())
         self._begun: list[Future[Any]] = []
 

@@ -2,7 +2,7 @@
 
 The frame has no common factor, dark signal or uneven response, and is one plane of a mosaic, turned and cropped.
 
-What is saturated in a file stays so: such pixels, and those that turning makes of them, have the end of the scale that
+Saturated pixels of a file stay so: they, and those that turning makes of them, have the end of the scale that
 :attr:`Preparer.digital` states.
 """
 
@@ -41,7 +41,7 @@ class Preparer:
     Attributes
     ----------
     how
-        what is done.
+        steps that are done.
     digital
         how digital numbers of the frames become electrons a second.
     end
@@ -65,12 +65,12 @@ class Preparer:
     def of(
         cls, how: Preparation, digital: Digital, wanted: Wanted, base: Path = Path(), end: float | None = None
     ) -> Preparer:
-        """With the dark and flat frames of ``how``.
+        """Make one with the dark and flat frames of ``how``.
 
         Parameters
         ----------
         how
-            what is done; of one plane.
+            steps that are done, to one plane.
         digital
             how numbers become electrons a second, before any is corrected.
         wanted
@@ -115,7 +115,7 @@ class Preparer:
 
     @property
     def counts(self) -> bool:
-        """Whether frames hold the numbers of the files, and nothing between."""
+        """True if frames hold the numbers of the files, and none between."""
         return self.dark is None and self.response is None and not self.how.turn_deg
 
     def plane(self, values: Numbers) -> Numbers:
@@ -226,7 +226,7 @@ def _part(path: Path, shape: tuple[int, ...], how: Preparation) -> tuple[tuple[i
 
 @dataclass
 class CommonFactor:
-    """What all numbers of some files are multiples of.
+    """The common factor of all numbers of some files.
 
     Attributes
     ----------

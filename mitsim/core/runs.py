@@ -46,7 +46,7 @@ class Capture:
     Attributes
     ----------
     manifest
-        what was projected and how the frames are read.
+        patterns that were projected, and how the frames are read.
     folder
         where the files lie; None for a capture in memory. Frames are then read when they are first asked for.
     """
@@ -79,7 +79,7 @@ class Capture:
 
     @property
     def name(self) -> str:
-        """The folder, or what messages call a capture in memory."""
+        """The folder, or the name of a capture in memory for messages."""
         return str(self.folder) if self.folder else "the capture"
 
     @cached_property
@@ -408,14 +408,14 @@ def _size(shape: tuple[int, ...]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Ambient:
-    """What a camera sees with the projector off, as it is taken off every frame of a run.
+    """Light that a camera sees with the projector off, as it is taken off every frame of a run.
 
     Attributes
     ----------
     rate
         (rows, columns) mean over the shots [electrons/s].
     variance
-        (rows, columns) of that mean [(electrons/s)^2], of what the manifest states of the sensor's noise. It is one
+        (rows, columns) of that mean [(electrons/s)^2], by the noise that the manifest states. It is one
         draw, the same in all frames.
     shots
         that were averaged.
@@ -452,7 +452,7 @@ class ClosingFrame:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What was measured under one pattern.
+    """The measurement under one pattern.
 
     Attributes
     ----------
@@ -462,7 +462,7 @@ class Measurement:
     row, column
         indices (i, j) of the pattern.
     light
-        (rows, columns) [electrons/s] sum of its shots as they were read: what their shot noise is of.
+        (rows, columns) [electrons/s] sum of its shots as they were read, which have shot noise.
     shots
         their number.
     saturated
@@ -506,7 +506,7 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False)
 class LineTruth:
-    """What a perfect image of a line would show.
+    """A perfect image of a line.
 
     Attributes
     ----------
@@ -532,7 +532,7 @@ class MosaicCapture:
     shots
         the frames. Their own truth is the lines' by the light that all pixels together see of each.
     manifest
-        lines, filters, and what each passes.
+        lines, filters, and the light that each passes.
     truths
         of each line by its name; none of a real camera.
     """
@@ -661,7 +661,7 @@ class Recorder:
         self.write(TRUTH, channels, {"board_reflectance": board})
 
     def finish(self, manifest: RunManifest) -> RunManifest:
-        """Return the ``manifest`` of the finished run, with what only the recorder knows."""
+        """Return the ``manifest`` of the finished run, with checksums where there are files."""
         return manifest
 
 
@@ -714,7 +714,7 @@ class RunFolder(Recorder):
         self._note(name, write_frame(self.folder / name, channels, metadata))
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        """Write one shot as :meth:`Recorder.write_frame`, with what tells it from other frames."""
+        """Write one shot as :meth:`Recorder.write_frame`, with its identity."""
         super().write_frame(index, channels, {**self._identity(index, channels), **metadata})
 
     def finish(self, manifest: RunManifest) -> RunManifest:
@@ -729,7 +729,7 @@ class RunFolder(Recorder):
             self._checksums[name] = value
 
     def _identity(self, index: int, channels: Channels) -> Metadata:
-        """Return what tells a frame from one of another run, another place in this one, or one that was damaged.
+        """Return the metadata that distinguish a frame from one of another run or place, and from a damaged one.
 
         In an interrupted run no manifest holds checksums of files yet.
         """

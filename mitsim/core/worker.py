@@ -1,7 +1,7 @@
 """A process of its own for long work: whatever becomes of it, somebody is left to say so.
 
-Native code (Dr.Jit, LLVM, OpenEXR) can end a process without an exception, and the kernel kills what takes too much
-memory. So the program splits in two before anything heavy is imported: the worker goes on, and the parent waits,
+Native code (Dr.Jit, LLVM, OpenEXR) can end a process without an exception, and the kernel kills one that takes too
+much memory. So the program splits in two before anything heavy is imported: the worker goes on, and the parent waits,
 passes signals on and turns the worker's end into an exit status and, where it died, one clear line.
 """
 
@@ -146,7 +146,7 @@ def _leave() -> None:
 
 
 def advise(text: str) -> None:
-    """Note what to do, ``text`` without a full stop, should the running command be cut short; empty for nothing."""
+    """Note advice, a ``text`` without a full stop, for a command that is cut short; empty for none."""
     if _advice is not None:
         _advice[:] = text.encode()[:_LONGEST_ADVICE].ljust(_LONGEST_ADVICE, b"\0")
 
@@ -155,7 +155,7 @@ def advise(text: str) -> None:
 def held_back() -> Iterator[None]:
     """Make signals that stop this process wait until the block ends.
 
-    Native code that is being imported turns what they raise into errors of its own, or ends the process. Threads that
+    Native code that is being imported turns their exceptions into errors of its own, or ends the process. Threads that
     begin in it leave them to the main one for good; those that were there, as of a library for linear algebra, may
     still take one, which is kept for the end.
     """
@@ -183,8 +183,8 @@ def held_back() -> Iterator[None]:
 def pause_collector() -> Iterator[None]:
     """Make Python's collector wait while modules are imported.
 
-    It would go through what they make again and again, for 0.06 to 0.1 s of a capture. What a worker has by then, it
-    goes past from there on.
+    It would go through their objects again and again, for 0.06 to 0.1 s of a capture. In a worker it ignores all
+    earlier objects from there on.
     """
     collecting, known = gc.isenabled(), len(sys.modules)
     gc.disable()
@@ -199,17 +199,17 @@ def pause_collector() -> Iterator[None]:
 
 
 def has_rows() -> bool:
-    """Whether standard error is a terminal on which rows of progress can be written again."""
+    """Return True if standard error is a terminal on which rows of progress can be written again."""
     return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def is_stopped() -> bool:
-    """Whether a signal asked this process to end."""
+    """Return True if a signal asked this process to end."""
     return _stopped_by is not None
 
 
 def end_stopped() -> NoReturn:
-    """Say what stopped this process, and what to do, and exit with 128 + the signal's number."""
+    """Report the signal that stopped this process, with advice, and exit with 128 + its number."""
     number = signal.Signals(_stopped_by or signal.SIGINT)
     _say(_with_advice(_ending(number)))
     sys.exit(128 + number)
@@ -258,7 +258,7 @@ def _say(text: str) -> None:
 
 
 def say_note(text: str) -> None:
-    """Tell a reader on stderr, in a line, the ``text`` of a Python warning, without the file and line of a program."""
+    """Write the ``text`` of a Python warning to stderr, in a line, without the file and line of a program."""
     _say(f"note: {' '.join(text.split())}")
 
 

@@ -1,4 +1,4 @@
-"""What a person knows of a real camera's frames, in a list or on the command line: checked before any is opened."""
+"""A person's knowledge of a real camera's frames, in a list or on the command line; checked before any is opened."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ TURNED = "turn_deg"
 
 
 class CaptureList(Configuration):
-    """What a real capture is of, and how its files become frames.
+    """Facts of a real capture, and how its files become frames.
 
-    Options of `mitsim import` take the place of what it says.
+    Options of `mitsim import` take their place.
     """
 
     camera: Identity | None = None
@@ -104,7 +104,7 @@ def _from_folder(holder: Configuration, folder: Path, *names: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class Electronics:
-    """A camera as its numbers tell it.
+    """A camera by its numbers.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class Electronics:
     largest
         number that it counts to; None: its numbers are real.
     stated
-        what a manifest's configuration says of it.
+        its part of a manifest's configuration.
     """
 
     name: str
@@ -134,7 +134,7 @@ class RealCapture:
     Attributes
     ----------
     listed
-        what a list says, or options in the place of it.
+        content of a list, or options in the place of it.
     camera
         electronics: name of a shipped file, or a TOML file; None: as ``listed`` says.
     exposure_s
@@ -161,12 +161,12 @@ class RealCapture:
 
     @property
     def in_file(self) -> bool:
-        """Whether the patterns are in a file."""
+        """True if the patterns are in a file."""
         return Path(self.patterns).suffix == ".json"
 
     @property
     def wanted(self) -> Wanted:
-        """How its files are read."""
+        """Kind of its files, and how they are read."""
         return Wanted.of(self.listed.raw, self.listed.prepare)
 
     @property
@@ -176,7 +176,7 @@ class RealCapture:
         return manifests.lines_of_planes(manifests.RUN, prepare.wavelengths_nm) if prepare.channel == ALL else None
 
     def electronics(self) -> tuple[Electronics, Preparation]:
-        """Return the camera, by its file or the list; and what is done to its numbers, with its mosaic.
+        """Return the camera, by its file or the list; and the preparation of its numbers, with its mosaic.
 
         MitsimError where neither says it, or a value cannot be.
         """
@@ -261,7 +261,7 @@ _LISTS, _CAMERAS = (partial(configuration.shipped_names, field) for field in (co
 
 
 class FrameFacts(Options):
-    """What is known of a real camera's frames, in the place of what a list states; None if not known."""
+    """Facts of a real camera's frames, in the place of a list's; None if not known."""
 
     VERB = "import_frames"
 
@@ -306,7 +306,7 @@ class FrameFacts(Options):
     seed: int | None = _said("root of every random stream", panel=configuration.QUALITY)
 
     def of(self, source: Path) -> RealCapture:
-        """Return what is known of the frames at ``source``, checked before any is opened.
+        """Return the facts of the frames at ``source``, checked before any is opened.
 
         MitsimError as :meth:`RealCapture.check`, and for options without effect.
         """

@@ -2,7 +2,7 @@
 
 A real camera's frames become folders, too, and patterns become pictures for a real projector.
 
-Each format is a row of :data:`FORMATS`. Its module is imported when it is used: what a request says is checked before.
+Each format is a row of :data:`FORMATS`. Its module is imported when it is used; a request is checked before.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def export(
     Returns
     -------
     dict
-        `format`, `output`, `frames` (of all lines), `calibration`, `notes`: what the command line prints.
+        `format`, `output`, `frames` (of all lines), `calibration`, `notes`: the output of the command line.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def check_export(
     calibration: Path | str | None = None,
     projector: str | None = None,
 ) -> None:
-    """Refuse what :func:`export` refuses before it writes.
+    """Refuse all that :func:`export` refuses before it writes.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def check_export(
 def check_format(
     format: str, output: Path | str, calibration: Path | str | None = None, projector: str | None = None
 ) -> None:
-    """Refuse what :func:`export` refuses before it looks into a folder.
+    """Refuse all that :func:`export` refuses before it looks into a folder.
 
     Parameters
     ----------
@@ -210,8 +210,8 @@ def import_file(
     Returns
     -------
     dict
-        `frames` (of all lines), `output`, `calibration_output`, `holds`, `left_out`, `notes`, `warnings`: what the
-        command line prints.
+        `frames` (of all lines), `output`, `calibration_output`, `holds`, `left_out`, `notes`, `warnings`: the output
+        of the command line.
 
     Raises
     ------
@@ -296,7 +296,7 @@ STRIPES = "stripes"
 
 
 class Pictures(Options):
-    """A projector that patterns are drawn for, its last picture, and what stripes need beside them."""
+    """A projector that patterns are drawn for, its last picture, and the camera that stripes need."""
 
     PANEL = configuration.DEVICES
     VERB = "pattern_pictures"

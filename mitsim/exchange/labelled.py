@@ -38,7 +38,7 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
     """Write a run as a file of tensors that `torch.load` reads with `weights_only`, whole or not at all.
 
     Of several lines the tensors have an axis of lines before the others. Behind colour filters `y` has none, and
-    `weights` (4, lines) is what each filter passes.
+    `weights` (4, lines) is the light that each filter passes.
 
     Parameters
     ----------

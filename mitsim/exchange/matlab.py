@@ -150,7 +150,7 @@ def endings(names: Sequence[str], path: Path) -> dict[str, str]:
     Parameters
     ----------
     names
-        of the lines; "" of a run that tells none apart.
+        of the lines; "" of a run without lines.
     path
         of the file, for messages.
 
@@ -181,8 +181,8 @@ def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple
     """Write a run with the paper's variables, whole or not at all; return sentences on the parts that are left out.
 
     Of several lines, the variables of each end in its name: `phi_left_638nm`. Behind colour filters the frames are
-    those of all lines, only the truths and factors of each line end in its name, and `weights` is (4, lines) of what
-    each filter passes.
+    those of all lines, only the truths and factors of each line end in its name, and `weights` is (4, lines) of the
+    light that each filter passes.
 
     Parameters
     ----------
@@ -412,7 +412,7 @@ def flatcam_calibration(path: Path, channel: str) -> Calibration:
     size = tuple(map(int, file.matrix("cSize").ravel())) if "cSize" in file else ()
 
     def part(plane: str) -> Packed[CalibrationManifest]:
-        """Of one plane."""
+        """Return the calibration of one plane."""
         sides = {name: file.image(f"{stem}{plane}") for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
         pixels, scene = zip(*(side.shape for side in sides.values()), strict=True)
         if size != pixels and all(map(operator.lt, pixels, scene)):

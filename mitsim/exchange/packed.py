@@ -1,8 +1,8 @@
 """RUN and CAL folders in, one HDF5 file out, and back, bit for bit; manifests and files by name for other formats.
 
-Whatever lines a folder tells apart, its content is one :class:`Content`: of a mono folder it has one part, of a
-coloured one a part for each line. A run behind colour filters is one RUN folder of all lines; of each there is what a
-perfect image would show. docs/exchange.md describes the layout of HDF5 files.
+The content of a folder is one :class:`Content`: of a mono folder it has one part, of a coloured one a part for each
+line. A run behind colour filters is one RUN folder of all lines, with a truth of each. docs/exchange.md describes the
+layout of HDF5 files.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Packed(Generic[Manifest]):
     manifest
         of the folder.
     text
-        of its `manifest.json`, letter by letter; empty where only the model is known, as of what is not exported.
+        of its `manifest.json`, letter by letter; empty where only the model is known.
     names
         of its files.
     read
@@ -89,7 +89,7 @@ class Content(Generic[Manifest]):
     parts
         content of each line's folder, by the line's name; that of the folder itself by "".
     colours
-        lines, and filters where there are some; None of a folder that tells no lines apart.
+        lines, and filters where there are some; None of a folder without lines.
     text
         of its `colour.json`, letter by letter.
     truths
@@ -108,7 +108,7 @@ class Content(Generic[Manifest]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of its lines; "" alone where it tells none apart."""
+        """Names of its lines; "" alone where it has none."""
         return self.colours.names if self.colours else ("",)
 
     def of_line(self, name: str) -> Packed[Manifest]:
@@ -232,7 +232,7 @@ def unpack_colours(text: str, kind: str, place: Path, beside: Sequence[str] = ()
     place
         the file, for messages.
     beside
-        names of what lies beside the lines' folders.
+        names of files beside the lines' folders.
 
     Raises
     ------
@@ -290,7 +290,7 @@ def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> 
     path
         of the file.
     run
-        with shots of one shape, each line's where they are told apart.
+        with shots of one shape, in each line.
     calibration
         that goes with it, of the same lines.
 

@@ -130,7 +130,7 @@ def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, A
     projector
         name or TOML file, of known rows and columns.
     listed
-        what the frames will be of.
+        list of the frames that will be taken.
 
     Returns
     -------
@@ -254,7 +254,7 @@ def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any
     sides
         rows and columns of the grid.
     place
-        what the grid is of, for messages.
+        name of the grid's projector or run, for messages.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""A real camera's frames and what is known of them in; a RUN folder that `mitsim reconstruct` takes out.
+"""A real camera's frames and their facts in; a RUN folder that `mitsim reconstruct` takes out.
 
 All planes of a mosaic make a coloured one.
 
-What a real capture lacks - truth, scene, expected electrons, predicted error - is left out.
+Truth, scene, expected electrons and predicted error, which a real capture lacks, are left out.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     output
         RUN folder to make.
     known
-        what is known of the capture.
+        facts of the capture.
     command
         command line that asks for it, which the manifests keep; None: Python does.
 
@@ -59,7 +59,7 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     -------
     dict
         `frames`, `shape`, `output`, `calibration_output` (None), `holds`, `left_out`, `divided_by`, `planes`,
-        `notes`, `warnings`: what the command line prints.
+        `notes`, `warnings`: the output of the command line.
 
     Raises
     ------
@@ -236,7 +236,7 @@ class _Plane:
         Parameters
         ----------
         how
-            what is done to its numbers.
+            preparation of its numbers.
         source, files, places
             of the frames, and file and page of each shot.
         first
@@ -359,7 +359,7 @@ def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
 def _configuration(
     known: RealCapture, camera: Electronics, how: Preparation, files: tuple[Path, ...]
 ) -> dict[str, Any]:
-    """All that decides the frames: whose files, and as what they are read."""
+    """Return all that decides the frames: whose files, and how they are read."""
     more = () if known.listed.ambient is None else image_files(Path(known.listed.ambient), known.wanted)
     corrected = {
         name: {path.name: checksum(path) for path in image_files(Path(place), known.wanted)}
