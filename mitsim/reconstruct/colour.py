@@ -95,12 +95,12 @@ class JointMosaic:
         rows, columns = np.flatnonzero(self.P_L[:, row]), np.flatnonzero(self.P_R[:, column])
         lit = images[:, rows[:, None], columns] * self.P_L[rows, row][:, None] * self.P_R[columns, column]
         seen = self.lefts[:, :, rows] @ lit @ self.rights[:, :, columns].transpose(0, 2, 1)
-        return np.asarray((self._filters(seen.shape[1:]) * seen).sum(axis=0))
+        return np.asarray((behind(self.weights, seen.shape[1:]) * seen).sum(axis=0))
 
     def gather(self, frame: FloatArray, row: int, column: int) -> FloatArray:
         """Apply the adjoint of :meth:`frame` to a ``frame`` (m, m'); return (lines, n, n')."""
         rows, columns = np.flatnonzero(self.P_L[:, row]), np.flatnonzero(self.P_R[:, column])
-        seen = self._filters(frame.shape) * frame
+        seen = behind(self.weights, frame.shape) * frame
         lit = self.lefts[:, :, rows].transpose(0, 2, 1) @ seen @ self.rights[:, :, columns]
         images = np.zeros(self.shape)
         images[:, rows[:, None], columns] = lit * self.P_L[rows, row][:, None] * self.P_R[columns, column]
@@ -139,20 +139,23 @@ class JointMosaic:
         # Imported here because a capture behind filters needs no linear algebra of SciPy.
         from mitsim.reconstruct.convolution import conjugate_gradients
 
-        return conjugate_gradients(
-            self.normal, gathered, lam, lambda images: self._precondition(images, lam), _TOLERANCE, _MOST_STEPS
-        )
-
-    def _precondition(self, images: FloatArray, lam: float) -> FloatArray:
         (rows, left), (columns, right), (lines, mixed) = self._spectra
-        turned = np.tensordot(mixed.T, left.T @ images @ right, axes=1)
-        turned /= lines[:, None, None] * np.outer(rows, columns) + lam
-        return np.asarray(np.tensordot(mixed, left @ turned @ right.T, axes=1))
+
+        def precondition(images: FloatArray) -> FloatArray:
+            turned = np.tensordot(mixed.T, left.T @ images @ right, axes=1)
+            turned /= lines[:, None, None] * np.outer(rows, columns) + lam
+            return np.asarray(np.tensordot(mixed, left @ turned @ right.T, axes=1))
+
+        return conjugate_gradients(self.normal, gathered, lam, precondition, _TOLERANCE, _MOST_STEPS)
 
     @cached_property
-    def _grams(self) -> tuple[FloatArray, FloatArray]:
+    def _grams(self) -> list[FloatArray]:
         """(2, lines, lines, n, n) for rows and for columns: Gram matrices of pairs of lines by parity."""
-        return _grams(self.lefts, self.P_L), _grams(self.rights, self.P_R)
+        found = []
+        for sides, patterns in ((self.lefts, self.P_L), (self.rights, self.P_R)):
+            halves, shared = (sides[:, parity::2] for parity in (0, 1)), patterns @ patterns.T
+            found.append(np.stack([shared * (half.transpose(0, 2, 1)[:, None] @ half[None]) for half in halves]))
+        return found
 
     @cached_property
     def _spectra(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
@@ -161,9 +164,6 @@ class JointMosaic:
         spectra = [np.linalg.eigh(part) for part in (rows, columns, self.weights.T @ self.weights)]
         return tuple((np.maximum(values, 0), vectors) for values, vectors in spectra)
 
-    def _filters(self, shape: Sequence[int]) -> FloatArray:
-        return behind(self.weights, shape)
-
 
 def behind(weights: FloatArray, shape: Sequence[int]) -> FloatArray:
     """Return the response (lines, m, m') of each pixel of a sensor of an even ``shape`` (m, m') to each line.
@@ -171,12 +171,6 @@ def behind(weights: FloatArray, shape: Sequence[int]) -> FloatArray:
     ``weights`` (4, lines) are the responses of each plane of :data:`PLANES`.
     """
     return np.tile(weights.T.reshape(-1, 2, 2), (1, shape[0] // 2, shape[1] // 2))
-
-
-def _grams(sides: FloatArray, patterns: npt.NDArray[np.floating]) -> FloatArray:
-    shared = patterns @ patterns.T
-    halves = (sides[:, parity::2] for parity in (0, 1))
-    return np.stack([shared * (half.transpose(0, 2, 1)[:, None] @ half[None]) for half in halves])
 
 
 # ---- Colours of images of lines --------------------------------------------------------------------------------------
@@ -229,19 +223,14 @@ def chart() -> Chart:
     spectra = colour.SDS_COLOURCHECKERS[CHART]
     names = tuple(name.split(" (")[0] for name in spectra)
     values = list(spectra.values())
-    white = white_xyz()
-    xyz = np.array([_tristimulus(spectrum) for spectrum in values])
-    # The sum over wavelengths gives a perfect reflector the white in five digits; this makes it exact.
-    xyz *= white / _tristimulus(colour.sd_ones(values[0].shape))
-    return Chart(names, np.array(values[0].wavelengths), np.array([each.values for each in values]), xyz)
-
-
-def _tristimulus(spectrum: Any) -> FloatArray:
-    """Return (3,) XYZ of a reflectance ``spectrum`` under D65, Y = 1 for a perfect reflector (ASTM E308)."""
-    colour = _colour()
+    observer, white = colour.MSDS_CMFS[_OBSERVER], colour.SDS_ILLUMINANTS[_WHITE]
     with colour.utilities.suppress_warnings(colour_runtime_warnings=True):  # that spectra end at 380 and 780 nm
-        found = colour.sd_to_XYZ(spectrum, colour.MSDS_CMFS[_OBSERVER], colour.SDS_ILLUMINANTS[_WHITE]) / 100
-    return np.asarray(found, dtype=np.float64)
+        # XYZ of reflectances, Y = 1 for a perfect reflector (ASTM E308).
+        of = [colour.sd_to_XYZ(each, observer, white) / 100 for each in (*values, colour.sd_ones(values[0].shape))]
+    *patches, perfect = (np.asarray(each, dtype=np.float64) for each in of)
+    # The sum over wavelengths gives a perfect reflector the white in five digits; this makes it exact.
+    xyz = np.array(patches) * (white_xyz() / perfect)
+    return Chart(names, np.array(values[0].wavelengths), np.array([each.values for each in values]), xyz)
 
 
 @cache
@@ -307,7 +296,13 @@ class ColourModel:
                 f"colour: patches are {values.shape} with {np.count_nonzero(~np.isfinite(values))} values that are not "
                 f"finite; give {expected[0]} patches of {expected[1]} lines"
             )
-        return cls(tuple(map(float, wavelengths_nm)), _white_preserving(values, chart().xyz, white_xyz()), fitted_on)
+        # Minimises ||values M^T - XYZ|| with M (1, ..., 1)^T = white: M = white (1, ..., 1) / L + C B^T with free C,
+        # where the columns of B (L, L - 1) are orthonormal and orthogonal to (1, ..., 1).
+        lines = values.shape[1]
+        even = np.outer(white_xyz(), np.full(lines, 1 / lines))
+        basis = np.linalg.svd(np.ones((1, lines)))[2][1:].T
+        free = np.linalg.lstsq(values @ basis, chart().xyz - values @ even.T, rcond=None)[0]
+        return cls(tuple(map(float, wavelengths_nm)), np.asarray(even + free.T @ basis.T), fitted_on)
 
     def xyz(self, reflectances: npt.ArrayLike) -> FloatArray:
         """Convert ``reflectances`` (..., lines) to (..., 3) CIE XYZ under D65 without clipping."""
@@ -331,19 +326,6 @@ def delta_e(xyz: npt.ArrayLike, reference: npt.ArrayLike) -> FloatArray:
         colour.XYZ_to_Lab(np.maximum(np.asarray(each, dtype=np.float64), 0), _white_xy()) for each in (xyz, reference)
     )
     return np.asarray(colour.delta_E(*labs, method="CIE 2000"), dtype=np.float64)
-
-
-def _white_preserving(values: FloatArray, xyz: FloatArray, white: FloatArray) -> FloatArray:
-    """Minimise ||values M^T - xyz|| over M (3, L) with M (1, ..., 1)^T = white.
-
-    The values are (patches, L) reflectances, xyz (patches, 3) colours. M = white (1, ..., 1) / L + C B^T with free C,
-    where the columns of B (L, L - 1) are orthonormal and orthogonal to (1, ..., 1).
-    """
-    lines = values.shape[1]
-    even = np.outer(white, np.full(lines, 1 / lines))
-    basis = np.linalg.svd(np.ones((1, lines)))[2][1:].T
-    free = np.linalg.lstsq(values @ basis, xyz - values @ even.T, rcond=None)[0]
-    return np.asarray(even + free.T @ basis.T)
 
 
 def _colour() -> Any:

@@ -501,19 +501,14 @@ def depth_map(
     basis, width, pixel = arrivals.basis, arrivals.width, arrivals.pixel
     pixels = PixelDepths(basis, arrivals.reach, _STEP * pixel)
 
-    def left_over(look: float, offset: float) -> float:
-        return pixels.solve(arrivals.most(look, offset)[0]).left_over
-
-    middle = centre / pixel
-    tried = {(look, middle): left_over(look, middle) for look in LAMBDAS}
+    offsets = {centre / pixel}
     if arrivals.limited:
-        look = min(tried, key=lambda begin: tried[begin])[0]
-        offsets = {begin + offset for begin in (middle, start / pixel) for offset in (0.0, *_OFFSETS)} - {middle}
-        tried |= {(look, offset): left_over(look, offset) for offset in offsets}
-    best = min(tried, key=lambda begin: tried[begin])
+        offsets |= {begin / pixel + offset for begin in (centre, start) for offset in (0.0, *_OFFSETS)}
+    tried = {offset: pixels.solve(arrivals.most(offset)[0]).left_over for offset in sorted(offsets)}
+    best = min(tried, key=lambda offset: tried[offset])
     rivals = [other for other, left in tried.items() if left < _RIVAL * tried[best]]
-    shift, confidence = arrivals.most(*best)
-    shift = _sharpen(pixels, _refine(pixels, shift, best[1] * pixel, width, pixel))
+    shift, confidence = arrivals.most(best)
+    shift = _sharpen(pixels, _refine(pixels, shift, best * pixel, width, pixel))
     # The depths are doubted where they explain no more than the calibrated one, or where others explain as much.
     reliable, found, doubt = confidence >= _RELIABLE, pixels.solve(shift), ""
     variance, unknowns = pixels.variance(found), 2 * shift.size
@@ -523,7 +518,7 @@ def depth_map(
         doubt = "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
     else:
         span = float(np.ptp(np.percentile(shift[reliable], (1, 99))))
-        away = (np.abs(arrivals.most(*rival)[0] - shift)[reliable] > width / 2 for rival in rivals)
+        away = (np.abs(arrivals.most(rival)[0] - shift)[reliable] > width / 2 for rival in rivals)
         spared = not arrivals.limited or width - span >= SPARE * pixel
         ties = [(other.mm, other.difference**2 * basis.energy) for other in plane.alternatives]
         others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
@@ -706,8 +701,8 @@ class PixelDepths:
 
 # ---- Where most light of each projector pixel arrives ----------------------------------------------------------------
 
-LAMBDAS = 1e-5, 1e-6, 1e-7
-"""Tried lambdas over the largest sigma^2: smaller ones add noise, larger ones blur dots."""
+_SHARP = 1e-6
+"""Lambda over the largest sigma^2 where light arrives: smaller ones add noise, larger ones blur dots."""
 _OFFSETS = -1.0, -0.5, 0.5, 1.0
 """Projector pixels by which the range of displacements may be moved, because a surface at its end is ambiguous."""
 _POOLED = 1.0
@@ -763,8 +758,8 @@ class Arrivals:
         ]
         self._images = self._class_images()
 
-    def _class_images(self) -> dict[float, FloatArray]:
-        """Return the images (K or 1, K' or 1, n, n') of all frames of a class, by lambda."""
+    def _class_images(self) -> FloatArray:
+        """Return the images (K or 1, K' or 1, n, n') of all frames of a class."""
         basis = self.basis
         sides = [basis.side(axis, 0.0, self._margin if opened else 0) for axis, opened in enumerate(self._open)]
         patterns, counts = list[FloatArray](), list[int]()
@@ -777,21 +772,17 @@ class Arrivals:
             (row, column), (down, across) = (each.row, each.column), self._open
             of_class = sums[row if down else 0, column if across else 0]
             of_class.add(each.frame, 0 if down else row, 0 if across else column)
-        scales = {key: prepared.problem(each).scale for key, each in sums.items()}
-        found = {}
-        for lam in LAMBDAS:
-            images = [prepared.solve(each, lam * scales[key]).image for key, each in sums.items()]
-            found[lam] = np.stack(images).reshape(*counts, *images[0].shape)
-        return found
+        images = [prepared.solve(each, _SHARP * prepared.problem(each).scale).image for each in sums.values()]
+        return np.stack(images).reshape(*counts, *images[0].shape)
 
-    def most(self, lam: float, offset: float) -> tuple[FloatArray, FloatArray]:
+    def most(self, offset: float) -> tuple[FloatArray, FloatArray]:
         """Return changes of 1/z by pixel where most light arrives, and the confidence.
 
-        ``lam`` is relative to the largest sigma^2, ``offset`` the middle of the displacements [projector pixels].
+        ``offset`` is the middle of the displacements [projector pixels].
         """
         count = 2 * int(np.ceil(self.width / self.pixel / _STEP / 2)) + 1
         shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
-        light = np.stack([self._arriving(self._images[lam], shift) for shift in shifts])
+        light = np.stack([self._arriving(shift) for shift in shifts])
         light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
         place, step, peak = light.argmax(axis=0), shifts[1] - shifts[0], light.max(axis=0)
         beside = np.arange(count)[:, None, None] - place
@@ -803,13 +794,13 @@ class Arrivals:
         elsewhere = np.maximum(other, np.median(other))  # of a dark pixel alone it would be small by chance
         return found, np.where(dark, 0.0, np.maximum(1 - elsewhere / np.where(dark, 1.0, peak), 0.0))
 
-    def _arriving(self, seen: FloatArray, shift: float) -> FloatArray:
+    def _arriving(self, shift: float) -> FloatArray:
         """Return the light (n, n') where each pixel's would be at 1/z changed by ``shift``, linear between pixels."""
         places, parts = list[npt.NDArray[np.intp]](), list[FloatArray]()
         for side, classes, opened in zip(self.basis.sides, self._classes, self._open, strict=True):
             place = np.arange(classes.size) + (side.edges * shift + self._margin if opened else 0.0)
             whole = np.floor(place).astype(np.intp)
-            whole = np.clip(whole, 0, max(seen.shape[2 + len(places)] - 2, 0)) if opened else whole
+            whole = np.clip(whole, 0, max(self._images.shape[2 + len(places)] - 2, 0)) if opened else whole
             places.append(whole)
             parts.append(place - whole)
         total = np.zeros(self.basis.shape)
@@ -817,5 +808,5 @@ class Arrivals:
             for column in (0, 1) if self._open[1] else (0,):
                 weights = [part if end else 1 - part for part, end in zip(parts, (row, column), strict=True)]
                 rows, columns = (places[0] + row)[:, None], places[1] + column
-                total += np.outer(*weights) * seen[self._classes[0][:, None], self._classes[1], rows, columns]
+                total += np.outer(*weights) * self._images[self._classes[0][:, None], self._classes[1], rows, columns]
         return total

@@ -153,7 +153,16 @@ def pattern_blocks(patterns: FloatArray) -> tuple[IndexArray, ...]:
 
 def group_pixels(patterns: FloatArray) -> tuple[Group, ...]:
     """Return the groups of scene pixels that ``patterns`` (n, K) allow to be factorised alone."""
-    return tuple(Group(block, patterns[block], _rank_one(patterns[block])) for block in pattern_blocks(patterns))
+    groups = []
+    for block in pattern_blocks(patterns):
+        lit, own = np.flatnonzero(patterns[block].any(axis=1)), patterns[block]
+        psi = own[lit[0]] if len(lit) else np.zeros(own.shape[1])
+        weights = np.zeros(len(own))
+        if len(lit):
+            pivot = int(np.flatnonzero(psi)[0])
+            weights = own[:, pivot] / psi[pivot]
+        groups.append(Group(block, own, (weights, psi) if np.array_equal(np.outer(weights, psi), own) else None))
+    return tuple(groups)
 
 
 def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], centred: bool = False) -> Side:
@@ -185,7 +194,11 @@ def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], 
         lit = [b for b, group in enumerate(groups) if group.lights(index)]
         columns = np.concatenate([np.arange(starts[b], starts[b + 1]) for b in lit] or [np.arange(0)])
         pieces = [parts[b][0][index] for b in lit] or [np.zeros((sensor, 0))]
-        slabs.append(Slab(_as_slice(columns), _frozen(np.concatenate(pieces, axis=1))))
+        # Equally spaced columns are a slice, because basic indexing is a view and twice as fast.
+        step = int(columns[1] - columns[0]) if len(columns) > 1 else 1
+        even = slice(int(columns[0]), int(columns[-1]) + 1, step) if len(columns) else slice(0, 0)
+        places = even if (np.diff(columns) == step).all() else columns
+        slabs.append(Slab(places, _frozen(np.concatenate(pieces, axis=1))))
     return Side(
         basis=_frozen(basis),
         singular=_frozen(singular),
@@ -198,57 +211,26 @@ def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], 
 
 
 def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray]:
+    """Return the slabs, singular values and right vectors of a group's stacked matrix.
+
+    The SVD is numpy's. scipy's wheel has a thread pool of its own, and two pools wait for each other on a busy machine
+    (2.5 s instead of 15 ms).
+    """
     patterns = group.patterns
     if group.shared is not None:
         # B = psi (x) Phi diag(w): the SVD of one slab serves all, whatever K.
         weights, psi = group.shared
         norm = float(np.linalg.norm(psi))
-        left, singular, right = _svd(phi * weights)
+        left, singular, right = np.linalg.svd(phi * weights, full_matrices=False)
         scale = psi / (norm or 1.0)
-        return tuple(_scale(left, factor) for factor in scale), singular * norm, right
+        # Without the work for 1, and without columns for 0.
+        scaled = (left[:, :0] if k == 0.0 else left if k == 1.0 else left * k for k in scale)
+        return tuple(scaled), singular * norm, right
     # Phi = Q R once: B = (I (x) Q) [R diag(p_1); R diag(p_2); ...] is then as short as R, and as accurate.
     q, small = np.linalg.qr(phi)
     stacked = np.concatenate([small * column for column in patterns.T])
-    left, singular, right = _svd(stacked)
+    left, singular, right = np.linalg.svd(stacked, full_matrices=False)
     return tuple(q @ slab for slab in np.split(left, patterns.shape[1])), singular, right
-
-
-def _scale(matrix: FloatArray, factor: float) -> FloatArray:
-    """Return matrix * factor without the work for 1, and without columns for 0."""
-    if factor == 0.0:
-        return matrix[:, :0]
-    return matrix if factor == 1.0 else matrix * factor
-
-
-def _rank_one(patterns: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return (w, psi) with patterns = w psi^T exactly, or None."""
-    lit_rows = np.flatnonzero(patterns.any(axis=1))
-    if len(lit_rows) == 0:
-        return np.zeros(len(patterns)), np.zeros(patterns.shape[1])
-    psi = patterns[lit_rows[0]]
-    pivot = int(np.flatnonzero(psi)[0])
-    weights = patterns[:, pivot] / psi[pivot]
-    return (weights, psi) if np.array_equal(np.outer(weights, psi), patterns) else None
-
-
-def _svd(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the thin SVD by numpy's LAPACK.
-
-    scipy's wheel has a thread pool of its own, and two pools wait for each other on a busy machine (2.5 s instead of 15
-    ms).
-    """
-    left, singular, right = np.linalg.svd(matrix, full_matrices=False)
-    return left, singular, right
-
-
-def _as_slice(columns: IndexArray) -> slice | IndexArray:
-    """Return equally spaced columns as a slice, because basic indexing is a view and twice as fast."""
-    if len(columns) == 0:
-        return slice(0, 0)
-    step = int(columns[1] - columns[0]) if len(columns) > 1 else 1
-    if (np.diff(columns) == step).all():
-        return slice(int(columns[0]), int(columns[-1]) + 1, step)
-    return columns
 
 
 def _frozen(array: FloatArray) -> FloatArray:
