@@ -24,6 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -126,39 +127,31 @@ MOST_FACTORISED = 2048
 """Largest number of pixels of a factorised class; all classes of 128 x 128 scene pixels then take 270 MB."""
 
 
-@dataclass(frozen=True, eq=False)
 class Classes:
-    """Camera under shifting dots of period ``k``; 1 is uniform light."""
+    """A ``camera`` under shifting dots of period ``k``; 1 is uniform light.
 
-    camera: ShiftedLight
-    k: int
+    Attributes
+    ----------
+    cropped
+        Whether light misses the sensor.
+    factorised
+        Whether normal matrices are formed and factorised.
+    largest
+        Largest number of S, which lambda is relative to.
+    """
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.k <= self._n:
-            raise MitsimError(f"dots of period {self.k}: give 1 to {self._n}, the scene's pixels a side")
-
-    @property
-    def cropped(self) -> bool:
-        """Whether light misses the sensor."""
-        return self.camera.sensor != self.camera.whole
-
-    @property
-    def _n(self) -> int:
-        return self.camera.scene[0]
-
-    @cached_property
-    def _lit(self) -> ShiftedLight:
-        return self.camera.under(parse_patterns(f"dots:{self.k}", self._n))
-
-    @property
-    def factorised(self) -> bool:
-        """Whether normal matrices are formed and factorised."""
-        return self.cropped and self._side**2 <= MOST_FACTORISED
-
-    @property
-    def largest(self) -> float:
-        """Largest number of S, which lambda is relative to."""
-        return float(self._power.max())
+    def __init__(self, camera: ShiftedLight, k: int) -> None:
+        self.camera, self.k, self._n = camera, k, camera.scene[0]
+        if not 1 <= k <= self._n:
+            raise MitsimError(f"dots of period {k}: give 1 to {self._n}, the scene's pixels a side")
+        self._lit = camera.under(parse_patterns(f"dots:{k}", self._n))
+        self._side = -(-self._n // k)
+        self.cropped = camera.sensor != camera.whole
+        self.factorised = self.cropped and self._side**2 <= MOST_FACTORISED
+        self._grid = [fft.next_fast_len(-(-size // k)) for size in camera.whole]
+        self._spectrum = fft.fft2(camera.psf, tuple(k * size for size in self._grid))
+        self._power: FloatArray = self._fold(np.square(np.abs(self._spectrum))).real
+        self.largest = float(self._power.max())
 
     def project(self, frames: FloatArray) -> FloatArray:
         """Return the (n, n) sum of all ``frames``, each correlated with the light of the pixels of its class."""
@@ -184,7 +177,7 @@ class Classes:
         if not self.factorised:
             return FactorisedClasses(self, lam, None)
         grams = self._grams.reshape(self.k**2, self._side**2, self._side**2)
-        lit = self._split_classes(np.ones((self._n,) * 2)).reshape(self.k**2, -1) > 0
+        lit = self._split(np.ones((self._n,) * 2)).reshape(self.k**2, -1) > 0
 
         def factor(index: int) -> FloatArray:
             gram = grams[index].copy()
@@ -199,15 +192,13 @@ class Classes:
 
         return FactorisedClasses(self, lam, in_threads(factor, range(self.k**2)))
 
-    # ---- equations
-
     def normal(self, image: FloatArray) -> FloatArray:
         """Return the normal matrix of all classes times an ``image`` (n, n)."""
-        if not self.cropped:
-            classes = fft.rfft2(self._split_classes(image), self._section[0])
-            whole = fft.irfft2(classes * self._section[1], self._section[0])
-            return self._join(whole[..., : self._side, : self._side])
-        return self._lit.correlate(self._lit.image_of(image))
+        if self.cropped:
+            return self._lit.correlate(self._lit.image_of(image))
+        size, kernel = self._section
+        whole = fft.irfft2(fft.rfft2(self._split(image), size) * kernel, size)
+        return self._join(whole[..., : self._side, : self._side])
 
     def inverse(self, lam: float) -> Operator:
         """Return the division of an image by S + ``lam``, symmetric, positive and near the normal matrix's inverse."""
@@ -215,46 +206,16 @@ class Classes:
         weight = 1 / (self._power[:, : self._grid[1] // 2 + 1] + least)
 
         def divide(image: FloatArray) -> FloatArray:
-            spectra = fft.rfft2(self._split_classes(image), self._grid) * weight
+            spectra = fft.rfft2(self._split(image), self._grid) * weight
             return self._join(fft.irfft2(spectra, self._grid)[..., : self._side, : self._side])
 
         return divide
 
-    # ---- grids
-
-    @property
-    def _side(self) -> int:
-        return -(-self._n // self.k)
-
-    @property
-    def _grid(self) -> tuple[int, int]:
-        rows, columns = (fft.next_fast_len(-(-size // self.k)) for size in self.camera.whole)
-        return rows, columns
-
-    @cached_property
-    def _spectrum(self) -> npt.NDArray[np.complex128]:
-        return np.asarray(fft.fft2(self.camera.psf, tuple(self.k * size for size in self._grid)))
-
-    def _fold(self, spectrum: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
+    def _fold(self, spectrum: npt.NDArray[Any]) -> npt.NDArray[Any]:
         rows, columns = self._grid
         return np.asarray(spectrum.reshape(self.k, rows, self.k, columns).mean(axis=(0, 2)))
 
-    @cached_property
-    def _power(self) -> FloatArray:
-        power = np.square(np.abs(self._spectrum))
-        return np.asarray(self._fold(power).real)
-
-    @cached_property
-    def _section(self) -> tuple[tuple[int, int], npt.NDArray[np.complex128]]:
-        size = fft.next_fast_len(2 * self._side - 1, real=True)
-        steps = (np.arange(size) + size // 2) % size - size // 2
-        near = np.abs(steps) < self._side
-        correlation = fft.ifft2(self._power).real
-        rows, columns = (steps % length for length in self._grid)
-        kernel = np.where(np.outer(near, near), correlation[np.ix_(rows, columns)], 0.0)
-        return (size, size), np.asarray(fft.rfft2(kernel))
-
-    def _split_classes(self, image: FloatArray) -> FloatArray:
+    def _split(self, image: FloatArray) -> FloatArray:
         room = self._side * self.k - self._n
         padded = np.pad(image, ((0, room), (0, room)))
         return padded.reshape(self._side, self.k, self._side, self.k).transpose(1, 3, 0, 2)
@@ -264,37 +225,44 @@ class Classes:
         return np.ascontiguousarray(classes.transpose(2, 0, 3, 1).reshape(size, size)[: self._n, : self._n])
 
     @cached_property
+    def _section(self) -> tuple[tuple[int, int], npt.NDArray[np.complex128]]:
+        """Size of the grid, and spectrum, of the section of h's autocorrelation at every k-th place."""
+        size = fft.next_fast_len(2 * self._side - 1, real=True)
+        steps = (np.arange(size) + size // 2) % size - size // 2
+        near = np.abs(steps) < self._side
+        rows, columns = (steps % length for length in self._grid)
+        kernel = np.where(np.outer(near, near), fft.ifft2(self._power).real[np.ix_(rows, columns)], 0.0)
+        return (size, size), np.asarray(fft.rfft2(kernel))
+
+    @cached_property
     def _grams(self) -> FloatArray:
-        k, side = self.k, self._side
+        """G (k, k, side, side, side, side) of each class, entry by entry from sums over the sensor."""
+        k, side, psf = self.k, self._side, self.camera.psf
         grams = np.zeros((k, k, side, side, side, side))
 
         def fill(step: tuple[int, int]) -> None:
-            below, right = step
-            i = np.arange(below, side)[:, None]
-            j = np.arange(max(right, 0), side + min(right, 0))[None, :]
-            shared = self._split_classes(self._shared_light(below * k, right * k))
-            grams[:, :, i, j, i - below, j - right] = shared[:, :, i, j]
+            # Each pixel's light times that of a pixel above and to the left, summed over the sensor.
+            below, right = (k * each for each in step)
+            first, last = max(-right, 0), psf.shape[1] - max(right, 0)
+            if below >= len(psf) or last <= first:
+                return
+            both = psf[: len(psf) - below, first:last] * psf[below:, first + right : last + right]
+            for axis, start in ((0, 0), (1, first)):
+                sums = np.insert(np.cumsum(both, axis=axis), 0, 0.0, axis=axis)
+                # Sensor pixel s is place s - p of the light of pixel p.
+                edge = self.camera.origin[axis] - np.arange(self._n) - start
+                ends = np.clip([edge, edge + self.camera.sensor[axis]], 0, both.shape[axis])
+                both = np.take(sums, ends[1], axis=axis) - np.take(sums, ends[0], axis=axis)
+            if right < 0:
+                both[:, right:] = 0  # their partner is beyond the scene's edge
+            down, across = step
+            i = np.arange(down, side)[:, None]
+            j = np.arange(max(across, 0), side + min(across, 0))[None, :]
+            grams[:, :, i, j, i - down, j - across] = self._split(both)[:, :, i, j]
 
         steps = product(range(side), range(1 - side, side))
         in_threads(fill, [(below, right) for below, right in steps if below or right >= 0])
         return grams
-
-    def _shared_light(self, below: int, right: int) -> FloatArray:
-        """Return the sum (n, n) over the sensor of each pixel's light times that of a pixel above and to the left."""
-        psf, (rows, columns) = self.camera.psf, self.camera.psf.shape
-        first, last = max(-right, 0), columns - max(right, 0)
-        if below >= rows or last <= first:
-            return np.zeros((self._n,) * 2)
-        both = psf[: rows - below, first:last] * psf[below:, first + right : last + right]
-        for axis, start in ((0, 0), (1, first)):
-            sums = np.insert(np.cumsum(both, axis=axis), 0, 0.0, axis=axis)
-            # Sensor pixel s is place s - p of the light of pixel p.
-            edge = self.camera.origin[axis] - np.arange(self._n) - start
-            ends = np.clip([edge, edge + self.camera.sensor[axis]], 0, both.shape[axis])
-            both = np.take(sums, ends[1], axis=axis) - np.take(sums, ends[0], axis=axis)
-        if right < 0:
-            both[:, right:] = 0  # their partner is beyond the scene's edge
-        return both
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,12 +280,10 @@ class FactorisedClasses:
             # On a section's small grids the division would take longer than the steps that it saves.
             inverse = classes.inverse(self.lam) if classes.cropped else None
             return conjugate_gradients(classes.normal, projected, self.lam, inverse, tolerance)
-        targets = classes._split_classes(projected)
-        image = np.empty_like(targets)
+        image = classes._split(projected).copy()
         for index, factor in enumerate(self.factors):
             place = divmod(index, classes.k)
-            image[place] = linalg.cho_solve((factor, True), targets[place].ravel(), check_finite=False).reshape(
-                image[place].shape
-            )
+            found = linalg.cho_solve((factor, True), image[place].ravel(), check_finite=False)
+            image[place] = found.reshape(image[place].shape)
         status = Status(Verdict.SOLVED, "Solved", "", f"{classes.k**2} classes of {factor.shape[0]} pixels factorised.")
         return Solution(classes._join(image), self.lam, 0.0, status)
