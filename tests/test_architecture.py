@@ -567,7 +567,7 @@ SIZES = {
     "mitsim": (1, 102),
     "optics": (10, 1944),
     "planner": (6, 1940),
-    "reconstruct": (23, 7035),
+    "reconstruct": (23, 6981),
     "report": (9, 2355),
     "scene": (8, 1788),
     "sensor": (5, 1210),
