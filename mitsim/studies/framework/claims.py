@@ -219,8 +219,7 @@ class Statement:
             return [self._judge(rows, self.claim)]
         return [
             self._judge(
-                choose_rows(rows, {self.each: value}),
-                self.claim.format(**{self.each: value_name(self.each, value)}),
+                choose_rows(rows, {self.each: value}), self.claim.format(**{self.each: value_name(self.each, value)})
             )
             for value in distinct(rows, self.each)
         ]

@@ -113,7 +113,7 @@ class Panel:
 
     def name(self, column: str, value: Any) -> str:
         """Return the name of a ``value`` of a ``column``."""
-        if isinstance(self.names, str) and _is_number(value):
+        if isinstance(self.names, str) and is_number(value):
             return self.names.format(f"{float(value):g}")
         for key in ((column, value), value):
             if not isinstance(self.names, str) and key in self.names:
@@ -144,7 +144,7 @@ class Panel:
         return ", ".join(filter(None, (self.name(*item) for item in values.items())))
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
     try:
         float(str(value))
     except ValueError:

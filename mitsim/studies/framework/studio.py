@@ -33,10 +33,6 @@ from mitsim.report.pages import Value
 from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Found, Point, Setup, picture
 
 Kept = TypeVar("Kept")
-_KEY_DIGITS = 16
-"""Of a calibration's name: as of a point's."""
-_PRINT = "reflectance.png"
-"""What a scene with a print of its own has beside it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,21 +66,13 @@ class Image:
     def of(
         cls, frames: Unexposed, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1
     ) -> Image:
-        """That of one exposure.
-
-        Parameters
-        ----------
-        frames
-            what is exposed.
-        seconds, lam, binning
-            as for :meth:`mitsim.report.lit_scene.Unexposed.solve`.
-        """
+        """Return the image of one exposure; arguments as for :meth:`mitsim.report.lit_scene.Unexposed.solve`."""
         solution = frames.solve(seconds, lam, binning)
         quality, shots = frames.lit.quality(solution.image), len(frames.family.shots)
         return cls(solution.image, quality, solution.lam, shots, seconds, flags_of(solution.status))
 
     def row(self) -> dict[str, Value]:
-        """As a table has it."""
+        """Return the columns of a table."""
         return {
             "psnr_db": self.quality.psnr_db,
             "ssim": self.quality.ssim,
@@ -102,28 +90,15 @@ def flags_of(*statuses: Status, misfit: Misfit | None = None, others: Iterable[s
     Parameters
     ----------
     statuses, misfit
-        of the solution, or of the solution of each line.
+        status and misfit of the solution, or statuses of the solutions of all lines.
     others
-        warnings of what the image was made of.
+        warnings of the objects that the image was made of.
     """
     cause = f", {misfit.reason}" if misfit and misfit.flagged and misfit.cause else ""
     reasons = [f"{each.verdict.value}{cause}" for each in statuses if not each.verdict.good]
     flags = [text for each in statuses for text in each.flags]
     reasons += [text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in (*flags, *others)]
     return {"flagged": bool(reasons), "reason": "; ".join(dict.fromkeys(reasons))}
-
-
-def _made_once(place: Path, make: Callable[[Path], object]) -> Path:
-    """A ``place`` that several processes share, with what the first of them ``make``s there: whole or not at all, for
-    it may be ended meanwhile."""
-    place.parent.mkdir(exist_ok=True)
-    with FileLock(place.with_suffix(".lock")):
-        if not place.exists():
-            part = place.with_suffix(".part")
-            shutil.rmtree(part, ignore_errors=True)
-            make(part)
-            part.rename(place)
-    return place
 
 
 class Studio:
@@ -138,8 +113,8 @@ class Studio:
     """
 
     def __init__(self, shared: str | None = None) -> None:
-        self._shared = None if shared is None else Path(shared)
         self._folder = tempfile.TemporaryDirectory(prefix="mitsim-study-")
+        self._shared = Path(self._folder.name) / "shared" if shared is None else Path(shared)
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
 
     def __enter__(self) -> Studio:
@@ -150,56 +125,85 @@ class Studio:
         self._folder.cleanup()
 
     def folder(self, name: str) -> Path:
-        """A new folder of this studio's own, which ends with it; what was in one of that ``name`` is removed."""
+        """Return a new folder of this studio's own, which ends with it; an earlier one of that ``name`` is removed."""
         place = Path(self._folder.name) / "own" / name
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir(parents=True)
         return place
 
+    def shared_folder(self, kind: str) -> Path:
+        """Return the folder of objects of a ``kind`` that studios share."""
+        place = self._shared / kind
+        place.mkdir(parents=True, exist_ok=True)
+        return place
+
     def made_once(self, kind: str, name: str, make: Callable[[Path], object]) -> Path:
-        """A file or folder that studios share: whole or not at all.
+        """Return a file or folder that studios share, which the first of them makes: whole or not at all.
 
         Parameters
         ----------
         kind, name
-            folder that it is in, and what it is called there.
+            folder that it is in, and its name there.
         make
             makes it at a path that does not exist.
         """
-        return _made_once(self.shared_folder(kind) / name, make)
-
-    def shared_folder(self, kind: str) -> Path:
-        """Folder of what studios share of a ``kind``; this studio's own where there are no others."""
-        place = (self._shared or Path(self._folder.name) / "shared") / kind
-        place.mkdir(parents=True, exist_ok=True)
+        place = self.shared_folder(kind) / name
+        with FileLock(place.with_suffix(".lock")):
+            if not place.exists():  # a studio may have been ended while it made it
+                part = place.with_suffix(".part")
+                shutil.rmtree(part, ignore_errors=True)
+                make(part)
+                part.rename(place)
         return place
 
     def bench(self, setup: Setup) -> Bench:
-        """The bench of a ``setup``.
+        """Return the bench of a ``setup``.
 
         MitsimError as :func:`mitsim.open_bench`, and for another print on a scene that has none.
         """
-        return self.once("bench", 3, setup, lambda: self._open(setup))
+
+        def make() -> Bench:
+            path: Path | str = setup.scene
+            if setup.picture is not None:
+                own = locate(setup.scene, "scenes", "scene.xml")
+                shown = "reflectance.png"
+                if not (own.parent / shown).is_file():
+                    raise MitsimError(
+                        f"scene {setup.scene}: has no {shown} beside it, so there is no print to replace; keep its own"
+                    )
+                place = Path(self._folder.name) / own.parent.name / setup.picture
+                if not place.exists():
+                    shutil.copytree(own.parent, place)
+                    io.imsave(place / shown, picture(setup.picture), check_contrast=False)
+                path = place / own.name
+            parameters: dict[str, Any] = dict(setup.parameters)
+            return open_bench(path, setup.variant, setup.camera, setup.projector, setup.outside, **parameters)
+
+        return self.once("bench", 3, setup, make)
 
     def lit_scene(self, setup: Setup) -> LitScene:
-        """The scene of a ``setup`` in its light."""
-        return self.once("light", 1, setup, lambda: LitScene(self.bench(setup).light(self._plan(setup))))
+        """Return the scene of a ``setup`` in its light."""
+
+        def make() -> LitScene:
+            bench, key = self.bench(setup), Point.of(setup).key
+            plan = self.made_once("plans", key, lambda part: bench.plan(accuracy=setup.accuracy).save(part))
+            return LitScene(bench.light(Plan.load(plan)))
+
+        return self.once("light", 1, setup, make)
 
     def factors(self, setup: Setup, seed: int) -> Factors:
-        """What a session with the devices of a ``setup`` estimates, its noise from ``seed``; whatever the scene is."""
+        """Return the factors that a session with the devices of a ``setup`` estimates, its noise from ``seed``."""
         bench = self.bench(setup)
-        return self.once("factors", 4, (bench.devices_digest, seed), lambda: self._calibrate(bench, seed))
+        name = f"{bench.devices_digest[:16]}-{seed}"
+
+        def make() -> Factors:
+            place = self.made_once("calibrations", name, lambda part: bench.calibrate(seed=seed).save(part))
+            return load_calibration(place)
+
+        return self.once("factors", 4, name, make)
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
-        """Frames of a family before any exposure.
-
-        Parameters
-        ----------
-        setup, model, seed
-            as for :meth:`image`.
-        patterns
-            the family, or its name.
-        """
+        """Return frames of a family, or of its name, before any exposure; the rest as for :meth:`image`."""
         factors = self.factors(setup, seed) if model == RENDERED else None  # first: a mask may have none
         lit = self.lit_scene(setup)
         family = lit.bench.family(patterns, seed) if isinstance(patterns, str) else patterns
@@ -215,18 +219,14 @@ class Studio:
         focus: Literal["auto", "map"] | None = None,
         method: str = TIKHONOV,
     ) -> Image:
-        """A scene as it comes out: rendered, as a user's own frames are exposed and reconstructed.
+        """Return the image of a scene; a rendered one is exposed and reconstructed as a user's own frames are.
 
         Parameters
         ----------
-        setup
-            the scene.
+        setup, patterns, seed
+            scene, pattern family, and seed of the frames' and the calibration's noise.
         model
             one of :data:`mitsim.report.MODELS`.
-        patterns
-            the family.
-        seed
-            of the frames' noise, and of the calibration's.
         exposure
             one of :data:`mitsim.report.CONVENTIONS`, or ``DIM``.
         focus, method
@@ -246,51 +246,17 @@ class Studio:
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
         flags = flags_of(found.status, misfit=misfit)
-        seconds = sum(found.seconds.values())
-        return Image(found.image, quality, found.lam, count, shots.exposure_s, flags, trust, seconds)
-
-    def _plan(self, setup: Setup) -> Plan:
-        """That of a ``setup``, made by this studio or by another that was first: one in a file is as one in memory."""
-
-        def make() -> Plan:
-            return self.bench(setup).plan(accuracy=setup.accuracy)
-
-        if self._shared is None:
-            return make()
-        return Plan.load(_made_once(self._shared / "plans" / Point.of(setup).key, lambda part: make().save(part)))
-
-    def _calibrate(self, bench: Bench, seed: int) -> Factors:
-        """The same of factors."""
-        if self._shared is None:
-            return bench.calibrate(seed=seed)
-        place = self._shared / "calibrations" / f"{bench.devices_digest[:_KEY_DIGITS]}-{seed}"
-        return load_calibration(_made_once(place, lambda part: bench.calibrate(seed=seed).save(part)))
-
-    def _open(self, setup: Setup) -> Bench:
-        path = setup.scene if setup.picture is None else self._copy_with_print(setup.scene, setup.picture)
-        parameters: dict[str, Any] = dict(setup.parameters)
-        return open_bench(path, setup.variant, setup.camera, setup.projector, setup.outside, **parameters)
-
-    def _copy_with_print(self, scene: str, name: str) -> Path:
-        """A copy of a ``scene`` with the picture ``name`` for its print."""
-        own = locate(scene, "scenes", "scene.xml")
-        if not (own.parent / _PRINT).is_file():
-            raise MitsimError(
-                f"scene {scene}: has no {_PRINT} beside it, so there is no print to replace; keep its own"
-            )
-        place = Path(self._folder.name) / own.parent.name / name
-        if not place.exists():
-            shutil.copytree(own.parent, place)
-            io.imsave(place / _PRINT, picture(name), check_contrast=False)
-        return place / own.name
+        return Image(
+            found.image, quality, found.lam, count, shots.exposure_s, flags, trust, sum(found.seconds.values())
+        )
 
     def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """What is made once while neighbours share it.
+        """Return an object that is made once while neighbouring points share it.
 
         Parameters
         ----------
         kind, most, key
-            what it is, how many of its kind are kept, and which of them it is.
+            kind of the object, how many of its kind are kept, and which of them it is.
         make
             makes it.
         """

@@ -179,8 +179,10 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
     assert "PSNR is highest at mask separable (31.2 dB), lowest at mask flatcam (20.0 dB)" in page
     assert "1 of 2 images are flagged" in page
     (table,) = section.parts
-    assert table.head == ("mask", "psnr [dB]", "misfit [1]", "flagged")
-    assert table.rows == (("separable", "31.2", "0", "0 of 1"), ("flatcam", "20.0", "0.0500", "1 of 1"))
+    assert table.head == ("", "psnr [dB]", "misfit [1]")
+    assert [(name, psnr, float(misfit)) for name, psnr, misfit in table.rows] == [
+        ("separable", "31.2", 0), ("flatcam", "20.0", 0.05)
+    ]  # fmt: skip
 
 
 def test_a_page_states_the_accuracy_that_light_was_traced_to() -> None:
