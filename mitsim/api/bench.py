@@ -1,4 +1,4 @@
-"""What one does with a bench: a scene, camera and projector in; plans, light, frames, factors and renderings out.
+"""Verbs of a bench of scene, camera and projector: plan, light, capture, calibrate and render.
 
 The objects below this floor are data; here they have their verbs, each of which calls the room that does the work.
 """
@@ -94,7 +94,7 @@ class Bench(Apparatus):
 
     @takes(Request, without="patterns")
     def plan(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Plan:
-        """Plan what is simulated, by a short look at the scene, with reasons and cost.
+        """Plan a simulation by a short look at the scene, with reasons and cost.
 
         Parameters
         ----------
@@ -402,7 +402,7 @@ class Bench(Apparatus):
     # ---- The bench to look at, renderings, and the same devices before a board ----
 
     def view(self) -> BenchView:
-        """Draw the bench to scale, with its distances and what the camera sees, before any light is simulated. The
+        """Draw the bench to scale, with its distances and the camera's view, before any light is simulated. The
         drawing shows itself in a notebook, and is saved as a picture or as a page on which it can be turned."""
         from mitsim.report.bench_view import view
 

@@ -428,7 +428,7 @@ def _kernel_lines(kernels: Mapping[str, float]) -> list[str]:
 
 
 def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
-    """Return what the terminal shows of a capture, by its ``payload``."""
+    """Return the lines of a capture for the terminal, by its ``payload``."""
 
     def frames(part: Mapping[str, Any]) -> str:
         return f"{part['frames']} frames of {part['shape'][0]}x{part['shape'][1]}"

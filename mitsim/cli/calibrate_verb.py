@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed):
-    """What factors are found from, how, and where they go."""
+    """Options of `mitsim calibrate`."""
 
     PANEL = WHAT
 
@@ -60,7 +60,7 @@ class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed
         return self.output
 
     def allow(self, names: str, reason: str) -> None:
-        """Refuse, for a ``reason``, all options that are given but for these ``names`` and those of how it is said."""
+        """Refuse, for a ``reason``, all given options but these ``names`` and those of the output."""
         allowed = {*names.split(), "output", "as_json", "quiet", "verbose", "no_pictures"}
         if others := sorted({*self.given} - allowed):
             raise MitsimError(f"{reason}; leave out {option_name(others[0])}")
@@ -98,8 +98,7 @@ def calibrate(asked: Calibrating) -> int:
 
 
 def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memory: float) -> int:
-    """Print what the terminal shows of calibrations by the name of their folder in ``folder``, or of one without a
-    name; return the exit status."""
+    """Print calibrations by the name of their folder in ``folder``, or one without a name; return the exit status."""
     results = {
         name: {
             **each.manifest.result,
@@ -137,7 +136,7 @@ def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memo
 
 
 def _finish_lines(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memory: float) -> int:
-    """Print what the terminal shows of a coloured calibration; return the exit status."""
+    """Print a coloured calibration; return the exit status."""
     results = {
         name: {**each.manifest.result, "warnings": each.warnings, "output": str(folder / name)}
         for name, each in found.items()

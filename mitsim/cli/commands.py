@@ -1,4 +1,4 @@
-"""Commands from models of options, and what a terminal shows of them: pages of help, results, warnings and progress.
+"""Commands from models of options, and their output on a terminal: pages of help, results, warnings and progress.
 
 A verb is a function of one model, which declares all that its command line takes; :func:`command` makes the command.
 Errors of the library speak of arguments; :func:`message_of` writes them as options.
@@ -181,8 +181,8 @@ class Pictured(Common):
         return self.finish({**payload, "picture": made}, [*lines, *said], [*warnings, *failed])
 
     def _attempt(self, make: Callable[[], dict[str, Any]], kept: str) -> tuple[dict[str, Any] | None, list[str]]:
-        """Return what ``make`` makes, unless pictures are not wanted. Work is not lost if they cannot be made: then
-        return None, and a warning that states what is ``kept``."""
+        """Return the result of ``make``, unless pictures are not wanted. If they cannot be made, return None and a
+        warning that the work is ``kept``."""
         if self.no_pictures:
             return None, []
         try:
@@ -402,7 +402,7 @@ class Verb(_Page, TyperCommand):
     """A verb, whose page has a heading for each panel of its options, and examples in the end."""
 
     def format_usage(self, ctx: Any, formatter: Any) -> None:
-        """Write the line of what must be given."""
+        """Write the line of required arguments and options."""
         words = [
             f"{each.opts[0]} {each.metavar}" if _is_option(each) else str(each.metavar)
             for each in self.params
@@ -411,7 +411,7 @@ class Verb(_Page, TyperCommand):
         formatter.write_usage(ctx.command_path, " ".join([*words, "[OPTIONS]"]))
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write all that may be given, by panels."""
+        """Write arguments and options, by panels."""
         panels: dict[str, list[tuple[str, str]]] = {name: [] for name in ("Arguments", *PANELS)}
         for each in self.get_params(ctx):
             name = (getattr(each, "rich_help_panel", None) or OUTPUT) if _is_option(each) else "Arguments"
@@ -445,7 +445,7 @@ def _is_option(parameter: Any) -> bool:
 
 
 def _row(parameter: Any) -> tuple[str, str]:
-    """Return what a user types for a ``parameter``, its shortest name first, and what it means, may be and is."""
+    """Return the names of a ``parameter``, the shortest first, and its meaning, limits and default."""
     if _is_option(parameter):
         names = ", ".join(sorted(parameter.opts, key=len))
         name = names if parameter.is_flag or not parameter.metavar else f"{names} {parameter.metavar}"
@@ -497,7 +497,7 @@ def print_result(as_json: bool, payload: Any, lines: Iterable[str], warnings: Se
 
 @contextmanager
 def write_at_end() -> Iterator[None]:
-    """Write what is printed in this context at its end. If nobody reads standard output any more, end the program
+    """Write the output of this context at its end. If nobody reads standard output any more, end the program
     quietly as SIGPIPE does; raise MitsimError if it cannot be written for another reason, such as a full disk."""
     try:
         yield

@@ -48,7 +48,7 @@ def _method(name: str) -> Any:
 
 
 class Reconstructing(ImageRequest, Pictured):
-    """What an image is made of, how, and where it goes."""
+    """Options of `mitsim reconstruct`."""
 
     PANEL = WHAT
     FIRST = "run output calibration"
@@ -160,7 +160,7 @@ def reconstruct(asked: Reconstructing) -> int:
 
 
 def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> list[str]:
-    """Return what the terminal shows of an image, by its ``payload``."""
+    """Return the lines of an image for the terminal, by its ``payload``."""
     image, rank = result.reconstruction, payload["rank"]
     inherits = image.status.verdict.good and not image.ok
     if result.quality is not None:
@@ -185,7 +185,7 @@ def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> l
 
 
 def _colours_lines(found: ColourImage, common: Pictured) -> list[str]:
-    """Return what the terminal shows of an image in colour."""
+    """Return the lines of an image in colour for the terminal."""
     verdict = "Solved" if found.ok else "Flagged"
     quality = f"PSNR {found.psnr_db:.2f} dB over all lines" if found.psnr_db is not None else "an image of every line"
     return [

@@ -1,4 +1,4 @@
-"""`mitsim list` and `mitsim new`: the name of a kind in; what there is of it, or a file to begin with, out."""
+"""`mitsim list` and `mitsim new`: the entries of a kind, and files to begin with."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from mitsim.core.errors import MitsimError, near_name
 
 @dataclass(frozen=True)
 class Entry:
-    """One thing that a command line may name, what it ``serves``, and ``what`` it is where that is another line."""
+    """A name on a command line, its purpose ``serves``, and a description ``what`` if that is another line."""
 
     name: str
     serves: str

@@ -1,4 +1,4 @@
-"""What people read of a run: pages, plots, tables; and the exposures and models of a scene that they compare."""
+"""Pages, plots and tables of results, and the exposures and models of a scene that studies compare."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
 
 
 def label(name: str) -> str:
-    """What people call the patterns ``name``, such as "49 dots" for ``dots:7`` and "7 x 14 dots" for ``dots:7x14``."""
+    """Return the usual name of the patterns ``name``: "49 dots" for ``dots:7``, "7 x 14 dots" for ``dots:7x14``."""
     kind, _, size = name.partition(":")
     count = size.replace("x", " x ") if "x" in size else size and str(int(size) ** 2)
     return f"{count} {FAMILIES[kind].label}" if count else kind.capitalize()
 
 
 def in_text(name: str) -> str:
-    """What people call the patterns ``name`` inside a sentence: "uniform", "49 dots", "64 Hadamard"."""
+    """Return the usual name of the patterns ``name`` inside a sentence: "uniform", "49 dots", "64 Hadamard"."""
     return label(name)[:1].lower() + label(name)[1:]

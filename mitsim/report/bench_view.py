@@ -133,7 +133,7 @@ class BenchView:
         return self.layout.obstacles
 
     def summary(self) -> dict[str, Any]:
-        """Return what the command line reports, but for the file's name."""
+        """Return the JSON of the command line without the file's name."""
         layout, geometry = self.layout, self.bench.geometry
         surfaces = [
             {
@@ -500,7 +500,7 @@ def _line(name: str, points: FloatArray, color: str, width: float = 3, mode: str
 
 
 def _place_words(place: FloatArray) -> str:
-    """State where the projector stands."""
+    """Return the place of the projector in words."""
     sides = ("left of", "right of"), ("above", "below"), ("ahead", "behind")
     words = [
         f"{abs(value):.4g} mm {plus if value > 0 else minus}"

@@ -1,4 +1,4 @@
-"""An image in colour from images of spectral lines: its colours, and how far they are from what is known."""
+"""An image in colour from images of spectral lines: its colours, and their differences from known ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ColourImage:
     images : (n, n', lines) array
         Reflectances, 1 = the calibration's board, whose own reflectance is ``board``.
     truth : (n, n', lines) array
-        What perfect images would show, relative to the board; None for a real camera.
+        Perfect images of the lines, relative to the board; None for a real camera.
     chart
         Place of a colour chart in the image, on which colours are then fitted; MitsimError if it lies outside.
     facts
@@ -140,7 +140,7 @@ class ColourImage:
 
     @property
     def table(self) -> dict[str, str]:
-        """What differs between lines that were solved one by one, in words by line."""
+        """Statements on each line that was solved by itself, by line."""
         rows = {}
         for number, line in enumerate(self.lines.names if self.of_lines else ()):
             found, size = self.of_lines[line], float(np.sqrt(np.square(self.images[..., number]).mean()))

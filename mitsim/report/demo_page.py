@@ -1,21 +1,20 @@
 """The page of `mitsim demo`: one self-contained HTML file, with images inside and without scripts or links.
 
-:class:`ReportData` says what a page shows; sections without data are left out. The page carries no time of writing, so
-that the same data give the same bytes.
+The content of a page is :class:`ReportData`; sections without data are left out. A page carries no time of writing,
+so that the same data give the same bytes.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -27,12 +26,10 @@ from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report import plots
 from mitsim.report.pages import (
-    DASH,
     Mean,
     Picture,
-    PlanChart,
     Scale,
-    figure_uri,
+    page_figure,
     reflectance,
     render_page,
     sentence,
@@ -44,7 +41,6 @@ _PATTERN_CORNER = 40
 """Projector pixels a side that are shown of a pattern, so that single pixels can be seen."""
 _SMALLEST = 384
 """Pixels a side of a picture: the width of a column of the page, on a screen of two dots a pixel."""
-_FIGURE_DPI = 160
 _GAIN_DB = 0.5
 """Least gain that counts: a tenth of the squared error."""
 _SHOWN_PERCENT = 99.0
@@ -143,7 +139,7 @@ class FamilyResult:
 
 
 class BudgetRow(NamedTuple):
-    """One source of error: relative rms of the expected frames [1] (None: unknown), and what that number means."""
+    """A source of error: relative rms of the expected frames [1] (None: unknown), and the meaning of that number."""
 
     name: str
     value: float | None
@@ -156,8 +152,7 @@ class ReportData:
 
     ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, as seen along +z, row 0 at the top.
     ``main`` is the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in
-    DN by caption, ``error`` is the relative error of the expected frames, and ``calibration`` what `calibrate --json`
-    reports.
+    DN by caption, ``error`` is the relative error of the expected frames, and ``calibration`` the JSON of `calibrate`.
     """
 
     title: str
@@ -240,21 +235,19 @@ def render_html(report: ReportData) -> str:
     trust = next((f.rendered.trust for f in report.families if f.rendered and f.name == report.main), None)
     return render_page(
         "report.html",
-        _FILTERS,
         report=report,
         best=best,
-        figures={name: _picture(figure) for name, figure in figures.items() if figure is not None},
+        figures={name: page_figure(figure)[0] for name, figure in figures.items() if figure is not None},
         frames=[Picture.of(name, name, _finite(dn, name), Scale.of(dn, "DN")) for name, dn in report.frames.items()],
         errors=trust.pictures() if trust else (),
-        plan=PlanChart.of(report.effects, report.accuracy) if report.effects else None,
         total=total_of(report.seconds),
         stages=stages_of(report.seconds),
         pattern_corner=_PATTERN_CORNER,
+        picture_of=_reflectance,
+        pattern_of=_pattern,
+        trouble_in=_trouble,
+        chi_square=chi_square_text,
     )
-
-
-def _picture(figure: Figure) -> str:
-    return figure_uri(figure, _FIGURE_DPI)
 
 
 def _reflectance(image: npt.ArrayLike, name: str = "image") -> str:
@@ -278,21 +271,3 @@ def _finite(image: npt.ArrayLike, name: str) -> FloatArray:
 def _trouble(status: str) -> str:
     """Return the first part of the solver's sentence, unless it is "Solved: ..." and nothing is missing."""
     return "" if status.startswith("Solved: ") else sentence(re.split(r"; |\. ", status)[0])
-
-
-def _chi_square(value: float | None) -> str:
-    return DASH if value is None else chi_square_text(value)
-
-
-def _decibel(value: float | None) -> str:
-    return DASH if value is None else f"{value:.1f} dB"
-
-
-_FILTERS: dict[str, Callable[..., str]] = {
-    "chi": _chi_square,
-    "db": _decibel,
-    "rms": reflectance,
-    "trouble": _trouble,
-    "reflectance": _reflectance,
-    "pattern": _pattern,
-}

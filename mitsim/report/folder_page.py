@@ -34,6 +34,7 @@ from mitsim.core.manifests import (
 )
 from mitsim.core.runs import TRUTH, load_mosaic, load_run
 from mitsim.devices.framelist import ChartPlace
+from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality, truth_for
 from mitsim.reconstruct.colour import chart, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
@@ -45,7 +46,6 @@ from mitsim.report.pages import (
     REFLECTANCE,
     SMALLEST,
     Picture,
-    PlanChart,
     Scale,
     contact_sheet,
     lines_of,
@@ -83,7 +83,8 @@ class Shown:
     warnings: Sequence[str] = ()
     command: str | None = None
     pictures: Sequence[Picture] = ()
-    plan: PlanChart | None = None
+    plan: Sequence[PlanRow] = ()
+    accuracy: float | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     kernels: Mapping[str, float] = field(default_factory=dict)
     tables: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -196,7 +197,7 @@ def _of_run(lines: SpectralFolder) -> Shown:
     manifest, taken, black = shots.manifest, shots.manifest.patterns, np.float64(shots.manifest.digital.black_level_dn)
     accuracy = (manifest.plan or {}).get("accuracy")
     accuracy = accuracy if isinstance(accuracy, float) else None
-    rows, error, count = plan_rows(manifest.plan), manifest.total_error_bound, len(taken.captures)
+    error, count = manifest.total_error_bound, len(taken.captures)
 
     def frame(name: str) -> FloatArray:
         """Read a frame less the black level [DN]."""
@@ -224,7 +225,8 @@ def _of_run(lines: SpectralFolder) -> Shown:
         warnings=manifest.warnings,
         command=manifest.command,
         pictures=pictures,
-        plan=PlanChart.of(rows, accuracy) if rows else None,
+        plan=plan_rows(manifest.plan),
+        accuracy=accuracy,
         seconds=manifest.seconds,
         kernels=manifest.kernels,
         tables=_tables(manifest, lines.folder, {"patterns": {"family": taken.family, "n": taken.n, "frames": count}}),

@@ -34,22 +34,22 @@ if TYPE_CHECKING:
 _SHOWN_DPI = 110
 
 
-def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
-    """Render a template of ``mitsim/report/templates``, with ``filters`` of its own; a missing variable is an error."""
-    return _environment(tuple((filters or {}).items())).get_template(template).render(**shown)
+def render_page(template: str, **shown: Any) -> str:
+    """Render a template of ``mitsim/report/templates``; a missing variable is an error."""
+    return _environment().get_template(template).render(**shown)
 
 
 @cache
-def _environment(filters: tuple[tuple[str, Callable[..., str]], ...]) -> Environment:
-    """Return templates with these ``filters``, kept for the next page because compiling takes longer than filling."""
+def _environment() -> Environment:
+    """Return the templates' environment, kept for the next page because compiling takes longer than filling."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("mitsim.report")
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    own = {"sci": scientific, "typeset": typeset, "sentence": sentence, "seconds": duration}
-    environment.filters.update({**own, **dict(filters)})
+    environment.filters |= {"sci": scientific, "typeset": typeset, "sentence": sentence, "seconds": duration}
+    environment.filters |= {"rms": reflectance, "db": lambda value: f"{value:.1f} dB"}
     return environment
 
 
@@ -68,12 +68,6 @@ def page_figure(figure: Figure) -> tuple[str, int]:
 def written_figure(figure: Figure, path: Path) -> tuple[str, int]:
     """Return a ``figure`` that was written to the PNG file ``path`` as data URI, and its width on a page [pixels]."""
     return data_uri(path.read_bytes(), "png"), round(float(figure.get_figwidth()) * _SHOWN_DPI)
-
-
-def figure_uri(figure: Figure, dots_per_inch: int) -> str:
-    """Return a figure as the data URI of a PNG."""
-    figure.savefig(buffer := BytesIO(), format="png", dpi=dots_per_inch)
-    return data_uri(buffer.getvalue())
 
 
 # -------- Numbers and plain text as pages and figures print them
@@ -151,54 +145,7 @@ def _power(found: re.Match[str]) -> str:
 
 _LEAST_STAGE = 0.01
 """Part of the total time below which a stage has no line of its own: its bar would be three pixels wide."""
-_LEAST_ERROR = 1e-7
-"""Smallest end of the scale of errors: smaller errors in plans are rounding."""
 _MOST_LISTED = 6
-
-
-class EffectBar(NamedTuple):
-    """Row of a plan's chart, and the widths of its two bars [%]."""
-
-    row: PlanRow
-    error: float
-    seconds: float
-
-
-@dataclass(frozen=True)
-class PlanChart:
-    """A plan as bars: effects that are on or would change frames, and idle rows.
-
-    ``decades`` are the powers of ten at the ends of the scale of errors, on which ``mark`` [%] is the place of the
-    accuracy.
-    """
-
-    bars: tuple[EffectBar, ...]
-    idle: tuple[PlanRow, ...]
-    decades: tuple[int, int]
-    accuracy: float | None
-    mark: float | None
-
-    @classmethod
-    def of(cls, rows: Sequence[PlanRow], accuracy: float | None) -> PlanChart:
-        """Lay out the ``rows`` of a plan at an ``accuracy``."""
-        shown = [row for row in rows if row.state != "off" or row.error_if_off]
-        errors = [max(row.error_if_off, _LEAST_ERROR) for row in shown if row.error_if_off] + [accuracy or 0.0]
-        logs = [math.log10(error) for error in errors if error] or [-6.0, 0.0]
-        low = math.floor(min(logs))
-        high = max(math.ceil(max(logs)), low + 1)
-
-        def place(error: float | None) -> float:
-            return 100 * (math.log10(max(error, 10.0**low)) - low) / (high - low) if error else 0.0
-
-        longest = max((row.seconds for row in shown), default=0.0) or math.inf
-        bars = tuple(EffectBar(row, place(row.error_if_off), 100 * row.seconds / longest) for row in shown)
-        idle = tuple(row for row in rows if row not in shown)
-        return cls(bars, idle, (low, high), accuracy, place(accuracy) if accuracy else None)
-
-    @property
-    def costly(self) -> bool:
-        """True if any effect takes time."""
-        return any(bar.row.seconds for bar in self.bars)
 
 
 def plan_rows(plan: Mapping[str, Any] | None) -> tuple[PlanRow, ...]:
@@ -386,7 +333,7 @@ class Mean(NamedTuple):
         return format(self)
 
     def __format__(self, sign: str) -> str:
-        """With its error; ``sign`` is "+" for a number that always shows its own."""
+        """Print the mean with its error; ``sign`` is "+" for a number that always shows its sign."""
         if math.isnan(self.error):
             return f"{self.value:{sign}.1f}"
         places = 1 if self.error >= _SEEN else 2
@@ -394,7 +341,7 @@ class Mean(NamedTuple):
 
     @classmethod
     def of_numbers(cls, numbers: Sequence[float], what: str) -> Mean:
-        """Of independent ``numbers``; MitsimError that nothing was measured of ``what`` where there are none."""
+        """Return the mean of independent ``numbers``; MitsimError that names ``what`` if there are none."""
         if not numbers:
             raise MitsimError(f"study: nothing was measured of {what}")
         array = np.array(numbers)

@@ -6,7 +6,6 @@ Colours are safe for the colour-blind. The caller saves the figure, and no state
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import FuncNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
@@ -70,8 +69,6 @@ Curve = Mapping[Any, Mean]
 """Means by what varies: numbers, or their text."""
 Point = tuple[float, float]
 """Wall seconds, relative error."""
-_SHORT_AXIS = 30.0
-"""Range of a logarithmic axis below which powers of ten alone leave at most one tick."""
 
 
 # -------- Figures
@@ -323,56 +320,6 @@ def error_bars(
     axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=FONT)
     axes.set_ylim(-0.6, len(values) - 0.4)
     label_axes(axes, "relative error [1]", "", grid="x")
-    return figure
-
-
-@dataclass(frozen=True)
-class Cost:
-    """An ``error`` and the median, least and most ``seconds`` of the work ``name``, with a ``text`` beside the dot.
-
-    The dot is hollow where the seconds were not ``measured``.
-    """
-
-    name: str
-    error: float
-    seconds: tuple[float, float, float]
-    text: str = ""
-    measured: bool = True
-
-
-def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str, float] | None = None) -> Figure:
-    """Draw error against time, in panels below each other, with rings around the Pareto front.
-
-    ``levels`` are errors for comparison, by name.
-    """
-    figure, places = panels_of(len(panels), 1, 1.3 + 2.8 * len(panels), _BARS, sharex=True)
-    names = list(dict.fromkeys(point.name for points in panels.values() for point in points))
-    shown: dict[str, Any] = {}
-    for axes, (title, points) in zip(places[:, 0], panels.items(), strict=True):
-        for point in points:
-            row, column = divmod(names.index(point.name), len(_PALETTE))
-            median, least, most = point.seconds
-            style = {"color": _PALETTE[column], "mfc": _PALETTE[column] if point.measured else "white", "zorder": 3}
-            axes.hlines([point.error], least, most, color=_PALETTE[column], lw=1.5)
-            (shown[point.name],) = axes.plot([median], [point.error], MARKERS[row], ms=8, **style)
-            axes.annotate(point.text, (median, point.error), (6, 6), textcoords="offset points", fontsize=FONT - 2)
-        front = np.array(pareto_front([(point.seconds[0], point.error) for point in points]))
-        ring: dict[str, Any] = {"ms": 13, "mfc": "none", "mec": GREY, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
-        (shown["best for its time"],) = axes.plot(*front.T, "o", color=GREY, **ring)
-        axes.set(xscale="log", yscale="log", xmargin=0.2)
-        axes.set_title(title, fontsize=FONT)
-        low, high = axes.get_xlim()
-        if high < _SHORT_AXIS * low:
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
-        label_axes(axes, "wall time [s]" if axes is places[-1, 0] else "", fill(error, _UPRIGHT_LETTERS))
-    for text, level in (levels or {}).items():
-        where: Any = places[0, 0].get_yaxis_transform()
-        places[0, 0].axhline(level, color=GREY, lw=1.5, ls="--")
-        places[0, 0].annotate(f"{text}: {scientific(level)}", (0.01, level), (2, 3), xycoords=where,
-                           textcoords="offset points", fontsize=FONT - 2, color=GREY)  # fmt: skip
-    legend_below(figure, shown.values(), shown.keys())
     return figure
 
 

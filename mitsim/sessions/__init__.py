@@ -1,1 +1,1 @@
-"""Sessions: one file that says what each verb is asked for in, one folder with all of their results out; and back."""
+"""Sessions: one file with the options of several verbs, one folder with their results, and the way back."""

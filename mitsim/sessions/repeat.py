@@ -1,4 +1,4 @@
-"""A folder that mitsim wrote in; the session file that repeats it, as its own files tell, out."""
+"""The session file that repeats a folder which mitsim wrote, from the folder's own files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from mitsim.studies.framework.campaign import read_scope
 
 
 class _Opened(BaseModel):
-    """How a manifest names the files that opened its bench."""
+    """Files in a manifest that opened its bench."""
 
     camera: str | None = None
     projector: str | None = None
@@ -47,7 +47,7 @@ class _Opened(BaseModel):
 
 
 class _Scene(BaseModel):
-    """What the configuration in a manifest states of the scene."""
+    """The scene in the configuration of a manifest."""
 
     scene: str
     defines: dict[str, str]
@@ -58,7 +58,7 @@ class _Scene(BaseModel):
 
 @dataclass(frozen=True)
 class Repeat:
-    """What repeats a folder: the ``text`` of a session file, and why it may come to something else.
+    """The ``text`` of a session file that repeats a folder, and reasons why its results may differ.
 
     Attributes
     ----------
@@ -97,13 +97,13 @@ def session_of(folder: Path | str) -> Repeat:
     Returns
     -------
     Repeat
-        its ``text``; ``warnings`` say which of its files are others now, or are not told.
+        its ``text``; ``warnings`` name files that have changed since, or that the folder does not name.
 
     Raises
     ------
     MitsimError
-        for a folder that holds none of these, and for what no session file tells: frames of a real camera, a bench
-        before a board, a calibration that is fitted to pictures.
+        for a folder that holds none of these, and for work that no session file describes: frames of a real camera,
+        a bench before a board, a calibration that is fitted to pictures.
     """
     folder = Path(folder)
     if (folder / SUMMARY).is_file() and (folder / SESSION_FILE).is_file():
@@ -135,7 +135,7 @@ def session_of(folder: Path | str) -> Repeat:
 
 @dataclass
 class _Found:
-    """Tables of a session, found in folders; ``warnings`` on what is not as it was; and the folders that the tables of
+    """Tables of a session that were found in folders; ``warnings`` on changes since; and the folders that the tables of
     capture and calibration were ``taken`` from."""
 
     tables: dict[str, Any] = field(default_factory=dict)
@@ -216,7 +216,7 @@ class _Found:
         self.taken["capture"] = str(folder)
 
     def colour_of(self, folder: Path) -> dict[str, str]:
-        """Return the word of the colours of a ``folder``; nothing if none are told apart."""
+        """Return the option ``colour`` of a ``folder``; nothing for light of all lines together."""
         lines = open_lines(folder, *KINDS)
         if lines.colours is None or lines.filters:
             return {"colour": "mosaic"} if lines.filters else {}

@@ -157,8 +157,8 @@ def run(
     Raises
     ------
     MitsimError
-        before any work, for a file with mistakes and for what any step would refuse; for an output that holds something
-        else, and for what a step refuses as it works.
+        before any work, for a file with mistakes and for a request that any step would refuse; for an output that holds
+        something else, and for errors of a step at work.
 
     Examples
     --------
@@ -187,7 +187,7 @@ def run(
         results, text = list[StepResult](), session_text(read.tables, folder)
 
         def note() -> None:
-            """Write what is finished and what is at work, so that a killed session can be resumed."""
+            """Write the finished steps and the one at work, so that a killed session can be resumed."""
             kept = {**steps.earlier, **{each.output: each for each in results}}
             stated = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
             write_json(folder / SUMMARY, {**head, **stated})
@@ -262,7 +262,7 @@ def _end(work: Work) -> Said:
 
 @dataclass
 class _Steps:
-    """The steps of a ``session`` in a ``folder``, and what they share, which is made once.
+    """The steps of a ``session`` in a ``folder``, and the bench and light that they share.
 
     ``earlier`` are results of an earlier run in the folder, and ``made`` the files, by the step's output. ``plan`` and
     ``light`` are those of an earlier step, by which frames are captured.
@@ -293,7 +293,7 @@ class _Steps:
         return work
 
     def check_bench(self, prepared: Sequence[tuple[Step, Work]]) -> None:
-        """Open the scene if a step needs it, and refuse what only the opened scene shows."""
+        """Open the scene if a step needs it, and check the steps against the opened scene."""
         for step, work in prepared:
             if step.verb in OF_A_BENCH:
                 self.bench  # noqa: B018 - opens it
@@ -332,9 +332,11 @@ class _Steps:
 
     @contextmanager
     def making(self, step: Step) -> Iterator[None]:
-        """Note that a ``step`` is at work, so that its earlier files no longer count as finished, and what it made. An
-        earlier image or export is kept aside, and restored if the step is refused; MitsimError if its folder has files
-        that the session did not make."""
+        """Note that a ``step`` is at work, so that its earlier files no longer count, and then the files that it made.
+
+        An earlier image or export is kept aside, and restored if the step is refused. MitsimError if its folder has
+        files that the session did not make.
+        """
         place, aside = self.folder / step.output, self.folder / f".{step.output}.before"
         _remove(aside)
         before, self.made[step.output] = self.made.get(step.output), _Made(inputs="")
@@ -564,7 +566,7 @@ def _of_lines(each: Mapping[str, Said]) -> Said:
 
 
 def _checksums(place: Path) -> dict[str, str]:
-    """Return the SHA-256 of a file, or of each file of a folder by name, without pages and what writing leaves."""
+    """Return the SHA-256 of a file, or of each file of a folder by name, without pages and unfinished files."""
     found = {}
     for path in sorted(place.rglob("*")) if place.is_dir() else [place] if place.is_file() else []:
         name = path.relative_to(place)

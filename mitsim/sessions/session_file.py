@@ -125,7 +125,7 @@ class _Study(_Placed, StudyOptions):
     scene: FilePath | None = None
 
     def model_post_init(self, _: object) -> None:
-        """Refuse values that parameters, and what is varied, cannot have."""
+        """Refuse values that parameters and varied fields cannot have."""
         for name, value in self.parameters.items():
             _one_value(f"parameters.{name}", value)
         for name, values in self.over.items() if isinstance(self.over, Mapping) else ():
@@ -323,7 +323,7 @@ class _Mistakes:
     tables: set[Place] = field(default_factory=set)
 
     def say(self, place: Place, text: str) -> None:
-        """Note a ``text`` on what is wrong at a ``place``."""
+        """Note the mistake ``text`` at a ``place``."""
         once = len(place) > 1 and place[0] in SEVERAL and not isinstance(self.data.get(str(place[0])), list)
         there = (place[0], *place[2:]) if once else place
         self.tables.add(place[: 1 + (place[0] in SEVERAL)])

@@ -23,9 +23,8 @@ from mitsim.core.images import lightness
 from mitsim.core.job import Job
 from mitsim.core.manifests import MANIFEST, RUN, ColourManifest, write_colours
 from mitsim.core.runs import RunFolder, load_run
-from mitsim.light.plan import PlanRow
 from mitsim.report.folder_page import report_folder
-from mitsim.report.pages import Picture, PlanChart, Scale, contact_sheet, lines_of, plan_rows
+from mitsim.report.pages import Picture, Scale, contact_sheet, lines_of, plan_rows
 from mitsim.report.reconstruct_run import reconstruct
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, Made, made
 from tests.unit.report.test_report import _Outside
@@ -279,21 +278,7 @@ def test_a_frame_in_one_file_has_its_picture_beside(tmp_path: Path, capsys: pyte
     assert np.asarray(Image.open(json.loads(capsys.readouterr().out)["picture"]["file"])).shape == (384, 512, 3)
 
 
-def test_errors_of_a_plan_stand_on_a_scale_of_powers_of_ten() -> None:
-    """From 1e-3 to 0.1 an error of 0.01 is in the middle. (Planted: a linear scale.)"""
-    rows = (
-        PlanRow("a", "exact", "", 0.1, 2.0),
-        PlanRow("b", "approximate", "", 0.01, 1.0),
-        PlanRow("c", "exact", "", None, 0.0),
-        PlanRow("d", "off", "", 0.0, 0.0),
-    )
-    found = PlanChart.of(rows, 1e-3)
-    assert found.decades == (-3, -1) and found.mark == pytest.approx(0) and found.costly
-    assert [bar.error for bar in found.bars] == pytest.approx([100, 50, 0])
-    assert [bar.seconds for bar in found.bars] == pytest.approx([100, 50, 0])
-    assert [row.name for row in found.idle] == ["d"]
-    bare = PlanChart.of((PlanRow("a", "exact", "", None, 0.0),), None)
-    assert bare.mark is None and not bare.costly and bare.bars[0].error == 0
+def test_rows_of_a_plan_that_other_programs_wrote_are_left_out() -> None:
     assert plan_rows({"effects": "none"}) == plan_rows(None) == () and len(plan_rows({"effects": [*EFFECTS, 1]})) == 3
 
 

@@ -23,25 +23,12 @@ from mitsim.report.pages import Mean
 from tests.exchanged import made
 from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
-NAMES = [f"{method}, {layout}" for method in ("svd", "gram") for layout in ("block", "full")]
-COSTS = {
-    f"lambda {lam:.0e}": [
-        plots.Cost(name, 1e-3 * 0.1**index, 3 * (0.02 * 1.2**index,)) for index, name in enumerate(NAMES)
-    ]
-    for lam in (1e-4, 1e-8)
-}
-
-
-def costs() -> Figure:
-    return plots.costs(COSTS, "relative error of the image [1]")
-
 
 def test_every_axis_has_a_unit() -> None:
     figures = (
         plots.singular_values({"a": np.ones(3)}),
         plots.error_bars({"a": 1e-3}, 1e-2),
         plots.grouped_bars({"a": {"b": Mean(20.0, 1.0, 8), "c": Mean(10.0, float("nan"), 1)}}, "PSNR [dB]"),
-        costs(),
     )
     for figure in figures:
         axes = figure.axes[0]
@@ -94,26 +81,6 @@ def test_seven_families_can_be_told_apart() -> None:
 def test_the_front_is_what_nothing_beats() -> None:
     points = [(3.0, 0.1), (1.0, 1.0), (2.0, 0.5), (2.5, 0.5), (1.0, 2.0), (4.0, 0.2)]
     assert plots.pareto_front(points) == [(1.0, 1.0), (2.0, 0.5), (3.0, 0.1)]
-
-
-def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
-    figure = costs()
-    figure.canvas.draw()
-    box = figure.legends[0].get_window_extent()
-    assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
-    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
-
-
-def test_costs_show_every_row_in_its_panel() -> None:
-    """Rings are around what no other row beats in both."""
-    figure = costs()
-    for axes, (title, rows) in zip(figure.axes, COSTS.items(), strict=True):
-        assert axes.get_title() == title
-        shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines[:-1]]
-        assert sorted(shown) == sorted((row.seconds[0], row.error) for row in rows)
-        assert list(zip(*axes.lines[-1].get_data(), strict=True)) == plots.pareto_front(shown)
-    looks = {(line.get_color(), line.get_marker()) for line in figure.axes[0].lines[:-1]}
-    assert len(looks) == len(NAMES)
 
 
 def test_an_error_of_nothing_has_no_dot() -> None:
