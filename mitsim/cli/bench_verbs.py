@@ -17,6 +17,7 @@ from mitsim.cli.commands import (
     KnownPlan,
     Limited,
     LimitedPictured,
+    OfScene,
     Overwritten,
     Resumed,
     argument,
@@ -127,10 +128,9 @@ def _repeat(asked: Running, folder: Path) -> int:
     return asked.finish(payload, lines, found.warnings)
 
 
-class Viewing(Opening, Common):
+class Viewing(OfScene, Opening, Common):
     """Options of `mitsim view`."""
 
-    scene: str = scene_named(..., metavar="SCENE")
     output: Path = to_make(Path("view.png"), "picture, or page to turn the bench on", "FILE.png|FILE.html")
 
 
@@ -216,13 +216,12 @@ def doctor(asked: Examining) -> int:
 # ---- plan ------------------------------------------------------------------------------------------------------------
 
 
-class Planning(Planned, Coloured, Opening, Overwritten, Common):
+class Planning(OfScene, Planned, Coloured, Opening, Overwritten, Common):
     """Options of `mitsim plan`."""
 
     FIRST = "scene patterns colour"
     CHANGES = _ACCURACY
 
-    scene: str = scene_named(..., metavar="SCENE")
     output: Path | None = to_make(None, "file to make, for capture --plan", "FILE.json")
     everything: bool = option(False, "all effects, and all of their reasons", "--all", panel=OUTPUT)
 
@@ -313,13 +312,12 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
 # ---- capture ---------------------------------------------------------------------------------------------------------
 
 
-class Capturing(Request, KnownPlan, Resumed, Coloured, Opening, LimitedPictured):
+class Capturing(OfScene, Request, KnownPlan, Resumed, Coloured, Opening, LimitedPictured):
     """Options of `mitsim capture`."""
 
     FIRST = "scene patterns exposure exposure_fraction noise_fraction ambient_frame ambient_shots closing_frame"
     CHANGES = shown(patterns={"default": None, "help": f"{pattern_names()}; needed without --plan"}, **_ACCURACY)
 
-    scene: str = scene_named(..., metavar="SCENE")
     output: Path = to_make(..., "run folder to make", "RUN")
     light: Path | None = option(
         None, "file of `mitsim transport`: nothing is traced again", metavar="FILE.h5", panel=WHAT
@@ -484,12 +482,11 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
 # ---- render, transport and pairs -------------------------------------------------------------------------------------
 
 
-class Rendering(Planned, LitScene, LimitedPictured):
+class Rendering(OfScene, Planned, LitScene, LimitedPictured):
     """Options of `mitsim render`."""
 
     FIRST, HIDDEN = "scene output estimator spp", "patterns seconds"
 
-    scene: str = scene_named(..., metavar="SCENE")
     output: Path = to_make(..., "frame to write", "FRAME.exr")
     estimator: str = option("reference", "reference or factored", metavar="NAME", panel=QUALITY)
     spp: int | None = option(
@@ -539,13 +536,12 @@ def render(asked: Rendering) -> int:
     return asked.finish_frame((output, mean, "W/m^2"), payload, lines, frame.warnings)
 
 
-class Tracing(Planned, KnownPlan, Overwritten, Opening, Limited):
+class Tracing(OfScene, Planned, KnownPlan, Overwritten, Opening, Limited):
     """Options of `mitsim transport`."""
 
     FIRST = "scene output patterns"
     CHANGES = _ACCURACY
 
-    scene: str = scene_named(..., metavar="SCENE")
     output: Path = to_make(..., "HDF5 file to make", "FILE.h5")
 
 
@@ -583,13 +579,12 @@ def transport(asked: Tracing) -> int:
     return asked.finish(payload, lines, payload["warnings"])
 
 
-class Pairing(PairOptions, Request, Resumed, Opening, Limited):
+class Pairing(OfScene, PairOptions, Request, Resumed, Opening, Limited):
     """Options of `mitsim pairs`."""
 
     FIRST, HIDDEN = "scene output count", "seconds noise_fraction closing_frame"
     CHANGES = shown(exposure={"help": "seconds a frame, or auto: each pair for itself"})
 
-    scene: str = scene_named(..., metavar="SCENE")
     output: Path = to_make(..., "folder to make", "DIR")
 
 

@@ -197,6 +197,12 @@ class LimitedPictured(Limited, Pictured):
     """Options of verbs that may work for long, and whose work has pictures."""
 
 
+class OfScene(Options):
+    """The scene of a verb."""
+
+    scene: str = scene_named(..., metavar="SCENE")
+
+
 class Resumed(Options):
     """Whether interrupted work goes on."""
 
