@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -45,90 +45,70 @@ _WHOLE = 1e4
 # ---- tables of the measured numbers ----------------------------------------------------------------------------------
 
 
-class EmvaFigure(NamedTuple):
-    """A figure of EMVA 1288, which `mitsim.sensor.emva.figures` finds by its name.
-
-    `set` is the value that a camera sets, `root` is True if a variance is found, and `method` if no file sets the
-    figure.
-    """
-
-    symbol: str
-    unit: str
-    set: Callable[[Frames], float]
-    root: bool = False
-    method: bool = False
-
-
-def _dark_noise(frames: Frames) -> float:
-    """Return the noise in the dark [e-]; at no exposure if the light varies by exposure."""
-    sensor, ladder = frames.sensor, len(np.unique(frames.exposure_s[frames.light > 0])) >= LINE
-    dark = 0.0 if ladder else mean_dark_current(sensor) * float(frames.exposure_s[frames.dark])
-    return math.sqrt(sensor.superpixel_reading_noise_e**2 + dark)
-
-
-def _brightest(frames: Frames, values: FloatArray) -> float:
-    return float(values[int(frames.light.argmax())])
-
-
-def _full_well(frames: Frames) -> float:
-    sensor = frames.sensor
-    dark = mean_dark_current(sensor) * _brightest(frames, frames.exposure_s)
-    return (capacity_of(sensor) - dark) * (1 - sensor.dead_pixels)
-
-
-def _nonuniformity(frames: Frames, kind: str, part: str) -> float:
-    values = frames.parts(frames.dark)
-    if kind == "prnu":
-        alive = float(frames.electrons[frames.bright]) * (1 - frames.sensor.dead_pixels)
-        values = (frames.parts(frames.bright) - values) / alive**2
-    return float(dict(zip(SPLIT, (values.sum(), *values), strict=True))[part])
-
-
-FIGURES: Mapping[str, EmvaFigure] = {
-    "system_gain": EmvaFigure("K", "DN/e-", lambda frames: frames.sensor.gain_dn_per_e),
-    "quantum_efficiency": EmvaFigure(
-        "eta", "e-/photon", lambda frames: _brightest(frames, frames.electrons) / _brightest(frames, frames.light)
-        * (1 - frames.sensor.dead_pixels)
-    ),
-    "dark_noise": EmvaFigure("sigma_d", "e-", _dark_noise),
-    "row_noise": EmvaFigure("sigma_row", "e-", lambda frames: frames.sensor.superpixel_row_noise_e**2, root=True),
-    "saturation_capacity": EmvaFigure("mu_e.sat", "e-", lambda frames: capacity_of(frames.sensor), method=True),
-    "full_well": EmvaFigure("F", "e-", _full_well),
-    "linearity_min": EmvaFigure("LE_min", "%", lambda frames: 0.0, method=True),
-    "linearity_max": EmvaFigure("LE_max", "%", lambda frames: 0.0, method=True),
-    "dark_current": EmvaFigure("mu_I.mean", "e-/s", lambda frames: mean_dark_current(frames.sensor)),
-    "dark_current_by_variance": EmvaFigure("mu_I.var", "e-/s", lambda frames: mean_dark_current(frames.sensor)),
-    **{
-        f"{kind}_{part}": EmvaFigure(
-            f"{kind.upper()}1288.{part}", unit, partial(_nonuniformity, kind=kind, part=part), root=True
-        )
-        for kind, unit in (("dsnu", "e-"), ("prnu", "%")) for part in SPLIT
-    },
+FIGURES: Mapping[str, tuple[str, str]] = {
+    "system_gain": ("K", "DN/e-"),
+    "quantum_efficiency": ("eta", "e-/photon"),
+    "dark_noise": ("sigma_d", "e-"),
+    "row_noise": ("sigma_row", "e-"),
+    "saturation_capacity": ("mu_e.sat", "e-"),
+    "full_well": ("F", "e-"),
+    "linearity_min": ("LE_min", "%"),
+    "linearity_max": ("LE_max", "%"),
+    "dark_current": ("mu_I.mean", "e-/s"),
+    "dark_current_by_variance": ("mu_I.var", "e-/s"),
+    **{f"dsnu_{part}": (f"DSNU1288.{part}", "e-") for part in SPLIT},
+    **{f"prnu_{part}": (f"PRNU1288.{part}", "%") for part in SPLIT},
+}
+"""Symbol and unit of the figures of EMVA 1288 that `mitsim.sensor.emva.figures` finds."""
+_VARIANCES = "dsnu", "prnu", "row_noise"
+"""Beginnings of the figures that are found as variances."""
+_UNITS = {
+    "gain_dn_per_e": "DN/e-", "quantum_efficiency": "e-/photon", "e_per_s": "e-/s", "_dn": "DN", "_e": "e-", "": "1"
 }  # fmt: skip
-FIELDS: Mapping[str, tuple[str, Callable[[SensorModel], float | None]]] = {
-    "gain_dn_per_e": ("DN/e-", lambda model: model.gain_dn_per_e),
-    "quantum_efficiency": ("e-/photon", lambda model: model.quantum_efficiency),
-    "read_noise_e": ("e-", lambda model: model.superpixel_read_noise_e),
-    "row_noise_e": ("e-", lambda model: model.superpixel_row_noise_e),
-    "black_level_dn": ("DN", lambda model: model.superpixel_black_level_dn),
-    "full_well_e": ("e-", capacity_of),
-    "dark_current_e_per_s": ("e-/s", lambda model: model.superpixel_dark_current_e_per_s),
-    "dark_current_spread_e_per_s": (
-        "e-/s", lambda model: model.binning * model.dark_factor * model.dark_current_spread_e_per_s
-    ),
-    "dsnu_row_e": ("e-", lambda model: model.offset_parts[1]),
-    "dsnu_column_e": ("e-", lambda model: model.offset_parts[2]),
-    "dsnu_pixel_e": ("e-", lambda model: model.offset_parts[0]),
-    "prnu_row": ("1", lambda model: model.response_parts[1]),
-    "prnu_column": ("1", lambda model: model.response_parts[2]),
-    "prnu_pixel": ("1", lambda model: model.response_parts[0]),
-    "hot_pixels": ("1", lambda model: model.hot_pixels if model.binning == 1 else None),
-    "hot_dark_current_e_per_s": ("e-/s", lambda model: model.hot_dark_current_e_per_s if model.binning == 1 else None),
-    "dead_pixels": ("1", lambda model: model.dead_pixels if model.binning == 1 else None),
-    "linearity.0": ("1", lambda model: (*model.linearity, 0.0)[0]),
-    "linearity.1": ("1", lambda model: (*model.linearity, 0.0, 0.0)[1]),
-}  # fmt: skip
-"""Measured fields of a camera file: unit, and the value that a model sets for its superpixels."""
+"""Unit of a field of a camera file by the first of these that its name ends with."""
+
+
+def figures_set(frames: Frames) -> dict[str, float]:
+    """Return the figures that the camera of some frames is set to; variances of those that are found as such."""
+    sensor, brightest, current = frames.sensor, int(frames.light.argmax()), mean_dark_current(frames.sensor)
+    alive, light = 1 - sensor.dead_pixels, float(frames.light[brightest])
+    # At no exposure if the light varies by exposure.
+    ladder = len(np.unique(frames.exposure_s[frames.light > 0])) >= LINE
+    dark = 0.0 if ladder else current * float(frames.exposure_s[frames.dark])
+    offsets = frames.parts(frames.dark)
+    responses = (frames.parts(frames.bright) - offsets) / (float(frames.electrons[frames.bright]) * alive) ** 2
+    return {
+        "system_gain": sensor.gain_dn_per_e,
+        "quantum_efficiency": float(frames.electrons[brightest]) / light * alive,
+        "dark_noise": math.sqrt(sensor.superpixel_reading_noise_e**2 + dark),
+        "row_noise": sensor.superpixel_row_noise_e**2,
+        "saturation_capacity": capacity_of(sensor),
+        "full_well": (capacity_of(sensor) - current * float(frames.exposure_s[brightest])) * alive,
+        **dict.fromkeys(("linearity_min", "linearity_max"), 0.0),
+        **dict.fromkeys(("dark_current", "dark_current_by_variance"), current),
+        **{f"dsnu_{part}": float(each) for part, each in zip(SPLIT, (offsets.sum(), *offsets), strict=True)},
+        **{f"prnu_{part}": float(each) for part, each in zip(SPLIT, (responses.sum(), *responses), strict=True)},
+    }
+
+
+def fields_set(model: SensorModel) -> dict[str, float | None]:
+    """Return the measured fields of a camera file, as a model sets them for its superpixels."""
+    offsets, responses = (np.roll(parts, -1).tolist() for parts in (model.offset_parts, model.response_parts))
+    defects = ("hot_pixels", "hot_dark_current_e_per_s", "dead_pixels")
+    return {
+        "gain_dn_per_e": model.gain_dn_per_e,
+        "quantum_efficiency": model.quantum_efficiency,
+        "read_noise_e": model.superpixel_read_noise_e,
+        "row_noise_e": model.superpixel_row_noise_e,
+        "black_level_dn": model.superpixel_black_level_dn,
+        "full_well_e": capacity_of(model),
+        "dark_current_e_per_s": model.superpixel_dark_current_e_per_s,
+        "dark_current_spread_e_per_s": model.binning * model.dark_factor * model.dark_current_spread_e_per_s,
+        **{f"dsnu_{part}_e": each for part, each in zip(SPLIT[1:], offsets, strict=True)},
+        **{f"prnu_{part}": each for part, each in zip(SPLIT[1:], responses, strict=True)},
+        **{name: getattr(model, name) if model.binning == 1 else None for name in defects},
+        **dict(zip(("linearity.0", "linearity.1"), (*model.linearity, 0.0, 0.0), strict=False)),
+    }
 
 
 @dataclass(frozen=True)
@@ -150,16 +130,15 @@ class Row:
     bias: float = 0.0
 
 
-def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray, bend: float = 0.0) -> Row:
+def row_of(frames: Frames, name: str, given: float, found: FloatArray, sessions: FloatArray, bend: float = 0.0) -> Row:
     """Compare a figure with its set or expected value.
 
     `sessions` (count,) are figures of drawn sessions, and `bend` is the standard error of the expected linearity.
     """
-    sensor, figure = frames.sensor, FIGURES[name]
+    sensor, (symbol, unit) = frames.sensor, FIGURES[name]
     value, spread, centre = float(found), max(float(sessions.std()), _DUST), float(sessions.mean())
-    given = figure.set(frames)
     # A linear method does not find the set value of a bent camera, or of nonuniformity under noise that rows share.
-    method = figure.method or bool(sensor.linearity)
+    method = name.startswith(("saturation", "linearity")) or bool(sensor.linearity)
     method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
     bias = 0.0 if method or sensor.bits is None else (centre - given) / spread
     method |= abs(bias) > _BIASED
@@ -170,26 +149,27 @@ def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray, b
         spread = math.hypot(spread, frames.step / math.sqrt(12))
     against = centre if method else given
     off = (value - against) / spread
-    if figure.root:
+    if name.startswith(_VARIANCES):
         root = math.sqrt(max(against, 0.0))
         spread = spread / (2 * max(root, math.sqrt(spread)))
         given, value, centre = (math.copysign(math.sqrt(abs(square)), square) for square in (given, value, centre))
-    scale = 100.0 if figure.unit == "%" else 1.0
+    scale = 100.0 if unit == "%" else 1.0
     expected = scale * centre if method else None
-    return Row(name, figure.symbol, figure.unit, scale * given, expected, scale * value, scale * spread, off, bias)
+    return Row(name, symbol, unit, scale * given, expected, scale * value, scale * spread, off, bias)
 
 
 def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
     """Compare the camera that was found with the model that took the frames, if it is known."""
-    rows = []
-    for name, (unit, given) in FIELDS.items():
-        value, error = getattr(found.sensor, name, None), found.errors.get(name, 0.0)
-        if name.startswith("linearity") and found.sensor.linearity:
-            power = int(name[-1])
-            value, error = found.sensor.linearity[power], found.transfer.error(("bend", "bend_2")[power])
-        if value is not None and math.isfinite(value):
-            set_value = None if model is None else given(model)
+    rows, transfer, given = [], found.transfer, {} if model is None else fields_set(model)
+    values = {**fields_set(found.sensor), "full_well_e": found.sensor.full_well_e}
+    errors = dict(found.errors)
+    if found.sensor.linearity:
+        errors |= {"linearity.0": transfer.error("bend"), "linearity.1": transfer.error("bend_2")}
+    for name, value in values.items():
+        if value is not None and math.isfinite(value) and name in errors:
+            error, set_value = errors.get(name, 0.0), given.get(name)
             off = None if set_value is None or not error else (value - set_value) / error
+            unit = next(unit for end, unit in _UNITS.items() if name.endswith(end))
             rows.append(Row(name, "", unit, set_value, None, value, error, off))
     return tuple(rows)
 
@@ -420,8 +400,9 @@ def _compare(
     session = frames.session((each.pair for each in taken), taken[frames.dark].stack, taken[frames.bright].stack)
     spread, of_frames = figures(draw_sessions(frames, expected)), figures(session)
     bend = found.transfer.error("bend") if real else 0.0  # the error of a real camera's expected linearity
+    given = figures_set(frames)
     rows = tuple(
-        row_of(frames, name, of_frames[name], spread[name], bend)
+        row_of(frames, name, given[name], of_frames[name], spread[name], bend)
         for name in FIGURES
         # Without a quantum efficiency light is counted in electrons, so there is none to find.
         if name in of_frames and name in spread and (sensor.states_efficiency or name != "quantum_efficiency")

@@ -16,7 +16,7 @@ from scipy.fft import dctn, idctn
 from mitsim.core.errors import MitsimError
 from mitsim.devices.framelist import load_flats
 from mitsim.devices.sensor import load_sensor
-from mitsim.studies.characterise import CAMERA_FILE, FIELDS, Characterisation, characterise_frames
+from mitsim.studies.characterise import CAMERA_FILE, Characterisation, characterise_frames, fields_set
 from tests.real_flats import CAMERAS, Light, camera, write_flats
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
@@ -32,7 +32,7 @@ SLOW_LAMPS = "random walk", "step", "linear"
 
 def off_by(done: Characterisation, name: str) -> dict[str, float]:
     """By how many standard errors each field of the camera found is off that of the camera of this ``name``."""
-    given = {row.name: FIELDS[row.name][1](camera(name)) for row in done.fields}
+    given = fields_set(camera(name))
     return {
         row.name: (row.found - value) / row.standard_error
         for row in done.fields
