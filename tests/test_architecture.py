@@ -572,7 +572,7 @@ SIZES = {
     "scene": (8, 1788),
     "sensor": (5, 1210),
     "sessions": (4, 1020),
-    "studies": (28, 7357),
+    "studies": (28, 7346),
     "transport": (21, 4549),
     "verbs": (1, 369),
     "version": (1, 1),
