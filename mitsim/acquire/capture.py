@@ -49,7 +49,7 @@ from mitsim.core.manifests import (
 )
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import AMBIENT, CLOSING, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
-from mitsim.devices.patterns import Lighting, PatternFamily
+from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.cost_model import first_shadow, frame_seconds, frames_cost
@@ -328,7 +328,7 @@ def _run(
     if ambient:
         part, noise = shooting.ambient_part, shooting.noise_to_signal
         ambient_file = AmbientFile(file=AMBIENT, shots=ambient.shots, part=part, noise=noise)
-    closing = _close(light, family, expected, request, exposer, recorder)
+    closing = _close(light, shooting, expected, request)
     total = light.plan.total(totals.noise)
     manifest = RunManifest(
         configuration=head.configuration,
@@ -364,14 +364,7 @@ def _run(
     return Capture.from_recorder(recorder, manifest)
 
 
-def _close(
-    light: SampledLight,
-    family: PatternFamily,
-    expected: ExpectedFrames,
-    request: Request,
-    exposer: Exposer,
-    recorder: Recorder,
-) -> ClosingFile | None:
+def _close(light: SampledLight, shooting: Shooting, expected: ExpectedFrames, request: Request) -> ClosingFile | None:
     """Record the closing frame of a run if requested, and return its manifest entry.
 
     The first shot has the same expectation again, speckle included. A uniform frame is exposed for a shorter time if it
@@ -380,6 +373,7 @@ def _close(
     if request.closing_frame is None:
         return None
     names: tuple[str | int, ...] = ("closing",)
+    family, exposer = shooting.family, shooting.exposer
     if request.closing_frame == "first":
         frame, names = next(iter(expected)), family.shots[0].names
     else:
@@ -391,7 +385,7 @@ def _close(
         exposer = replace(exposer, exposure_s=seconds, speckle=light.speckle())
     electrons = exposer.shot_electrons(frame, *names)
     channels = frame_channels(exposer.digital(electrons, "closing"), electrons)
-    recorder.write(CLOSING, channels, {"exposure_s": exposer.exposure_s, "seed": request.seed})
+    shooting.recorder.write(CLOSING, channels, {"exposure_s": exposer.exposure_s, "seed": request.seed})
     return ClosingFile(kind=request.closing_frame, file=CLOSING, exposure_s=exposer.exposure_s)
 
 

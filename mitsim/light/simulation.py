@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -130,19 +131,14 @@ class Simulation(Tracers):
         value = mean.value * (mean.kind == DIRECT) / samples
         return np.asarray(np.bincount(mean.pixel, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
-    def _estimate(
-        self,
-        light: Mapping[str, sparse.csr_array],
-        received: float = 0.0,
-        outside: float = 0.0,
-        flux: FloatArray | None = None,
-    ) -> LightEstimate:
+    def _estimate(self, light: Mapping[str, sparse.csr_array], *totals: Any) -> LightEstimate:
+        """Return an estimate with empty grids beside; ``totals`` are light received and outside, and flux."""
         rows = next(iter(light.values())).shape[0]
         every = {
             name: light[name] if name in light else sparse.csr_array((rows, grid.bundle.size))
             for name, grid in self.grids.items()
         }
-        return LightEstimate(every, received, outside, flux)
+        return LightEstimate(every, *totals)
 
     # ---- Frames
 

@@ -203,8 +203,9 @@ class _Prediction:
         table, result = self.table, self.table.pilot_result
         numbers = (int(number) for number in table.rows[self.best])
         anchors, layers, cells, followed, occluded, all_layers = numbers
+        found = ("depth", "shared", "repeats", "reach", "sharp", "occluded")
         return Settings(
-            depth=result.depth,
+            **{name: getattr(result, name) for name in found},
             anchors=anchors,
             layers=result.layers[layers] if layers > 1 else (),
             subdivision=cells,
@@ -212,11 +213,6 @@ class _Prediction:
             samples={name: float(count[self.best]) for name, count in self.needed.items()},
             followed_anchors=followed,
             coarse_layers=bool(all_layers),
-            shared=result.shared,
-            repeats=result.repeats,
-            reach=result.reach,
-            sharp=result.sharp,
-            occluded=result.occluded,
             occluded_anchors=occluded,
             raster=table.raster_cells > 0,
             raster_cells=table.raster_cells,

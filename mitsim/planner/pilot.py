@@ -105,19 +105,25 @@ class PilotRuns:
         self._base = Settings(depth=depth, effects=first_pilot_run, reach=reach, sharp=apart)
         sample, self._hits = Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors), math.inf
         if not bench.loaded.mirrors and not self._sharp.irradiance:
-            sample = _enough(sample, hits, bench)
             self._hits = hits if hits < _FEWEST_HITS else math.inf
+            # Enough rays for a small target.
+            times = math.ceil(_FEWEST_IN_RUN / (hits * sample.direct)) if hits else 1
+            sample = replace(sample, times=times * sample.times)
+            if times > 1 and hits * sample.direct < _FEWEST_IN_RUN:
+                n, side = bench.n, math.sqrt(hits)
+                raise MitsimError(
+                    f"what the camera sees is too small for the projector's light: all that it lights fills "
+                    f"{hits:.1e} of one of {n} x {n} projector pixels ({side:.1e} a side); give the projector a narrower fov, or a "
+                    "larger target"
+                )
         self.samples = dict.fromkeys(RUNS, sample)
         self.occluded: PenumbraRuns | None = None
         for run in RUNS:
             self._measure(run)
-        if self._rough:
-            self._look_for_occluded()
-
-    def _look_for_occluded(self) -> None:
-        own = integer(self.seed, "pilot", "occluded")
-        occluded = occluded_pixels(Simulation(self.bench, self._base), self.accuracy, own)
-        shown = np.isin(self.samples["occluded"].shown, occluded)
+        if not self._rough:
+            return
+        occluded = occluded_pixels(Simulation(bench, self._base), accuracy, integer(seed, "pilot", "occluded"))
+        shown = np.isin(sample.shown, occluded)
         # Unless the sample's shots show some of either kind, nobody knows how many anchors each takes.
         if shown.any() and not shown.all():
             self._base = replace(self._base, occluded=occluded)
@@ -290,22 +296,6 @@ def run_of(part: Approximation) -> str:
     if light:
         return PASSES[light].pilot if PASSES[light].anchors else "effects"
     return _RUN_OF.get(part.name, "effects")
-
-
-# ---- Sharp lobes, and light that no tracer finds ----
-
-
-def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
-    """Return the ``sample`` with enough rays for a small target; refuse targets that are too small."""
-    times = math.ceil(_FEWEST_IN_RUN / (hits * sample.direct)) if hits else 1
-    more = replace(sample, times=times * sample.times)
-    if times > 1 and hits * more.direct < _FEWEST_IN_RUN:
-        n, side = bench.n, math.sqrt(hits)
-        raise MitsimError(
-            f"what the camera sees is too small for the projector's light: all that it lights fills {hits:.1e} of one "
-            f"of {n} x {n} projector pixels ({side:.1e} a side); give the projector a narrower fov, or a larger target"
-        )
-    return more
 
 
 # ---- Where light is first seen, and how many rays bring it ----

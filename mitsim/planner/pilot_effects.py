@@ -143,15 +143,11 @@ class AnchorRuns:
         return self._beyond(self._simulation(self.few, cells, layers), self._few, known)
 
     def _beyond(
-        self,
-        simulation: Simulation,
-        replicates: Sequence[PathSamples],
-        frames: FloatArray | None = None,
-        samples: int | None = None,
+        self, simulation: Simulation, seen: Sequence[PathSamples], frames: FloatArray | None = None, samples: int = 0
     ) -> FloatArray:
         weights, grids = simulation.mean_weights(self.few), self._grids(simulation)
-        mean = [replicate.average(weights) for replicate in replicates]
-        frames = self._form(grids, replicates, samples) if frames is None else frames
+        mean = [replicate.average(weights) for replicate in seen]
+        frames = self._form(grids, seen, samples) if frames is None else frames
         return frames - self._form([grid.of_mean for grid in grids], mean, samples)
 
     @cached_property
@@ -179,7 +175,7 @@ class AnchorRuns:
             self.traced[anchors] = tracer.replicates(self._seeds, self._samples)[0]
         return self.traced[anchors]
 
-    def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None) -> FloatArray:
+    def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int = 0) -> FloatArray:
         samples = samples or self._samples
         frames = self.sample.frames(grids[0], replicates, samples)
         return frames + self.sample.lamps(grids[1], replicates, samples) if len(grids) > 1 else frames
