@@ -29,24 +29,13 @@ from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request, Task
+from mitsim.core import manifests
 from mitsim.core.configuration import takes
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import ArgumentError, check_arguments, cut
 from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
-from mitsim.core.manifests import (
-    MOSAIC,
-    RUN,
-    AmbientFile,
-    ClosingFile,
-    ColourManifest,
-    MosaicManifest,
-    Patterns,
-    RunHead,
-    RunManifest,
-    write_colours,
-)
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import AMBIENT, CLOSING, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
 from mitsim.devices.patterns import Lighting
@@ -273,7 +262,7 @@ def capture(
             asked["plan_seed"] = plan.known_request.seed  # frames hang on it, and a run is resumed by the same alone
         if lights and lights[0].plan.request is not None:
             asked["light"] = {"patterns": lights[0].plan.request.patterns, "seed": lights[0].seed}
-        heads = [RunHead.of({**each.provenance(), **each.identity(), **asked}) for each in readings]
+        heads = [manifests.RunHead.of({**each.provenance(), **each.identity(), **asked}) for each in readings]
         recorders = [
             places.enter_context(claim_run(place, head, task.resume)) if place else Recorder()
             for place, head in zip(folders, heads, strict=True)
@@ -299,10 +288,16 @@ def capture(
 
 
 def _run(
-    bench: Apparatus, light: SampledLight, plan: Plan, request: Request, job: Job, head: RunHead, recorder: Recorder
+    bench: Apparatus,
+    light: SampledLight,
+    plan: Plan,
+    request: Request,
+    job: Job,
+    head: manifests.RunHead,
+    recorder: Recorder,
 ) -> Capture:
     family = bench.family(request.patterns, request.seed)
-    patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
+    patterns = manifests.Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     with job.clock.stage("truth"):
         truth = light.apparent
     with job.clock.stage("optics"):
@@ -327,10 +322,10 @@ def _run(
     ambient_file = None
     if ambient:
         part, noise = shooting.ambient_part, shooting.noise_to_signal
-        ambient_file = AmbientFile(file=AMBIENT, shots=ambient.shots, part=part, noise=noise)
+        ambient_file = manifests.AmbientFile(file=AMBIENT, shots=ambient.shots, part=part, noise=noise)
     closing = _close(light, shooting, expected, request)
     total = light.plan.total(totals.noise)
-    manifest = RunManifest(
+    manifest = manifests.RunManifest(
         configuration=head.configuration,
         configuration_sha256=head.configuration_sha256,
         camera=bench.identity(),
@@ -364,7 +359,9 @@ def _run(
     return Capture.from_recorder(recorder, manifest)
 
 
-def _close(light: SampledLight, shooting: Shooting, expected: ExpectedFrames, request: Request) -> ClosingFile | None:
+def _close(
+    light: SampledLight, shooting: Shooting, expected: ExpectedFrames, request: Request
+) -> manifests.ClosingFile | None:
     """Record the closing frame of a run if requested, and return its manifest entry.
 
     The first shot has the same expectation again, speckle included. A uniform frame is exposed for a shorter time if it
@@ -386,11 +383,11 @@ def _close(light: SampledLight, shooting: Shooting, expected: ExpectedFrames, re
     electrons = exposer.shot_electrons(frame, *names)
     channels = frame_channels(exposer.digital(electrons, "closing"), electrons)
     shooting.recorder.write(CLOSING, channels, {"exposure_s": exposer.exposure_s, "seed": request.seed})
-    return ClosingFile(kind=request.closing_frame, file=CLOSING, exposure_s=exposer.exposure_s)
+    return manifests.ClosingFile(kind=request.closing_frame, file=CLOSING, exposure_s=exposer.exposure_s)
 
 
 @contextmanager
-def colour_folder(task: Task, manifest: ColourManifest) -> Iterator[Path | None]:
+def colour_folder(task: Task, manifest: manifests.ColourManifest) -> Iterator[Path | None]:
     """Claim the folder of the lines' folders; colour.json is written when all of them are finished."""
     if task.output is None:
         yield None
@@ -398,19 +395,19 @@ def colour_folder(task: Task, manifest: ColourManifest) -> Iterator[Path | None]
     again = task.resume and any((task.output / name).is_dir() for name in manifest.names)
     with output_folder(task.output, overwrite=again) as folder:
         yield folder
-        write_colours(folder, manifest)
+        manifests.write_colours(folder, manifest)
 
 
 def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> dict[str, Capture]:
     """Capture a run for each line, by its name; see :meth:`mitsim.api.bench.Bench.capture_lines`."""
-    lines = SpectralBench.of(bench, RUN)
+    lines = SpectralBench.of(bench, manifests.RUN)
     return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
 def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> MosaicCapture:
     """Capture a run of all lines at once; see :meth:`mitsim.api.bench.Bench.capture_mosaic`."""
-    lines = SpectralBench.of(bench, MOSAIC)
-    assert isinstance(lines.manifest, MosaicManifest)
+    lines = SpectralBench.of(bench, manifests.MOSAIC)
+    assert isinstance(lines.manifest, manifests.MosaicManifest)
     captured, board = capture(lines, request, task, plan), load_recipe().board_reflectance
     each = [LineTruth(truth.reflectance, truth.standard_error, board) for truth in captured.truths]
     found = MosaicCapture(captured.runs[0], lines.manifest, dict(zip(lines.names, each, strict=True)))

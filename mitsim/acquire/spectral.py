@@ -28,22 +28,9 @@ from mitsim.bench.apparatus import Apparatus, Opened, reopen
 from mitsim.bench.effects import present
 from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request, check_untimed
+from mitsim.core import manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.manifests import (
-    BANDS,
-    LINES,
-    MONO,
-    MOSAIC,
-    MOST_LINES,
-    RUN,
-    ColourManifest,
-    Line,
-    MosaicManifest,
-    bands_of,
-    check_undecided,
-    spectral_of,
-)
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import SPECTRA_NM, Band, CountedLamps, Lines, Response, Spectrum, line_units
@@ -76,7 +63,7 @@ class SpectralBench:
     """
 
     whole: Apparatus
-    manifest: ColourManifest | None = None
+    manifest: manifests.ColourManifest | None = None
 
     @classmethod
     def of(cls, bench: Apparatus, kind: str) -> SpectralBench:
@@ -85,20 +72,20 @@ class SpectralBench:
         Raises MitsimError if light cannot be traced by line, and for :data:`MOSAIC` without filters that pass the
         lines.
         """
-        if kind == MOSAIC:
+        if kind == manifests.MOSAIC:
             bench = without_filters(bench)
         if not bench.variant.endswith("_spectral"):
-            needed = spectral_of(bench.variant)
+            needed = manifests.spectral_of(bench.variant)
             raise ArgumentError("variant", f"{bench.variant}: knows no wavelengths; open the bench with {needed}")
         lines = bench.projector.traced_lines
         named = tuple(
-            Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
+            manifests.Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
             for wavelength, share in zip(lines.wavelengths_nm, lines.shares, strict=True)
         )
         message: dict[str, Any] = {"kind": kind, "channels": named}
-        if kind == MOSAIC:
+        if kind == manifests.MOSAIC:
             message |= {"mosaic": bench.counting.mosaic, "weights": bench.counting.planes(lines.wavelengths_nm)}
-        model = MosaicManifest if kind == MOSAIC else ColourManifest
+        model = manifests.MosaicManifest if kind == manifests.MOSAIC else manifests.ColourManifest
         return cls(replace(bench, lines=lines), model.model_validate(message))
 
     @cached_property
@@ -443,7 +430,7 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
     lines = bench.projector.lines
     counted_lamps = CountedLamps(
         responses,
-        tuple(band for response in responses for band in response.bands(MOST_LINES)),
+        tuple(band for response in responses for band in response.bands(manifests.MOST_LINES)),
         tuple(spectrum for run in runs for spectrum in run.spectra),
         light / light.sum() if light.any() else np.full(len(light), 1 / len(light)),
         max(run.unknown for run in runs),
@@ -461,15 +448,22 @@ class _LampRuns:
     @classmethod
     def of(cls, response: Response, tracer: FromCameraTracer, stream: int) -> _LampRuns:
         (first, last), (begin, end) = response.range_nm, SPECTRA_NM
-        parts = math.ceil((last - first) / MOST_LINES / _STEP_NM)
+        parts = math.ceil((last - first) / manifests.MOST_LINES / _STEP_NM)
 
         def fit_response(*bands: Band) -> FloatArray:
             light = LampTracer(tracer, LampResponse(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
-            return np.asarray(np.bincount(light.pixel - tracer.projector.n**2, light.value, MOST_LINES) / _SAMPLES)
+            return np.asarray(
+                np.bincount(light.pixel - tracer.projector.n**2, light.value, manifests.MOST_LINES) / _SAMPLES
+            )
 
         # (bands, parts)
-        light = np.stack([fit_response(*response.bands(MOST_LINES, part, parts)) for part in range(parts)], axis=1)
-        middles = [[(low + high) / 2 for low, high in response.bands(MOST_LINES, part, parts)] for part in range(parts)]
+        light = np.stack(
+            [fit_response(*response.bands(manifests.MOST_LINES, part, parts)) for part in range(parts)], axis=1
+        )
+        middles = [
+            [(low + high) / 2 for low, high in response.bands(manifests.MOST_LINES, part, parts)]
+            for part in range(parts)
+        ]
         beyond = fit_response((begin, first), (last, end), (end - _END_NM, end), (end, end))
         missing = float(beyond[0] + beyond[1] + beyond[2] / _END_NM * response.beyond_nm)
         unknown = missing / (missing + float(light.sum())) if missing else 0.0
@@ -517,7 +511,7 @@ class Coloured(Generic[Opened]):
     @property
     def mono(self) -> bool:
         """Return True if wavelengths are not distinguished."""
-        return self.plan.colour is not None and self.plan.colour.chosen == MONO
+        return self.plan.colour is not None and self.plan.colour.chosen == manifests.MONO
 
 
 def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
@@ -526,10 +520,10 @@ def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
     See :meth:`mitsim.api.bench.Bench.choose_colour`, also for errors.
     """
     check_untimed(request.seconds)
-    check_undecided(bench.variant)
+    manifests.check_undecided(bench.variant)
     started, runs = time.perf_counter(), _runs(bench)
     if not bench.loaded.coloured and bench.sensor.quantum_efficiency_curve is None:
-        errors, spectral = {name: 0.0 for name in runs if name in (MONO, LINES)}, None
+        errors, spectral = {name: 0.0 for name in runs if name in (manifests.MONO, manifests.LINES)}, None
     else:
         pilot = _ColourPilot(bench, request)
         errors, spectral = pilot.errors(runs), pilot.spectral
@@ -539,13 +533,13 @@ def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
     left = request
     if 0 < errors[chosen] <= most:
         left = request.with_values(accuracy=math.sqrt(request.accuracy**2 - errors[chosen] ** 2))
-    if chosen == MONO:
+    if chosen == manifests.MONO:
         own = reopen(bench, bench.variant) if spectral else bench
         plan = plan_request(own, left)
     else:
-        whole = spectral or reopen(bench, spectral_of(bench.variant))
-        own = whole if chosen == LINES else whole.in_bands(bands_of(chosen))
-        plan = SpectralBench.of(own, RUN).plan(left)
+        whole = spectral or reopen(bench, manifests.spectral_of(bench.variant))
+        own = whole if chosen == manifests.LINES else whole.in_bands(manifests.bands_of(chosen))
+        plan = SpectralBench.of(own, manifests.RUN).plan(left)
     plan = plan.taking(plan=plan.predicted["plan"] + looked)
     parted = bool(bench.loaded.parting)
     each = [(name, _seconds(plan.predicted, runs[chosen], runs[name], parted)) for name in errors]
@@ -555,8 +549,8 @@ def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
         warnings = (
             *warnings,
             f"colour: {chosen} leaves {error:.1e} of a band's light, more than half of the accuracy "
-            f"{request.accuracy:g}, and no more than {MOST_LINES} bands are traced; ask for less, or give a projector "
-            "of fewer lines",
+            f"{request.accuracy:g}, and no more than {manifests.MOST_LINES} bands are traced; ask for less, or give a "
+            "projector of fewer lines",
         )
     rows = plan.effects
     if mono:
@@ -574,9 +568,9 @@ def _seconds(predicted: Mapping[str, float], runs: int, others: int, parted: boo
 
 def _runs(bench: Apparatus) -> dict[str, int]:
     lines = bench.projector.lines
-    bands = range(1, min(len(lines.shining.shares) - 1, MOST_LINES) + 1)
-    every = {LINES: len(lines.shares)} if len(lines.shares) <= MOST_LINES else {}
-    return {MONO: 1} | {f"{BANDS}:{count}": count for count in bands} | every
+    bands = range(1, min(len(lines.shining.shares) - 1, manifests.MOST_LINES) + 1)
+    every = {manifests.LINES: len(lines.shares)} if len(lines.shares) <= manifests.MOST_LINES else {}
+    return {manifests.MONO: 1} | {f"{manifests.BANDS}:{count}": count for count in bands} | every
 
 
 class _ColourPilot(Generic[Opened]):
@@ -596,12 +590,12 @@ class _ColourPilot(Generic[Opened]):
 
     @cached_property
     def spectral(self) -> Opened:
-        return reopen(self._bench, spectral_of(self._bench.variant))
+        return reopen(self._bench, manifests.spectral_of(self._bench.variant))
 
     def errors(self, names: Iterable[str]) -> dict[str, float]:
         mono = self._electrons(self._bench, self._path_samples(self._bench)[0])  # before another variant is set
         lines = self._bench.projector.lines.shining
-        cut = {name: lines.bands(bands_of(name)) for name in names if name.startswith(BANDS)}
+        cut = {name: lines.bands(manifests.bands_of(name)) for name in names if name.startswith(manifests.BANDS)}
         bands = {band for each in cut.values() for band in each if band.several}
         sums = {band: np.zeros_like(mono) for band in bands | {lines}}
         for line, frames in self._of_lines(lines.single):
@@ -611,12 +605,12 @@ class _ColourPilot(Generic[Opened]):
         merged = {Lines((band.mean_nm,), (sum(band.shares),)): band for band in bands}
         left = {merged[line]: _relative(frames, sums[merged[line]]) for line, frames in self._of_lines(tuple(merged))}
         errors = {name: max(left.get(band, 0.0) for band in each) for name, each in cut.items()}
-        known = {MONO: _relative(mono, sums[lines]), **errors, LINES: 0.0}
+        known = {manifests.MONO: _relative(mono, sums[lines]), **errors, manifests.LINES: 0.0}
         return {name: known[name] for name in names}
 
     def _of_lines(self, lines: tuple[Lines, ...]) -> Iterator[tuple[Lines, FloatArray]]:
-        for first in range(0, len(lines), MOST_LINES):
-            some = lines[first : first + MOST_LINES]
+        for first in range(0, len(lines), manifests.MOST_LINES):
+            some = lines[first : first + manifests.MOST_LINES]
             together = Lines(tuple(line.wavelengths_nm[0] for line in some), tuple(line.shares[0] for line in some))
             lit = self._path_samples(replace(self.spectral, lines=together))
             for line, path_samples in zip(some, lit, strict=True):

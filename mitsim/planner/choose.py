@@ -20,21 +20,7 @@ import numpy.typing as npt
 from mitsim.bench.effects import EFFECTS, names
 from mitsim.bench.request import HIGHEST_ACCURACY
 from mitsim.core.arrays import FloatArray
-from mitsim.light.cost_model import (
-    FIXED,
-    MIXING,
-    Numbers,
-    UnitCosts,
-    accumulation_seconds,
-    checking_seconds,
-    entries,
-    in_waves,
-    optics_seconds,
-    sample_costs,
-    tells_all,
-    traced_for,
-    truth_seconds,
-)
+from mitsim.light import cost_model
 from mitsim.light.passes import FOLLOWED, PASSES
 from mitsim.light.settings import (
     COUNTED,
@@ -122,7 +108,7 @@ class Candidates:
         self._tables = [
             _Table(pilot_result, frozenset(always | set(several)), cells, rows, given)
             for several in subsets
-            for cells in pilot_result.forms(in_waves(frozenset(always | set(several))))
+            for cells in pilot_result.forms(cost_model.in_waves(frozenset(always | set(several))))
         ]
 
     def best(self, accuracy: float, sure: float = SURE) -> _Prediction:
@@ -149,7 +135,7 @@ class Candidates:
     def seconds(self, accuracy: float) -> tuple[float, bool]:
         """Return seconds of the choice and its truth, and True if it keeps ``accuracy``."""
         found = self.best(accuracy)
-        truth = truth_seconds(self.pilot_result, found.settings, FIXED)
+        truth = cost_model.truth_seconds(self.pilot_result, found.settings, cost_model.FIXED)
         return float(found.work[found.best]) + truth, bool(found.fits[found.best])
 
 
@@ -162,7 +148,7 @@ def predicted_candidate(
 
 def _table_of(pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]) -> _Table:
     row = np.array([[*counts_of(settings), settings.coarse_layers]], dtype=np.float64)
-    drawn = pilot_result.raster[in_waves(settings.effects)]
+    drawn = pilot_result.raster[cost_model.in_waves(settings.effects)]
     cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
     return _Table(pilot_result, settings.effects, cells, row, _omissions(switches))
 
@@ -236,7 +222,7 @@ class _Table:
     ) -> None:
         self.pilot_result, self.effects, self.raster_cells = pilot_result, effects, raster_cells
         self.rows, self.given = rows, given
-        self.numbers = Numbers.of_counts([*rows.T], effects, len(pilot_result.occluded), raster_cells)
+        self.numbers = cost_model.Numbers.of_counts([*rows.T], effects, len(pilot_result.occluded), raster_cells)
 
     # ---- errors
 
@@ -258,7 +244,7 @@ class _Table:
             if name not in self.effects and Approximation(name) not in ignored
         ]
         drawn += [result.sharp.left**2] if result.sharp else []
-        of_raster = result.raster[in_waves(self.effects)].error_left(cells) if cells else None
+        of_raster = result.raster[cost_model.in_waves(self.effects)].error_left(cells) if cells else None
         drawn += [of_raster[sure > 0] ** 2] if of_raster else []
         squared, spread = self._squares_of_given if ignored == self.given else self._squares(ignored)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
@@ -304,16 +290,16 @@ class _Table:
 
         # ---- Monte Carlo error at which sampling may stop; checks of all shots need no margin
         left = np.square(_MARGIN * accuracy) - np.square(avoidable)
-        margin = _MARGIN if tells_all(forming.classes, forming.shots, forming.pixels) else 1.0
+        margin = _MARGIN if cost_model.tells_all(forming.classes, forming.shots, forming.pixels) else 1.0
         target = np.where(left > 0, np.sqrt(np.maximum(left, 0)) / margin, _MARGIN * accuracy)
         if not math.isinf(result.hits):
             target = target * math.sqrt(1 - (_ONE_HIT * _OFF_BY_HITS.bound) ** 2)
 
         # ---- Samples of a group: the least work for a sum of variances
-        lines = traced_for(forming.lines, forming.parted)
+        lines = cost_model.traced_for(forming.lines, forming.parted)
         work_of_sample = {
-            name: lines * GROUPS * FIXED.passes[name] * cost.paths * PASSES[name].connections(numbers)
-            for name, cost in sample_costs(result, self.effects).items()
+            name: lines * GROUPS * cost_model.FIXED.passes[name] * cost.paths * PASSES[name].connections(numbers)
+            for name, cost in cost_model.sample_costs(result, self.effects).items()
         }
         parts = {
             name: np.sqrt(self._by_row(name, lambda cost: cost.variance) * price)
@@ -332,10 +318,15 @@ class _Table:
         samples = {name: np.asarray(PASSES[name].whole(count)) for name, count in found.items()}
 
         # ---- Work, and the best row
-        held = np.asarray(entries(result.sample_costs["direct"].paths, forming.classes, numbers, samples)) + none
+        held = (
+            np.asarray(cost_model.entries(result.sample_costs["direct"].paths, forming.classes, numbers, samples))
+            + none
+        )
         tracing = sum(samples[name] * price for name, price in work_of_sample.items())
-        accumulating = accumulation_seconds(forming, numbers, held, FIXED)
-        shown = optics_seconds(forming, numbers, FIXED) + checking_seconds(forming, numbers, FIXED)
+        accumulating = cost_model.accumulation_seconds(forming, numbers, held, cost_model.FIXED)
+        shown = cost_model.optics_seconds(forming, numbers, cost_model.FIXED) + cost_model.checking_seconds(
+            forming, numbers, cost_model.FIXED
+        )
         work = np.asarray(tracing + accumulating + shown)
         fits = (avoidable < _MARGIN * accuracy) & (held <= _MOST_ENTRIES)
         chosen = fits
@@ -376,7 +367,7 @@ class _Table:
         )
 
     def _by_row(self, name: str, of: Callable[..., Number], *by: Number) -> FloatArray:
-        found = of(sample_costs(self.pilot_result, self.effects)[name], *by) + np.zeros(len(self.rows))
+        found = of(cost_model.sample_costs(self.pilot_result, self.effects)[name], *by) + np.zeros(len(self.rows))
         if name == "direct":
             found = np.where(self.rows[:, 0] > 1, of(self.pilot_result.spread, *by), found)
         return np.asarray(found)
@@ -394,7 +385,7 @@ def _samples_for(kind: SampleCost, target: Number) -> Number:
 
 
 def counts_of(settings: Settings) -> tuple[int, ...]:
-    numbers = Numbers.of(settings)
+    numbers = cost_model.Numbers.of(settings)
     return tuple(int(getattr(numbers, name)) for name in COUNTED)
 
 
@@ -408,17 +399,19 @@ def _omissions(switches: Mapping[str, bool]) -> frozenset[Approximation]:
 def costly_effects() -> frozenset[str]:
     """Return the names of effects that take time."""
     traced = frozenset[str]().union(*(row.effects for row in PASSES.values()))
-    return traced | names(lambda effect: effect.in_shadow) | {MIXING}
+    return traced | names(lambda effect: effect.in_shadow) | {cost_model.MIXING}
 
 
-def unit_costs_of(pilot_result: PilotResult) -> UnitCosts:
+def unit_costs_of(pilot_result: PilotResult) -> cost_model.UnitCosts:
     """Return the measured unit costs, and the fixed ones where nothing was measured."""
     # All matrix work is as much slower or faster as the products.
-    slower = (pilot_result.forming.product or FIXED.product) / FIXED.product
+    slower = (pilot_result.forming.product or cost_model.FIXED.product) / cost_model.FIXED.product
     measured = {name: cost.seconds for name, cost in pilot_result.sample_costs.items() if cost.seconds}
-    matrices = {name: slower * getattr(FIXED, name) for name in ("frame", "product", "entry", "accumulated", "pixel")}
-    ray = pilot_result.spread.seconds * FIXED.ray / FIXED.passes["direct"] or FIXED.ray
-    return UnitCosts(passes={**FIXED.passes, **measured}, ray=ray, **matrices)
+    matrices = {
+        name: slower * getattr(cost_model.FIXED, name) for name in ("frame", "product", "entry", "accumulated", "pixel")
+    }
+    ray = pilot_result.spread.seconds * cost_model.FIXED.ray / cost_model.FIXED.passes["direct"] or cost_model.FIXED.ray
+    return cost_model.UnitCosts(passes={**cost_model.FIXED.passes, **measured}, ray=ray, **matrices)
 
 
 # -------- The finest accuracy that a time buys

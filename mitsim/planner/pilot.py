@@ -112,9 +112,9 @@ class PilotRuns:
             if times > 1 and hits * sample.direct < _FEWEST_IN_RUN:
                 n, side = bench.n, math.sqrt(hits)
                 raise MitsimError(
-                    f"what the camera sees is too small for the projector's light: all that it lights fills "
-                    f"{hits:.1e} of one of {n} x {n} projector pixels ({side:.1e} a side); give the projector a narrower fov, or a "
-                    "larger target"
+                    "what the camera sees is too small for the projector's light: all that it lights fills "
+                    f"{hits:.1e} of one of {n} x {n} projector pixels ({side:.1e} a side); give the projector a "
+                    "narrower fov, or a larger target"
                 )
         self.samples = dict.fromkeys(RUNS, sample)
         self.occluded: PenumbraRuns | None = None

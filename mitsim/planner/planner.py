@@ -22,20 +22,7 @@ from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import (
-    FIXED,
-    ROUNDS,
-    Numbers,
-    UnitCosts,
-    accumulation_seconds,
-    checking_seconds,
-    entries,
-    frame_seconds,
-    in_waves,
-    optics_seconds,
-    tracing_seconds,
-    truth_seconds,
-)
+from mitsim.light import cost_model
 from mitsim.light.passes import FOLLOWED
 from mitsim.light.plan import Plan, PlanRow, State
 from mitsim.light.settings import (
@@ -52,18 +39,7 @@ from mitsim.light.settings import (
 from mitsim.light.simulation import Simulation
 from mitsim.optics.diffraction import check_openings
 from mitsim.optics.fft_shadow import check_waves
-from mitsim.planner import pilot
-from mitsim.planner.choose import (
-    FIRST_ACCURACY,
-    Candidate,
-    Candidates,
-    accuracy_for_time,
-    costly_effects,
-    counts_of,
-    predicted_candidate,
-    unit_costs_of,
-    value_of_refining,
-)
+from mitsim.planner import choose, pilot
 from mitsim.transport.connect import part_of_view, shines_in
 from mitsim.transport.missed import polished_shapes
 from mitsim.transport.plugins.base import turn_and_origin
@@ -128,12 +104,14 @@ def make_plan(
     return replace(plan, notes=notes)
 
 
-def _refine(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> tuple[Candidates, tuple[str, ...]]:
+def _refine(
+    runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]
+) -> tuple[choose.Candidates, tuple[str, ...]]:
     """Repeat pilot runs with more samples while that is worth its work; return candidates and notes."""
     spent = 0.0
     while True:
-        candidates = Candidates(runs.pilot_result, switches)
-        worth, part = value_of_refining(accuracy, candidates)
+        candidates = choose.Candidates(runs.pilot_result, switches)
+        worth, part = choose.value_of_refining(accuracy, candidates)
         run = pilot.run_of(part)
         work = runs.work(run)
         if _SELDOM * work > worth:
@@ -159,19 +137,19 @@ def plan_within(
     """
     started, switches = time.perf_counter(), switches or {}
     _refuse_unfit(bench, switches)
-    around = OPENING_S + sum(frame_seconds(bench, len(lighting.weights)).values())
-    runs = pilot.PilotRuns(bench, lighting, FIRST_ACCURACY, seed)
+    around = OPENING_S + sum(cost_model.frame_seconds(bench, len(lighting.weights)).values())
+    runs = pilot.PilotRuns(bench, lighting, choose.FIRST_ACCURACY, seed)
     around += runs.seconds
     again = _LONGER * runs.seconds
-    candidates = Candidates(runs.pilot_result, switches)
-    found = accuracy_for_time(candidates, seconds - around, FIRST_ACCURACY)
+    candidates = choose.Candidates(runs.pilot_result, switches)
+    found = choose.accuracy_for_time(candidates, seconds - around, choose.FIRST_ACCURACY)
     # What a look tells of finer accuracies than its own is their price, not whether they are kept.
-    aim = accuracy_for_time(candidates, seconds - around - again, 0.0, kept=False)
-    if found.fits and aim.fits and aim.accuracy < FIRST_ACCURACY:
+    aim = choose.accuracy_for_time(candidates, seconds - around - again, 0.0, kept=False)
+    if found.fits and aim.fits and aim.accuracy < choose.FIRST_ACCURACY:
         around += again
         closer = pilot.PilotRuns(bench, lighting, aim.accuracy, seed)
-        others = Candidates(closer.pilot_result, switches)
-        finer = accuracy_for_time(others, seconds - around, aim.accuracy)
+        others = choose.Candidates(closer.pilot_result, switches)
+        finer = choose.accuracy_for_time(others, seconds - around, aim.accuracy)
         # It may say that no accuracy is kept at all, and then has the loosest.
         if finer.fits and finer.accuracy <= found.accuracy:
             runs, candidates, found = closer, others, finer
@@ -194,7 +172,7 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
         check_waves(bench.geometry, bench.spectrum)
 
 
-def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: Candidates) -> Plan:
+def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: choose.Candidates) -> Plan:
     pilot_result, switches, bench = candidates.pilot_result, candidates.switches, runs.bench
     chosen = candidates.choice(accuracy)
     if pilot_result.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
@@ -210,10 +188,10 @@ def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: Candidates) -> P
 
 
 def _with_heavy_paths(
-    runs: pilot.PilotRuns, accuracy: float, chosen: Candidate, switches: Mapping[str, bool]
-) -> tuple[PilotResult, Candidate]:
+    runs: pilot.PilotRuns, accuracy: float, chosen: choose.Candidate, switches: Mapping[str, bool]
+) -> tuple[PilotResult, choose.Candidate]:
     """Return the pilot result and choice with samples for rare heavy paths, which a run's first samples may miss."""
-    plain = tracing_seconds(runs.pilot_result, chosen.settings, FIXED)
+    plain = cost_model.tracing_seconds(runs.pilot_result, chosen.settings, cost_model.FIXED)
     paths = _HEAVY_PATHS
     while True:
         known = runs.pilot_result.sample_costs
@@ -223,12 +201,12 @@ def _with_heavy_paths(
             if sample_cost.variance > known[name].variance
         }
         pilot_result = runs.pilot_result.with_sample_costs(heavier)
-        planned = predicted_candidate(accuracy, pilot_result, chosen.settings, switches)
-        seconds = tracing_seconds(pilot_result, planned.settings, FIXED)
+        planned = choose.predicted_candidate(accuracy, pilot_result, chosen.settings, switches)
+        seconds = cost_model.tracing_seconds(pilot_result, planned.settings, cost_model.FIXED)
         if sum(seconds.values()) <= _HEAVIER * sum(plain.values()):
             return runs.pilot_result, chosen
         paths *= _MORE
-        asked = {name: seconds[name] / FIXED.passes[name] for name in heavier}
+        asked = {name: seconds[name] / cost_model.FIXED.passes[name] for name in heavier}
         few = any(sample_cost.noise.heavy < _FEW for sample_cost in heavier.values())
         if paths > (_MOST_HEAVY_PATHS if few else min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values()))):
             samples = dict(planned.settings.samples)
@@ -238,8 +216,8 @@ def _with_heavy_paths(
 
 def _range(pilot_result: PilotResult, plan: Plan) -> tuple[float, float] | None:
     """Return the seconds between which nine of ten runs end, if few heavy paths make most of their noise."""
-    costs, least, most = unit_costs_of(pilot_result), 0.0, 0.0
-    for name, seconds in tracing_seconds(pilot_result, plan.settings, costs).items():
+    costs, least, most = choose.unit_costs_of(pilot_result), 0.0, 0.0
+    for name, seconds in cost_model.tracing_seconds(pilot_result, plan.settings, costs).items():
         heavy = pilot_result.sample_costs[name].noise.heavy
         if seconds and math.isfinite(heavy):
             limit = MOST_PATHS * costs.passes[name]
@@ -261,7 +239,9 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
 def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
     """Measure the seconds of a path in the passes that take most, and scale the others."""
     own, spread = integer(seed, "pilot", "paces"), pilot_result.spread
-    fixed = {name: 0.0 for name in simulation.passes} | tracing_seconds(pilot_result, simulation.settings, FIXED)
+    fixed = {name: 0.0 for name in simulation.passes} | cost_model.tracing_seconds(
+        pilot_result, simulation.settings, cost_model.FIXED
+    )
     timed, ratios, ray = dict[str, float](), dict[str, float](), 0.0
     for name in sorted(simulation.passes, key=lambda name: -fixed[name]):
         rest = sum(seconds for other, seconds in fixed.items() if other not in timed)
@@ -271,7 +251,7 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
         own_paths = simulation.passes[name].tracer.paths_per_sample
         paths = pilot_result.sample_costs[name].paths if name == "indirect" else own_paths
         seconds, alone = _pace(simulation, name, labels, own)
-        timed[name], ratios[name] = seconds / paths, seconds / paths / FIXED.passes[name]
+        timed[name], ratios[name] = seconds / paths, seconds / paths / cost_model.FIXED.passes[name]
         if name == "direct":
             ray = alone / paths
     whole = sum(fixed[name] for name in timed)
@@ -280,11 +260,12 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
     slower = sum(by[name] * ratio for name, ratio in ratios.items()) if timed else 1.0
     found = {
         name: replace(
-            pilot_result.sample_costs.get(name, SampleCost.none()), seconds=timed.get(name, slower * FIXED.passes[name])
+            pilot_result.sample_costs.get(name, SampleCost.none()),
+            seconds=timed.get(name, slower * cost_model.FIXED.passes[name]),
         )
         for name in simulation.passes
     }
-    spread = replace(spread, seconds=ray or slower * FIXED.passes["direct"])
+    spread = replace(spread, seconds=ray or slower * cost_model.FIXED.passes["direct"])
     return replace(pilot_result.with_sample_costs(found), spread=spread)
 
 
@@ -297,7 +278,7 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
     def once(samples: int) -> float:
         seconds = _seconds(simulation, name, seed, labels, samples)
         # The first may compile the kernel, and what disturbs a moment would be multiplied.
-        unusual = seconds > _USUAL * samples * paths_per_sample * FIXED.passes[name]
+        unusual = seconds > _USUAL * samples * paths_per_sample * cost_model.FIXED.passes[name]
         again = unusual and (samples == 1 or samples <= _TIMED * every)
         return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
 
@@ -310,7 +291,7 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
         longest = once(samples)
         least = min(least, longest / samples)
     slope = min(max((longest - launch) / (samples - 1), _LEAST_SLOPE * least), least) if samples > 1 else launch
-    launches = ROUNDS * math.ceil(planned / max(1, at_once // paths_per_sample))
+    launches = cost_model.ROUNDS * math.ceil(planned / max(1, at_once // paths_per_sample))
     return slope + max(launch - slope, 0.0) * launches / planned, slope
 
 
@@ -343,13 +324,13 @@ def explain_plan(
     pilot_result: PilotResult,
     facts: SceneFacts,
     switches: Mapping[str, bool] | None = None,
-    chosen: Candidate | None = None,
+    chosen: choose.Candidate | None = None,
 ) -> Plan:
     """Choose effects, numbers and samples, and list them in a table; ``chosen`` is the choice if it is known."""
     check_accuracy(accuracy)
     switches = switches or {}
-    chosen = chosen or Candidates(pilot_result, switches).choice(accuracy)
-    stages = _stages(pilot_result, chosen.settings, unit_costs_of(pilot_result))
+    chosen = chosen or choose.Candidates(pilot_result, switches).choice(accuracy)
+    stages = _stages(pilot_result, chosen.settings, choose.unit_costs_of(pilot_result))
     return Plan(
         accuracy=accuracy,
         effects=tuple(_rows(pilot_result, chosen.settings, facts, switches)),
@@ -363,15 +344,15 @@ def explain_plan(
     )
 
 
-def _stages(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
-    forming, numbers = pilot_result.forming, Numbers.of(settings)
-    held = entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
+def _stages(pilot_result: PilotResult, settings: Settings, costs: cost_model.UnitCosts) -> dict[str, float]:
+    forming, numbers = pilot_result.forming, cost_model.Numbers.of(settings)
+    held = cost_model.entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
     return {
-        "transport": sum(tracing_seconds(pilot_result, settings, costs).values())
-        + float(accumulation_seconds(forming, numbers, held, costs))
-        + float(checking_seconds(forming, numbers, costs)),
-        "truth": truth_seconds(pilot_result, settings, costs),
-        "optics": float(optics_seconds(forming, numbers, costs)),
+        "transport": sum(cost_model.tracing_seconds(pilot_result, settings, costs).values())
+        + float(cost_model.accumulation_seconds(forming, numbers, held, costs))
+        + float(cost_model.checking_seconds(forming, numbers, costs)),
+        "truth": cost_model.truth_seconds(pilot_result, settings, costs),
+        "optics": float(cost_model.optics_seconds(forming, numbers, costs)),
     }
 
 
@@ -379,7 +360,7 @@ def _rows(
     result: PilotResult, settings: Settings, facts: SceneFacts, switches: Mapping[str, bool]
 ) -> Iterator[PlanRow]:
     """Yield a row for each number, for how frames are formed, and for each effect."""
-    costs, costly, waves = unit_costs_of(result), costly_effects(), in_waves(settings.effects)
+    costs, costly, waves = choose.unit_costs_of(result), choose.costly_effects(), cost_model.in_waves(settings.effects)
     now = _stages(result, settings, costs)
 
     def stages(**changes: Any) -> dict[str, float]:
@@ -388,7 +369,7 @@ def _rows(
     def saved(**changes: Any) -> float:
         return max(sum(now.values()) - sum(stages(**changes).values()), 0.0)
 
-    for name, count in zip(COUNTED, counts_of(settings), strict=True):
+    for name, count in zip(COUNTED, choose.counts_of(settings), strict=True):
         one, several, with_one = _NUMBERS[name]
         errors, row = result.ladders[name], name.replace("_", "-")
         if name == "followed_anchors" and not settings.effects & FOLLOWED:
@@ -455,7 +436,7 @@ def _words(error: Estimate) -> str:
     return f"{error.value:.1e}" if error.bound < _VAGUE * error.value else f"less than {error.bound:.1e}"
 
 
-def _shortfall(accuracy: float, result: PilotResult, chosen: Candidate, facts: SceneFacts) -> list[str]:
+def _shortfall(accuracy: float, result: PilotResult, chosen: choose.Candidate, facts: SceneFacts) -> list[str]:
     """Return why the choice does not keep the accuracy, and what helps; nothing if it does."""
     if chosen.total.bound <= accuracy:
         return []
@@ -464,9 +445,12 @@ def _shortfall(accuracy: float, result: PilotResult, chosen: Candidate, facts: S
         f"{name.replace('_', ' ')} ({count}{'' if name == 'layers' else f'x{count}'})": result.ladders[name][
             count
         ].bound
-        for name, count in zip(COUNTED, counts_of(settings), strict=True)
+        for name, count in zip(COUNTED, choose.counts_of(settings), strict=True)
     }
-    width, raster = settings.followed_width, result.raster[in_waves(settings.effects)].error_left(settings.raster_cells)
+    width, raster = (
+        settings.followed_width,
+        result.raster[cost_model.in_waves(settings.effects)].error_left(settings.raster_cells),
+    )
     if width > 1:
         parts[f"cells of their light ({width} pixels)"] = result.error(WIDE).bound / settings.coarse_cells**2
     if raster and settings.raster:

@@ -26,22 +26,8 @@ import numpy as np
 
 from mitsim.core.manifests import MOST_LINES
 from mitsim.devices.projector import SPECTRA_NM, Band, Response
+from mitsim.transport import integrator
 from mitsim.transport.connect import Connection, OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
-from mitsim.transport.integrator import (
-    KINDS,
-    FollowingTracer,
-    InFlight,
-    PathIntegrator,
-    Paths,
-    PathState,
-    Tracer,
-    Turn,
-    camera_part,
-    is_delta,
-    matt_part,
-    projector_part,
-    tilt,
-)
 from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, streams, x_y
 from mitsim.transport.records import CellAxis, CellGrid, DeviceAccumulator, PathSamples, Sightings
 from mitsim.transport.transmission import refracted_way
@@ -52,12 +38,14 @@ some 0.02 % of indirect light here."""
 _MARGIN = 1e-4
 
 
-class FromCameraTracer(FollowingTracer):
+class FromCameraTracer(integrator.FollowingTracer):
     """Light of a scene from the camera's side; `of_projector` includes the projector's light beside that of lamps."""
 
     of_projector: ClassVar[bool] = True
 
-    def __init__(self, setup: OpticalSetup, grid: CellGrid, paths: Paths, points: SensorPoints | None = None) -> None:
+    def __init__(
+        self, setup: OpticalSetup, grid: CellGrid, paths: integrator.Paths, points: SensorPoints | None = None
+    ) -> None:
         super().__init__(setup, paths, points)
         self.grid, self.connector = grid, ProjectorConnector(setup.projector)
 
@@ -68,15 +56,15 @@ class FromCameraTracer(FollowingTracer):
     def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
         return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
-    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+    def _launch(self, flight: integrator.InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return self._paths(flight).path_samples()
 
-    def _paths(self, flight: InFlight) -> CameraPaths[Any]:
+    def _paths(self, flight: integrator.InFlight) -> CameraPaths[Any]:
         return CameraPaths(self, CameraState, flight)
 
 
 @dataclass(kw_only=True)
-class CameraState(PathState):
+class CameraState(integrator.PathState):
     """Paths from the camera under way.
 
     Attributes
@@ -113,12 +101,12 @@ class CameraState(PathState):
 State = TypeVar("State", bound=CameraState)
 
 
-class CameraPaths(PathIntegrator[State]):
+class CameraPaths(integrator.PathIntegrator[State]):
     """Paths from the camera, which keep one connection of each kind of light."""
 
     IMPORTANCE = False
 
-    def __init__(self, tracer: FromCameraTracer, state: type[State], flight: InFlight) -> None:
+    def __init__(self, tracer: FromCameraTracer, state: type[State], flight: integrator.InFlight) -> None:
         super().__init__(tracer)
         cell, row, column = tracer.points.of(flight.index, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
@@ -150,13 +138,13 @@ class CameraPaths(PathIntegrator[State]):
         if self.geometry.angular_exponent > 0:
             solid *= dr.power(squared, -0.5 * dr.opaque(mi.Float, self.geometry.angular_exponent))
         self.weight = spectral * solid
-        sightings = {kind: Sightings.none(tracer.by_line) for kind in KINDS}
+        sightings = {kind: Sightings.none(tracer.by_line) for kind in integrator.KINDS}
         self.paths = state(active=active, ray=ray, rng=rng, sightings=sightings)
 
     def path_samples(self) -> list[PathSamples]:
         kept = self.follow(self.paths).sightings
         dr.eval(kept, self.anchor)
-        return [PathSamples.fetch(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
+        return [PathSamples.fetch(seen, integrator.KINDS[kind], self.anchor) for kind, seen in kept.items()]
 
     # ---- lights that paths run into ---------------------------------------------------------------------------------
 
@@ -216,7 +204,7 @@ class CameraPaths(PathIntegrator[State]):
         else:
             value = bsdf.eval(mi.BSDFContext(), si, toward, active)
         light = self._irradiance(paths, value * connection.weight * passed)
-        light *= self._part(paths, paths.kept * paths.turned * (matt_part(si) if self.rules.steep else 1))
+        light *= self._part(paths, paths.kept * paths.turned * (integrator.matt_part(si) if self.rules.steep else 1))
         self._keep_projector(paths, active, light, connection.pixel, paths.scattered + 1)
 
     def _connection(self, paths: State, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
@@ -253,18 +241,18 @@ class CameraPaths(PathIntegrator[State]):
 
     # ---- turns ------------------------------------------------------------------------------------------------------
 
-    def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+    def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: integrator.Turn, first: bool) -> mi.Bool:
         passing, pdf, going = turn.passing, turn.sample.pdf, mi.Bool(True)
         before_sensor = paths.straight & ~passing
         if first or self.passage.open:
             paths.in_mirror = dr.select(before_sensor, turn.delta, paths.in_mirror)
-            paths.part = dr.select(before_sensor, dr.select(turn.delta, 1, camera_part(pdf)), paths.part)
+            paths.part = dr.select(before_sensor, dr.select(turn.delta, 1, integrator.camera_part(pdf)), paths.part)
             if not self.emitters:
                 going = paths.part > 0
         if self.rules.steep:
-            leaving = dr.select(before_sensor, 1, tilt(si, -paths.ray.d))
-            turned = projector_part(si, tilt(si, si.to_world(turn.sample.wo)) / leaving)
-            kept = paths.kept * paths.turned * matt_part(si)
+            leaving = dr.select(before_sensor, 1, integrator.tilt(si, -paths.ray.d))
+            turned = integrator.projector_part(si, integrator.tilt(si, si.to_world(turn.sample.wo)) / leaving)
+            kept = paths.kept * paths.turned * integrator.matt_part(si)
             paths.kept = dr.select(turn.delta, 1, dr.select(passing, paths.kept, kept))
             paths.turned = dr.select(turn.delta, 1, dr.select(passing, paths.turned, turned))
             # Light that only later turns may leave to this side is little: few paths go on for it.
@@ -273,7 +261,7 @@ class CameraPaths(PathIntegrator[State]):
             paths.throughput *= dr.select(idle, 1 / _SELDOM, 1)
         paths.travelled += si.t
         paths.since = dr.select(passing, paths.since + si.t, 0)
-        paths.behind_glass = passing & (paths.behind_glass | is_delta(turn.sample))
+        paths.behind_glass = passing & (paths.behind_glass | integrator.is_delta(turn.sample))
         paths.came_from = dr.select(passing, paths.came_from, si.p)
         paths.came_pdf = dr.select(passing, paths.came_pdf, pdf)
         paths.by_delta = dr.select(passing, paths.by_delta, turn.delta)
@@ -404,7 +392,7 @@ class LampTracer(FromCameraTracer):
             wavelengths = [sum(own, mi.Float(0))] * len(own)
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
-    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+    def _launch(self, flight: integrator.InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return [self._by_band(found) for found in super()._launch(flight)]
 
     def _by_band(self, found: PathSamples) -> PathSamples:
@@ -429,7 +417,7 @@ class LampTracer(FromCameraTracer):
 class CombinedTracer:
     """Sum of the light of several tracers, with the same samples of each."""
 
-    def __init__(self, *tracers: Tracer) -> None:
+    def __init__(self, *tracers: integrator.Tracer) -> None:
         self.tracers = tracers
 
     @property

@@ -23,24 +23,15 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
+from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints, Way, sample_wavelengths
-from mitsim.transport.integrator import (
-    KINDS,
-    FollowingTracer,
-    InFlight,
-    PathIntegrator,
-    PathState,
-    camera_part,
-    part_over_turn,
-    tilt,
-)
 from mitsim.transport.plugins.base import sobol_point, streams
 from mitsim.transport.records import DeviceAccumulator, PathSamples, Sightings
 
 _ROOMS = (4**2, 12**2)
 
 
-class IndirectTracer(FollowingTracer):
+class IndirectTracer(integrator.FollowingTracer):
     """Indirect light of a projector, and its caustics, at points of the sensor."""
 
     adaptive: AdaptiveSamples | None = None
@@ -66,10 +57,10 @@ class IndirectTracer(FollowingTracer):
     def board(self) -> float:
         return self.setup.board
 
-    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+    def _launch(self, flight: integrator.InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return self._paths(self._emission(flight)).path_samples(accumulator)
 
-    def _emission(self, flight: InFlight) -> Emission:
+    def _emission(self, flight: integrator.InFlight) -> Emission:
         index, sample, weight = flight.index, flight.sample, 1.0
         if self.adaptive:
             index, sample, weight = self.adaptive.at(index, sample)
@@ -105,7 +96,7 @@ class Emission:
     weight: mi.Float | float
 
 
-class ProjectorPaths(PathIntegrator[PathState]):
+class ProjectorPaths(integrator.PathIntegrator[integrator.PathState]):
     """Paths from the projector's pixels, which keep one connection of each kind of light for each anchor."""
 
     IMPORTANCE = True
@@ -121,9 +112,9 @@ class ProjectorPaths(PathIntegrator[PathState]):
         connections = _OneConnection if tracer.points.count == 1 else _AnchorConnections
         self.connections = connections(tracer.points, emission)
         sightings = self.connections.none(("direct", "indirect") if self.rules.mirrors else ("indirect",), self.by_line)
-        self.paths = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
+        self.paths = integrator.PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
 
-    def _connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: integrator.PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         if first:
             return
         drawn = self._draw_numbers(paths)
@@ -135,17 +126,17 @@ class ProjectorPaths(PathIntegrator[PathState]):
         paths.sightings = self.connections.at_each(paths.sightings, paths.active, connect)
 
     @staticmethod
-    def _draw_numbers(paths: PathState) -> dict[str, mi.Float]:
+    def _draw_numbers(paths: integrator.PathState) -> dict[str, mi.Float]:
         return {kind: paths.rng.next_float32() for kind in ("direct", "indirect")}
 
-    def _way(self, paths: PathState, si: mi.SurfaceInteraction3f, sensor: mi.Point3f) -> Way:
+    def _way(self, paths: integrator.PathState, si: mi.SurfaceInteraction3f, sensor: mi.Point3f) -> Way:
         # Light that has met nothing but what it passes is the direct tracer's.
         active = paths.active & ~paths.straight & self._is_wanted(paths.scattered + 1)
         return self.setup.way(si, sensor, active)
 
     def _keep_light(
         self,
-        paths: PathState,
+        paths: integrator.PathState,
         si: mi.SurfaceInteraction3f,
         way: Way,
         drawn: dict[str, mi.Float],
@@ -153,9 +144,9 @@ class ProjectorPaths(PathIntegrator[PathState]):
     ) -> None:
         reception = self.setup.received(si, -paths.ray.d, way)
         light = reception.irradiance * self.flux * paths.throughput
-        caustic, part = paths.scattered == 0, 1 - camera_part(reception.pdf)
+        caustic, part = paths.scattered == 0, 1 - integrator.camera_part(reception.pdf)
         if self.rules.steep:
-            part *= part_over_turn(paths, si, tilt(si, -paths.ray.d))
+            part *= integrator.part_over_turn(paths, si, integrator.tilt(si, -paths.ray.d))
         light *= dr.select(caustic, 1, part)
         held, number = at
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
@@ -212,7 +203,7 @@ class _OneConnection:
     def fetch(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
         """Fetch some kinds with `also` in one kernel, because each would trace all paths again."""
         dr.eval([held[kind] for kind in kinds], self._anchor if kinds else (), also)
-        return [PathSamples.fetch(held[kind], KINDS[kind], self._anchor) for kind in kinds]
+        return [PathSamples.fetch(held[kind], integrator.KINDS[kind], self._anchor) for kind in kinds]
 
 
 class _AnchorConnections(_OneConnection):
@@ -261,7 +252,10 @@ class _AnchorConnections(_OneConnection):
         dr.eval(found, self._pixel, also)
         index = dr.arange(mi.UInt32, size)
         pixel, anchor = dr.gather(mi.UInt32, self._pixel, index // self._count), self.anchor(index % self._count)
-        return [PathSamples.fetch(_sightings(pixel, values), KINDS[kind], anchor) for kind, values in found.items()]
+        return [
+            PathSamples.fetch(_sightings(pixel, values), integrator.KINDS[kind], anchor)
+            for kind, values in found.items()
+        ]
 
 
 def _differing(seen: Sightings) -> list[mi.Float]:

@@ -32,15 +32,7 @@ from mitsim.transport.connect import LensHit, OpticalSetup, Reception, landing, 
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer
 from mitsim.transport.integrator import InFlight, Paths, Turn, camera_part, launches
-from mitsim.transport.plugins.base import (
-    channels,
-    device_vectors,
-    host_values,
-    panchromatic,
-    streams,
-    turn_and_origin,
-    vectors,
-)
+from mitsim.transport.plugins import base
 from mitsim.transport.projector import PinholeRays, wavelength_sets
 from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, PathSamples, Sightings, check_finite
 from mitsim.transport.specular import turned_by_mirrors
@@ -130,10 +122,10 @@ class _Landed:
         found = turned_by_mirrors(setup.scene, setup.camera, setup.projector)
         if not (count := len(found.index)):
             return None
-        start, way = (mi.Vector3f(*device_vectors(each)) for each in (found.start, found.direction))
+        start, way = (mi.Vector3f(*base.device_vectors(each)) for each in (found.start, found.direction))
         si, side = setup.scene.ray_intersect(mi.Ray3f(start, way)), mi.Float(_CUBE * setup.geometry.scene_distance)
-        scatters = host_values(si.bsdf().flags() & int(mi.BSDFFlags.Smooth), count) != 0
-        code = np.where(scatters, host_values(_cube(si.p, side), count), _CUBES)
+        scatters = base.host_values(si.bsdf().flags() & int(mi.BSDFFlags.Smooth), count) != 0
+        code = np.where(scatters, base.host_values(_cube(si.p, side), count), _CUBES)
         order = np.argsort(code, kind="stable")
         first = np.searchsorted(code[order], np.arange(_CUBES + 1))
         rays = _Turned(mi.Vector3f(si.p), way, mi.UInt32(found.mirror), *map(mi.Float, found.spectrum.T))
@@ -194,7 +186,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
         light, turned, mirror = self.tracer.landed.light(si, mi.PCG32(paths.rng), foreign)
         missed, hit = (self._irradiance(paths, each) * paths.part for each in (light, turned))
         none = mi.Float(0)
-        self._join(paths, "indirect", Sightings.of(missed, self.by_line, mirror, panchromatic(hit), none, none))
+        self._join(paths, "indirect", Sightings.of(missed, self.by_line, mirror, base.panchromatic(hit), none, none))
 
     def _hit_lens(self, paths: _MissedState, si: mi.SurfaceInteraction3f) -> None:
         once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
@@ -202,7 +194,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
         hit = self.connector.hit(paths.ray, si.t, paths.rng, met, paths.since)
         light, none = self._irradiance(paths, hit.radiance), mi.Float(0)
         met &= hit.met
-        in_mirror = panchromatic(light) * paths.density / hit.pdf
+        in_mirror = base.panchromatic(light) * paths.density / hit.pdf
         connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, self._projector_light(paths, hit)), 0)
         self._join(
             paths, "direct", Sightings.of(dr.select(met, light, 0), self.by_line, paths.lobe, connected, none, none)
@@ -214,7 +206,9 @@ class _MissedPaths(CameraPaths[_MissedState]):
         # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
         view = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) * dr.square(dr.square(self.slope))
         distance = paths.inverse_depth * self.slope
-        return panchromatic(self._irradiance(paths, flux)) / view * paths.density * self.slope * dr.square(distance)
+        return (
+            base.panchromatic(self._irradiance(paths, flux)) / view * paths.density * self.slope * dr.square(distance)
+        )
 
     def _note_turn(self, paths: _MissedState, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
         going = super()._note_turn(paths, si, turn, first)
@@ -282,7 +276,7 @@ def highlights(setup: OpticalSetup) -> Highlights:
         return Highlights(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
     wavelengths = wavelength_sets(projector.lines)
     rays = PinholeRays(projector, wavelengths)
-    turn, eye = turn_and_origin(setup.camera.world_transform())
+    turn, eye = base.turn_and_origin(setup.camera.world_transform())
     centre = np.array([np.array(ball.bbox().center(), dtype=np.float64).ravel() for ball in balls])
     radius = np.array([float(np.array(ball.bbox().extents()).max()) / 2 for ball in balls])
     normal = _mirror_normals(centre, radius, rays.origin, eye)
@@ -344,7 +338,7 @@ def _radiance_toward(
 ) -> tuple[FloatArray, FloatArray]:
     to = aimed - origin
     ray = mi.Ray3f(
-        mi.Point3f(origin.tolist()), mi.Vector3f(*device_vectors(to / np.linalg.norm(to, axis=1, keepdims=True)))
+        mi.Point3f(origin.tolist()), mi.Vector3f(*base.device_vectors(to / np.linalg.norm(to, axis=1, keepdims=True)))
     )
     si = scene.ray_intersect(ray)
     target = mi.Point3f(eye.tolist())
@@ -354,9 +348,11 @@ def _radiance_toward(
     value, density = si.bsdf().eval_pdf(context, si, way, active)
     count = len(aimed)
     sharp = dr.select(active & (density > _LEAST_SHARP), value, 0)
-    light = channels(mi.unpolarized_spectrum(sharp), count).mean(axis=1)
-    met = np.linalg.norm(vectors(si.p, count) - aimed, axis=1) < _ON_BALL * radius + 1e-4 * np.abs(aimed).max(axis=1)
-    return light * met, host_values(dr.abs(mi.Frame3f.cos_theta(si.wi)), count)
+    light = base.channels(mi.unpolarized_spectrum(sharp), count).mean(axis=1)
+    met = np.linalg.norm(base.vectors(si.p, count) - aimed, axis=1) < _ON_BALL * radius + 1e-4 * np.abs(aimed).max(
+        axis=1
+    )
+    return light * met, base.host_values(dr.abs(mi.Frame3f.cos_theta(si.wi)), count)
 
 
 # -------- Direct light over sharp lobes
@@ -570,7 +566,7 @@ class _Lobes:
         self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float, turned: mi.Float
     ) -> tuple[Labels, FloatArray, FloatArray, FloatArray]:
         half = dr.opaque(mi.Float, wider * self.setup.geometry.half_width)
-        _, rng = streams(seed, pixel, sample)
+        _, rng = base.streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
         wavelengths, spectral = sample_wavelengths(self.setup.camera, rng, self.setup.projector.lines)
         ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
@@ -608,6 +604,6 @@ class _Lobes:
         reception = self.setup.receive(at.si, -at.direction, sensor, active)
         active &= reception.pdf > least
         per_area = density * reception.solid_angle(sensor)
-        connected = dr.select(active, panchromatic(reception.irradiance * at.light), 0)
+        connected = dr.select(active, base.panchromatic(reception.irradiance * at.light), 0)
         mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
         return met.joined_by(_SensorHits(mean, mean * connected, per_area, turns), rng), rng

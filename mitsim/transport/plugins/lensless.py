@@ -68,16 +68,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import BoolArray, Flaws, Mask
 from mitsim.devices.plate import Plate
-from mitsim.transport.plugins.base import (
-    RIGID,
-    generator,
-    rigidity_error,
-    rows_columns,
-    shuffle,
-    sobol_point,
-    turn_and_origin,
-    x_y,
-)
+from mitsim.transport.plugins import base
 
 PLUGIN = "mitsim_lensless"
 _BOX_RADIUS = 0.5 + 1e-4
@@ -96,9 +87,9 @@ def _geometry(props: mi.Properties, film: mi.Film) -> CameraGeometry:
 
 
 def _check_rigid(transform: mi.AffineTransform4f) -> None:
-    turn, origin = turn_and_origin(transform)
-    error = rigidity_error(turn)
-    if not (np.isfinite(turn).all() and np.isfinite(origin).all() and error < RIGID and np.linalg.det(turn) > 0):
+    turn, origin = base.turn_and_origin(transform)
+    error = base.rigidity_error(turn)
+    if not (np.isfinite(turn).all() and np.isfinite(origin).all() and error < base.RIGID and np.linalg.det(turn) > 0):
         raise MitsimError(
             f"{PLUGIN}: to_world is no rotation and translation (it scales, shears or mirrors: R^T R is {error:.2g} "
             "from 1); lengths are mm everywhere, so move and turn the camera only"
@@ -182,10 +173,10 @@ def plugin_class() -> type:
             count = mi.Point2f(columns, rows)
             place = dr.minimum(dr.floor(film * count), count - 1)
             pixel = mi.UInt32(place.y) * columns + mi.UInt32(place.x)
-            rng = generator(dr.opaque(mi.UInt32, seed), pixel)
+            rng = base.generator(dr.opaque(mi.UInt32, seed), pixel)
             index = dr.arange(mi.UInt32, dr.width(film)) % dr.opaque(mi.UInt32, paths)
-            film = (place + sobol_point(index, rng)) / count
-            return film, sobol_point(shuffle(index, rng), rng)
+            film = (place + base.sobol_point(index, rng)) / count
+            return film, base.sobol_point(base.shuffle(index, rng), rng)
 
         def _on_sensor(self, film: mi.Point2f) -> mi.Point2f:
             geometry, roi = self.geometry, self.geometry.roi
@@ -208,18 +199,18 @@ def plugin_class() -> type:
             # What the field stop shows of the mask, in features from the mask's first corner.
             first = [
                 (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._cover
-                for start, centre in zip(rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
+                for start, centre in zip(base.rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
             ]
             width = 2 * stop * geometry.mask_distance / side
             row, column, part = self._openings.draw(mi.Point2f(*first), width, sample)
-            t = mi.Vector2f(*x_y(*(place * (2 * stop / width) - stop for place in (row, column))))
+            t = mi.Vector2f(*base.x_y(*(place * (2 * stop / width) - stop for place in (row, column))))
             return t, part
 
         def _crossing(self, u: mi.Point2f, t: mi.Vector2f, sample: mi.Point2f) -> mi.Point2f:
             distance, flaws = self.geometry.mask_distance, self._flaws
             if any(flaws.tilt_mrad):
-                tilt = mi.Vector2f(*x_y(*(float(np.tan(angle * 1e-3)) for angle in flaws.tilt_mrad)))
-                centre = mi.Point2f(*x_y(*self.geometry.mask_offset))
+                tilt = mi.Vector2f(*base.x_y(*(float(np.tan(angle * 1e-3)) for angle in flaws.tilt_mrad)))
+                centre = mi.Point2f(*base.x_y(*self.geometry.mask_offset))
                 along = (distance + dr.dot(tilt, u - centre)) / (1 - dr.dot(tilt, t))
                 # A length along the tilted plane is longer than what it covers of the even one.
                 point = (u + along * t - centre) * dr.sqrt(1 + dr.square(tilt)) + centre
@@ -227,7 +218,7 @@ def plugin_class() -> type:
                 point = u + distance * t
             if flaws.blur_mm:
                 bits = [dr.reinterpret_array(mi.UInt32, mi.Float32(number)) for number in (sample.x, sample.y)]
-                rng = generator(*bits)
+                rng = base.generator(*bits)
                 moved = mi.Point2f(rng.next_float32(), rng.next_float32())
                 point += flaws.blur_mm * mi.warp.square_to_std_normal(moved)
             return point
@@ -246,7 +237,7 @@ def plugin_class() -> type:
             )
 
         def _transmission(self, point: mi.Point2f, active: mi.Bool) -> mi.Float:
-            row, column = rows_columns(point.x, point.y)
+            row, column = base.rows_columns(point.x, point.y)
             row_centre, column_centre = self.geometry.mask_offset
             row, column = self._place(row - row_centre, column - column_centre)
             inside = (row >= 0) & (row < self._features) & (column >= 0) & (column < self._features)

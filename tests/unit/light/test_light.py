@@ -338,7 +338,7 @@ def test_a_plan_of_several_lines_is_priced_for_all(
             seen.append(pilot_result.forming.lines)
             super().__init__(pilot_result, switches)
 
-    monkeypatch.setattr(planner, "Candidates", Candidates)
+    monkeypatch.setattr(choose, "Candidates", Candidates)
     plan = planner.make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False), lines=3)
     assert seen == [3]
     monkeypatch.setattr(cost_model, "workers", lambda: 1)  # files one line at a time

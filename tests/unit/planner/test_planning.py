@@ -74,10 +74,10 @@ def runs(made: Plan, monkeypatch: pytest.MonkeyPatch) -> CountedRuns:
         return replace(made, accuracy=accuracy, warnings=(OWN,))
 
     monkeypatch.setattr(pilot, "PilotRuns", PilotRuns)
-    monkeypatch.setattr(planner, "Candidates", Invented)
+    monkeypatch.setattr(planner.choose, "Candidates", Invented)
     monkeypatch.setattr(planner, "_refuse_unfit", lambda bench, switches: None)
     monkeypatch.setattr(planner, "_decide", decided)
-    monkeypatch.setattr(planner, "frame_seconds", lambda bench, shots: FRAMES)
+    monkeypatch.setattr(planner.cost_model, "frame_seconds", lambda bench, shots: FRAMES)
     return seen
 
 
@@ -165,11 +165,11 @@ def test_closer_looks_take_a_fifth_of_the_run_at_most(
     """However much they promise; and the plan says so. (Planted: each of them for itself.)"""
     whole = cheapest(3e-3, ONE_CLASS, {}).work
     looked: Any = Refined(part * whole)
-    monkeypatch.setattr(planner, "value_of_refining", lambda *_: (math.inf, Approximation("followed_anchors", 2)))
+    monkeypatch.setattr(planner.choose, "value_of_refining", lambda *_: (math.inf, Approximation("followed_anchors", 2)))
     _, (note,) = planner._refine(looked, 3e-3, {})
     assert looked.refined == ["followed"] * closer
     assert "followed anchors and all that hangs on them are chosen safely" in note and f"the {whole:.1f} s" in note
-    monkeypatch.setattr(planner, "value_of_refining", lambda *_: (0.0, Approximation("followed_anchors", 2)))
+    monkeypatch.setattr(planner.choose, "value_of_refining", lambda *_: (0.0, Approximation("followed_anchors", 2)))
     assert not planner._refine(looked, 3e-3, {})[1], "worth nothing"
 
 
