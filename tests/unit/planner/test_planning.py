@@ -165,11 +165,12 @@ def test_closer_looks_take_a_fifth_of_the_run_at_most(
     """However much they promise; and the plan says so. (Planted: each of them for itself.)"""
     whole = cheapest(3e-3, ONE_CLASS, {}).work
     looked: Any = Refined(part * whole)
-    monkeypatch.setattr(planner.choose, "value_of_refining", lambda *_: (math.inf, Approximation("followed_anchors", 2)))
+    doubt = Approximation("followed_anchors", 2)
+    monkeypatch.setattr(planner.choose, "value_of_refining", lambda *_: (math.inf, doubt))
     _, (note,) = planner._refine(looked, 3e-3, {})
     assert looked.refined == ["followed"] * closer
     assert "followed anchors and all that hangs on them are chosen safely" in note and f"the {whole:.1f} s" in note
-    monkeypatch.setattr(planner.choose, "value_of_refining", lambda *_: (0.0, Approximation("followed_anchors", 2)))
+    monkeypatch.setattr(planner.choose, "value_of_refining", lambda *_: (0.0, doubt))
     assert not planner._refine(looked, 3e-3, {})[1], "worth nothing"
 
 
