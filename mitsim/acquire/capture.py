@@ -15,16 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.acquire.exposure import (
-    AmbientFrame,
-    Exposer,
-    Shooting,
-    Totals,
-    ambient_shots,
-    camera_warnings,
-    frame_channels,
-    takes_ambient_frame,
-)
+from mitsim.acquire import exposure
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import obstacles
@@ -303,21 +294,23 @@ def _run(
     with job.clock.stage("optics"):
         expected = light.frames(family.lighting, request.seed)
         # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
-        totals = Totals.of(expected)
+        totals = exposure.Totals.of(expected)
     exposure_s = request.timing.choose(bench.devices, totals.peak)
-    exposer = Exposer(bench.devices, exposure_s, request.seed, light.speckle(family))
+    exposer = exposure.Exposer(bench.devices, exposure_s, request.seed, light.speckle(family))
     with job.clock.stage("write"):
         recorder.begin()
         recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
     ambient = None
     with job.clock.stage("ambient frame"):
-        if takes_ambient_frame(request.ambient_frame, family, expected):
-            ambient = AmbientFrame.expose(exposer, expected, request.ambient_shots or ambient_shots(family))
+        if exposure.takes_ambient_frame(request.ambient_frame, family, expected):
+            ambient = exposure.AmbientFrame.expose(
+                exposer, expected, request.ambient_shots or exposure.ambient_shots(family)
+            )
     if ambient:
         single = {"DN": ambient.digital, "electrons": ambient.electrons}
         channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
         recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposure_s, "seed": request.seed})
-    shooting = Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
+    shooting = exposure.Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
     shooting.shoot(expected, job)
     ambient_file = None
     if ambient:
@@ -360,7 +353,7 @@ def _run(
 
 
 def _close(
-    light: SampledLight, shooting: Shooting, expected: ExpectedFrames, request: Request
+    light: SampledLight, shooting: exposure.Shooting, expected: ExpectedFrames, request: Request
 ) -> manifests.ClosingFile | None:
     """Record the closing frame of a run if requested, and return its manifest entry.
 
@@ -381,7 +374,7 @@ def _close(
             seconds = min(seconds, replace(request.timing, seconds=None).choose(exposer.devices, peak))
         exposer = replace(exposer, exposure_s=seconds, speckle=light.speckle())
     electrons = exposer.shot_electrons(frame, *names)
-    channels = frame_channels(exposer.digital(electrons, "closing"), electrons)
+    channels = exposure.frame_channels(exposer.digital(electrons, "closing"), electrons)
     shooting.recorder.write(CLOSING, channels, {"exposure_s": exposer.exposure_s, "seed": request.seed})
     return manifests.ClosingFile(kind=request.closing_frame, file=CLOSING, exposure_s=exposer.exposure_s)
 
@@ -419,7 +412,9 @@ def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | 
 # -------- Why a run is flagged
 
 
-def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: Request) -> Iterator[str]:
+def _warnings(
+    light: SampledLight, totals: exposure.Totals, shooting: exposure.Shooting, request: Request
+) -> Iterator[str]:
     accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
     # The light may have been planned for other patterns, which do not give the same numbers.
     own, patterns = obstacles(light.bench, shooting.family), light.plan.known_request.patterns
@@ -445,7 +440,7 @@ def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: 
         )
     if shooting.ambient is not None and shooting.ambient.saturated:
         yield "saturation: the ambient frame has pixels at the full well or the ADC's end; expose for less"
-    yield from camera_warnings(light.bench.sensor, shooting.always.shape)
+    yield from exposure.camera_warnings(light.bench.sensor, shooting.always.shape)
     if shooting.always.any():
         yield from _of_ambient_light(shooting, accuracy, total.bound * shooting.dilution)
         yield from _of_unknown_light(light, shooting)
@@ -453,7 +448,7 @@ def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: 
         yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"
 
 
-def _foreign(light: SampledLight, totals: Totals, request: Request) -> str:
+def _foreign(light: SampledLight, totals: exposure.Totals, request: Request) -> str:
     traced = light.plan.request.patterns if light.plan.request else request.patterns
     if traced == request.patterns:
         return ""
@@ -479,7 +474,7 @@ def _sparser(light: SampledLight, lighting: Lighting) -> str:
     )
 
 
-def _of_unknown_light(light: SampledLight, shooting: Shooting) -> Iterator[str]:
+def _of_unknown_light(light: SampledLight, shooting: exposure.Shooting) -> Iterator[str]:
     counted_lamps, accuracy = light.bench.counted_lamps, light.plan.accuracy
     if counted_lamps is not None and counted_lamps.unknown * shooting.ambient_part > accuracy:
         first, last = counted_lamps.range_nm
@@ -492,7 +487,7 @@ def _of_unknown_light(light: SampledLight, shooting: Shooting) -> Iterator[str]:
         )
 
 
-def _of_ambient_light(shooting: Shooting, accuracy: float, of_projector: float) -> Iterator[str]:
+def _of_ambient_light(shooting: exposure.Shooting, accuracy: float, of_projector: float) -> Iterator[str]:
     part = f"{shooting.ambient_part:.1%} of the frames' light is ambient"
     if of_projector > _DILUTED * accuracy:
         yield (

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.acquire.capture import Totals
+from mitsim.acquire.exposure import Totals
 from mitsim.api.bench import open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting

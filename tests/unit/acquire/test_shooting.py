@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from mitsim.acquire.capture import Shooting, Totals
+from mitsim.acquire.exposure import Shooting, Totals
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import Recorder
