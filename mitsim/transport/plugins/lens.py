@@ -109,7 +109,6 @@ def plugin_class() -> type:
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
-            self.m_needs_sample_3 = True
             self.scale = float(props.get("scale", 1.0))
             self.focus = _number(props, "focus", 0, math.inf)
             self.reach = math.tan(math.radians(_number(props, "fov", 0, 180)) / 2)
@@ -160,39 +159,6 @@ def plugin_class() -> type:
         def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
             active &= dr.dot(ds.d, ds.n) < 0
             return mi.depolarizer(self._radiance(ds.p, -ds.d, it.wavelengths, active))
-
-        def sample_position(
-            self, time: mi.Float, sample: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[mi.PositionSample3f, mi.Float]:
-            ps = self.get_shape().sample_position(time, sample, active)
-            return ps, dr.select(active & (ps.pdf > 0), dr.rcp(ps.pdf), 0)
-
-        def pdf_position(self, ps: mi.PositionSample3f, active: mi.Bool = True) -> mi.Float:
-            return self.get_shape().pdf_position(ps, active)
-
-        def sample_wavelengths(
-            self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
-        ) -> tuple[mi.Color0f, mi.Spectrum]:
-            none = dr.zeros(mi.Ray3f).wavelengths
-            # Spectral variants take several wavelengths at once, evenly apart.
-            places = [sample + i / max(1, len(none)) for i in range(len(none))]
-            shifted = type(none)(*(place - dr.floor(place) for place in places))
-            wavelengths, weight = self.irradiance.sample_spectrum(si, shifted, active)
-            return wavelengths, weight * self.scale
-
-        def sample_ray(
-            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[mi.Ray3f, mi.Spectrum]:
-            ps, _ = self.sample_position(time, sample2, active)
-            near = mi.Vector3f((1 - 2 * sample3.x) * self.reach, (1 - 2 * sample3.y) * self.reach / self.aspect, 1)
-            direction = dr.normalize(self.to_world @ mi.Point3f(near * self.focus) - ps.p)
-            si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Ray3f).wavelengths)
-            si.uv = sample3
-            wavelengths, weight = self.sample_wavelengths(si, sample1, active)
-            ray = si.spawn_ray(direction)
-            ray.time, ray.wavelengths = time, wavelengths
-            area = 4 * self.reach**2 / self.aspect
-            return ray, mi.depolarizer(weight * (dr.pi * area)) & active
 
         def bbox(self) -> mi.BoundingBox3f:
             return self.get_shape().bbox()

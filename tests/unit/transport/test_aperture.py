@@ -102,23 +102,6 @@ def test_defocus_keeps_the_flux() -> None:
         assert flux == pytest.approx(expected, rel=1e-2)
 
 
-@pytest.mark.slow
-def test_light_traced_from_the_projector_agrees() -> None:
-    """``sample_ray`` against ``sample_direction``: mean of what a particle tracer and a path tracer render."""
-    parts = aperture_scene_parts(stock(turn=3.0), 3.0, 300.0)
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
-    camera = {"type": "perspective", "fov": 50, "film": film}
-    scene = mi.load_dict({"type": "scene", "camera": camera, "board": board(400), **parts})
-    means = {}
-    for name in ("path", "ptracer"):
-        integrator = mi.load_dict({"type": name, "max_depth": 2})
-        runs = [np.array(mi.render(scene, integrator=integrator, spp=4096, seed=s)).mean() for s in range(8)]
-        means[name] = np.mean(runs), np.std(runs, ddof=1) / np.sqrt(8)
-    error = np.hypot(means["path"][1], means["ptracer"][1])
-    assert 7 * error < 0.02 * means["path"][0]  # t distribution of 7 degrees and more: 5 sigma become about 7
-    assert abs(means["path"][0] - means["ptracer"][0]) < 7 * error
-
-
 def lensless(light: dict, bsdf: dict, integrator: str = "path", spp: int = 256, seed: int = 0) -> np.ndarray:
     film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     camera = {"type": "mitsim_lensless", "mask": "open", "film": film, "pixel_pitch": 0.1875}
