@@ -27,9 +27,13 @@ layer. The paper's geometry has 150.
 """
 
 
+_Place = tuple[int, float, float, tuple[int, int]]
+"""Pixels per side of a window, its first row and column, and its canvas."""
+
+
 @dataclass(frozen=True)
-class Window:
-    """Window of n x n projector pixels in a canvas.
+class ProjectorGrid:
+    """A window of n x n projector pixels in a canvas, and its position on the camera's aligned plane.
 
     Attributes
     ----------
@@ -39,20 +43,6 @@ class Window:
         Canvas texel of the window's pixel (0, 0); fractional for a drifted picture.
     canvas
         (rows, columns) of the whole texture.
-    """
-
-    n: int
-    first_row: float
-    first_column: float
-    canvas: tuple[int, int]
-
-
-@dataclass(frozen=True)
-class ProjectorGrid(Window):
-    """A projector's window and its position on the camera's aligned plane.
-
-    Attributes
-    ----------
     row_tan, column_tan
         (first edge, last edge) of the window as tan-angles y/z and x/z from the camera in index coordinates, on the
         plane at the camera's scene distance; the bounding box in case of keystone.
@@ -60,9 +50,18 @@ class ProjectorGrid(Window):
         Largest deviation of the window's corners from that box in projector pixels; 0 for a shifted lens.
     """
 
+    n: int
+    first_row: float
+    first_column: float
+    canvas: tuple[int, int]
     row_tan: tuple[float, float]
     column_tan: tuple[float, float]
     keystone: float
+
+    @property
+    def place(self) -> _Place:
+        """Return n, first row, first column and canvas."""
+        return self.n, self.first_row, self.first_column, self.canvas
 
 
 def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> ProjectorGrid:
@@ -100,7 +99,7 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
             "paint the window white"
         )
     z = camera.geometry.scene_distance
-    window = Window(width, int(rows[0]), int(columns[0]), (int(lit.shape[0]), int(lit.shape[1])))
+    window = width, int(rows[0]), int(columns[0]), (int(lit.shape[0]), int(lit.shape[1]))
     corners = _window_corners(where, projector, camera, window, z)
     low, high = corners.min(axis=0), corners.max(axis=0)
     span = float((high - low).min())
@@ -112,12 +111,8 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
         )
     ideal = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
     keystone = float(np.abs((corners - ideal) / (high - low)).max()) * width
-    return ProjectorGrid(
-        **vars(window),
-        row_tan=(float(low[0]), float(high[0])),
-        column_tan=(float(low[1]), float(high[1])),
-        keystone=keystone if keystone > _NO_KEYSTONE else 0.0,
-    )
+    tangents = (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
+    return ProjectorGrid(*window, *tangents, keystone if keystone > _NO_KEYSTONE else 0.0)
 
 
 def window_at(
@@ -130,7 +125,7 @@ def window_at(
     MitsimError
         If the projector does not light the plane.
     """
-    corners = _window_corners(where, projector, camera, grid, depth)
+    corners = _window_corners(where, projector, camera, grid.place, depth)
     (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
     return (float(top), float(bottom)), (float(left), float(right))
 
@@ -147,12 +142,12 @@ def straightening(
     MitsimError
         If the projector does not light the plane.
     """
-    corners = _window_corners(where, projector, camera, grid, depth)
+    corners = _window_corners(where, projector, camera, grid.place, depth)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return _homography(corners, np.where([[0, 0], [0, 1], [1, 0], [1, 1]], high, low))
 
 
-def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window: Window, z: float) -> FloatArray:
+def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window: _Place, z: float) -> FloatArray:
     """Return the (4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
 
     The plane and the projector's image are related by a homography, which four probes of the emitter determine.
@@ -168,8 +163,9 @@ def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window
     uv = np.array(sample.uv, dtype=np.float64).T
     uv = uv.T if uv.shape[0] == 2 and uv.shape[1] == len(probes) else uv
     homography = _homography(uv, probes) if np.isfinite(uv).all() else np.full((3, 3), np.nan)
-    rows = (window.first_row + window.n * np.array([0, 0, 1, 1])) / window.canvas[0]
-    columns = (window.first_column + window.n * np.array([0, 1, 0, 1])) / window.canvas[1]
+    n, row, column, canvas = window
+    rows = (row + n * np.array([0, 0, 1, 1])) / canvas[0]
+    columns = (column + n * np.array([0, 1, 0, 1])) / canvas[1]
     mapped = np.stack([columns, rows, np.ones(4)], axis=1) @ homography.T
     points = mapped[:, :2] / mapped[:, 2:]
     if not np.isfinite(points).all():
