@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -161,28 +160,6 @@ class Mixture:
     def sparse(self) -> bool:
         """Return True if shots have so few frames of their own that adding is faster than a matrix product."""
         return bool(self.own.nnz <= _FEW * len(self.weights))
-
-    @cached_property
-    def one_each(self) -> bool:
-        """Return True if every shot is one frame, and every frame belongs to one shot."""
-        shots, held = self.own.shape
-        alone = np.array_equal(np.diff(self.own.indptr), np.ones(shots))
-        return shots == held and alone and np.array_equal(np.sort(self.own.indices), np.arange(held))
-
-    def in_place(self, basis: FloatArray) -> Sequence[FloatArray]:
-        """Return all shots in the memory of ``basis`` (b, ...) if :attr:`one_each` holds."""
-        common = mix_frames(self.least[None], basis)[0] if self.least.any() else None
-
-        def weigh_in_place(shot: int) -> FloatArray:
-            (number,), (weight,) = _row(self.own, shot)
-            frame: FloatArray = basis[number]
-            if weight != 1:
-                frame *= weight
-            if common is not None:
-                frame += common
-            return frame
-
-        return in_threads(weigh_in_place, range(len(self.weights)))
 
     def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
         """Return the shots ``start`` to ``stop`` from the frames ``basis`` (b, ...)."""

@@ -187,14 +187,11 @@ class ExpectedFrames:
         """Return the same shots without ambient light."""
         dark = copy(self)
         dark._ambient = ()
-        for with_ambient in ("_ambient_light", "_frames_of_classes", "_energies"):
+        for with_ambient in ("_ambient_light", "_energies"):
             vars(dark).pop(with_ambient, None)
         return dark
 
     def __iter__(self) -> Iterator[Frame]:
-        if self._mixed and self._of_classes.one_each:
-            yield from self._frames_of_classes
-            return
         step = at_once(side_of(self._shape))
         for start in range(0, len(self), step):
             stop = min(start + step, len(self))
@@ -280,12 +277,6 @@ class ExpectedFrames:
         return None if self._leak is None else self._form_with_probes(self._lights, self._leak)
 
     @cached_property
-    def _frames_of_classes(self) -> Sequence[Frame]:
-        irradiance, probed = self._form(0, len(self))
-        shots = self._of_classes.in_place(irradiance)
-        return self._frames(shots, self._of_classes.shots(probed, 0, len(self)), owned=True)
-
-    @cached_property
     def _mixed_basis(self) -> tuple[FloatArray, FloatArray]:
         irradiance, probed = self._form(0, self._basis.shape[0])
         if self._pairs is None:
@@ -323,15 +314,14 @@ class ExpectedFrames:
     def _shape(self) -> tuple[int, int]:
         return self._lights[0].optics.frame_shape
 
-    def _frames(self, light: Sequence[FloatArray], probes: Sequence[FloatArray], owned: bool = False) -> list[Frame]:
+    def _frames(self, light: Sequence[FloatArray], probes: Sequence[FloatArray]) -> list[Frame]:
         ambient, count = self._ambient_light, self._groups
         pairs = count * (count - 1)
 
         def frame_of(row: int) -> Frame:
             frame, probed = light[row], probes[row]
             if ambient is not None:
-                frame = np.add(frame, ambient[0][0], out=frame if owned else None)
-                probed = probed + ambient[1][0]
+                frame, probed = frame + ambient[0][0], probed + ambient[1][0]
             products = noise_of_groups(probed, self._shape[0], count) if pairs else np.zeros((1, 1))
             spread = float(np.trace(products))
             scale = self._restated**2 / max(pairs, 1) / frame.size
@@ -339,10 +329,10 @@ class ExpectedFrames:
             heaviest = float(products.max()) / spread if spread else 0.0
             removed = 0.0
             if frame.min() < 0:
-                whole, frame = float(frame.sum()), np.maximum(frame, 0, out=frame if owned else None)
+                whole, frame = float(frame.sum()), np.maximum(frame, 0)
                 total = float(frame.sum())
                 removed = (total - whole) / total if total else 0.0
-            frame.flags.writeable = False  # of those that are held, which nobody may change
+            frame.flags.writeable = False  # a view of one that is held, which nobody may change
             return Frame(frame, variance, removed, heaviest, parts)
 
         return in_threads(frame_of, range(len(light)))
