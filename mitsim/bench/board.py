@@ -195,10 +195,8 @@ def show_picture(bench: Apparatus, reflectance: npt.NDArray[np.float64]) -> None
     for sheet, held, names in _prints(bench):
         for name in names:
             if not name.endswith(_BITMAP):
-                raise MitsimError(
-                    f"{bench.loaded.path}: has no printed surface (a reflectance by bitmap) to put pictures on; give "
-                    "one its texture"
-                )
+                problem = f"{bench.loaded.path}: has no printed surface (a reflectance by bitmap) to put pictures on"
+                raise MitsimError(f"{problem}; give one its texture")
             shape, turned = np.shape(held[name]), held[name.replace(".data", ".to_uv")]
             if shape[2] != 1 or not np.array_equal(np.array(turned.matrix), np.eye(3)):
                 raise MitsimError(

@@ -118,10 +118,8 @@ class Exposure:
                 "capture and calibrate by --colour mosaic (capture_mosaic, calibrate_mosaic), make pairs by another"
             )
         if self.seconds is None and not math.isfinite(sensor.full_well_e):
-            raise MitsimError(
-                f"camera {camera_file}: full_well_e is inf, so there is no full well to fill; "
-                "give a finite one, or an exposure in seconds"
-            )
+            problem = f"camera {camera_file}: full_well_e is inf, so there is no full well to fill"
+            raise MitsimError(f"{problem}; give a finite one, or an exposure in seconds")
 
     def choose(self, devices: Devices, peak_irradiance: float) -> float:
         """Return the exposure time [s] for a brightest expected pixel of ``peak_irradiance`` [W m^-2]."""
@@ -434,17 +432,11 @@ class Opening(LitScene):
         camera, projector = check_devices(self.camera, self.projector)
         sensor = load_sensor(camera)
         if colour == MOSAIC and sensor.mosaic is None:
-            raise ArgumentError(
-                "colour",
-                f"mosaic: camera {camera} has no mosaic of colour filters; give one that has, such as imx249_rggb, or "
-                "use colour lines",
-            )
+            problem = f"mosaic: camera {camera} has no mosaic of colour filters"
+            raise ArgumentError("colour", f"{problem}; give one that has, such as imx249_rggb, or use colour lines")
         if colour not in (NO, MOSAIC) and sensor.mosaic is not None:
-            raise ArgumentError(
-                "colour",
-                f"{colour}: camera {camera} has a mosaic {sensor.mosaic}, whose frames show all lines at once; use "
-                "colour mosaic",
-            )
+            problem = f"{colour}: camera {camera} has a mosaic {sensor.mosaic}, whose frames show all lines at once"
+            raise ArgumentError("colour", f"{problem}; use colour mosaic")
         if colour != NO:
             check_untimed(seconds)
         if colour == AUTO:

@@ -302,11 +302,8 @@ def load_frames(folder: Path | str) -> SessionFrames:
             raise _refusal(folder, f"{_words(key)} is there twice, {shots[key].file} and {frame.file}; leave one out")
         shots[key] = frame
     if missing := [key for key in wanted if key not in shots]:
-        raise _refusal(
-            folder,
-            f"{len(missing)} of {len(wanted)} frames are missing, first {_words(missing[0])}; take them, and name them "
-            "in the list",
-        )
+        problem = f"{len(missing)} of {len(wanted)} frames are missing, first {_words(missing[0])}"
+        raise _refusal(folder, f"{problem}; take them, and name them in the list")
     session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
     _check_files(folder, session.files)
     _check_exposures(session)
@@ -327,28 +324,19 @@ def _check_exposures(session: SessionFrames) -> None:
                 f"{frame.file} is of exposure {frame.exposure}, but exposure_ladder has {rungs}; give 0 to {rungs - 1}",
             )
         if rungs > 1 and frame.exposure_s is not None:
-            raise _refusal(
-                folder,
-                f"{frame.file} states exposure_s, and exposure_ladder as well; leave it out, and give the number "
-                "`exposure`",
-            )
+            problem = f"{frame.file} states exposure_s, and exposure_ladder as well"
+            raise _refusal(folder, f"{problem}; leave it out, and give the number `exposure`")
     for (side, index, sign, exposure, repeat), shot in session.shots.items():
         other = session.shots[side, index, sign if repeat or not session.pairs else -sign, exposure, 0]
         seconds, others = session.exposure_s(shot), session.exposure_s(other)
         if seconds != others:
-            raise _refusal(
-                folder,
-                f"{shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one pattern, exposed for "
-                f"{seconds:g} and {others:g} s; expose them alike",
-            )
+            problem = f"{shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one pattern"
+            raise _refusal(folder, f"{problem}, exposed for {seconds:g} and {others:g} s; expose them alike")
     exposures = {session.exposure_s(shot) for shot in session.shots.values()}
     without = exposures - {session.exposure_s(frame) for frame in session.dark}
     if session.dark and without and not session.pairs:
-        raise _refusal(
-            folder,
-            f"no dark frame is exposed for {min(without):g} s, as other frames are; take one for each exposure, or "
-            "none",
-        )
+        problem = f"no dark frame is exposed for {min(without):g} s, as other frames are"
+        raise _refusal(folder, f"{problem}; take one for each exposure, or none")
 
 
 def _words(key: Key) -> str:
@@ -370,10 +358,8 @@ def capacity_of(sensor: SensorModel) -> float:
     if sensor.largest_dn is not None:
         full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
     if not math.isfinite(full):
-        raise MitsimError(
-            f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it; "
-            "give full_well_e or bits"
-        )
+        problem = f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it"
+        raise MitsimError(f"{problem}; give full_well_e or bits")
     return full
 
 
@@ -447,20 +433,14 @@ def load_flats(folder: Path | str) -> FlatFrames:
         for number, each in enumerate(sets):
             if len(each.files) < 2:
                 held = each.files[0] if each.files else "no frame"
-                raise _refusal(
-                    folder,
-                    f"{kind}.{number} holds {held} alone, of {each.exposure_s:g} s, and one frame tells no noise; add "
-                    "its partner, taken alike",
-                )
+                problem = f"{kind}.{number} holds {held} alone, of {each.exposure_s:g} s, and one frame tells no noise"
+                raise _refusal(folder, f"{problem}; add its partner, taken alike")
     _check_files(folder, (name for each in flats.sets for name in each.files))
     exposures = {each.exposure_s for each in flats.listed.dark}
     for number, each in enumerate(flats.listed.lit):
         if each.exposure_s not in exposures:
-            raise _refusal(
-                folder,
-                f"lit.{number} ({each.files[0]}) is exposed for {each.exposure_s:g} s, and no dark set is; add a dark "
-                "pair of that exposure",
-            )
+            problem = f"lit.{number} ({each.files[0]}) is exposed for {each.exposure_s:g} s, and no dark set is"
+            raise _refusal(folder, f"{problem}; add a dark pair of that exposure")
     return flats
 
 
@@ -567,10 +547,8 @@ def load_known(path: Path | str) -> KnownCaptures:
         manifests = {name: read_manifest(part, RunManifest) for name, part in lines.parts.items()}
         check_plain(found.picture(capture), "picture")
         if capture.colour is not None and lines.colours is not None:
-            raise MitsimError(
-                f"list {path}: {capture.run} has planes of its own, so its colour is known; leave colour "
-                f"{capture.colour!r} out"
-            )
+            problem = f"list {path}: {capture.run} has planes of its own, so its colour is known"
+            raise MitsimError(f"{problem}; leave colour {capture.colour!r} out")
         if number == 0:
             found = KnownCaptures(path, listed, lines.colours, manifests)
         if unlike := _difference(manifests, found.manifests, capture.run, listed.known[0].run, path):
@@ -649,10 +627,8 @@ class ChartPlace(Configuration):
         rows, columns = image.shape[:2]
         outside = next((box for box in self.patches if box[1] > rows or box[3] > columns), None)
         if outside is not None:
-            raise MitsimError(
-                f"chart: a patch is {list(outside)}, but the image has {rows} x {columns} pixels; give the chart's "
-                "place in this image"
-            )
+            problem = f"chart: a patch is {list(outside)}, but the image has {rows} x {columns} pixels"
+            raise MitsimError(f"{problem}; give the chart's place in this image")
         return [image[top:bottom, left:right] for top, bottom, left, right in self.patches]
 
 

@@ -315,10 +315,8 @@ def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float
     """
     centres = dust.centres_mm[(np.abs(dust.centres_mm) < reach_mm + dust.radius_mm).all(axis=1)]
     if len(centres) > _MOST_DISCS:
-        raise MitsimError(
-            f"mask: {len(centres)} discs of dust are in sight, and at most {_MOST_DISCS} are drawn; set a lower "
-            "dust_per_mm2, or fewer pixels"
-        )
+        problem = f"mask: {len(centres)} discs of dust are in sight, and at most {_MOST_DISCS} are drawn"
+        raise MitsimError(f"{problem}; set a lower dust_per_mm2, or fewer pixels")
     if not len(centres):
         return lines, values
     across = dust.radius_mm * -np.cos(np.linspace(0, np.pi, _LINES + 1))  # closer where a disc's edge is steep

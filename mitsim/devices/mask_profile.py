@@ -116,10 +116,8 @@ class MaskProfile(Configuration):
         if self.kind == "mura" and not (is_prime(self.features or 0) and self.features != 2):
             raise ValueError(f"features: got {self.features}; a MURA has an odd prime, as 101 or 251")
         if self.opaque_transmission >= self.clear_transmission:
-            raise ValueError(
-                f"opaque_transmission: got {self.opaque_transmission:g}; give less than clear_transmission, "
-                f"{self.clear_transmission:g}"
-            )
+            problem = f"opaque_transmission: got {self.opaque_transmission:g}"
+            raise ValueError(f"{problem}; give less than clear_transmission, {self.clear_transmission:g}")
         if abs(self.over_etch_um) * 1e-3 >= _MOST_GROWTH * self.feature_mm:
             raise ValueError(f"over_etch_um: got {self.over_etch_um:g}; give less than {_MOST_GROWTH} features")
         return self
@@ -174,10 +172,8 @@ class MaskProfile(Configuration):
         """
         path, distance = folder / str(self.file), self.psf_distance_mm or 0.0
         if distance <= mask_distance_mm:
-            raise MitsimError(
-                f"mask psf: psf_distance_mm is {distance:g}; the point must lie beyond the mask, at "
-                f"{mask_distance_mm:g} mm"
-            )
+            problem = f"mask psf: psf_distance_mm is {distance:g}"
+            raise MitsimError(f"{problem}; the point must lie beyond the mask, at {mask_distance_mm:g} mm")
         light = load_psf(path, self.psf_reduce, LARGEST // 2)
         feature, values = make_square(light, self.feature_mm * self.psf_reduce * (1 - mask_distance_mm / distance))
         values *= float(self.aperture_mm2 or 0.0) / (values.sum() * feature**2)
@@ -287,11 +283,8 @@ def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> Floa
     size = image_size(path, _PICTURE)
     rows, columns = (side // reduce for side in size) if reduce >= 1 else (0, 0)
     if min(rows, columns) < 1 or min(size) <= 2 * _BORDER:
-        raise _PICTURE.refusal(
-            path,
-            f"{size[0]} x {size[1]} pixels, reduce {reduce}; it needs "
-            f"more than {2 * _BORDER} pixels a side, and reduce from 1 to its shorter side",
-        )
+        problem = f"{size[0]} x {size[1]} pixels, reduce {reduce}; it needs more than {2 * _BORDER} pixels a side"
+        raise _PICTURE.refusal(path, f"{problem}, and reduce from 1 to its shorter side")
     if most is not None and max(rows, columns) > most:
         raise _PICTURE.refusal(
             path, f"{rows} x {columns} pixels; at most {most} a side make a mask, so set a larger psf_reduce"

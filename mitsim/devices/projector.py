@@ -238,19 +238,15 @@ class ProjectorModel(Configuration):
     @model_validator(mode="after")
     def _fields_fit_together(self) -> ProjectorModel:
         if len(self.wavelengths_nm) != len(self.radiant_shares):
-            raise ValueError(
-                f"{len(self.wavelengths_nm)} wavelengths_nm and {len(self.radiant_shares)} radiant_shares; "
-                "give one share a line"
-            )
+            problem = f"{len(self.wavelengths_nm)} wavelengths_nm and {len(self.radiant_shares)} radiant_shares"
+            raise ValueError(f"{problem}; give one share a line")
         if self.radiant_shares and not sum(self.radiant_shares) > 0:
             raise ValueError("radiant_shares are all 0; at least one line must have power")
         if self.speckle is not None and "speckle_contrast" in self.model_fields_set:
             raise ValueError(f"got speckle_contrast {self.speckle_contrast:g} and the table speckle; give one of them")
         if self.ansi_contrast is not None and not self.ansi_contrast < self.contrast_ratio:
-            raise ValueError(
-                f"ansi_contrast: got {self.ansi_contrast:g}, and black pixels leave {self.contrast_ratio:g} "
-                "(contrast_ratio); give less"
-            )
+            problem = f"ansi_contrast: got {self.ansi_contrast:g}"
+            raise ValueError(f"{problem}, and black pixels leave {self.contrast_ratio:g} (contrast_ratio); give less")
         if not self.glare < 1:
             raise ValueError(
                 f"ansi_contrast: got {self.ansi_contrast:g}, which a lens that scatters all light exceeds at "
@@ -303,10 +299,8 @@ class ProjectorModel(Configuration):
         """Return the lines, which paths carry together; raise MitsimError for more than they can carry."""
         lines = self.lines
         if len(lines.shares) > MOST_LINES:
-            raise MitsimError(
-                f"colour: projector {self.name} has {len(lines.shares)} lines, and a path carries {MOST_LINES}; give "
-                f"bands, bands:{MOST_LINES} at most, or leave colour out"
-            )
+            problem = f"colour: projector {self.name} has {len(lines.shares)} lines, and a path carries {MOST_LINES}"
+            raise MitsimError(f"{problem}; give bands, bands:{MOST_LINES} at most, or leave colour out")
         return lines
 
     def in_bands(self, count: int) -> ProjectorModel:

@@ -170,10 +170,8 @@ class SensorModel(Configuration, defer_build=True):
         if self.bits is not None and self.black_level_dn >= 2**self.bits - 1:
             raise ValueError(f"black_level_dn {self.black_level_dn} leaves no room below 2^{self.bits} - 1")
         if self.largest_dn is not None and self.largest_dn > _LARGEST_CODE:
-            raise ValueError(
-                f"bits {self.bits} with binning {self.binning} has codes up to {self.largest_dn}; "
-                f"frames hold at most {_LARGEST_CODE}, so bin less or take fewer bits"
-            )
+            problem = f"bits {self.bits} with binning {self.binning} has codes up to {self.largest_dn}"
+            raise ValueError(f"{problem}; frames hold at most {_LARGEST_CODE}, so bin less or take fewer bits")
         if (self.rows is None) != (self.columns is None):
             raise ValueError("rows and columns go together; give both, or none")
         if self.rows is not None and self.columns is not None and min(self.rows, self.columns) < self.binning:
@@ -186,10 +184,8 @@ class SensorModel(Configuration, defer_build=True):
                 "and dark_doubling_c; give both, or leave it out"
             )
         if self.dark_current_spread_e_per_s and not self.dark_current_e_per_s:
-            raise ValueError(
-                f"dark_current_spread_e_per_s {self.dark_current_spread_e_per_s:g} is of a dark current of 0; "
-                "give dark_current_e_per_s"
-            )
+            problem = f"dark_current_spread_e_per_s {self.dark_current_spread_e_per_s:g} is of a dark current of 0"
+            raise ValueError(f"{problem}; give dark_current_e_per_s")
         if self.line_time_us is not None and self.shutter == "global":
             raise ValueError(f"line_time_us {self.line_time_us:g} is of a rolling shutter; set shutter 'rolling'")
         if bool(self.hot_pixels) != bool(self.hot_dark_current_e_per_s):
@@ -430,10 +426,8 @@ def sensor_table(path: Path | str) -> Table:
         beside, known = Path(path).parent / base, shipped_files("calibration", ".toml", CAMERA)
         is_beside = os.path.isfile(beside)  # False of a name that is too long
         if not is_beside and Path(base).name == base and not Path(base).suffix and base not in known:
-            raise MitsimError(
-                f"file {path}: {BASE}: got {base!r}, no such camera; {near_name(base, known)}shipped are "
-                f"{', '.join(known)}"
-            )
+            problem = f"file {path}: {BASE}: got {base!r}, no such camera"
+            raise MitsimError(f"{problem}; {near_name(base, known)}shipped are {', '.join(known)}")
         path = beside if is_beside else locate(base, "calibration", ".toml", CAMERA)
         if path.resolve() in read or len(read) > _MOST_BASES:
             raise MitsimError(f"file {path}: {BASE}: its bases come back to it, or are over {_MOST_BASES}; remove some")
@@ -499,10 +493,8 @@ class EfficiencyCurve(Configuration):
     @model_validator(mode="after")
     def _a_curve(self) -> EfficiencyCurve:
         if len(self.wavelengths_nm) != len(self.efficiency):
-            raise ValueError(
-                f"got {len(self.wavelengths_nm)} wavelengths_nm and {len(self.efficiency)} of efficiency; "
-                "give one efficiency a wavelength"
-            )
+            problem = f"got {len(self.wavelengths_nm)} wavelengths_nm and {len(self.efficiency)} of efficiency"
+            raise ValueError(f"{problem}; give one efficiency a wavelength")
         for low, high in zip(self.wavelengths_nm, self.wavelengths_nm[1:], strict=False):
             if high <= low:
                 raise ValueError(f"wavelengths_nm: got {high:g} after {low:g}; give rising wavelengths")
@@ -514,10 +506,8 @@ class EfficiencyCurve(Configuration):
         """Return the electrons per photon of ``wavelength_nm``; raise MitsimError outside the curve."""
         first, last = self.wavelengths_nm[0], self.wavelengths_nm[-1]
         if not first <= wavelength_nm <= last:
-            raise MitsimError(
-                f"got {wavelength_nm:g} nm; the curve of quantum efficiency is of {first:g} to {last:g} nm; "
-                "use light of these"
-            )
+            problem = f"got {wavelength_nm:g} nm; the curve of quantum efficiency is of {first:g} to {last:g} nm"
+            raise MitsimError(f"{problem}; use light of these")
         # Without numpy, which would be half the time of a refusal.
         above = max(1, bisect_left(self.wavelengths_nm, wavelength_nm))
         part = (wavelength_nm - self.wavelengths_nm[above - 1]) / (

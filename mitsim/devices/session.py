@@ -289,19 +289,15 @@ class SessionRecipe(Configuration):
     @model_validator(mode="after")
     def _dark_frames_are_of_use(self) -> SessionRecipe:
         if self.dark_frames and self.signed_capture == "pair":
-            raise ValueError(
-                f"dark_frames: got {self.dark_frames}, but a pair's difference has no dark signal; set 0, or "
-                "signed_capture 'uniform'"
-            )
+            problem = f"dark_frames: got {self.dark_frames}, but a pair's difference has no dark signal"
+            raise ValueError(f"{problem}; set 0, or signed_capture 'uniform'")
         return self
 
     def of_one_depth(self) -> SessionRecipe:
         """Return the recipe itself as that of one calibration; raise MitsimError if it has depths."""
         if self.depths:
-            raise MitsimError(
-                f"recipe: has {len(self.depths)} depths, and this makes one calibration; use calibrate_depths, or "
-                "leave depths out"
-            )
+            problem = f"recipe: has {len(self.depths)} depths, and this makes one calibration"
+            raise MitsimError(f"{problem}; use calibrate_depths, or leave depths out")
         return self
 
 

@@ -102,10 +102,8 @@ def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | Non
     step = pixel / cells_per_pixel(geometry)
     count = _cells(geometry, mask, step, spectrum)
     if count > _LARGEST:
-        raise MitsimError(
-            f"{mask.words}: its shadow needs a raster of {count} cells a side, more than {_LARGEST}; take fewer "
-            "pixels, larger features, or a mask of one or two separable terms"
-        )
+        problem = f"{mask.words}: its shadow needs a raster of {count} cells a side, more than {_LARGEST}"
+        raise MitsimError(f"{problem}; take fewer pixels, larger features, or a mask of one or two separable terms")
     if mask.irradiance:
         values = _resample(mask, step, count)
     elif spectrum is None:
@@ -210,10 +208,8 @@ def _resample(mask: Plate, step: float, count: int) -> FloatArray:
 def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) -> FloatArray:
     mask = cast("Plate", shadow.mask)
     if mask.blur_mm:
-        raise MitsimError(
-            f"{mask.words}: the waves behind a blurred mask of more than one separable term are not worked out; use "
-            "--effects=-diffraction for its geometric shadow"
-        )
+        problem = f"{mask.words}: the waves behind a blurred mask of more than one separable term are not worked out"
+        raise MitsimError(f"{problem}; use --effects=-diffraction for its geometric shadow")
     if mask.flaws.turn_deg:
         # Waves turn with the mask.
         even = replace(shadow, mask=replace(mask, flaws=NO_FLAWS))
@@ -232,10 +228,8 @@ def _intensity(shadow: ShadowGeometry, mask: Plate, wavelength_nm: float, step: 
     distance = shadow.distance_mm * shadow.shrink
     points = points_per_cell(wavelength_nm, distance, step)
     if count * points > _MOST_WAVE_POINTS:
-        raise MitsimError(
-            f"mask {shadow.distance_mm:g} mm from the sensor: its waves need {count * points} points a side, more than "
-            f"{_MOST_WAVE_POINTS}; move it off the sensor, or take fewer pixels"
-        )
+        problem = f"mask {shadow.distance_mm:g} mm from the sensor: its waves need {count * points} points a side"
+        raise MitsimError(f"{problem}, more than {_MOST_WAVE_POINTS}; move it off the sensor, or take fewer pixels")
     between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
     half = count * step / 2
     span = half + mask.extent_mm / 2 + step

@@ -250,10 +250,8 @@ def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:
             case ["property", *_, name] if parts and len(words) in (3, 5) and {*kinds} <= _PLY_TYPES.keys():
                 parts[[*parts][-1]].properties.append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))
             case _:
-                raise ValueError(
-                    f"has a header line that is not understood ({' '.join(words)[:40]!r}); remove it, or export "
-                    "the mesh again"
-                )
+                problem = f"has a header line that is not understood ({' '.join(words)[:40]!r})"
+                raise ValueError(f"{problem}; remove it, or export the mesh again")
     if order == "" or not {"vertex", "face"} <= parts.keys():
         raise ValueError("has no format, or no elements vertex and face; export vertices and triangles")
     for element, part in parts.items():

@@ -83,10 +83,8 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
     """
     parameters = mi.traverse(projector)
     if "irradiance.data" not in parameters:
-        raise MitsimError(
-            f"{where}: the projector's irradiance is not a bitmap; "
-            "give a raw bitmap texture whose white texels are the projector's pixels"
-        )
+        problem = f"{where}: the projector's irradiance is not a bitmap"
+        raise MitsimError(f"{problem}; give a raw bitmap texture whose white texels are the projector's pixels")
     texels = np.array(parameters["irradiance.data"])
     lit = texels.reshape(texels.shape[0], texels.shape[1], -1).max(axis=-1) > 0
     rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
@@ -94,10 +92,8 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
         raise MitsimError(f"{where}: the projector's bitmap is all black; its white texels are the projector's pixels")
     height, width = int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1
     if height != width or not lit[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all():
-        raise MitsimError(
-            f"{where}: the lit texels of the projector's bitmap span {height}x{width} and must fill a square; "
-            "paint the window white"
-        )
+        problem = f"{where}: the lit texels of the projector's bitmap span {height}x{width} and must fill a square"
+        raise MitsimError(f"{problem}; paint the window white")
     z = camera.geometry.scene_distance
     window = width, int(rows[0]), int(columns[0]), (int(lit.shape[0]), int(lit.shape[1]))
     corners = _window_corners(where, projector, camera, window, z)
@@ -105,10 +101,9 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
     span = float((high - low).min())
     across = 2 * camera.geometry.tan_half_fov * width / span if span > 0 else np.inf
     if across > _MOST_ACROSS:
-        raise MitsimError(
-            f"{where}: the camera's field is {across:.3g} pixels of the projector wide; at most {_MOST_ACROSS} are "
-            "simulated, so widen the projector's fov, or narrow the camera's"
-        )
+        problem = f"{where}: the camera's field is {across:.3g} pixels of the projector wide"
+        remedy = f"at most {_MOST_ACROSS} are simulated, so widen the projector's fov, or narrow the camera's"
+        raise MitsimError(f"{problem}; {remedy}")
     ideal = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
     keystone = float(np.abs((corners - ideal) / (high - low)).max()) * width
     tangents = (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
