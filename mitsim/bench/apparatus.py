@@ -439,10 +439,8 @@ def open_apparatus(
 
     mask = load_mask(sensor_path)
     if mask is not None and "mask" in defines:
-        raise MitsimError(
-            f"camera {sensor_path}: has a table [mask], and the scene's mask was set to {defines['mask']!r} as well; "
-            "give one of the two"
-        )
+        problem = f"camera {sensor_path}: has a table [mask], and the scene's mask was set to {defines['mask']!r}"
+        raise MitsimError(f"{problem} as well; give one of the two")
     light = load_model(projector_path, ProjectorModel)
     # All lines at once behind colour filters are for variants that tell them apart.
     if not for_render and not (sensor.mosaic and variant.endswith("_spectral")):
@@ -457,11 +455,9 @@ def open_apparatus(
     for axis, name in reversed([*enumerate(names)]):
         own, stated = sensor.pitches_mm[axis], loaded.camera.geometry.pitches[axis]
         if abs(own - stated) > PITCH_TOLERANCE * stated:
-            raise MitsimError(
-                f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {own * 1e3:g} um, but {scene} has "
-                f"{stated * 1e3:g} um; name the scene's own camera by --camera, whose pixels count then, or change "
-                f"{name}"
-            )
+            own_um, stated_um = f"{own * 1e3:g} um", f"{scene} has {stated * 1e3:g} um"
+            problem = f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {own_um}, but {stated_um}"
+            raise MitsimError(f"{problem}; name the scene's own camera by --camera, or change {name}")
     _adapt(loaded, mask, sensor_path, light)
     devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
     # By their whole paths: who repeats this from another folder finds them.

@@ -222,10 +222,8 @@ def _prints(bench: Apparatus) -> list[tuple[mi.Shape, Any, list[str]]]:
 
     found = named(_BITMAP) or (named(_PLAIN) if len(every) == 1 else [])
     if not found:
-        raise MitsimError(
-            f"{bench.loaded.path}: none of its {len(every)} surfaces has a print (a reflectance by bitmap) to put "
-            "pictures on; give one a bitmap"
-        )
+        problem = f"{bench.loaded.path}: none of its {len(every)} surfaces has a print to put pictures on"
+        raise MitsimError(f"{problem}; give one a reflectance by bitmap")
     return found
 
 

@@ -384,14 +384,10 @@ def obstacles(bench: Apparatus, family: PatternFamily | None = None) -> tuple[st
         if not seen:
             found.insert(0, Fault("no light of the projector reaches the camera", why_dark(bench.loaded)))
         elif seen < _SEEN * every:
-            reason = (
-                f"the camera sees the light of {seen} of {every} projector pixels ({seen / every:.1%}), and the rest "
-                "of the image is empty"
-            )
-            remedy = (
-                f"move the scene to {bench.geometry.scene_distance:g} mm, where the projector's window lies in the "
-                "camera's view, or make it larger"
-            )
+            part = f"{seen} of {every} projector pixels ({seen / every:.1%})"
+            reason = f"the camera sees the light of {part}, and the rest of the image is empty"
+            place = f"{bench.geometry.scene_distance:g} mm, where the projector's window lies in the camera's view"
+            remedy = f"move the scene to {place}, or make it larger"
             found.insert(0, Fault(reason, remedy))
     return tuple(f"{fault.reason}; {fault.remedy}" for fault in found if fault)
 
@@ -430,12 +426,9 @@ def mask_fault(bench: Apparatus) -> Fault | None:
         return None
     own = 0.0 if isinstance(mask, Mask) else mask.residual
     if own > residual / 2:
-        return Fault(
-            f"the mask ({geometry.mask_words}) has no two factors: frames can be captured, but the best separable mask "
-            f"leaves {own:.0%} of it, which images lack",
-            "use a mask of the kind separable, flatcam or mura",
-            residual,
-        )
+        problem = f"the mask ({geometry.mask_words}) has no two factors: frames can be captured, but the best separable"
+        remedy = "use a mask of the kind separable, flatcam or mura"
+        return Fault(f"{problem} mask leaves {own:.0%} of it, which images lack", remedy, residual)
     needed = 2 * max(float(np.abs(each).max()) for each in crossings)
     if mask.flaws.turn_deg:
         turned = (
@@ -447,12 +440,9 @@ def mask_fault(bench: Apparatus) -> Fault | None:
     larger = f"use order {order} ({2**order - 1} features of {feature}), or larger features"
     if geometry.mask_plate is not None:
         larger = f"use at least {next(n for n in count(least) if n > 2 and is_prime(n))} features of {feature}"
-    return Fault(
-        f"the mask covers {mask.extent_mm:.2g} mm of the {needed:.2g} mm that the sensor sees through it, and its edge "
-        f"leaves {residual:.0%} of what is seen without factors",
-        larger,
-        residual,
-    )
+    covers = f"covers {mask.extent_mm:.2g} mm of the {needed:.2g} mm that the sensor sees through it"
+    reason = f"the mask {covers}, and its edge leaves {residual:.0%} of what is seen without factors"
+    return Fault(reason, larger, residual)
 
 
 def _beyond_one(values: FloatArray) -> float:

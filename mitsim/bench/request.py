@@ -113,10 +113,9 @@ class Exposure:
     def check(self, sensor: SensorModel, camera_file: Path | str) -> None:
         """Refuse a ``sensor`` under colour filters, and one without the full well that decides the time."""
         if sensor.mosaic is not None:
-            raise MitsimError(
-                f"camera {camera_file}: has a mosaic {sensor.mosaic}, whose frames show all lines at once; "
-                "capture and calibrate by --colour mosaic (capture_mosaic, calibrate_mosaic), make pairs by another"
-            )
+            problem = f"camera {camera_file}: has a mosaic {sensor.mosaic}, whose frames show all lines at once"
+            remedy = "capture and calibrate by --colour mosaic (capture_mosaic, calibrate_mosaic)"
+            raise MitsimError(f"{problem}; {remedy}, make pairs by another")
         if self.seconds is None and not math.isfinite(sensor.full_well_e):
             problem = f"camera {camera_file}: full_well_e is inf, so there is no full well to fill"
             raise MitsimError(f"{problem}; give a finite one, or an exposure in seconds")
@@ -324,10 +323,8 @@ class Request(Timed, Planned):
         """Refuse a second rule that ends sampling beside seconds."""
         super().model_post_init(context)
         if self.seconds is not None and self.noise_fraction is not None:
-            raise ArgumentError(
-                "noise_fraction",
-                f"{self.noise_fraction:g}: stops sampling by another rule than seconds; give one of both",
-            )
+            problem = f"{self.noise_fraction:g}: stops sampling by another rule than seconds"
+            raise ArgumentError("noise_fraction", f"{problem}; give one of both")
 
 
 class SessionRequest(Sampled):

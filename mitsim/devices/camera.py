@@ -126,19 +126,15 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     @model_validator(mode="after")
     def _parts_fit_together(self) -> CameraGeometry:
         if self.mask_distance + self.mask_thickness >= self.scene_distance:
-            raise ValueError(
-                f"mask_distance {self.mask_distance} mm plus mask_thickness {self.mask_thickness} mm must be less than "
-                f"scene_distance {self.scene_distance} mm"
-            )
+            ends = f"mask_distance {self.mask_distance} mm plus mask_thickness {self.mask_thickness} mm"
+            raise ValueError(f"{ends} must be less than scene_distance {self.scene_distance} mm")
         if self.roi is not None:
             row, column, rows, columns = self.roi
             all_rows, all_columns = self.shape
             inside = row + rows <= all_rows and column + columns <= all_columns
             if min(row, column) < 0 or min(rows, columns) < 1 or not inside:
-                raise ValueError(
-                    f"roi {list(self.roi)}: {rows} rows from {row} and {columns} columns from {column} are not on a "
-                    f"sensor of {all_rows} x {all_columns} pixels"
-                )
+                part = f"roi {list(self.roi)}: {rows} rows from {row} and {columns} columns from {column}"
+                raise ValueError(f"{part} are not on a sensor of {all_rows} x {all_columns} pixels")
         rows, columns = self.frame_shape
         if not fits_a_frame(self.frame_shape):
             raise ValueError(f"{rows} x {columns} pixels; {FRAME_LIMITS} are written and read, so read a part by roi")
@@ -146,15 +142,13 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         if (self.mask == "plate") != (plate is not None):
             raise ValueError("mask: got 'plate'; use separable, flatcam or open, or --camera with a table [mask]")
         if plate is not None and self.mask_thickness and not (plate.crosses is not None and plate.flaws == NO_FLAWS):
-            raise ValueError(
-                f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms, or one "
-                f"that is blurred, dusty, turned or tilted ({plate.words}), is thin, so set 0"
-            )
+            drawn = f"blurred, dusty, turned or tilted ({plate.words})"
+            problem = f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms"
+            raise ValueError(f"{problem}, or one that is {drawn}, is thin, so set 0")
         if self.pitches[0] != self.pitches[1] and self.is_drawn(waves=True):
-            raise ValueError(
-                f"row_pitch: got {self.pitches[0]:g} beside pixel_pitch {self.pitches[1]:g}; behind {self.mask_words} "
-                "pixels must be square; give equal ones, or a mask of one or two separable terms that is not turned"
-            )
+            got = f"row_pitch: got {self.pitches[0]:g} beside pixel_pitch {self.pitches[1]:g}; behind {self.mask_words}"
+            remedy = "give equal ones, or a mask of one or two separable terms that is not turned"
+            raise ValueError(f"{got} pixels must be square; {remedy}")
         return self
 
     @classmethod

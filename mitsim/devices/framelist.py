@@ -293,11 +293,8 @@ def load_frames(folder: Path | str) -> SessionFrames:
     for frame in frames:
         key = frame.side, frame.index, frame.sign, frame.exposure, frame.repeat
         if key not in known:
-            raise _refusal(
-                folder,
-                f"{frame.file} is {_words(key)}, which no such session has; it has {_words(wanted[0])} to "
-                f"{_words(wanted[-1])}; correct n, signed_capture or the frame's entry",
-            )
+            problem = f"{frame.file} is {_words(key)}, which no such session has; it has {_words(wanted[0])} to"
+            raise _refusal(folder, f"{problem} {_words(wanted[-1])}; correct n, signed_capture or the frame's entry")
         if key in shots:
             raise _refusal(folder, f"{_words(key)} is there twice, {shots[key].file} and {frame.file}; leave one out")
         shots[key] = frame
@@ -319,10 +316,8 @@ def _check_exposures(session: SessionFrames) -> None:
     frames: tuple[StripeFile | DarkFile, ...] = (*session.shots.values(), *session.dark)
     for frame in frames:
         if frame.exposure >= rungs:
-            raise _refusal(
-                folder,
-                f"{frame.file} is of exposure {frame.exposure}, but exposure_ladder has {rungs}; give 0 to {rungs - 1}",
-            )
+            problem = f"{frame.file} is of exposure {frame.exposure}, but exposure_ladder has {rungs}"
+            raise _refusal(folder, f"{problem}; give 0 to {rungs - 1}")
         if rungs > 1 and frame.exposure_s is not None:
             problem = f"{frame.file} states exposure_s, and exposure_ladder as well"
             raise _refusal(folder, f"{problem}; leave it out, and give the number `exposure`")
@@ -578,16 +573,12 @@ def _difference(
         how, first_how = (preparation_of(each, path) for each in (manifest, ours))
         unlike = next((field for field in _PLACING if getattr(how, field) != getattr(first_how, field)), None)
         if unlike is not None:
-            return (
-                f"{run} was imported with another {unlike} than {first}, so its pixels see other parts of the mask; "
-                "import both alike"
-            )
+            how_seen = "so its pixels see other parts of the mask; import both alike"
+            return f"{run} was imported with another {unlike} than {first}, {how_seen}"
         sides, own = ([len(rows) for rows in (each.patterns.P_L, each.patterns.P_R)] for each in (manifest, ours))
         if sides != own:
-            return (
-                f"{run} has {sides[0]} x {sides[1]} scene pixels, but {first} {own[0]} x {own[1]}; give runs of one "
-                "size"
-            )
+            pixels = f"{sides[0]} x {sides[1]} scene pixels, but {first} {own[0]} x {own[1]}"
+            return f"{run} has {pixels}; give runs of one size"
     return ""
 
 

@@ -130,10 +130,8 @@ class MaskProfile(Configuration):
         values, lines, feature = drawn.values, None, drawn.feature_mm
         if self.over_etch_um:
             if len(values) > _MOST_ETCHED:
-                raise MitsimError(
-                    f"{drawn.words}: has {len(values)} features a side, and over_etch_um is worked out for at most "
-                    f"{_MOST_ETCHED}; draw the part that the sensor sees"
-                )
+                problem = f"{drawn.words}: has {len(values)} features a side, and over_etch_um is worked out for"
+                raise MitsimError(f"{problem} at most {_MOST_ETCHED}; draw the part that the sensor sees")
             lines, values = etch(values, feature, self.over_etch_um * 1e-3)
         values = self.opaque_transmission + (self.clear_transmission - self.opaque_transmission) * values
         extent = drawn.extent_mm + 2 * max(self.over_etch_um, 0.0) * 1e-3
@@ -190,10 +188,8 @@ class MaskProfile(Configuration):
         """Return the plate as it is drawn; files count from ``folder``."""
         if self.kind in get_args(MaskKind):
             if 2**self.order - 1 > LARGEST:
-                raise MitsimError(
-                    f"mask {self.kind} of order {self.order}: what is wrong with it is worked out for at most "
-                    f"{LARGEST} features a side; give an order up to 12"
-                )
+                problem = f"mask {self.kind} of order {self.order}: flaws are worked out for at most {LARGEST} features"
+                raise MitsimError(f"{problem} a side; give an order up to 12")
             mask = mls_mask(cast("MaskKind", self.kind), self.feature_mm, self.order)
             values = sum(weight * np.outer(rows, columns) for weight, rows, columns in mask.terms)
             return Plate(self.feature_mm, np.asarray(values), f"{self.kind}, order {self.order}")

@@ -469,11 +469,9 @@ def read_drawing(path: Path) -> FloatArray:
     """
     rows, columns = image_size(path, _DRAWING)
     if (rows - columns) % 2 and 2 * max(rows, columns) > LARGEST:
-        raise _DRAWING.refusal(
-            path,
-            f"{rows} x {columns} pixels: about its centre the shorter side needs half a pixel, so features become half "
-            f"as large, of which {LARGEST} a side are allowed; make its sides differ by an even number",
-        )
+        problem = f"{rows} x {columns} pixels: about its centre the shorter side needs half a pixel, so features become"
+        allowed = f"half as large, of which {LARGEST} a side are allowed"
+        raise _DRAWING.refusal(path, f"{problem} {allowed}; make its sides differ by an even number")
     values = read_image(path, _DRAWING)
     white = own_end(values) if path.suffix.lower() in _PICTURES else None
     transmissions = np.asarray(values, dtype=np.float64) / (white or 1.0)

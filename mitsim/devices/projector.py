@@ -248,10 +248,8 @@ class ProjectorModel(Configuration):
             problem = f"ansi_contrast: got {self.ansi_contrast:g}"
             raise ValueError(f"{problem}, and black pixels leave {self.contrast_ratio:g} (contrast_ratio); give less")
         if not self.glare < 1:
-            raise ValueError(
-                f"ansi_contrast: got {self.ansi_contrast:g}, which a lens that scatters all light exceeds at "
-                f"glare_spread {self.glare_spread:g}; give more"
-            )
+            problem = f"ansi_contrast: got {self.ansi_contrast:g}, which a lens that scatters all light exceeds at"
+            raise ValueError(f"{problem} glare_spread {self.glare_spread:g}; give more")
         unknown = [name for name in (*self.assumed, *self.derived) if name not in type(self).model_fields]
         if unknown:
             raise ValueError(f"assumed and derived list fields of this file, and {unknown[0]!r} is none")
@@ -397,10 +395,9 @@ class Response(ByValue):
         known, efficiency = np.array(curve.wavelengths_nm), np.array(curve.efficiency)
         first, last = max(SPECTRA_NM[0], known[0]), min(SPECTRA_NM[1], known[-1])
         if not first < last:
-            raise MitsimError(
-                f"sensor {sensor.name!r}: its curve of quantum efficiency is of {known[0]:g} to {known[-1]:g} nm, and "
-                f"lamps' spectra are of {SPECTRA_NM[0]:g} to {SPECTRA_NM[1]:g} nm; switch lamps off with -ambient"
-            )
+            curve_nm, lamps_nm = f"{known[0]:g} to {known[-1]:g} nm", f"{SPECTRA_NM[0]:g} to {SPECTRA_NM[1]:g} nm"
+            problem = f"sensor {sensor.name!r}: its curve of quantum efficiency is of {curve_nm}"
+            raise MitsimError(f"{problem}, and lamps' spectra are of {lamps_nm}; switch lamps off with -ambient")
         counts = np.interp(wavelengths, known, efficiency) * wavelengths
         farther = np.linspace(SPECTRA_NM[1], max(SPECTRA_NM[1], known[-1]), _PLACES)
         unseen = np.interp(farther, known, efficiency) * farther

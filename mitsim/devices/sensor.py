@@ -179,10 +179,8 @@ class SensorModel(Configuration, defer_build=True):
                 f"rows {self.rows} and columns {self.columns} hold no superpixel of binning {self.binning}; bin less"
             )
         if self.temperature_c is not None and None in (self.dark_current_temperature_c, self.dark_doubling_c):
-            raise ValueError(
-                f"temperature_c {self.temperature_c:g} moves the dark current only with dark_current_temperature_c "
-                "and dark_doubling_c; give both, or leave it out"
-            )
+            needed = "dark_current_temperature_c and dark_doubling_c; give both, or leave it out"
+            raise ValueError(f"temperature_c {self.temperature_c:g} moves the dark current only with {needed}")
         if self.dark_current_spread_e_per_s and not self.dark_current_e_per_s:
             problem = f"dark_current_spread_e_per_s {self.dark_current_spread_e_per_s:g} is of a dark current of 0"
             raise ValueError(f"{problem}; give dark_current_e_per_s")
@@ -235,11 +233,9 @@ class SensorModel(Configuration, defer_build=True):
         except MitsimError as error:
             raise MitsimError(f"sensor {self.name!r}: {error}") from None
         if self.sensor_only or found is None:
-            raise MitsimError(
-                f"sensor {self.name!r}: sensor only: its file states no quantum_efficiency, so light makes no known "
-                "number of electrons; characterise works without; else give a file of two lines, base = (this camera) "
-                "and quantum_efficiency = (yours)"
-            )
+            problem = f"sensor {self.name!r}: sensor only: its file states no quantum_efficiency, so light makes no"
+            remedy = "give a file of two lines, base = (this camera) and quantum_efficiency = (yours)"
+            raise MitsimError(f"{problem} known number of electrons; characterise works without; else {remedy}")
         return float(found)
 
     def planes(self, wavelengths_nm: Sequence[float]) -> tuple[tuple[float, ...], ...]:
@@ -332,10 +328,9 @@ class SensorModel(Configuration, defer_build=True):
         if self.shutter == "global":
             return 0.0
         if self.line_time_us is None:
-            raise MitsimError(
-                f"sensor {self.name!r}: its shutter is rolling and its file states no line_time_us, so a ripple of the "
-                "light falls on no known rows; give line_time_us, with its source, or leave ripples out"
-            )
+            problem = f"sensor {self.name!r}: its shutter is rolling and its file states no line_time_us, so a ripple"
+            remedy = "give line_time_us, with its source, or leave ripples out"
+            raise MitsimError(f"{problem} of the light falls on no known rows; {remedy}")
         return self.line_time_us * 1e-6
 
     @property

@@ -96,10 +96,9 @@ class EdgeWaves:
         self._reach = reach = max(int(np.ceil(min(fade, span_mm) / step_mm)), 1)
         size = count + 2 * reach
         if size > _LARGEST_GRID:
-            raise MitsimError(
-                f"mask: its diffraction, {product**0.5 * 1e3:.3g} um wide, needs {size:.3g} points, more than "
-                f"{_LARGEST_GRID}; move the mask off the sensor and the scene, or take fewer or smaller pixels"
-            )
+            needed = f"{size:.3g} points, more than {_LARGEST_GRID}"
+            problem = f"mask: its diffraction, {product**0.5 * 1e3:.3g} um wide, needs {needed}"
+            raise MitsimError(f"{problem}; move the mask off sensor and scene, or take fewer or smaller pixels")
         x = (np.arange(reach) + 0.5) * step_mm
         wave = edge_wave(x * (2 / product) ** 0.5)
         wave *= np.square(np.cos(np.pi / 2 * np.clip(4 * x / fade - 3, 0, 1)))
@@ -216,10 +215,8 @@ def wave_profiles(
 def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
     mask = shadow.mask.amplitude
     if mask.crosses is None:
-        raise MitsimError(
-            f"{mask.words}: its field is no sum of {FEW} separable terms, and diffraction is worked out for those "
-            "alone; use --effects=-diffraction for its geometric shadow"
-        )
+        problem = f"{mask.words}: its field is no sum of {FEW} separable terms, so its diffraction is not worked out"
+        raise MitsimError(f"{problem}; use --effects=-diffraction for its geometric shadow")
     return replace(shadow, mask=mask)
 
 
@@ -231,11 +228,10 @@ def narrowest_mm(wavelength_nm: float) -> float:
 def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
     """Raise MitsimError if the openings of a ``mask`` are too narrow for scalar waves of ``wavelength_nm``."""
     if mask.opening_mm < narrowest_mm(wavelength_nm):
-        raise MitsimError(
-            f"mask: its openings are {mask.opening_mm:.3g} mm wide, and diffraction of {wavelength_nm:.0f} nm needs "
-            f"{narrowest_mm(wavelength_nm):.3g}, half a wavelength; give a larger feature_mm (camera file) or "
-            "mask_feature (scene), or --effects=-diffraction"
-        )
+        least = f"{wavelength_nm:.0f} nm needs {narrowest_mm(wavelength_nm):.3g}, half a wavelength"
+        problem = f"mask: its openings are {mask.opening_mm:.3g} mm wide, and diffraction of {least}"
+        remedy = "give a larger feature_mm (camera file) or mask_feature (scene), or --effects=-diffraction"
+        raise MitsimError(f"{problem}; {remedy}")
 
 
 def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:

@@ -145,10 +145,9 @@ def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
     )
     terms = mask.amplitude.most_terms
     if terms * float(points) ** 2 * mask.amplitude.uneven_part > _MOST_WAVE_TERMS:
-        raise MitsimError(
-            f"{mask.words}: waves of {len(mask.values)} features a side, in {terms} terms, take minutes a line of "
-            "light; use --effects=-diffraction, for its geometric shadow, or give larger features or fewer pixels"
-        )
+        problem = f"{mask.words}: waves of {len(mask.values)} features a side, in {terms} terms, take minutes a line"
+        remedy = "use --effects=-diffraction, for its geometric shadow, or give larger features or fewer pixels"
+        raise MitsimError(f"{problem} of light; {remedy}")
 
 
 def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:

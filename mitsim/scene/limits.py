@@ -229,10 +229,7 @@ class Unfit:
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         factored = _unfit_for_factored(outline, tree)
         if medium is not None:
-            rule = (
-                "only the reference estimator follows light through media; remove it, or use render's reference with "
-                "the integrator volpath"
-            )
+            rule = "only the reference estimator follows light through media; remove it, or render by it with volpath"
             factored = outline.tag(medium[0]).refusal(medium[1], "a medium", rule)
         opaque = _under_bumps(outline, tree)
         return cls(

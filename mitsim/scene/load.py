@@ -389,10 +389,8 @@ def _stand(props: mi.Properties, path: Path) -> str:
     _, sides = tree.tilts(props)
     behind = int((sides < 0).sum())
     if behind > _BEHIND * sides.size:
-        raise MitsimError(
-            f"object {path}: the normals of {behind} of {sides.size} corners face against the way that their faces are "
-            "wound; recompute normals outwards, or export without"
-        )
+        problem = f"object {path}: the normals of {behind} of {sides.size} corners face against the way that their"
+        raise MitsimError(f"{problem} faces are wound; recompute normals outwards, or export without")
     corners = np.array(mi.traverse(mesh)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
     longest = float((high - low).max())
@@ -454,27 +452,24 @@ def why_dark(loaded: LoadedScene) -> str:
     facing = lit & (back | (dr.dot(si.n, centre - si.p) * dr.sign(dr.dot(si.n, start - si.p)) > 0))
     if not _is_any(lit) or not _is_any(facing):
         which = "camera" if _is_any(lit) else "projector"
-        return (
-            f"{met.sum()} of {met.size} rays of the projector meet a surface, and it turns its back to the {which}: a "
-            "mesh wound the wrong way; flip its normals or put its material in <bsdf type='twosided'>"
-        )
+        met_by = f"{met.sum()} of {met.size} rays of the projector meet a surface, and it turns its back to the {which}"
+        remedy = "flip its normals or put its material in <bsdf type='twosided'>"
+        return f"{met_by}: a mesh wound the wrong way; {remedy}"
     seen = np.array(to_world.inverse() @ si.p).reshape(3, -1)[:, np.array(facing).ravel()]
     slope = np.abs(seen[:2] / seen[2]).max(axis=0)
     if seen[2].max() <= geometry.mask_distance:
         return f"what is lit lies at z = {seen[2].max():.4g} mm, not in front of the mask; move the scene along +z"
     if slope.min() > geometry.tan_half_fov:
-        return (
-            f"what is lit lies outside the field stop: {np.degrees(np.arctan(slope.min())):.3g} degrees off the axis "
-            f"or more, and the stop (fov) lets {geometry.fov / 2:g} degrees pass; turn the camera or widen fov"
-        )
+        off = f"{np.degrees(np.arctan(slope.min())):.3g} degrees off the axis or more, and the stop (fov) lets"
+        remedy = f"{geometry.fov / 2:g} degrees pass; turn the camera or widen fov"
+        return f"what is lit lies outside the field stop: {off} {remedy}"
     if not _is_any(facing & ~_meet_opaque(loaded.scene, si.spawn_ray_to(centre), centre).is_valid()):
         return "something hides from the camera what is lit; move it out of the way"
     if part is not window:
         extents = [(own[1] - own[0]) / (whole[1] - whole[0]) for own, whole in zip(part, window, strict=True)]
-        return (
-            f"what is lit spans {min(extents):.1e} of the window only, {min(extents) * grid.n:.1e} projector pixels: "
-            "too few rays meet it; give the projector a narrower fov, or a larger target"
-        )
+        spans = f"{min(extents):.1e} of the window only, {min(extents) * grid.n:.1e} projector pixels"
+        remedy = "give the projector a narrower fov, or a larger target"
+        return f"what is lit spans {spans}: too few rays meet it; {remedy}"
     return "what is lit lies edge-on, is hidden or reflects nothing; turn it, move it or check its material"
 
 
@@ -529,10 +524,8 @@ def _where_scene_lies(loaded: LoadedScene, to_world: mi.Transform4f, within: boo
     if high[2] <= 0:
         return f"{where}: behind the camera, which looks along +z; move the scene or turn the camera"
     if within:
-        return (
-            f"{where}: within the window, but {_RAYS} x {_RAYS} rays at each of its shapes miss them; give the "
-            "projector a narrower fov, or a larger target"
-        )
+        problem = f"{where}: within the window, but {_RAYS} x {_RAYS} rays at each of its shapes miss them"
+        return f"{problem}; give the projector a narrower fov, or a larger target"
     rows, columns = loaded.pixels.row_tan, loaded.pixels.column_tan
     x, y = (f"{-distance * edges[1]:.4g} to {-distance * edges[0]:.4g}" for edges in (columns, rows))
     window = f"x = {x}, y = {y}"

@@ -346,10 +346,8 @@ class SceneFiles:
             folders = " or ".join(str(folder) for folder in dict.fromkeys((Path.cwd(), self.folder)))
             raise MitsimError(f"parameter {cut(parameter)}={cut(name)}: no such file in {folders}; mend the name")
         if len(found) > 1:
-            raise MitsimError(
-                f"parameter {cut(parameter)}={cut(name)}: the scene's folder and the working folder have a file of "
-                f"that name; give ./{cut(name)} or {own}"
-            )
+            problem = f"parameter {cut(parameter)}={cut(name)}: the scene's folder and the working folder have"
+            raise MitsimError(f"{problem} a file of that name; give ./{cut(name)} or {own}")
         path = next(iter(found.values()))
         path = self.folder.absolute() / name if path == own else path.absolute()
         self.own[path] = parameter

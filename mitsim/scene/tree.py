@@ -69,10 +69,8 @@ def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tupl
     for index, place in places.items():
         props, distance = nodes[index].props, float(np.linalg.norm(place[:3, 3]))
         if props.plugin_name() == "projector" and distance * _ROUNDING > _COARSEST * reach:
-            rule = (
-                f"single precision loses the places that it lights {reach:g} mm before the camera; it may stand "
-                f"{_COARSEST / _ROUNDING * reach:.0f} mm away"
-            )
+            rule = f"single precision loses the places that it lights {reach:g} mm before the camera; it may stand"
+            rule = f"{rule} {_COARSEST / _ROUNDING * reach:.0f} mm away"
             got = f"{distance:.0f} mm from the camera"
             raise outline.tag(mi.parser.SceneNode(nodes[index]), "to_world").refusal("to_world", got, rule)
         if away[:3, 3].any():
@@ -388,11 +386,8 @@ def emit_by_faces(checked: CheckedScene) -> tuple[str, ...]:
         tag = checked.outline.tag(node)
         behind = int((~(sides > 0)).sum())
         if behind not in (0, sides.size):
-            raise tag.refusal(
-                "normals",
-                f"{behind} of {sides.size} corners that do not face the way that their face is wound",
-                "a lamp emits from one side; wind all faces alike, or give face_normals",
-            )
+            got = f"{behind} of {sides.size} corners that do not face the way that their face is wound"
+            raise tag.refusal("normals", got, "a lamp emits from one side; wind all faces alike, or give face_normals")
         props["face_normals"] = True
         if behind:
             props["flip_normals"] = not props.get("flip_normals", False)
@@ -480,10 +475,8 @@ def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
                     del films[0][name]
         after = _sensor_words(node.props, films[0])
         if after != before:
-            words = (
-                f"sensor {sensor.name!r}: {after}, as its camera file says; the scene's own, {before}, stand where no "
-                "camera is named"
-            )
+            words = f"sensor {sensor.name!r}: {after}, as its camera file says; the scene's own, {before},"
+            words = f"{words} stand where no camera is named"
     return words
 
 
