@@ -172,8 +172,13 @@ class SensorModel(Configuration, defer_build=True):
         if self.largest_dn is not None and self.largest_dn > _LARGEST_CODE:
             problem = f"bits {self.bits} with binning {self.binning} has codes up to {self.largest_dn}"
             raise ValueError(f"{problem}; frames hold at most {_LARGEST_CODE}, so bin less or take fewer bits")
-        if (self.rows is None) != (self.columns is None):
-            raise ValueError("rows and columns go together; give both, or none")
+        for one, other in (
+            ("rows", "columns"),
+            ("hot_pixels", "hot_dark_current_e_per_s"),
+            ("mosaic", "mosaic_curves"),
+        ):
+            if bool(getattr(self, one)) != bool(getattr(self, other)):
+                raise ValueError(f"{one} and {other} go together; give both, or none")
         if self.rows is not None and self.columns is not None and min(self.rows, self.columns) < self.binning:
             raise ValueError(
                 f"rows {self.rows} and columns {self.columns} hold no superpixel of binning {self.binning}; bin less"
@@ -186,8 +191,6 @@ class SensorModel(Configuration, defer_build=True):
             raise ValueError(f"{problem}; give dark_current_e_per_s")
         if self.line_time_us is not None and self.shutter == "global":
             raise ValueError(f"line_time_us {self.line_time_us:g} is of a rolling shutter; set shutter 'rolling'")
-        if bool(self.hot_pixels) != bool(self.hot_dark_current_e_per_s):
-            raise ValueError("hot_pixels and hot_dark_current_e_per_s go together; give both, or none")
         if self.binned_full_well_e is not None and not self.binning_on_chip:
             raise ValueError(
                 f"binned_full_well_e {self.binned_full_well_e:g} is of charge summed on chip; set binning_on_chip"
@@ -201,8 +204,6 @@ class SensorModel(Configuration, defer_build=True):
         given = [name for name in names if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"got {' and '.join(given)}; give one of them")
-        if (self.mosaic is None) != (self.mosaic_curves is None):
-            raise ValueError("mosaic and mosaic_curves go together; give both, or none")
         if self.mosaic is not None and self.binning > 1:
             raise ValueError(f"mosaic {self.mosaic}: binning {self.binning} would sum its colours; set binning 1")
         return self

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,26 @@ from mitsim.optics.shadow import (
     lagrange_weights,
     nodes_between,
 )
+
+
+# -------- A mask that is mounted askew, and the shadow of any mask
+#
+# Where a mask's distance grows by alpha along its rows and by beta along its columns, a ray of slope t that would
+# cross the even plane at s crosses the mask at s + t (alpha s_row + beta s_col) / (1 - t . (alpha, beta)). Along the
+# rows::
+#
+#     s_row + t_row (alpha s_row + beta s_col) / (1 - alpha t_row)
+#
+# but for the other axis's part of the slope, beta t_col of the shift, 30 nm of 5 um at 40 mrad. The rows' own tilt
+# moves rows alone: the profile stays one. What the other axis adds is a profile that is moved by beta s_col t_row, as
+# much as the column says; between Chebyshev's nodes sigma_k of s_col it is interpolated by Lagrange's polynomials
+# l_k::
+#
+#     a(s_row + t_row beta s_col / ..) = sum_k l_k(s_col) a(s_row + t_row beta sigma_k / ..)
+#
+# so K nodes make K terms of each, and two tilts K L. Waves come from as far as the mask is where the ray crosses it:
+# rows are formed at d + beta sigma_k, and interpolated over alpha s_row between those of three distances
+# (:mod:`mitsim.optics.diffraction`), which keeps them one profile.
 
 
 def shadow_terms(
@@ -62,8 +83,23 @@ def shadow_terms(
             return geometric_terms(shadow, rows, columns)
         return wave_terms(shadow, rows, columns, spectrum)
 
-    nodes = geometry.tilt_nodes(waves)
-    terms = _tilted_terms(shadow, rows, columns, geometry.mask_tilt, nodes, form) if nodes else form(shadow)
+    nodes, terms = geometry.tilt_nodes(waves), list[SeparableTerm]()
+    if nodes is None:
+        terms = form(shadow)
+    else:  # a tilted mask
+        along, across = geometry.mask_tilt
+        by_row, by_column = _crossings(shadow, rows, columns)
+        first, second = nodes_between(by_column, nodes[0]), nodes_between(by_row, nodes[1])
+        # One look at both axes serves a node of each; the last of fewer nodes is looked at again.
+        padded = [np.pad(each, (0, max(nodes) - len(each)), "edge") for each in (first, second)]
+        seen = [
+            form(replace(shadow, tilt=((along, across * float(row)), (across, along * float(column)))))
+            for row, column in zip(*padded, strict=True)
+        ]
+        row_weights, column_weights = lagrange_weights(by_column, first), lagrange_weights(by_row, second)
+        for i, j in product(range(nodes[0]), range(nodes[1])):
+            both = zip(seen[i], seen[j], strict=True)
+            terms += [(left * column_weights[j], right * row_weights[i]) for (left, _), (_, right) in both]
     part = geometry.pixel_fill_factor
     return terms if part == 1 else [(part * left, right) for left, right in terms]
 
@@ -123,8 +159,7 @@ def _moving_terms(
     by_row, by_column = _hats(-angle * row, nodes), _hats(angle * column, nodes)
     return [
         (left * by_row[second], right * by_column[first])
-        for first, lefts in enumerate(at_nodes)
-        for second, rights in enumerate(at_nodes)
+        for (first, lefts), (second, rights) in product(enumerate(at_nodes), enumerate(at_nodes))
         for (left, _), (_, right) in zip(lefts, rights, strict=True)
     ]
 
@@ -138,51 +173,6 @@ def _crossings(shadow: ShadowGeometry, rows: Directions, columns: Directions) ->
 def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
     place = (shift - nodes[0]) / (nodes[1] - nodes[0])
     return [np.maximum(1 - np.abs(place - index), 0.0) for index in range(len(nodes))]
-
-
-# -------- A tilted mask
-# Where a mask's distance grows by alpha along its rows and by beta along its columns, a ray of slope t that would
-# cross the even plane at s crosses the mask at s + t (alpha s_row + beta s_col) / (1 - t . (alpha, beta)). Along the
-# rows::
-#
-#     s_row + t_row (alpha s_row + beta s_col) / (1 - alpha t_row)
-#
-# but for the other axis's part of the slope, beta t_col of the shift, 30 nm of 5 um at 40 mrad. The rows' own tilt
-# moves rows alone: the profile stays one. What the other axis adds is a profile that is moved by beta s_col t_row, as
-# much as the column says; between Chebyshev's nodes sigma_k of s_col it is interpolated by Lagrange's polynomials
-# l_k::
-#
-#     a(s_row + t_row beta s_col / ..) = sum_k l_k(s_col) a(s_row + t_row beta sigma_k / ..)
-#
-# so K nodes make K terms of each, and two tilts K L. Waves come from as far as the mask is where the ray crosses it:
-# rows are formed at d + beta sigma_k, and interpolated over alpha s_row between those of three distances
-# (:mod:`mitsim.optics.diffraction`), which keeps them one profile.
-
-
-def _tilted_terms(
-    shadow: ShadowGeometry,
-    rows: Directions,
-    columns: Directions,
-    tilt: tuple[float, float],
-    nodes: tuple[int, int],
-    formed: Callable[[ShadowGeometry], SeparableTerms],
-) -> SeparableTerms:
-    along, across = tilt
-    by_row, by_column = _crossings(shadow, rows, columns)
-    first, second = nodes_between(by_column, nodes[0]), nodes_between(by_row, nodes[1])
-    # One look at both axes serves a node of each; the last of fewer nodes is looked at again.
-    padded = [np.pad(each, (0, max(nodes) - len(each)), "edge") for each in (first, second)]
-    seen = [
-        formed(replace(shadow, tilt=((along, across * float(row)), (across, along * float(column)))))
-        for row, column in zip(*padded, strict=True)
-    ]
-    row_weights, column_weights = lagrange_weights(by_column, first), lagrange_weights(by_row, second)
-    return [
-        (left * column_weights[second_node], right * row_weights[first_node])
-        for first_node in range(nodes[0])
-        for second_node in range(nodes[1])
-        for (left, _), (_, right) in zip(seen[first_node], seen[second_node], strict=True)
-    ]
 
 
 # -------- Sums of separable terms as operators

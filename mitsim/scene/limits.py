@@ -247,10 +247,9 @@ def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estima
     if mirror is None or light is None:
         return None
     place, what = outline.tag(mirror[0]), tree.plugin(*mirror)
-    rule = (
-        f"{estimator} finds no light of it that {place.path.name}:{place.line} ({what}) brings to other surfaces, so "
-        "that is missing; use a light that has a surface (area; mitsim_projector for the reference)"
-    )
+    brought = f"that {place.path.name}:{place.line} ({what}) brings to other surfaces, so that is missing"
+    remedy = "use a light that has a surface (area; mitsim_projector for the reference)"
+    rule = f"{estimator} finds no light of it {brought}; {remedy}"
     return str(outline.tag(light).refusal("light", repr(str(light.props.plugin_name())), rule))
 
 
@@ -265,18 +264,15 @@ def _unfit_for_factored(outline: Outline, tree: _References) -> MitsimError | No
             continue
         kind = picture.props.get("filter_type", "bilinear")  # Mitsuba's default
         if kind != "nearest":
-            rule = (
-                "the projector's pixels would run into each other, where patterns need them even; give its bitmap "
-                '<string name="filter_type" value="nearest"/>, and blur_pixels of the projector\'s TOML file for a blur'
-            )
+            why = "the projector's pixels would run into each other, where patterns need them even; give its bitmap"
+            nearest = '<string name="filter_type" value="nearest"/>'
+            rule = f"{why} {nearest}, and blur_pixels of the projector's TOML file for a blur"
             return outline.tag(picture, "filter_type").refusal("filter_type", repr(kind), rule)
     for node, name in tree.to(("principledthin",)):
         thin = tree.nodes[node.props[name].index()]
         if thin.props.get("spec_trans", 0.0) != 0.0:  # a number, or a texture of unknown values
-            rule = (
-                "its sharp transmission is defined for light from the camera alone, so only the reference renders it; "
-                "remove it, or use diff_trans, a thindielectric or render's reference"
-            )
+            why = "its sharp transmission is defined for light from the camera alone, so only the reference renders it"
+            rule = f"{why}; remove it, or use diff_trans, a thindielectric or render's reference"
             return outline.tag(thin, "spec_trans").refusal("spec_trans", "a transmission", rule)
     return None
 
@@ -286,10 +282,8 @@ def _in_instances(outline: Outline, tree: _References) -> str | None:
     mirror = next((mirror for node in groups for mirror in tree.below(node, MIRRORS)), None)
     if mirror is None:
         return None
-    rule = (
-        "inside of an instance glass is no pane and a mirror casts no glint: light that it brings from the projector "
-        "is missing; place the shape itself"
-    )
+    why = "inside of an instance glass is no pane and a mirror casts no glint: light that it brings from the projector"
+    rule = f"{why} is missing; place the shape itself"
     return str(outline.tag(mirror).refusal("bsdf", repr(str(mirror.props.plugin_name())), rule))
 
 
@@ -301,15 +295,13 @@ def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
         for inner in tree.below(bumps, PLUGINS["bsdf"].split()):
             plugin = str(inner.props.plugin_name())
             if plugin in STRAIGHT:
-                rule = (
-                    f"inside of a {what} Mitsuba takes it for opaque wherever it connects a surface to a light, so "
-                    "that is missing; turn them round: the mask, or other material that light passes, outermost"
-                )
+                why = f"inside of a {what} Mitsuba takes it for opaque wherever it connects a surface to a light"
+                remedy = "turn them round: the mask, or other material that light passes, outermost"
+                rule = f"{why}, so that is missing; {remedy}"
             elif what == "bumpmap" and (plugin in _TURNING or any(each in inner.props for each in _ALONG)):
-                rule = (
-                    "inside of a bumpmap Mitsuba mixes up the axes along the surface, so it would be turned about its "
-                    "normal; give one bumpmap, a normalmap outermost, or a material that is alike in all directions"
-                )
+                why = "inside of a bumpmap Mitsuba mixes up the axes along the surface, so it would be turned about its"
+                remedy = "give one bumpmap, a normalmap outermost, or a material that is alike in all directions"
+                rule = f"{why} normal; {remedy}"
             else:
                 continue
             return outline.tag(inner).refusal("bsdf", repr(plugin), rule)

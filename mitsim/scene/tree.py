@@ -99,10 +99,9 @@ def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
             box = shape.bbox()
             nearest = float(np.linalg.norm(np.clip(0, np.array(box.min), np.array(box.max))))
         if distance * _ROUNDING > _COARSEST * nearest:
-            rule = (
-                f"vertices are of single precision; {nearest:.4g} mm from the camera, as these are at their nearest, "
-                f"they may be moved by {_COARSEST / _ROUNDING * nearest:.0f} mm; write the mesh about its own origin"
-            )
+            why = f"vertices are of single precision; {nearest:.4g} mm from the camera, as these are at their nearest"
+            most = f"{_COARSEST / _ROUNDING * nearest:.0f} mm"
+            rule = f"{why}, they may be moved by {most}; write the mesh about its own origin"
             raise tag.refusal("mesh", f"vertices that are moved by {distance:.0f} mm to stand before the camera", rule)
 
 
