@@ -25,7 +25,6 @@ from mitsim.optics.shadow import (
     nodes_between,
 )
 
-
 # -------- A mask that is mounted askew, and the shadow of any mask
 #
 # Where a mask's distance grows by alpha along its rows and by beta along its columns, a ray of slope t that would
