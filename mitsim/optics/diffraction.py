@@ -175,7 +175,7 @@ def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, sp
     means = _thick_means if shadow.thickness_mm else _thin_means
 
     def of_line(wavelength: float) -> tuple[FloatArray, FloatArray]:
-        return both_axes(shadow, rows, columns, partial(means, wavelength_nm=float(wavelength)))
+        return both_axes(shadow, rows, columns, partial(means, nm=float(wavelength)))
 
     lines = in_threads(of_line, spectrum.wavelengths_nm)
     return [
@@ -280,21 +280,19 @@ def _integrate(apertures: tuple[Steps, ...], light: _Propagation, low: float, hi
 _keep_integrated = lru_cache(maxsize=_KEPT)(_integrate)
 
 
-def _thin_means(
-    shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
-) -> FloatArray:
+def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, nm: float) -> FloatArray:
     """Return the (pairs, m, c) mean products of fields; one grid serves all directions.
 
     Behind a tilted mask they are interpolated between those of a few distances.
     """
     growth, beyond = shadow.tilt[0]
     if not growth:
-        return _thin_means_at(beyond, shadow, profiles, directions, wavelength_nm)
+        return _thin_means_at(beyond, shadow, profiles, directions, nm)
     even = shadow.crossings(directions)
     nodes, total = nodes_between(even, _DISTANCES), np.zeros(())
     for weight, node in zip(lagrange_weights(even, nodes), nodes, strict=True):
         at_node = beyond + growth * float(node)
-        total = total + weight * _thin_means_at(at_node, shadow, profiles, directions, wavelength_nm)
+        total = total + weight * _thin_means_at(at_node, shadow, profiles, directions, nm)
     return total
 
 
@@ -313,13 +311,11 @@ def _thin_means_at(
     return integrated.smooth_means(met, shadow.half_pixel, half_cell)
 
 
-def _thick_means(
-    shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
-) -> FloatArray:
+def _thick_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, nm: float) -> FloatArray:
     crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
     reach = shadow.half_pixel + half_cell
     lows, highs = crossings.min(axis=0) - reach, crossings.max(axis=0) + reach
-    light = _Propagation.of(shadow, wavelength_nm)
+    light = _Propagation.of(shadow, nm)
     waves = light.waves(lows, highs)
 
     def toward(j: int) -> FloatArray:

@@ -292,6 +292,9 @@ _APART = 8
 """Step in pixels of the first lit pixel, so that light in cells of other sizes reuses the raster's spectra."""
 
 
+_Pair = tuple[int, int]
+
+
 class Correlation:
     """Shadow of a raster at one depth, prepared once; a pixel is a whole number of cells.
 
@@ -341,9 +344,7 @@ def _by_phase(cells: npt.NDArray[Any], phases: tuple[int, int]) -> npt.NDArray[A
 
 
 @lru_cache(maxsize=RASTERS_KEPT)
-def _spectra(
-    drawn: Plate, firsts: tuple[int, int], size: tuple[int, int], phases: tuple[int, int]
-) -> npt.NDArray[np.complex64]:
+def _spectra(drawn: Plate, firsts: _Pair, size: _Pair, phases: _Pair) -> npt.NDArray[np.complex64]:
     along = [count * each for count, each in zip(size, phases, strict=True)]
     seen = _part(_part(drawn.values, firsts[0], along[0]).T, firsts[1], along[1]).T.astype(np.float32)
     return np.stack([scipy.fft.rfft2(np.ascontiguousarray(row)) for row in _by_phase(seen, phases)])
@@ -424,6 +425,7 @@ Sampler = Callable[[FloatArray, FloatArray], FloatArray]
 """Function of places s and widths [mm] that returns means of a profile over [s - width/2, s + width/2]."""
 SampledTerm = tuple[float, Sampler, Sampler]
 """Weight, and samplers of rows and of columns."""
+SampledTerms = list[SampledTerm]
 
 
 class ProfileSampler:
@@ -463,9 +465,7 @@ class ProfileSampler:
         return np.clip(np.floor(x), -1, self._count).astype(np.intp) + 1
 
 
-def wave_samplers(
-    geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: tuple[float, float]
-) -> list[SampledTerm]:
+def wave_samplers(geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: Sequence[float]) -> SampledTerms:
     """Return the wave-optical shadow of a (virtual) source at ``depth`` [mm] and tan-angles ``tau`` as samplers."""
     if geometry.is_drawn(spectrum is not None):
         return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)

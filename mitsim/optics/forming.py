@@ -44,9 +44,12 @@ class AccumulatedLight:
     groups: tuple[sparse.csr_array, ...]
 
 
-def form_frames(
-    lights: Sequence[AccumulatedLight], basis: sparse.csr_array, probes: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
+Lights = Sequence[AccumulatedLight]
+Formed = tuple[FloatArray, FloatArray]
+"""Frames, and their products with random signs."""
+
+
+def form_frames(lights: Lights, basis: sparse.csr_array, probes: FloatArray | None) -> Formed:
     """Form frames of mixtures of light, and its replicates times probes.
 
     Parameters
@@ -80,9 +83,7 @@ def form_frames(
     return frames, probed
 
 
-def probe_frames(
-    lights: Sequence[AccumulatedLight], basis: sparse.csr_array, probes: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def probe_frames(lights: Lights, basis: sparse.csr_array, probes: FloatArray) -> Formed:
     """Return the replicates of mixtures of light without forming the frames.
 
     Returns
@@ -107,9 +108,7 @@ def probe_frames(
     return probed, noise
 
 
-def _mix_lights(
-    lights: Sequence[AccumulatedLight], basis: sparse.csr_array
-) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
+def _mix_lights(lights: Lights, basis: sparse.csr_array) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     for part in (part for _, parts in mixed for part in parts):
         part.sort_indices()

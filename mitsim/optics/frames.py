@@ -20,6 +20,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Coherence
 from mitsim.optics.forming import (
     AccumulatedLight,
+    Formed,
     Mixture,
     bound_of,
     form_frames,
@@ -37,8 +38,6 @@ _LARGEST_BASIS, _BASIS_BYTES = 256, 7 * 2**28
 """Largest number of class frames in memory, and their bytes. Beyond, frames are formed twice."""
 _FLOAT = 8
 """Bytes per pixel."""
-Formed = tuple[FloatArray, FloatArray]
-"""Frames, and their products with random signs."""
 _ALL = sparse.csr_array(np.ones((1, 1)))
 """Mixture of ambient light: all of it."""
 

@@ -131,12 +131,29 @@ def specular_frames(
     on_sensor = (corners.max(axis=1) > -geometry.half_width) & (corners.min(axis=1) < geometry.half_width)
     reached = np.flatnonzero(on_sensor.all(axis=1))
     classes = np.unique(labels[beams.pixel[reached]])
-    frames = np.zeros((len(classes), *geometry.frame_shape))
+    shape = geometry.frame_shape
+    frames = np.zeros((len(classes), *shape))
     total, lit = 0.0, np.zeros(len(labels), dtype=bool)
     for cut in _cuts(beams, reached, min(geometry.pitches) / boxes_per_pixel):
         boxes = _boxes(beams, cut, geometry)
         pixels = beams.pixel[boxes.beam]
-        total += _accumulate(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms)
+        slot, within = np.searchsorted(classes, labels[pixels]), 0.0
+        rows, columns = ([_pieces(boxes, axis, step, geometry) for step in (0, 1)] for axis in (0, 1))
+        shadows = [
+            (weight, [by_row(*piece[2:]) for piece in rows], [by_column(*piece[2:]) for piece in columns])
+            for weight, by_row, by_column in terms
+        ]
+        for i, (row, row_share, *_) in enumerate(rows):
+            for j, (column, column_share, *_) in enumerate(columns):
+                flux = boxes.flux * row_share * column_share
+                within += float(flux.sum())
+                met = np.flatnonzero(flux)
+                passed = np.zeros(len(met))
+                for weight, left, right in shadows:
+                    passed = passed + weight * left[i][met] * right[j][met]
+                flat = (slot[met] * shape[0] + row[met]) * shape[1] + column[met]
+                np.add.at(frames.reshape(-1), flat, flux[met] * passed)
+        total += within
         lit[pixels] = True
     used, area = np.isin(classes, labels[lit]), math.prod(geometry.active_sides)
     lit_classes, lit_frames = classes[used].astype(np.int64), frames[used] / area
@@ -205,28 +222,6 @@ def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry) -> _Boxes:
     response = geometry.pixel_fill_factor * geometry.angular_response(squared)
     magnification = 1 + geometry.mask_distance * _slope(corners, beams.tangent[cut.beams])
     return _Boxes(cut.beams[owner], flux * response, place, extent, tangent, magnification[owner])
-
-
-def _accumulate(
-    frames: FloatArray, slot: IntArray, boxes: _Boxes, geometry: CameraGeometry, terms: Sequence[SampledTerm]
-) -> float:
-    count, total = geometry.frame_shape, 0.0
-    rows, columns = ([_pieces(boxes, axis, step, geometry) for step in (0, 1)] for axis in (0, 1))
-    shadows = [
-        (weight, [row(*piece[2:]) for piece in rows], [column(*piece[2:]) for piece in columns])
-        for weight, row, column in terms
-    ]
-    for i, (row, row_share, *_) in enumerate(rows):
-        for j, (column, column_share, *_) in enumerate(columns):
-            flux = boxes.flux * row_share * column_share
-            total += float(flux.sum())
-            met = np.flatnonzero(flux)
-            passed = np.zeros(len(met))
-            for weight, left, right in shadows:
-                passed = passed + weight * left[i][met] * right[j][met]
-            flat = (slot[met] * count[0] + row[met]) * count[1] + column[met]
-            np.add.at(frames.reshape(-1), flat, flux[met] * passed)
-    return total
 
 
 def _pieces(

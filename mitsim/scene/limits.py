@@ -308,9 +308,7 @@ def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
     return None
 
 
-def _lost_by_integrator(
-    outline: Outline, tree: _References, cause: tuple[mi.parser.SceneNode, str] | None
-) -> MitsimError | None:
+def _lost_by_integrator(outline: Outline, tree: _References, cause: _Found | None) -> MitsimError | None:
     found = (node for node in tree.nodes if node.props.plugin_name() in PLUGINS["integrator"].split())
     integrator = next(found, None)
     plugin = integrator.props.plugin_name() if integrator is not None else "path"  # Mitsuba's own default
@@ -324,13 +322,17 @@ def _lost_by_integrator(
     return outline.tag(integrator or tree.nodes[0]).refusal("integrator", repr(plugin), rule)
 
 
+_Found = tuple[mi.parser.SceneNode, str]
+"""A node, and the name of one of its properties."""
+
+
 @dataclass(frozen=True)
 class _References:
     """The nodes of a tree and their references."""
 
     nodes: Sequence[mi.parser.SceneNode]
 
-    def to(self, plugins: Sequence[str]) -> Iterator[tuple[mi.parser.SceneNode, str]]:
+    def to(self, plugins: Sequence[str]) -> Iterator[_Found]:
         """Yield nodes, and names of their properties, that refer to one of the ``plugins``.
 
         The scene and materials without a shape are ignored because they only list.

@@ -174,6 +174,7 @@ _POLISHED = ("conductor", "dielectric", "mitsim_glass", "thindielectric")
 """Materials with light in single directions alone, which are followed on the cylinder itself."""
 _MIXED = ("plastic", "pplastic")
 """Materials whose specular chains need the cylinder, which cannot hold their matt light."""
+Uv = tuple[FloatArray, FloatArray]
 Mesh = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """Corners (k, 3), normals (k, 3), uv (k, 2), and triangles (m, 3)."""
 
@@ -316,9 +317,7 @@ def ball(props: mi.Properties) -> Mesh:
     return _in_world(props, _point(props, "center", (0, 0, 0)) + grown * normal, normal, (u, v), True)
 
 
-def _in_world(
-    props: mi.Properties, points: FloatArray, normals: FloatArray, uv: Sequence[FloatArray], turned: bool
-) -> Mesh:
+def _in_world(props: mi.Properties, points: FloatArray, normals: FloatArray, uv: Uv, turned: bool) -> Mesh:
     matrix = placement_of(props, centred=False)
     triangles = _triangles(*uv[0].shape)
     points = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]

@@ -125,10 +125,8 @@ def window_at(
     return (float(top), float(bottom)), (float(left), float(right))
 
 
-def straightening(
-    where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, depth: float
-) -> FloatArray:
-    """Return the (3, 3) homography that removes the keystone from tan-angles (row, column, 1) at ``depth``.
+def straightening(where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, z: float) -> FloatArray:
+    """Return the (3, 3) homography that removes the keystone from tan-angles (row, column, 1) at the depth ``z``.
 
     It maps to the positions of the projector pixels if the window filled its bounding box evenly.
 
@@ -137,7 +135,7 @@ def straightening(
     MitsimError
         If the projector does not light the plane.
     """
-    corners = _window_corners(where, projector, camera, grid.place, depth)
+    corners = _window_corners(where, projector, camera, grid.place, z)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return _homography(corners, np.where([[0, 0], [0, 1], [1, 0], [1, 1]], high, low))
 
