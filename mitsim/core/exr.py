@@ -107,8 +107,11 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
         with opened as file:
             header = file.header()
             # Both are emptied when the file closes, so they are copied here.
-            metadata = {key[len(_PREFIX) :]: _plain(header[key]) for key in header if key.startswith(_PREFIX)}
+            own = (key for key in header if key.startswith(_PREFIX))
+            metadata = {key[len(_PREFIX) :]: parse_json(header[key]) for key in own}
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        if wrong := [key for key, value in metadata.items() if not isinstance(value, (str, int, float))]:
+            raise ValueError(f"metadata {cut(wrong[0])!r} is no text or number")
     except (OSError, RuntimeError, ValueError, TypeError) as error:
         raise MitsimError(
             f"frame {path}: damaged or incomplete OpenEXR file ({reason_of(error)}); write or copy it again"
@@ -195,13 +198,6 @@ def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
     if not np.isfinite(total) and (bad := int(np.count_nonzero(~np.isfinite(values)))):
         raise MitsimError(f"{path}: {bad} values are not finite; capture or calibrate again")
     return values
-
-
-def _plain(text: str) -> Value:
-    value = parse_json(text)
-    if not isinstance(value, (str, int, float)):
-        raise ValueError(f"metadata {cut(text)!r} is no text or number")
-    return value
 
 
 # -------- An OpenEXR file's path in

@@ -236,10 +236,9 @@ def image_files(source: Path, wanted: Wanted = FRAME) -> tuple[Path, ...]:
     if not files:
         bare = "" if wanted.raw else f"; {', '.join(BARE)} count where shape and bits are stated"
         raise MitsimError(f"{source}: holds no file that ends in {', '.join(endings)}{bare}")
-    return tuple(sorted(files, key=_natural))
 
+    def natural(path: Path) -> tuple[list[tuple[int, str]], str]:
+        parts = re.split(r"([0-9]+)", path.name)
+        return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts], path.name
 
-def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """Return a key by which shot 10 comes after shot 9."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts], path.name
+    return tuple(sorted(files, key=natural))

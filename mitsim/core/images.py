@@ -616,16 +616,13 @@ def table(
         how many of the last columns hold numbers.
     """
 
-    def wrap(cell: str) -> str:
-        return ";white-space:nowrap" if len(cell) < _SHORT_CELL else ""
-
     def line(cells: Sequence[str], tag: str) -> str:
         sides = ["left"] * (len(cells) - numbers) + ["right"] * numbers
-        return "".join(
-            f'<{tag} style="padding:2px 10px 2px 0;text-align:{side};vertical-align:top{wrap(cell)}">'
-            f"{html.escape(cell)}</{tag}>"
-            for cell, side in zip(cells, sides, strict=True)
-        )
+        style = "padding:2px 10px 2px 0;vertical-align:top"
+        whole = (";white-space:nowrap" if len(cell) < _SHORT_CELL else "" for cell in cells)
+        each = zip(cells, sides, whole, strict=True)
+        texts = (f'<{tag} style="{style};text-align:{side}{wrap}">{html.escape(cell)}' for cell, side, wrap in each)
+        return "".join(f"{text}</{tag}>" for text in texts)
 
     body = "".join(f"<tr>{line(row, 'td')}</tr>" for row in rows)
     return _with_title(title, f"<table><tr>{line(headings, 'th')}</tr>{body}</table>", facts)

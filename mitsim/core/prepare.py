@@ -185,7 +185,17 @@ class Preparer:
         """Return the plane of ``values``, oriented, turned and cropped."""
         values = self.plane(values)
         values = orient(values, self.how.orientation) if isinstance(self.how.orientation, int) else values
-        first, end = _part(path, values.shape, self.how)
+        first, end, crop = (0, 0), values.shape, self.how.crop
+        if crop is not None:
+            rows, columns = values.shape
+            first = crop.row, crop.column
+            end = crop.row + (crop.rows or rows - crop.row), crop.column + (crop.columns or columns - crop.column)
+            if not (crop.row < end[0] <= rows and crop.column < end[1] <= columns):
+                kind = "its plane" if self.how.channel else "it"
+                raise MitsimError(
+                    f"{path}: {kind} is {_size(values)}, and crop takes rows {crop.row} to {end[0] - 1} and columns "
+                    f"{crop.column} to {end[1] - 1}; correct the crop"
+                )
         if self.how.turn_deg:
             from scipy.ndimage import affine_transform  # here: most frames are not turned
 
@@ -207,21 +217,6 @@ class Preparer:
                 )
             values = affine_transform(values, matrix, offset, order=1, mode="nearest")
         return values[first[0] : end[0], first[1] : end[1]]
-
-
-def _part(path: Path, shape: tuple[int, ...], how: Preparation) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return first row and column of the part of a picture that is taken, and the ones behind its last."""
-    crop = how.crop
-    if crop is None:
-        return (0, 0), (shape[0], shape[1])
-    end = crop.row + (crop.rows or shape[0] - crop.row), crop.column + (crop.columns or shape[1] - crop.column)
-    if not (crop.row < end[0] <= shape[0] and crop.column < end[1] <= shape[1]):
-        kind = "its plane" if how.channel else "it"
-        raise MitsimError(
-            f"{path}: {kind} is {shape[0]}x{shape[1]}, and crop takes rows {crop.row} to {end[0] - 1} and columns "
-            f"{crop.column} to {end[1] - 1}; correct the crop"
-        )
-    return (crop.row, crop.column), end
 
 
 @dataclass
