@@ -25,27 +25,25 @@ from mitsim.studies.framework.campaign import Shard, batches
 from mitsim.studies.framework.claims import choose_rows, mean_of
 from mitsim.studies.framework.experiment import Point, Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.learned_bench import (
+from mitsim.studies.learned_study import (
     AMBIENT,
+    AUTHORS,
+    BEST,
     DEPTH,
     DIM,
     DRIFT,
     ELSEWHERE,
     FULL,
     GLOSS,
+    NONE,
     PICTURES,
+    STUDY,
     VARIED,
     Budget,
+    Camera,
     Case,
     Cell,
     School,
-)  # fmt: skip
-from mitsim.studies.learned_study import (
-    AUTHORS,
-    BEST,
-    NONE,
-    STUDY,
-    Camera,
     cells,
     classical_rows,
     compare,
@@ -54,7 +52,7 @@ from mitsim.studies.learned_study import (
     scores,
     transfer,
     twin_sums,
-)  # fmt: skip
+)  # fmt: skip  # fmt: skip
 from mitsim.studies.twin_study import Learned, Recipe
 from tests.ideal_sessions import bench, picture
 from tests.unit.learn.pairs import FakeStore
