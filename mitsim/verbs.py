@@ -1,6 +1,6 @@
-"""Verbs of the Python face that belong to no object: scenes, cameras and folders by name in; results out.
+"""Verbs of the Python face that belong to no object, and take scenes, cameras and folders by name.
 
-Each is a verb of the command line, which calls it: what is asked is checked here before anything heavy is imported.
+The command line calls them. A request is checked here before anything heavy is imported.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ def doctor(warm: bool = False, variant: str = DEFAULT_VARIANT) -> list[Check]:
     Parameters
     ----------
     warm
-        whether the usual kernels are compiled into Dr.Jit's cache too, in half a minute.
+        True to compile the usual kernels into Dr.Jit's cache too, in half a minute.
     variant
-        of Mitsuba, that they are compiled for.
+        Variant of Mitsuba that kernels are compiled for.
     """
     from mitsim.core.environment import check_variant, warm_up
     from mitsim.core.environment import doctor as check_machine
@@ -322,7 +322,7 @@ def study(
     Parameters
     ----------
     name
-        of the study, or ``merge``, which joins the parts of ``shard``.
+        Name of the study, or ``merge``, which joins the parts of ``shard``.
     scene
         name of a shipped one, or a path; None: the photograph, or the study's own. Of ``merge`` folders of parts.
     output

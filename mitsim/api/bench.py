@@ -52,19 +52,19 @@ def open_bench(
     Parameters
     ----------
     scene
-        name of a shipped scene, or path of a scene XML or of the folder that holds it (``./name`` for a folder that is
-        called like a shipped scene).
+        Name of a shipped scene, or path of a scene XML or of its folder (``./name`` for a folder that has the name of a
+        shipped scene).
     variant
-        of Mitsuba.
+        Variant of Mitsuba.
     camera, projector
-        name of a shipped device, or path of its TOML file; None: IMX249 and MP-CL1. The pitch of a camera that is
+        Name of a shipped device, or path of its TOML file; None: IMX249 and MP-CL1. The pitch of a camera that is
         named, and its rows and columns where its file states them, count in place of the scene's, which a warning says.
     allow_outside_files
-        whether the scene may read files outside its folder.
+        True to let the scene read files outside its folder.
     for_render
-        only light matters: the camera's electronics need not fit, and the scene needs no projector.
+        True if only light matters: the camera's electronics need not fit, and the scene needs no projector.
     **parameters
-        values of the scene's ``<default>`` parameters, text or numbers.
+        Values of the scene's ``<default>`` parameters, text or numbers.
 
     Raises
     ------
@@ -99,7 +99,7 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            of a family (:func:`mitsim.devices.patterns.parse_patterns`).
+            Name of a family (:func:`mitsim.devices.patterns.parse_patterns`).
 
         Raises
         ------
@@ -117,9 +117,9 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            the family whose frames are to have the accuracy, or a plan of this bench.
+            Family whose frames are to have the accuracy, or a plan of this bench.
         job
-            clock, progress and limits.
+            Clock, progress and limits.
         """
         from mitsim.acquire.capture import check_plan, request_of, trace_request
         from mitsim.acquire.spectral import SpectralBench, plan_request
@@ -149,13 +149,13 @@ class Bench(Apparatus):
         Parameters
         ----------
         plan
-            a plan of this bench, or the name of a family.
+            Plan of this bench, or name of a family.
         output
-            folder that the frames are written to as they are made; None keeps them in memory.
+            Folder that the frames are written to as they are made; None keeps them in memory.
         resume
-            go on with an interrupted capture of the same request in ``output``, bit-equal to an uninterrupted one.
+            True to resume an interrupted capture of the same request in ``output``, bit-equal to an uninterrupted one.
         job
-            clock, progress and limits.
+            Clock, progress and limits.
 
         Raises
         ------
@@ -188,11 +188,11 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            name of the family, or a plan of this bench, of :meth:`choose_colour`.
+            Name of the family, or a plan of :meth:`choose_colour`.
         output
-            folder that holds a run's folder for each line, and colour.json; None keeps them in memory.
+            Folder of a run's folder for each line, and colour.json; None keeps the runs in memory.
         resume, job
-            as for :meth:`capture`.
+            As for :meth:`capture`.
 
         Raises
         ------
@@ -216,7 +216,7 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            name of the family.
+            Name of the family.
 
         Raises
         ------
@@ -246,9 +246,9 @@ class Bench(Apparatus):
         Parameters
         ----------
         resume, job
-            as for :meth:`calibrate`.
+            As for :meth:`calibrate`.
         output
-            folder that holds a calibration's folder for each line, and colour.json; None keeps them in memory.
+            Folder of a calibration's folder for each line, and colour.json; None keeps the factors in memory.
 
         Raises
         ------
@@ -276,11 +276,11 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            name of the family, or a plan of this bench.
+            Name of the family, or a plan of this bench.
         output
-            RUN folder, with the lines' truths and colour.json beside; None keeps all in memory.
+            RUN folder, which also holds the lines' truths and colour.json; None keeps all in memory.
         resume, job
-            as for :meth:`capture`.
+            As for :meth:`capture`.
 
         Raises
         ------
@@ -311,7 +311,7 @@ class Bench(Apparatus):
         Parameters
         ----------
         output, resume, job
-            as for :meth:`calibrate_lines`.
+            As for :meth:`calibrate_lines`.
 
         Raises
         ------
@@ -339,11 +339,11 @@ class Bench(Apparatus):
         Parameters
         ----------
         output
-            CAL folder that is written, with its unfinished parts meanwhile; None keeps the factors in memory.
+            CAL folder to write, with its unfinished parts meanwhile; None keeps the factors in memory.
         resume
-            go on with an interrupted session in ``output``.
+            True to resume an interrupted session in ``output``.
         job
-            clock, progress and limits.
+            Clock, progress and limits.
 
         Raises
         ------
@@ -369,9 +369,9 @@ class Bench(Apparatus):
         Parameters
         ----------
         resume, job
-            as :meth:`calibrate`.
+            As for :meth:`calibrate`.
         output
-            folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
+            Folder of a CAL folder for each depth, named by its millimetres; None keeps the factors in memory.
         """
         from mitsim.calibrate.calibrate import calibrate_depths
 
@@ -391,9 +391,9 @@ class Bench(Apparatus):
         Parameters
         ----------
         frames
-            new or empty folder.
+            New or empty folder for the frames.
         output, job
-            as :meth:`calibrate`.
+            As for :meth:`calibrate`.
         """
         from mitsim.calibrate.calibrate import write_session
 
@@ -423,15 +423,15 @@ class Bench(Apparatus):
         Parameters
         ----------
         estimator
-            ``reference``: the scene's own integrator, path by path; ``factored``: what all captures are made with.
+            ``reference``: the scene's own integrator, path by path; ``factored``: the estimator of captures.
         spp
-            samples a pixel of the reference; None: the ``sample_count`` of the scene's sampler, or 64 without.
+            Samples a pixel of the reference; None: the ``sample_count`` of the scene's sampler, or 64 without.
         accuracy, effects
-            of the factored estimator: relative error, and effects switched on or off by name.
+            Relative error of the factored estimator, and effects that are switched on or off, by name.
         seed
-            root of every random stream.
+            Root of every random stream.
         job
-            clock, progress and limits.
+            Clock, progress and limits.
 
         Raises
         ------
@@ -449,11 +449,11 @@ class Bench(Apparatus):
         Parameters
         ----------
         reflectance
-            of the board.
+            Reflectance of the board.
         shape
-            its size, bow and tilt; None: flat, and larger than the view.
+            Size, bow and tilt of the board; None: flat, and larger than the view.
         depth
-            distance of its middle [mm]; None: on the aligned plane.
+            Distance of the board's middle [mm]; None: on the aligned plane.
         """
         from mitsim.bench.board import before_board
 
@@ -473,20 +473,21 @@ def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.
     Parameters
     ----------
     picture
-        a PNG, TIFF, NPY, OpenEXR or JPEG file, or an array (rows, columns) or (rows, columns, 3). Its numbers are
+        PNG, TIFF, NPY, OpenEXR or JPEG file, or an array (rows, columns) or (rows, columns, 3). Its numbers are
         reflectances, 0 to 1, of whole numbers the part of their type's largest; of colours the mean is taken. It is as
         high to wide as its pixels are; what is left of the sheet is black.
     size_mm
-        side of the sheet, and longer side of the picture [mm]. At 400 mm the projector lights 120 mm: there an array
+        Side of the sheet, and longer side of the picture [mm]. At 400 mm the projector lights 120 mm: there an array
         of 128 x 128 numbers has one for each of its pixels.
     distance_mm
-        from the camera to the sheet [mm]. The bench stays aligned to 400 mm, and so does its calibration.
+        Distance from the camera to the sheet [mm]. The bench stays aligned to 400 mm, and so does its calibration.
     **options
-        other arguments of :func:`mitsim.open_bench`: ``camera``, ``projector``, ``variant``, parameters of the scene.
+        Other arguments of :func:`mitsim.open_bench`: ``camera``, ``projector``, ``variant``, parameters of the scene.
 
     Returns
     -------
-    the bench; its truth is the picture where the projector lights it.
+    Bench
+        Its truth is the picture where the projector lights it.
 
     Raises
     ------
@@ -506,15 +507,15 @@ def shelf_scene(
     Parameters
     ----------
     mesh
-        a PLY file of triangles, or an OBJ file; its y axis is up. It is centred, and stands on the shelf.
+        PLY file of triangles, or OBJ file, with the y axis up. The object is centred on the shelf.
     size_mm
-        its longest side [mm].
+        Longest side of the object [mm].
     reflectance
-        of its matt surface, on either side, 0 to 1.
+        Reflectance of the object's matt surface, on either side, 0 to 1.
     turn_deg
-        about its upright axis [degrees].
+        Rotation about the upright axis [degrees].
     **options
-        other arguments of :func:`mitsim.open_bench`.
+        Other arguments of :func:`mitsim.open_bench`.
 
     Raises
     ------

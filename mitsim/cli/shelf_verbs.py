@@ -379,7 +379,7 @@ def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") 
     Parameters
     ----------
     model
-        of the file.
+        Model of the file.
     values
         Fields that are set; they make the file whole.
     table

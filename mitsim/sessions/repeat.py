@@ -63,11 +63,11 @@ class Repeat:
     Attributes
     ----------
     text
-        with whole paths.
+        Text of the file, with whole paths.
     warnings
-        sentences.
+        Sentences.
     tables, notes
-        of the file, and lines of comment before them.
+        Tables of the file, and lines of comment before them.
     """
 
     text: str
@@ -92,12 +92,12 @@ def session_of(folder: Path | str) -> Repeat:
     Parameters
     ----------
     folder
-        of a session, a capture, a calibration, an image, the demo, or a study of many points.
+        Folder of a session, a capture, a calibration, an image, the demo, or a study of many points.
 
     Returns
     -------
     Repeat
-        its ``text``; ``warnings`` name files that have changed since, or that the folder does not name.
+        The ``text``; ``warnings`` name files that have changed since, or that the folder does not name.
 
     Raises
     ------

@@ -146,13 +146,13 @@ def run(
     Parameters
     ----------
     session
-        its file, the name of a shipped one, or its tables.
+        Session file, name of a shipped one, or its tables.
     output
-        folder to make; with ``resume`` one of an earlier run.
+        Folder to make; with ``resume`` the folder of an earlier run.
     values
-        of fields, in place of the file's, by name: ``{"capture.patterns": "dots:4"}``.
+        Values of fields by name, in place of those of the file: ``{"capture.patterns": "dots:4"}``.
     job
-        clock, progress and limits.
+        Clock, progress and limits.
 
     Raises
     ------
