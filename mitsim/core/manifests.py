@@ -649,8 +649,24 @@ def is_coloured(folder: Path | str) -> bool:
     return (Path(folder) / COLOUR).is_file()
 
 
+class Coloured:
+    """A folder or its content with ``colours``, its lines and filters; None where wavelengths are not separated."""
+
+    colours: ColourManifest | None
+
+    @property
+    def filters(self) -> MosaicManifest | None:
+        """The colour filters that the frames were seen through."""
+        return self.colours if isinstance(self.colours, MosaicManifest) else None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the lines; one empty name where wavelengths are not separated."""
+        return self.colours.names if self.colours else ("",)
+
+
 @dataclass(frozen=True)
-class SpectralFolder:
+class SpectralFolder(Coloured):
     """A run, calibration or image, and its spectral lines.
 
     Attributes
@@ -663,16 +679,6 @@ class SpectralFolder:
 
     folder: Path
     colours: ColourManifest | None
-
-    @property
-    def filters(self) -> MosaicManifest | None:
-        """The colour filters that the frames were seen through."""
-        return self.colours if isinstance(self.colours, MosaicManifest) else None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the lines; one empty name where wavelengths are not separated."""
-        return self.colours.names if self.colours else ("",)
 
     @property
     def parts(self) -> dict[str, Path]:

@@ -22,7 +22,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata, Value, checksum, read_frame, verify, write_frame
 from mitsim.core.files import MOST_BYTES, parse_json, read_text, write_text
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import CalibrationManifest, ColourManifest, MosaicManifest, RunManifest, ShotFile
+from mitsim.core.manifests import CalibrationManifest, ColourManifest, RunManifest, ShotFile
 from mitsim.core.runs import TRUTH, load_run
 from mitsim.version import __version__
 
@@ -81,7 +81,7 @@ class Packed(Generic[Manifest]):
 
 
 @dataclass(frozen=True, eq=False)
-class Content(Generic[Manifest]):
+class Content(manifests.Coloured, Generic[Manifest]):
     """All that a RUN or CAL folder holds.
 
     Attributes
@@ -100,16 +100,6 @@ class Content(Generic[Manifest]):
     colours: ColourManifest | None = None
     text: str = ""
     truths: Mapping[str, tuple[Channels, Metadata]] = field(default_factory=dict)
-
-    @property
-    def filters(self) -> MosaicManifest | None:
-        """The filters that its frames were seen through."""
-        return self.colours if isinstance(self.colours, MosaicManifest) else None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of its lines; "" alone where it has none."""
-        return self.colours.names if self.colours else ("",)
 
     def of_line(self, name: str) -> Packed[Manifest]:
         """Return the folder that a line called ``name`` is in: its own, or that of all lines."""
