@@ -149,17 +149,11 @@ def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Show
         lighting = Lighting(labels, (1 + signs.T[own]) / 2)
         frames = lit.light.frames(lighting, session.seed) if own else ()
         formed |= {(side, index): frame for index, frame in zip(own, frames, strict=True)}
-    shown = [
-        _response(
-            signs[:, index],
-            side,
-            lit.noisy(side, index, formed.get((side, index), lit.white)).rate,
-            lit.response_noise,
-            session.centre,
-        )
-        for side, index in chosen
-    ]
-    return shown, frames_of(chosen, pairs, repeats) * len(session.recipe.exposure_ladder)
+    noise = lit.response_noise
+    rates = ((lit.noisy(side, index, formed.get((side, index), lit.white)).rate, noise) for side, index in chosen)
+    return _shown(signs, chosen, rates, session.centre), frames_of(chosen, pairs, repeats) * len(
+        session.recipe.exposure_ladder
+    )
 
 
 def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -> tuple[list[Shown], Digital, int]:
@@ -171,16 +165,15 @@ def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -
         )
     signs = stripe_signs(listed.n).astype(np.float64)
     chosen = modelling.used_patterns(_changes(signs), pairs, listed.repeats)
-    shown = []
-    for (side, index), (rate, noise) in zip(chosen, chosen_responses(session, chosen), strict=True):
-        rows, columns = bench.geometry.frame_shape
-        if rate.shape != (rows, columns):
+    shape, rates = bench.geometry.frame_shape, [*chosen_responses(session, chosen)]
+    for rate, _ in rates:
+        if rate.shape != tuple(shape):
             raise MitsimError(
                 f"frames {session.folder}: are {rate.shape[0]} x {rate.shape[1]} pixels, but the scene's camera has "
-                f"{rows} x {columns}; give the scene of these devices"
+                f"{shape[0]} x {shape[1]}; give the scene of these devices"
             )
-        shown.append(_response(signs[:, index], side, rate, noise, listed.centre))
-    return shown, listed.digital, frames_of(chosen, pairs, listed.repeats) * len(listed.exposure_ladder)
+    frames = frames_of(chosen, pairs, listed.repeats) * len(listed.exposure_ladder)
+    return _shown(signs, chosen, rates, listed.centre), listed.digital, frames
 
 
 def _changes(signs: FloatArray) -> list[int]:
@@ -188,10 +181,15 @@ def _changes(signs: FloatArray) -> list[int]:
     return found
 
 
-def _response(signs: FloatArray, side: Side, rate: FloatArray, noise: float, centre: bool) -> Shown:
-    across = side == SIDES[0]
-    even = np.ones_like(signs)
-    return Shown(signs if across else even, even if across else signs, centre_frame(rate) if centre else rate, noise)
+def _shown(
+    signs: FloatArray, chosen: Sequence[tuple[Side, int]], rates: Iterable[tuple[FloatArray, float]], centre: bool
+) -> list[Shown]:
+    """Return the responses to the ``chosen`` patterns, whose ``rates`` come with their noise."""
+    shown, even = [], np.ones(len(signs))
+    for (side, index), (rate, noise) in zip(chosen, rates, strict=True):
+        rows, columns = (signs[:, index], even) if side == SIDES[0] else (even, signs[:, index])
+        shown.append(Shown(rows, columns, centre_frame(rate) if centre else rate, noise))
+    return shown
 
 
 @single_threaded_blas()
