@@ -1,4 +1,4 @@
-"""Checks of single frames: each against what all other frames of the run predict of it.
+"""Checks of single frames: each is compared with the prediction from all other frames of the run.
 
 Where patterns overlap, the other frames predict a frame by the model: e^T (I - H_kk)^-1 e is the energy of the frame's
 difference from the prediction, in closed form. Signed patterns have a second redundancy, because the halves of every
@@ -66,7 +66,7 @@ from which the picture varies in one direction only, and decides nothing."""
 
 
 class PictureCheck:
-    """What the picture decides of the frames of a run of shifting dots, in the order of its K shots.
+    """Comparison of each of the K frames of a run of shifting dots with the picture that the others show.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ _FEWEST_PAIRS, _FEWEST_FRAMES, _MOST_NUMBERS = 4, 3, 3e7
 _DOTS = "under dots each scene pixel is in one frame, so that only the picture shows a change of lamp, camera or scene."
 _LEAKING = "Light of the room cancels. A projector that leaks it since it was calibrated darkens the image as much."
 _REMEDY = "A closing frame (--closing-frame uniform) decides it."
-"""Sentences on what is not decided."""
+"""Sentences on questions that the frames leave undecided."""
 _LEAK = 5e-3
 """Light of a dark pattern, over that of the bright one, from which a leaking projector is reported."""
 _RESTORED, _SCATTERS = 0.9, 4.0

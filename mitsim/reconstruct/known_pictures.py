@@ -236,7 +236,7 @@ def _finish(
     found: tuple[tuple[float, float, float], Mapping[str, Any], tuple[str, ...]],
     job: Job,
 ) -> Factors:
-    """Return factors of a plane, whose manifest has what both ways of calibrating state.
+    """Return factors of a plane, with the manifest entries that both ways of calibrating share.
 
     ``found`` are the results of :meth:`KnownFrames.misfit`, more results, and the warnings.
     """

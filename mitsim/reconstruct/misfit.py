@@ -1,4 +1,4 @@
-"""Misfit of a run: what the factorised model leaves of the measurements, held against their noise.
+"""Misfit of a run: the residual of the factorised model, compared with the noise of the measurements.
 
 A run either fits its model at the level of its noise, or it is flagged, with the place and with the readings of the
 data that restore the fit. Four measurements decide, in this order:
@@ -153,7 +153,7 @@ def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defec
 
 
 def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects | None:
-    """Pixels whose residual is beyond noise, and beyond that of their neighbours; None where there are none.
+    """Return pixels whose residual exceeds noise and that of their neighbours, or None where there are none.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
 
 
 def _limit(count: int) -> float:
-    """Quantile of a chi-square of ``count`` degrees of freedom over their number, after Wilson and Hilferty (1931)."""
+    """Return the quantile of a chi-square of ``count`` degrees of freedom over their number, after Wilson and Hilferty (1931)."""
     return float((1 - 2 / (9 * count) + _SPREADS * np.sqrt(2 / (9 * count))) ** 3)
 
 
@@ -224,12 +224,12 @@ class Cause(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """What the model leaves unexplained.
+    """Part of the measurements that the model does not explain, and its cause.
 
     Attributes
     ----------
     chi_square
-        energy of the residual over what is expected of it; 1 where the model fits.
+        energy of the residual over the expected energy; 1 where the model fits.
     unexplained
         square root of the energy beyond that and beyond what print within a pixel may add, relative to the
         measurements; 0 where nothing is.
@@ -255,11 +255,11 @@ class Misfit:
         part of the measurements, rms, that the frames show to be print finer than a scene pixel; no part of
         ``unexplained``.
     picture
-        what the picture decides of frames under shifting dots; None under other patterns.
+        result of the picture's check under shifting dots; None under other patterns.
     common
         relative change of the image, rms, by light that is the same in all frames.
     limits
-        what the frames leave undecided.
+        questions that the frames leave undecided.
     """
 
     chi_square: float

@@ -176,7 +176,7 @@ def reconstruct_psf_request(
 
 
 def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:
-    """Return what decides an image: fingerprints of the ``shots`` and of the ``psf``, and the request."""
+    """Return the inputs of an image: fingerprints of the ``shots`` and of the ``psf``, and the request."""
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
     asked = {
         "run": shots.fingerprint,

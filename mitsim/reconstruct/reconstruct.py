@@ -128,7 +128,7 @@ class Reconstruction(Solution):
 
     @property
     def limits(self) -> tuple[str, ...]:
-        """Sentences on what the frames of a real camera leave undecided."""
+        """Sentences on questions that the frames of a real camera leave undecided."""
         return tuple(f"Not decided: {limit['words']}" for limit in self.misfit.limits) if self.misfit else ()
 
     def summary(self) -> dict[str, Any]:

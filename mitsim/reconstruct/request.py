@@ -1,4 +1,4 @@
-"""How an image is asked for in; a refusal, or what it takes, out, before the solver is imported."""
+"""Request of an image: its options, their checks, and its cost, before the solver is imported."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
 TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
-"""Of solving: names of :data:`mitsim.reconstruct.solvers.SOLVERS`."""
+"""Names of the methods in :data:`mitsim.reconstruct.solvers.SOLVERS`."""
 MODEL = ".pt"
-"""Ending of a trained network's file, which may stand for the name of a method."""
+"""Ending of a trained network's file, which may replace the name of a method."""
 MOST_REDUCED = 1024
 """Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
 _MOST = 1e100
@@ -27,11 +27,11 @@ _MOST = 1e100
 Bounds = tuple[float, float]
 """Least and largest number of an image; -inf and inf: any."""
 IMAGE_FILE, PICTURE_FILE, RESULT_FILE = "image.exr", "image.png", "result.json"
-"""Files of an image: its numbers, what people look at, and what is stated of it."""
+"""Files of an image: its numbers, a picture for display, and its results."""
 
 
 def holds_image(folder: Path) -> bool:
-    """Return True if a ``folder`` holds an image, finished or not."""
+    """Return True if a ``folder`` contains an image, finished or not."""
     return (folder / IMAGE_FILE).is_file() or (folder / RESULT_FILE).is_file()
 
 
@@ -70,7 +70,7 @@ Two = Annotated[Any, validated_by(_two_numbers)]
 
 
 class ImageRequest(Options):
-    """How an image is solved for."""
+    """Options of an image."""
 
     PANEL = QUALITY
     VERB = "reconstruct"
@@ -106,7 +106,7 @@ class ImageRequest(Options):
     )
 
     def model_post_init(self, context: object) -> None:
-        """Refuse what no image is made by."""
+        """Refuse combinations of options by which no image is made."""
         lam: Any = self.lam
         focus: Any = self.focus
         if not isinstance(self.method, str) and not hasattr(self.method, "name"):
@@ -205,7 +205,7 @@ class ImageKeys(TypedDict, total=False):
 
 
 def plain_bounds(bounds: Bounds) -> list[float | None]:
-    """``bounds`` as JSON holds them: None for an end that is infinite."""
+    """Return ``bounds`` for JSON, with None for an infinite end."""
     return [end if math.isfinite(end) else None for end in bounds]
 
 
@@ -225,7 +225,7 @@ def check_joint(lam: float | str) -> None:
         raise ArgumentError("lam", f"{short_text(lam)}: behind colour filters give a finite number above 0, or auto")
 
 
-# ---- What a Tikhonov image takes -------------------------------------------------------------------------------------
+# ---- Cost of a Tikhonov image ----------------------------------------------------------------------------------------
 
 KEPT_NUMBERS = 1 << 24
 """Pixels of all measurements up to which they are kept for a second look: 64 of 512 x 512, at most 256 MiB."""
@@ -235,7 +235,7 @@ _FRAMES, _KEPT = 16.0, 2.0
 """Frames in double precision that are held at once: one as it is read (its file, channels, numbers, rates), its
 residual and squares, and sums that tell causes; and of each measurement that is kept."""
 _BASE_BYTES = 1e8
-"""What the solver's libraries take, and the tables of uncertainty."""
+"""Memory of the solver's libraries, and of the tables of uncertainty."""
 _READ_S, _ADD_S, _JUDGE_S = 3.5e-8, 1.5e-8, 2e-8
 """A pixel of a frame, on one processor: read and checked, added up, and held against the model."""
 _SHOT_S = 4e-3
@@ -248,7 +248,7 @@ _PLAIN_S = 0.05
 
 @dataclass(frozen=True)
 class ImageCost:
-    """What an image takes: ``seconds`` by stage as it will state them, and ``memory_bytes`` at most."""
+    """Predicted ``seconds`` by stage of an image, and the largest ``memory_bytes``."""
 
     seconds: dict[str, float]
     memory_bytes: float
@@ -281,7 +281,7 @@ def keeps_frames(shots: Capture, factors: Factors) -> bool:
 
 
 def slab_numbers(shots: Capture, factors: Factors, whole: bool = False) -> float:
-    """Numbers of the factors and of all slabs that they are factorised into.
+    """Return the count of numbers in the factors and in all slabs that they are factorised into.
 
     Parameters
     ----------

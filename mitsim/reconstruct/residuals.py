@@ -282,7 +282,7 @@ exceed."""
 
 @dataclass(frozen=True)
 class NoiseTest:
-    """Noise of the frames as they show it, over what is stated.
+    """Measured noise of the frames over the stated noise.
 
     Attributes
     ----------
@@ -299,7 +299,7 @@ class NoiseTest:
     gain_error: float
 
     def off(self, noise: FrameNoise, whole: float, stated: float, beside: float) -> bool:
-        """Return True if the noise is not what is stated.
+        """Return True if the noise differs from the stated one.
 
         Energy and second differences must agree, because structure adds to the energy, and the error of rendering may
         be stated too large. Where read noise is not stated, only the slope over the light is compared.
@@ -335,7 +335,7 @@ class Place(NamedTuple):
 
 
 class Residuals:
-    """Sums over what the model leaves of every measurement; made by one reading of all frames.
+    """Sums over the residuals of all measurements, from one reading of all frames.
 
     Attributes
     ----------
@@ -534,7 +534,7 @@ class Residuals:
 
 
 def noise_chance(noise: FrameNoise, pixels: float) -> float:
-    """Return what chance may add to the chi-square of that many ``pixels`` in all measurements of a ``noise``.
+    """Return the excess by chance of the chi-square of so many ``pixels`` in all measurements of a ``noise``.
 
     The energy of normal noise of variance v in n data varies by sqrt(2 n) v.
     """

@@ -281,7 +281,7 @@ class SessionFault:
     detail
         the same in words, after the frame's name.
     repair
-        what is done about it, in words.
+        the repair in words.
     cost
         relative error of its factor that this leaves beyond the noise.
     other
@@ -348,7 +348,7 @@ class CheckedSession:
 
 
 def check_session(sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> CheckedSession:
-    """Check a session, mend what can be mended with a check afterwards, and add what is left to the stated error.
+    """Check a session, make repairs that a check afterwards confirms, and add remaining errors to the stated error.
 
     Parameters
     ----------
@@ -419,7 +419,7 @@ class _Side:
         return max(float(np.square(self.vectors).sum()), 1e-300)
 
     def result(self) -> StripeSums:
-        """Return the sums with what was mended; a good session's are left as they are."""
+        """Return the sums with all repairs; those of a good session are unchanged."""
         if np.array_equal(self.vectors, self.sums.vectors):
             return self.sums
         return replace(self.sums, vectors=self.vectors, misfit=float(self.misfits.sum()))

@@ -189,7 +189,7 @@ class Codes:
     gains
         Gain of each plane.
     variances
-        Mean square of what is left of each frame.
+        Mean square of the residual of each frame.
     explained
         Mean explained part of the frames' energy.
     errors

@@ -20,7 +20,7 @@ class Verdict(Enum):
     RANK_DEFICIENT = "rank deficient"
     """Some directions are not measured, and nothing fills them."""
     ILL_CONDITIONED = "ill-conditioned"
-    """Rounding may change what is seen."""
+    """Rounding may change the visible image."""
     MISFIT = "misfit"
     """The measurements contain more than any image explains."""
     NOT_CONVERGED = "not converged"

@@ -450,7 +450,7 @@ class Prepared:
         return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
 
     def weights(self, frame: FloatArray, pattern: tuple[int, int]) -> FloatArray:
-        """Return what a centred ``frame`` (m, m') of a ``pattern`` adds to W at its :meth:`places`."""
+        """Return the contribution of a centred ``frame`` (m, m') of a ``pattern`` to W at its :meth:`places`."""
         left, right = self.slabs(pattern)
         return np.asarray(left.matrix.T @ frame @ right.matrix)
 
@@ -653,7 +653,7 @@ _LARGEST_SUM = 1e100
 
 
 class Accumulator:
-    """Sum over frames of what the solver needs: W by quarters of the sensor, and the energy of the frames."""
+    """Sums over frames for the solver: W by quarters of the sensor, and the energy of the frames."""
 
     def __init__(self, prepared: Prepared) -> None:
         left, right = prepared.left, prepared.right
@@ -692,7 +692,7 @@ class Accumulator:
         return [(int(i), int(j)) for i, j in np.argwhere(~self._seen)]
 
     def add(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
-        """Add one frame, and return what it adds to W at its places (c, c').
+        """Add one frame, and return its contribution (c, c') to W at its places.
 
         Parameters
         ----------
