@@ -320,9 +320,9 @@ class Bench(Apparatus):
         """
         task = Task.of(output, resume, job)
         with task.importing():
-            from mitsim.calibrate.calibrate import calibrate_mosaic
+            from mitsim.calibrate.calibrate import calibrate_lines
 
-        return calibrate_mosaic(self, SessionRequest(**request), task)
+        return calibrate_lines(self, SessionRequest(**request), task, mosaic=True)
 
     # ---- Calibration sessions ----
 
@@ -395,9 +395,9 @@ class Bench(Apparatus):
         output, job
             As for :meth:`calibrate`.
         """
-        from mitsim.calibrate.calibrate import write_session
+        from mitsim.calibrate.calibrate import calibrate
 
-        return write_session(self, frames, SessionRequest(**request), Task.of(output, job=job))
+        return calibrate(self, SessionRequest(**request), Task.of(output, job=job), frames)
 
     # ---- The bench to look at, renderings, and the same devices before a board ----
 

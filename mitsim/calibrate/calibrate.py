@@ -244,10 +244,19 @@ class SessionSums:
 # ---- Sessions ----
 
 
-def calibrate(bench: Apparatus, request: SessionRequest, task: Task) -> Factors:
-    """Run a calibration session and estimate the camera's factors; see :meth:`mitsim.api.bench.Bench.calibrate`."""
+def calibrate(bench: Apparatus, request: SessionRequest, task: Task, frames: Path | str | None = None) -> Factors:
+    """Run a calibration session and estimate the camera's factors; see :meth:`mitsim.api.bench.Bench.calibrate`.
+
+    Frames are written to a folder ``frames`` that `mitsim calibrate --frames` reads. Raises MitsimError for a recipe
+    with depths, a folder that contains something, and a full disk.
+    """
     session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
-    return _run_sessions([session], request, task, [task.output])[0]
+    with nullcontext() if frames is None else whole_folder(frames) as folder:
+        if folder is not None:
+            number_bytes = 2 if (bench.sensor.largest_dn or math.inf) <= MOST_TIFF else 8
+            size = Cost(disk_bytes=float(session.shots * math.prod(bench.geometry.frame_shape) * number_bytes))
+            size.check("frames", Limits(), folder)
+        return _run_sessions([session], request, task, [task.output], folder)[0]
 
 
 def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> dict[float, Factors]:
@@ -272,33 +281,14 @@ def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> d
     return found
 
 
-def write_session(bench: Apparatus, frames: Path | str, request: SessionRequest, task: Task) -> Factors:
-    """Run :func:`calibrate` and write its frames to a folder that `mitsim calibrate --frames` reads.
+def calibrate_lines(whole: Apparatus, request: SessionRequest, task: Task, mosaic: bool = False) -> dict[str, Factors]:
+    """Estimate factors at each line, by its name, or behind the filters of a ``mosaic``.
 
-    Raises MitsimError as there, for a recipe with depths, a folder that holds something, and a full disk.
+    See :meth:`mitsim.api.bench.Bench.calibrate_lines` and :meth:`mitsim.api.bench.Bench.calibrate_mosaic`.
     """
-    session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
-    with whole_folder(frames) as folder:
-        number_bytes = 2 if (bench.sensor.largest_dn or math.inf) <= MOST_TIFF else 8
-        size = Cost(disk_bytes=float(session.shots * math.prod(bench.geometry.frame_shape) * number_bytes))
-        size.check("frames", Limits(), folder)
-        return _run_sessions([session], request, task, [task.output], folder)[0]
-
-
-def calibrate_lines(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
-    """Estimate factors at each line, by its name; see :meth:`mitsim.api.bench.Bench.calibrate_lines`."""
-    return _by_line(SpectralBench.of(bench, CALIBRATION), request, task)
-
-
-def calibrate_mosaic(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
-    """Estimate factors at each line behind filters; see :meth:`mitsim.api.bench.Bench.calibrate_mosaic`."""
-    lines = SpectralBench.of(without_filters(bench), CALIBRATION)
-    if request.recipe is None:
+    bench = SpectralBench.of(without_filters(whole) if mosaic else whole, CALIBRATION)
+    if mosaic and request.recipe is None:
         request = replace(request, recipe=load_recipe().model_copy(update={"repeats": _REPEATS_BEHIND_FILTERS}))
-    return _by_line(lines, request, task)
-
-
-def _by_line(bench: SpectralBench, request: SessionRequest, task: Task) -> dict[str, Factors]:
     assert bench.manifest is not None
     names, filters = bench.names, bench.whole.filters
     passed: Sequence[FloatArray | None] = [None] * len(names)
@@ -312,9 +302,9 @@ def _by_line(bench: SpectralBench, request: SessionRequest, task: Task) -> dict[
                 "filters pass"
             )
         passed = list(behind(weights, bench.whole.geometry.frame_shape))
-    whole = Session(bench.whole, (request.recipe or load_recipe()).of_one_depth(), request.seed)
+    white = Session(bench.whole, (request.recipe or load_recipe()).of_one_depth(), request.seed)
     sessions = [
-        replace(whole, bench=each, filters=own, whole=whole) for each, own in zip(bench.benches, passed, strict=True)
+        replace(white, bench=each, filters=own, whole=white) for each, own in zip(bench.benches, passed, strict=True)
     ]
     with colour_folder(task, bench.manifest) as folder:
         places = [folder and folder / name for name in names]

@@ -182,7 +182,7 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
 
 
 def _limit(count: int) -> float:
-    """Return the quantile of a chi-square of ``count`` degrees of freedom over their number, after Wilson and Hilferty (1931)."""
+    """Return the quantile of a chi-square of ``count`` degrees of freedom over ``count`` (Wilson and Hilferty 1931)."""
     return float((1 - 2 / (9 * count) + _SPREADS * np.sqrt(2 / (9 * count))) ** 3)
 
 
