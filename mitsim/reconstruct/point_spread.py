@@ -44,7 +44,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -84,7 +84,7 @@ _HUGE = 1e30
 # ---- The camera ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ShiftedLight:
     """Camera whose scene points all cast one pattern of light.
 
@@ -100,6 +100,14 @@ class ShiftedLight:
         Type of all numbers.
     seen : (m, m') array
         1 for pixels that count, 0 for those that are held out; None: all count.
+    scene, whole, origin
+        Rows and columns of the scene, those that light reaches, and the first of these on the sensor.
+    window
+        Part of the scene that is the image.
+    count
+        Number of frames.
+    grid
+        Rows and columns of transforms; light that wraps round lands beside the sensor.
     """
 
     psf: FloatArray
@@ -107,10 +115,33 @@ class ShiftedLight:
     patterns: tuple[FloatArray, FloatArray] | None = None
     precision: Any = np.float64
     seen: Array | None = None
+    scene: tuple[int, int] = field(init=False)
+    whole: tuple[int, int] = field(init=False)
+    origin: tuple[int, int] = field(init=False)
+    window: tuple[slice, slice] = field(init=False)
+    count: int = field(init=False)
+    grid: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
         if self.psf.ndim != 2 or not np.isfinite(self.psf).all() or not self.psf.any():
             raise MitsimError(f"point spread function of shape {self.psf.shape}: give finite rows x columns, not all 0")
+        (rows, columns), (m, n), self.count = self.psf.shape, self.sensor, 1
+        self.scene, self.window = (m + rows - 1, n + columns - 1), (slice(None), slice(None))
+        if self.patterns is None:
+            up, before = (rows - 1) // 2, (columns - 1) // 2
+            self.window = slice(up, up + m), slice(before, before + n)
+        else:
+            left, right = self.patterns
+            self.scene, self.count = (len(left), len(right)), left.shape[1] * right.shape[1]
+        self.whole = self.scene[0] + rows - 1, self.scene[1] + columns - 1
+        self.origin = (self.whole[0] - m) // 2, (self.whole[1] - n) // 2
+        self._crop = slice(self.origin[0], self.origin[0] + m), slice(self.origin[1], self.origin[1] + n)
+        sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
+        down, across = (
+            fft.next_fast_len(max(scene, whole - origin, origin + size), real=True)
+            for scene, whole, origin, size in sides
+        )
+        self.grid = down, across
         for size, most in zip(self.sensor, self.whole, strict=True):
             if size > most:
                 raise MitsimError(
@@ -141,29 +172,6 @@ class ShiftedLight:
                 f"frames of shape {frames.shape}: give {self.count} of {self.sensor[0]} x {self.sensor[1]} finite "
                 "numbers"
             )
-
-    @property
-    def scene(self) -> tuple[int, int]:
-        """Rows and columns of the scene."""
-        if self.patterns is not None:
-            return len(self.patterns[0]), len(self.patterns[1])
-        rows, columns = (m + k - 1 for m, k in zip(self.sensor, self.psf.shape, strict=True))
-        return rows, columns
-
-    @property
-    def count(self) -> int:
-        """Number of frames."""
-        return 1 if self.patterns is None else self.patterns[0].shape[1] * self.patterns[1].shape[1]
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """Part of the scene that is the image."""
-        if self.patterns is not None:
-            return slice(None), slice(None)
-        rows, columns = (
-            slice((k - 1) // 2, (k - 1) // 2 + m) for m, k in zip(self.sensor, self.psf.shape, strict=True)
-        )
-        return rows, columns
 
     def image_of(self, scene: Array) -> Array:
         """Return the frames (K K', m, m') of a ``scene`` (n, n')."""
@@ -224,34 +232,9 @@ class ShiftedLight:
         return power * left * right
 
     @cached_property
-    def grid(self) -> tuple[int, int]:
-        """Rows and columns of transforms; light that wraps round lands beside the sensor."""
-        sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
-        rows, columns = (
-            fft.next_fast_len(max(scene, whole - origin, origin + size), real=True)
-            for scene, whole, origin, size in sides
-        )
-        return rows, columns
-
-    @cached_property
     def spectrum(self) -> Array:
         """Spectrum of h on the grid."""
         return np.asarray(fft.rfft2(self.psf.astype(self.precision), self.grid))
-
-    @property
-    def whole(self) -> tuple[int, int]:
-        rows, columns = (n + k - 1 for n, k in zip(self.scene, self.psf.shape, strict=True))
-        return rows, columns
-
-    @property
-    def origin(self) -> tuple[int, int]:
-        rows, columns = ((whole - size) // 2 for whole, size in zip(self.whole, self.sensor, strict=True))
-        return rows, columns
-
-    @property
-    def _crop(self) -> tuple[slice, slice]:
-        (row, column), (rows, columns) = self.origin, self.sensor
-        return slice(row, row + rows), slice(column, column + columns)
 
     @property
     def _lights(self) -> Iterable[Array | None]:
