@@ -94,7 +94,7 @@ def test_a_spot_lamp_is_taken_off(bench: Callable[[str], Bench], tmp_path: Path)
 
     To the bound that the run states of all light, and five standard deviations of the noise of 4 x 4096 pixels.
     """
-    light = bench("spot").light("dots:2", accuracy=1e-2, seed=1)
+    light = bench("spot").light("dots:2", accuracy=2e-3, seed=1)
     captured = light.expose("dots:2", tmp_path / "run")
     manifest, exposer = captured.manifest, Exposer(light.bench.devices, captured.exposure_s, 0)
     unit = float(exposer.electrons(_Unit()))
