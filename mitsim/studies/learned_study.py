@@ -127,11 +127,8 @@ def place_setup(studio: Studio, setup: Setup, place: str) -> Setup:
         folder.mkdir()
         text = locate(shipped, "scenes", "scene.xml").read_text(encoding="utf-8")
         fov = math.degrees(2 * math.atan(_CANVAS_MM / 2 / 400))
-        changes = {
-            'name="fov" value="33.398488"': f'name="fov" value="{fov:.6f}"',
-            '<scale x="64" y="64" z="1"/>': f'<scale x="{_SHEET_MM / 2:g}" y="{_SHEET_MM / 2:g}" z="1"/>',
-            **({_PAINT: _COAT} if place == GLOSS else {}),
-        }
+        changes = {'name="fov" value="33.398488"': f'name="fov" value="{fov:.6f}"'}
+        changes |= {_PAINT: _COAT} if place == GLOSS else {}
         for old, new in changes.items():
             if text.count(old) != 1:
                 raise MitsimError(f"study learned: the shipped scene {shipped} has no {old!r}, which it changes")
@@ -143,7 +140,7 @@ def place_setup(studio: Studio, setup: Setup, place: str) -> Setup:
         io.imsave(folder / "reflectance.png", np.full((SIDE, SIDE), 128, np.uint8), check_contrast=False)
 
     folder = studio.made_once("scenes", f"{shipped}_{GLOSS}" if place == GLOSS else shipped, write)
-    own = replace(setup, scene=str(folder / "scene.xml"))
+    own = replace(setup, scene=str(folder / "scene.xml")).with_parameters(sheet_mm=_SHEET_MM)
     return own.with_parameters(sheet_z=_DEPTH_MM) if place == DEPTH else own
 
 
@@ -571,21 +568,11 @@ def _captures(data: str) -> Mapping[str, tuple[Path, Path]]:
     return captures
 
 
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """A capture's ``measured`` plane, with its scene as it lies before the mask, and the ``prepared`` factors of
-    ``sides`` by the codes of another capture."""
-
-    measured: Measured
-    sides: tuple[FloatArray, FloatArray]
-    prepared: Prepared
-
-    @classmethod
-    def of(cls, measured: Measured, learned: Learned) -> Camera:
-        """Return the camera of a ``measured`` plane with codes that were ``learned``."""
-        sides = learned.codes.factors(measured.offset, measured.plane)
-        rows, columns = (np.ones((side.shape[1], 1)) for side in sides)
-        return cls(learned.see(measured), sides, prepare(*sides, rows, columns, centre=True))
+def twin_camera(measured: Measured, learned: Learned) -> tuple[tuple[FloatArray, FloatArray], Prepared]:
+    """Return the factors of a ``measured`` plane by codes that were ``learned``, and their factorised model."""
+    sides = learned.codes.factors(measured.offset, measured.plane)
+    rows, columns = (np.ones((side.shape[1], 1)) for side in sides)
+    return sides, prepare(*sides, rows, columns, centre=True)
 
 
 def noise_range(planes: Sequence[Measured], learned: Learned) -> tuple[float, float]:
@@ -661,25 +648,26 @@ def transfer(data: str, held_out: str, seed: int) -> Found:
     planes = read_captures(_captures(data), seed)
     known = [each for each in planes if each.capture != held_out]
     learned = Learned.of(known)
-    cameras = {each.plane: Camera.of(each, learned) for each in planes if each.capture == held_out}
+    seen_by = {
+        each.plane: (learned.see(each), *twin_camera(each, learned)) for each in planes if each.capture == held_out
+    }
     pictures, n = DrawnPictures(seed), len(planes[0].scene)
     truths = np.stack([pictures.draw(number, n) / np.float32(WHITE) for number in range(TEACHING["pairs"])])
-    prepared = cameras[_TAUGHT].prepared
-    sums = twin_sums(prepared, noise_range(known, learned), truths, seed)
+    taught = seen_by[_TAUGHT][2]
+    sums = twin_sums(taught, noise_range(known, learned), truths, seed)
     networks = {TIKHONOV: None, TV: None}
     rows: list[dict[str, Value]] = []
-    images = {(AUTHORS, plane): camera.measured.scene for plane, camera in cameras.items()}
+    images = {(AUTHORS, plane): measured.scene for plane, (measured, *_) in seen_by.items()}
     for method in (TIKHONOV, TV, REFINED, UNROLLED):
         started = time.process_time()
-        network = None if method in networks else teach(method, prepared, sums, seed)
+        network = None if method in networks else teach(method, taught, sums, seed)
         named = {"held_out": held_out, "method": method, "train_s": time.process_time() - started if network else None}
-        for plane, camera in cameras.items():
-            measured, (left, right) = camera.measured, camera.sides
+        for plane, (measured, (left, right), prepared) in seen_by.items():
             frames = {REAL: measured.frame}
             if plane == _TAUGHT:
                 frames[SIMULATED] = np.asarray(left @ measured.scene @ right.T + measured.noise)
             for kind, frame in frames.items():
-                seen, beyond = _image(camera.prepared, frame, method, network)
+                seen, beyond = _image(prepared, frame, method, network)
                 like = correlation(np.maximum(seen, 0), measured.scene)
                 rows.append({**named, "picture": measured.name, "frame": kind, "correlation": like, "beyond": beyond})
                 if kind == REAL:

@@ -37,10 +37,11 @@ from mitsim.studies.learned_study import (
     GLOSS,
     NONE,
     PICTURES,
+    PLACES,
+    SIDE,
     STUDY,
     VARIED,
     Budget,
-    Camera,
     Case,
     Cell,
     School,
@@ -49,8 +50,10 @@ from mitsim.studies.learned_study import (
     compare,
     network_row,
     noise_range,
+    place_setup,
     scores,
     transfer,
+    twin_camera,
     twin_sums,
 )  # fmt: skip  # fmt: skip
 from mitsim.studies.twin_study import Learned, Recipe
@@ -334,6 +337,21 @@ def test_a_network_taught_by_pictures_serves_all_patterns(tmp_path: Path, monkey
 # -------- The study's points
 
 
+def test_scenes_of_the_bench_are_the_middle_of_shipped_ones(tmp_path: Path) -> None:
+    """Each place opens: 64 pixels a side of the photograph's size, and another coat, depth or lamp. (Seen failing: a
+    change of a line that the shipped scenes had no longer.)"""
+    with Studio(str(tmp_path)) as studio:
+        setups = {place: place_setup(studio, Setup(), place) for place in PLACES}
+        benches = {place: studio.bench(setup) for place, setup in setups.items()}
+    for one in benches.values():
+        assert one.n == SIDE
+        assert_allclose(np.ptp(one.windows, axis=1), SIDE * 120 / 128 / 400, rtol=1e-4)
+    assert (
+        "roughplastic" in Path(setups[GLOSS].scene).read_text() and len({each.scene for each in setups.values()}) == 3
+    )
+    assert dict(setups[DEPTH].parameters)["sheet_z"] == "405.0"
+
+
 def test_points_share_files_and_not_a_process() -> None:
     """(Planted: batches by setup as of other studies.)"""
     points = [Point.of(Setup(), number=number) for number in range(5)]
@@ -418,15 +436,15 @@ def test_a_twins_sums_are_those_of_its_frames() -> None:
     it, white, of the deviation that the pair is told."""
     pytest.importorskip("torch", reason=TORCH)
     learned = Learned(Pose("upright", (0.6, 0.7)), made_codes())
-    camera = Camera.of(made(0, learned.codes), learned)
+    (left, right), prepared = twin_camera(made(0, learned.codes), learned)
     truths = np.random.default_rng(2).random((6, SCENE, SCENE), np.float32)
-    clean = twin_sums(camera.prepared, (1e-9, 1e-9), truths[:2], seed=5)
+    clean = twin_sums(prepared, (1e-9, 1e-9), truths[:2], seed=5)
     for truth, weights in zip(clean.truths, clean.weights, strict=True):
-        frames = camera.prepared.accumulator()
-        frames.add(camera.sides[0] @ truth @ camera.sides[1].T, 0, 0)
-        assert_allclose(weights, camera.prepared.problem(frames).projected, atol=1e-5 * np.abs(weights).max())
-    noisy = twin_sums(camera.prepared, (0.1, 10.0), truths, seed=5)
-    expected = camera.prepared.sigma * np.stack([camera.prepared.coefficients(each) for each in noisy.truths])
+        frames = prepared.accumulator()
+        frames.add(left @ truth @ right.T, 0, 0)
+        assert_allclose(weights, prepared.problem(frames).projected, atol=1e-5 * np.abs(weights).max())
+    noisy = twin_sums(prepared, (0.1, 10.0), truths, seed=5)
+    expected = prepared.sigma * np.stack([prepared.coefficients(each) for each in noisy.truths])
     spread = np.square(noisy.weights - expected).mean(axis=(1, 2))
     assert_allclose(spread, noisy.variances, rtol=5 * np.sqrt(2 / expected[0].size))
     assert np.ptp(np.log(noisy.variances)) > 1
