@@ -572,7 +572,7 @@ SIZES = {
     "scene": (8, 1748),
     "sensor": (5, 1210),
     "sessions": (4, 1020),
-    "studies": (27, 7320),
+    "studies": (27, 7312),
     "transport": (21, 4489),
     "verbs": (1, 369),
     "version": (1, 1),
