@@ -178,13 +178,12 @@ class BenchView:
 
     def figure(self) -> Figure:
         """Draw the plans from above and from the side, the camera enlarged, both previews, and the facts."""
-        parts = [*self._parts]
         with rc_context(_STYLE):
             figure = Figure(figsize=(13, 8.6), layout="constrained")
             FigureCanvasAgg(figure)
             grid = figure.add_gridspec(3, 2, width_ratios=(2.3, 1))
-            for place, part in zip((0, 2, 1, 3, 5), parts, strict=True):
-                part(figure.add_subplot(grid[place]))
+            for place, (_, _, draw) in zip((0, 2, 1, 3, 5), self._parts, strict=True):
+                draw(figure.add_subplot(grid[place]))
             axes = figure.add_subplot(grid[4])
             axes.set_axis_off()
             lines = _as_text("\n".join(typeset(line) for line in self.lines()))
@@ -193,15 +192,16 @@ class BenchView:
         return figure
 
     @property
-    def _parts(self) -> dict[Callable[[Axes], None], tuple[str, tuple[float, float]]]:
-        """Functions that draw the parts, with the name and the size [inches] of each on a page."""
-        return {
-            lambda axes: self._plan(axes, 0): ("From above", _PLAN_INCHES),
-            lambda axes: self._plan(axes, 1): ("From the camera's right side", _PLAN_INCHES),
-            self._camera: ("The camera enlarged", _PLAN_INCHES),
-            self._from_camera: ("From the camera, without its mask", _SQUARE_INCHES),
-            self._from_beside: ("From beside", _SQUARE_INCHES),
-        }
+    def _parts(self) -> list[tuple[str, tuple[float, float], Callable[[Axes], None]]]:
+        """Name of each part, its size [inches] on a page, and the function that draws it."""
+        seen = "From the camera, without its mask"
+        return [
+            ("From above", _PLAN_INCHES, lambda axes: self._plan(axes, 0)),
+            ("From the camera's right side", _PLAN_INCHES, lambda axes: self._plan(axes, 1)),
+            ("The camera enlarged", _PLAN_INCHES, self._camera),
+            (seen, _SQUARE_INCHES, lambda axes: _show(axes, self.previews[0], seen)),
+            ("From beside", _SQUARE_INCHES, self._from_beside),
+        ]
 
     @property
     def _name(self) -> str:
@@ -301,9 +301,6 @@ class BenchView:
         axes.set(xlim=(-0.12 * wide, wide), ylim=(-reach, reach), xlabel="z [mm]", ylabel="x [mm]")
         axes.set_title("The camera enlarged, from above", loc="left")
 
-    def _from_camera(self, axes: Axes) -> None:
-        _show(axes, self.previews[0], "From the camera, without its mask")
-
     def _from_beside(self, axes: Axes) -> None:
         """Draw the preview from a free place, with the light and the camera's field over it."""
         preview, layout, geometry = self.previews[1], self.layout, self.bench.geometry
@@ -388,7 +385,7 @@ class BenchView:
     def _page(self) -> str:
         controls = {"displayModeBar": False, "responsive": True}
         pictures = {}
-        for draw, (name, inches) in self._parts.items():
+        for name, inches, draw in self._parts:
             with rc_context(_STYLE):
                 figure = Figure(figsize=inches, layout="constrained")
                 FigureCanvasAgg(figure)
