@@ -65,11 +65,6 @@ def page_figure(figure: Figure) -> tuple[str, int]:
     return data_uri(buffer.getvalue(), "svg+xml"), round(float(figure.get_figwidth()) * _SHOWN_DPI)
 
 
-def written_figure(figure: Figure, path: Path) -> tuple[str, int]:
-    """Return a ``figure`` that was written to the PNG file ``path`` as data URI, and its width on a page [pixels]."""
-    return data_uri(path.read_bytes(), "png"), round(float(figure.get_figwidth()) * _SHOWN_DPI)
-
-
 # -------- Numbers and plain text as pages and figures print them
 
 DASH = "\N{EN DASH}"

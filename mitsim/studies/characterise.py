@@ -22,7 +22,7 @@ from mitsim.core.files import write_json, write_text
 from mitsim.core.job import Job
 from mitsim.devices.framelist import FlatFrames, capacity_of
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.pages import Mean, round_to_error, typeset, written_figure
+from mitsim.report.pages import Mean, page_figure, round_to_error, typeset
 from mitsim.report.plots import curves, grouped_bars
 from mitsim.sensor.camera_fit import FoundCamera, Stated, find_camera
 from mitsim.sensor.chain import mean_dark_current
@@ -421,7 +421,7 @@ def _write(measure: Callable[[str | None], Characterisation], output: Path | str
         results = folder / "characterise.json"  # written last, so that a folder with it is complete
         results.unlink(missing_ok=True)
         drawn = write_figures(folder, figures_of(done))
-        pictures = {name: written_figure(figure, folder / name) for name, figure in drawn.items()}
+        pictures = {name: page_figure(figure) for name, figure in drawn.items()}
         titles = f"{done.camera} after EMVA 1288", done.message
         page = build_findings("characterise", titles, done.where, done.parts, pictures, done.warnings)
         write_text(folder / "characterise.html", page)
