@@ -568,7 +568,7 @@ SIZES = {
     "optics": (10, 1885),
     "planner": (6, 1905),
     "reconstruct": (23, 6967),
-    "report": (9, 2271),
+    "report": (9, 2267),
     "scene": (8, 1748),
     "sensor": (5, 1210),
     "sessions": (4, 1020),
