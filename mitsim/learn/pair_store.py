@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -245,16 +245,8 @@ class PrintLight:
 # -------- Writing
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """Pair before it is stored, with frames (shots, m, m') and those of lamps unless the shard's light serves."""
-
-    picture: npt.NDArray[np.uint8]
-    truth: FloatArray
-    exposure_s: float
-    saturated: bool = False
-    warnings: tuple[str, ...] = ()
-    frames: tuple[Frames, npt.NDArray[np.float32]] | None = None
+Pair = tuple[dict[str, Any], Sequence[str]]
+"""Arrays and numbers of a pair by their names in a shard, and its warnings."""
 
 
 def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, light: PrintLight | None) -> None:
@@ -267,12 +259,8 @@ def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, 
         if light is not None:
             light.write(file.create_group("light", track_order=True))
         warnings = dict[str, None]()
-        for number, pair in enumerate(pairs):
-            warnings |= dict.fromkeys(pair.warnings)
-            rows: dict[str, Any] = {"picture": pair.picture, "truth": pair.truth.astype(np.float32)}
-            rows |= {"exposure_s": pair.exposure_s, "saturated": np.uint8(pair.saturated)}
-            if pair.frames is not None:
-                rows["expected"], rows["lamps"] = pair.frames
+        for number, (rows, own) in enumerate(pairs):
+            warnings |= dict.fromkeys(own)
             for name, values in rows.items():
                 row = np.asarray(values)
                 if name not in file:

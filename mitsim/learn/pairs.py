@@ -444,12 +444,13 @@ class _Maker:
             peak = peak_irradiance(expected) * unit
             exposure_s = timing.choose(moved.devices, peak / per_joule)
             saturated = (peak + sensor.superpixel_dark_current_e_per_s) * exposure_s >= sensor.superpixel_full_well_e
-            frames = None
+            rows: dict[str, Any] = {"picture": picture, "truth": truth.astype(np.float32)}
+            rows |= {"exposure_s": exposure_s, "saturated": np.uint8(saturated)}
             if keep:
-                rates = np.stack([(frame.irradiance * unit).astype(np.float32) for frame in expected])
-                frames = rates, (expected.projector_off.irradiance * unit).astype(np.float32)
+                rows["expected"] = np.stack([(frame.irradiance * unit).astype(np.float32) for frame in expected])
+                rows["lamps"] = (expected.projector_off.irradiance * unit).astype(np.float32)
             self._job.progress("pairs", (index + 1) / self._asked.count)
-            yield Pair(picture, truth, exposure_s, saturated, warnings, frames)
+            yield rows, warnings
 
     def cost(self, left: Sequence[Shard]) -> Cost:
         pairs, pixels, shots = sum(shard.count for shard in left), self.bench.n**2, len(self._family.shots)

@@ -7,7 +7,7 @@ at once, because readings cut at 0 and rounding to few codes bend the straight l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -324,17 +324,6 @@ class _Problem:
 # ---- differences between pixels, and the camera ----------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Stated:
-    """Facts of a camera that frames do not show; `photons`: light is counted in photons."""
-
-    name: str
-    pixel_pitch_um: float
-    source: str
-    bits: int | None
-    photons: bool
-
-
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
     """The camera that frames show, with the standard error of each measured field."""
@@ -355,22 +344,20 @@ class FoundCamera:
         return "\n".join(lines) + "\n"
 
 
-def find_camera(
-    taken: Sequence[Alike], images: Images, stated: Stated, again: Callable[[Places], Sequence[Alike]]
-) -> FoundCamera:
-    """Find the camera that explains frames.
-
-    Hot and dead pixels are counted and then replaced, so that they affect no other number. `images` returns the mean
-    image of a set, and `again` statistics of the sets with some pixels replaced.
-    """
-    return Pixels(taken, images, again).camera(stated)
-
-
 class Pixels:
     """Differences between pixels, and the fields of the camera that follow.
 
-    `uneven` and `surface` are the range of the light over the frame and its relative variances by row, column and
-    pixel.
+    Hot and dead pixels are counted and then replaced, so that they affect no other number.
+
+    Parameters
+    ----------
+    taken, images, again
+        Statistics of the sets, the mean image of a set, and statistics of the sets with some pixels replaced.
+
+    Attributes
+    ----------
+    uneven, surface
+        Range of the light over the frame, and its relative variances by row, column and pixel.
     """
 
     def __init__(self, taken: Sequence[Alike], images: Images, again: Callable[[Places], Sequence[Alike]]) -> None:
@@ -425,12 +412,13 @@ class Pixels:
 
     def _shared(self, *sets: int) -> float:
         """Return the part of :meth:`_noise` that rows share."""
-        return sum(float(self.taken[index].pair.rows) / self.taken[index].count for index in sets)
+        return sum(self.taken[index].rows / self.taken[index].count for index in sets)
 
     def _mean_variance(self, parts: FloatArray) -> float:
         return max(float((parts / [self.size, *self.shape]).sum()), 0.0)
 
-    def camera(self, stated: Stated) -> FoundCamera:
+    def camera(self, stated: Mapping[str, Any], photons: bool) -> FoundCamera:
+        """Find the camera; frames do not show the `stated` fields, nor whether light is counted in `photons`."""
         if self.uneven > _MOST_UNEVEN:
             raise MitsimError(
                 f"light differs by {100 * self.uneven:.0f} % over the frame; at most {100 * _MOST_UNEVEN:.0f} % is "
@@ -442,14 +430,15 @@ class Pixels:
                 f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
                 f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
             )
-        least = 1e-12 if stated.bits is None else 1 / self.size  # one pixel may have another code
+        bits = stated["bits"]
+        least = 1e-12 if bits is None else 1 / self.size  # one pixel may have another code
         spatial = float(self.offsets[0].sum()), max(math.hypot(*self.offsets[1]), least)
-        transfer = fit(self.taken, stated.bits, self.short, spatial)
+        transfer = fit(self.taken, bits, self.short, spatial)
         gain, gain_error, bends = transfer["gain"], transfer.error("gain"), (transfer["bend"], transfer["bend_2"])
         found = {"gain_dn_per_e": (gain, gain_error), **self._read(transfer), **self._dark(transfer)}
         found |= self._offsets(transfer, spatial, found["dark_current_spread_e_per_s"][0])
         found["dead_pixels"] = self.dead, math.sqrt(max(self.dead, 1 / self.size) / self.size)
-        top = None if stated.bits is None else 2.0**stated.bits - 1
+        top = None if bits is None else 2.0**bits - 1
         if any(bends):  # relative responses are steeper or flatter on a bent curve
             well = max(((transfer.saturation_dn or math.inf) - transfer["black"]) / gain / (1 + sum(bends)), 1.0)
             x = transfer["response"] * self.taken[self.bright].light / well
@@ -458,7 +447,7 @@ class Pixels:
             bent = 1.0
         for name, value, error in zip(("pixel", "row", "column"), *self.responses, strict=True):
             found[f"prnu_{name}"] = _root(value / bent**2, error / bent**2)
-        if stated.photons:
+        if photons:
             still = self._mean_variance(np.maximum(self.responses[0], 0))  # of a specimen's pixels
             value, error = transfer["response"], transfer.error("response")
             found["quantum_efficiency"] = min(value, 1.0), math.hypot(error, value * math.sqrt(still))
@@ -487,8 +476,7 @@ class Pixels:
         if any(bends):
             fields["linearity"] = tuple(float(f"{value:.7g}") for value in bends)
             errors["linearity"] = transfer.error("bend")
-        fields |= {name: getattr(stated, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
-        sensor = validate(SensorModel, fields, "camera found")
+        sensor = validate(SensorModel, {**fields, **stated}, "camera found")
         return FoundCamera(sensor, errors, transfer, self, tuple(self.notes))
 
     def _read(self, transfer: Transfer) -> dict[str, Known]:
@@ -500,7 +488,7 @@ class Pixels:
         read, error = transfer["read"], transfer.error("read")
         if min(each.variance for each in dark) < LEAST_DARK:
             error = max(error, math.sqrt(LEAST_DARK - 1 / 12) - read)  # few codes hide the noise: an upper limit
-        (m, n), values = self.shape, np.array([float(each.pair.rows) for each in dark])
+        (m, n), values = self.shape, np.array([each.rows for each in dark])
         middle = max(float(np.median(values)), 0.0)
         errors = [math.sqrt(2 / m / (each.count - 1)) * ((each.variance - middle) / n + middle) for each in dark]
         weight = 1 / np.maximum(errors, 1e-12) ** 2
@@ -537,7 +525,7 @@ class Pixels:
             error = 0.5 / unit
             self.notes.append(f"dark current is hidden by rounding, and taken as 0; it is below {error:.2g} e-/s")
         beyond = max(self.beyond, 0.0) / unit
-        rows = sum(max(float(each.pair.rows), 0.0) / each.count for each in both) * (1 - 1 / m)
+        rows = sum(max(each.rows, 0.0) / each.count for each in both) * (1 - 1 / m)
         noise = self._noise(self.long, self.least) - rows
         even = self.excess - self.excess.mean(axis=1, keepdims=True)
         variance = float(np.square(even).mean()) * n / (n - 1)

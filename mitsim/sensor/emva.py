@@ -109,9 +109,9 @@ class Session:
 class Alike:
     """Statistics of frames that were taken alike.
 
-    Attributes
-    ----------
-    variance_error : standard error of the temporal variance [DN^2].
+    Attributes ---------- mean, variance, rows, variance_error : mean [DN], temporal variance [DN^2], its part that rows
+    share, and the standard
+        error of the variance.
     cut : fractions of all numbers that are 0, and that are the largest code.
     flicker : standard deviation of the frames' means beyond noise [DN].
     neighbours : correlation of the noise of neighbours in a row and in a column.
@@ -121,7 +121,9 @@ class Alike:
 
     count: int
     shape: tuple[int, int]
-    pair: Pair
+    mean: float
+    variance: float
+    rows: float
     stack: Stack
     variance_error: float
     cut: tuple[float, float]
@@ -133,17 +135,9 @@ class Alike:
     exposure_s: float
 
     @property
-    def mean(self) -> float:
-        return float(self.pair.mean)
-
-    @property
-    def variance(self) -> float:
-        return float(self.pair.variance)
-
-    @property
     def mean_error(self) -> float:
         """Standard error of the mean due to noise [DN]."""
-        rows = max(float(self.pair.rows), 0.0)
+        rows = max(self.rows, 0.0)
         own = max(self.variance - rows, 0.0)
         return math.sqrt((own / math.prod(self.shape) + rows / self.shape[0]) / self.count)
 
@@ -181,7 +175,7 @@ def alike(
     own = (squares - np.square(total) / count) / (count - 1)
     variance = float(own.sum()) / (m * n - 1)
     shared = (float(np.var(lines, axis=0, ddof=1).sum()) / (m - 1) - variance / n) * n / (n - 1)
-    pair = Pair(*map(np.asarray, (first.mean() + np.mean(means), variance, shared)))
+    mean = float(first.mean() + np.mean(means))
     about = first + total / count
     about -= about.mean()
     parts = np.square(about).sum() / (m * n - 1), *(np.square(about.mean(axis=k)).mean() for k in (1, 0))
@@ -196,7 +190,7 @@ def alike(
     power = float(np.square(difference).mean()) or math.inf
     beside, below = (difference[:, 1:] * difference[:, :-1]).mean(), (difference[1:] * difference[:-1]).mean()
     return Alike(
-        count, (m, n), pair, Stack(pair.mean, *left), math.sqrt(spread / (m * n)),
+        count, (m, n), mean, variance, shared, Stack(np.asarray(mean), *left), math.sqrt(spread / (m * n)),
         (ends[0] / count / m / n, ends[1] / count / m / n), math.sqrt(max(drift, 0.0)),
         (float(beside) / power, float(below) / power),
         _comb(codes, noise) if math.isfinite(largest) else (0.0, 1.0), tuple(digests), light, exposure_s,
@@ -216,7 +210,8 @@ def _comb(codes: FloatArray, noise: float) -> tuple[float, float]:
     return float(waves[strongest]), len(codes) / (first + strongest)
 
 
-def pairs_of(pairs: Sequence[Pair]) -> Pair:
+def pairs_of(pairs: Sequence[Pair | Alike]) -> Pair:
+    """Return the statistics of several sets in arrays."""
     return Pair(*(np.array([getattr(pair, name) for pair in pairs]) for name in ("mean", "variance", "rows")))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -124,9 +124,9 @@ class Frames:
         with job.clock.stage("frames"):
             return in_threads(taken, range(len(self.light)))
 
-    def session(self, pairs: Iterable[Pair], dark: Stack, bright: Stack) -> Session:
+    def session(self, pairs: Sequence[Pair | Alike], dark: Stack, bright: Stack) -> Session:
         return Session(
-            self.shape, self.light, self.exposure_s, pairs_of([*pairs]), self.dark, self.bright, dark, bright,
+            self.shape, self.light, self.exposure_s, pairs_of(pairs), self.dark, self.bright, dark, bright,
             self.saturates, self.sensor.bits is not None,
         )  # fmt: skip
 
@@ -297,13 +297,13 @@ def read_sets(flats: FlatFrames, job: Job) -> list[Alike]:
     Cost(memory_bytes=2 * 8 * _FLOATS * math.prod(shape)).check(where, job.limits)
     job.progress("frames", 0.0)
     with job.clock.stage("frames"):
-        taken = read_again(flats, None, shape)
+        taken = read_again(flats, shape)
     for fault in _faults(flats, taken):
         raise MitsimError(f"{where}: {fault}")
     return taken
 
 
-def read_again(flats: FlatFrames, places: Places | None, shape: tuple[int, int]) -> list[Alike]:
+def read_again(flats: FlatFrames, shape: tuple[int, int], places: Places | None = None) -> list[Alike]:
     """Compute the statistics of every set, with the pixel at `places` (M, N) read in place of each pixel."""
     bits = flats.listed.bits
     largest = math.inf if bits is None else 2.0**bits - 1

@@ -24,7 +24,7 @@ from mitsim.devices.framelist import FlatFrames, capacity_of
 from mitsim.devices.sensor import SensorModel
 from mitsim.report.pages import Mean, page_figure, round_to_error, typeset
 from mitsim.report.plots import curves, grouped_bars
-from mitsim.sensor.camera_fit import FoundCamera, Stated, find_camera
+from mitsim.sensor.camera_fit import FoundCamera, Pixels
 from mitsim.sensor.chain import mean_dark_current
 from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, QUANTISATION, SPLIT, Alike, Session, figures
 from mitsim.studies.camera_frames import Frames, draw_sessions, mean_image, read_again, read_sets, remarks
@@ -359,15 +359,13 @@ def characterise(
     procedure, job = procedure or Procedure(), job or Job()
     frames = Frames.of(sensor, procedure)
     bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
-    source = f"simulated frames of {sensor.name}"
-    stated = Stated(f"{sensor.name}, found", sensor.superpixel_pitch_um, source, bits, sensor.states_efficiency)
+    stated = {"name": f"{sensor.name}, found", "pixel_pitch_um": sensor.superpixel_pitch_um, "bits": bits}
+    stated["source"] = f"simulated frames of {sensor.name}"
 
     def measure(folder: str | None) -> Characterisation:
         taken = frames.take(job)
-        found = find_camera(
-            taken, lambda index: np.mean([*frames.images(index)], axis=0), stated,
-            lambda places: frames.take(job, places),
-        )  # fmt: skip
+        pixels = Pixels(taken, lambda index: np.mean([*frames.images(index)], axis=0), partial(frames.take, job))
+        found = pixels.camera(stated, sensor.states_efficiency)
         return _compare(frames, taken, found, asked=procedure.stated, camera=sensor.name, output=folder)
 
     return _write(measure, output)
@@ -378,15 +376,13 @@ def characterise_frames(
 ) -> Characterisation:
     """Measure a real camera by its frames under even light and in the dark (`mitsim.devices.framelist.load_flats`)."""
     job, facts = job or Job(), listed.listed
-    stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
+    stated = {name: getattr(facts, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
 
     def measure(folder: str | None) -> Characterisation:
         taken = read_sets(listed, job)
-        shape = taken[0].shape
-        found = find_camera(
-            taken, partial(mean_image, listed), stated, lambda places: read_again(listed, places, shape)
-        )
-        asked = {"folder": str(listed.folder), "shape": shape, "sets": len(taken)}
+        pixels = Pixels(taken, partial(mean_image, listed), partial(read_again, listed, taken[0].shape))
+        found = pixels.camera(stated, facts.photons_per_s is not None)
+        asked = {"folder": str(listed.folder), "shape": taken[0].shape, "sets": len(taken)}
         frames, about = Frames.as_taken(taken, found), remarks(listed, found)
         return _compare(frames, taken, found, asked=asked, camera=facts.name, output=folder, real=True, about=about)
 
@@ -397,7 +393,7 @@ def _compare(
     frames: Frames, taken: list[Alike], found: FoundCamera, real: bool = False, **facts: Any
 ) -> Characterisation:
     expected, sensor = frames.expect(), frames.sensor
-    session = frames.session((each.pair for each in taken), taken[frames.dark].stack, taken[frames.bright].stack)
+    session = frames.session(taken, taken[frames.dark].stack, taken[frames.bright].stack)
     spread, of_frames = figures(draw_sessions(frames, expected)), figures(session)
     bend = found.transfer.error("bend") if real else 0.0  # the error of a real camera's expected linearity
     given = figures_set(frames)

@@ -60,7 +60,7 @@ def test_the_reference_package_agrees_on_the_same_frames(
     ran = subprocess.run([reference_python, DRIVER, given], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     reference = json.loads(ran.stdout.splitlines()[-1])
-    pairs = pairs_of([alike(pair).pair for pair in (*ladder, dark)])
+    pairs = pairs_of([alike(pair) for pair in (*ladder, dark)])
     of_stacks = [alike(stack).stack for stack in stacks]
     found = figures(Session(SHAPE, np.append(light, 0.0), np.zeros(STEPS + 1), pairs, STEPS, STEPS // 2, *of_stacks))
     for name, value in reference.items():

@@ -14,7 +14,7 @@ def test_a_pair_s_variance_is_free_of_what_is_fixed_and_of_drift() -> None:
     rng = stream(1, "pair")
     fixed = rng.normal(0, 50, (200, 300))
     first, second = (fixed + drift + rng.normal(0, 2, fixed.shape) for drift in (0.0, 3.0))
-    pair = alike((first, second)).pair
+    pair = alike((first, second))
     assert pair.variance == pytest.approx(4, rel=5 * np.sqrt(2 / fixed.size))
     assert pair.rows == pytest.approx(0, abs=5 * 4 / 300 * np.sqrt(2 / 200))
     assert pair.mean == pytest.approx((first.mean() + second.mean()) / 2)
@@ -23,7 +23,7 @@ def test_a_pair_s_variance_is_free_of_what_is_fixed_and_of_drift() -> None:
 def test_noise_that_rows_share_is_told_from_the_pixels_own() -> None:
     rng = stream(2, "rows")
     frames = [rng.normal(0, 3, (400, 1)) + rng.normal(0, 2, (400, 100)) for _ in range(2)]
-    assert alike(frames).pair.rows == pytest.approx(9, rel=5 * np.sqrt(2 / 400))
+    assert alike(frames).rows == pytest.approx(9, rel=5 * np.sqrt(2 / 400))
 
 
 def test_a_stack_tells_rows_columns_and_pixels_apart_and_takes_off_what_noise_is_left() -> None:
