@@ -415,7 +415,7 @@ def _study_of_points(
     data = _captures(name, scene, asked)
     scope = Scope(setup, pictures, seeds=(asked.seed,), quick=asked.quick, recipe=recipe, data=data)
     scope = scope_of(name, scope, request.patterns, asked.varied, asked.measure)
-    if name not in ("accuracy", "sweep", "drift"):
+    if name not in ("accuracy", "calibration", "sweep", "drift"):
         asked.refuse(["patterns"], f"on the study {name}, which has its own")
     if asked.scheduler is not None:
         asked.refuse(["jobs"], "with a scheduler, whose machines have processes of their own")
@@ -458,7 +458,7 @@ def scope_of(
         check_sweep(tuple(varied), len(scope.pictures))
         read_name(patterns)
         return replace(scope, sweep=tuple(varied), measures=measures_of(measure), patterns=patterns)
-    if name == "accuracy" and measure == "psnr" and not varied:
+    if name in ("accuracy", "calibration") and measure == "psnr" and not varied:
         read_name(patterns)
         return replace(scope, patterns=patterns)
     if name == "drift" and measure == "psnr":
@@ -466,7 +466,7 @@ def scope_of(
         read_name(patterns)
         return replace(scope, sweep=tuple(varied), patterns=patterns)
     if varied or patterns != "dots:7" or measure != "psnr":
-        others = "measure is for sweep, over for drift and sweep, patterns for these and accuracy"
+        others = "measure is for sweep, over for drift and sweep, patterns for these, accuracy and calibration"
         raise MitsimError(f"study {name}: has its own points and measures; {others}")
     return scope
 

@@ -5,7 +5,7 @@ This file has their names alone. The study NAME is the module ``mitsim.studies.N
 
 from __future__ import annotations
 
-STUDIES = ("calibration",)
+STUDIES: tuple[str, ...] = ()
 """Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
 :class:`mitsim.studies.framework.campaign.Findings`."""
 OF_NO_SCENE = ("twin",)
@@ -29,7 +29,7 @@ PAPER = (
 )
 """Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
 order."""
-EXPERIMENTS = (*PAPER, "accuracy", "colour", "drift", "learned", "sweep", "twin")
+EXPERIMENTS = (*PAPER, "accuracy", "calibration", "colour", "drift", "learned", "sweep", "twin")
 """Studies of many points: their modules have a ``STUDY``. ``learned`` is not on the page of all: it takes hours,
 and torch, which may be missing."""
 SHARED = {

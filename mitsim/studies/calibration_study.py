@@ -1,26 +1,35 @@
-"""`mitsim study calibration`: how far a session's factors are off, by entry, singular value and cause; what it costs.
+"""What limits a calibration session and an image that is made with its factors, on one bench.
 
-Factors of noisy frames are compared with those of the expected frames of the same light, whose difference is noise
-alone; how large it may be is predicted from the sensor's closed form, before any frame is drawn. What no separable
-camera explains of the expected frames is told apart by forming them again with one cause left out. What the session's
-noise, the capture's, the scene's light, and each drift of the recipe cost an image of the scene is told beside one
-image that is solved, and what of it is not explained (:mod:`mitsim.studies.error_budget`).
+*entries*, *singular*: factors of noisy frames against factors of the expected frames of the same light, beside the
+errors that the sensor's closed form predicts before any frame is drawn. *causes*: what no separable camera explains of
+the expected frames, formed again without one cause. *models*: images with factors of models that are fitted to a few
+frames. *shadows*: diffraction at the mask. *losses*: what each source costs one image.
+
+The squared error E of the image is divided into parts V, which add up. Parts of noise are expected values of a
+perturbation of the solver with a fixed lambda (:mod:`mitsim.studies.causes`). What the light of the scene has that
+factors, measured on an even white board, do not hold (detail inside projector pixels, depth, light over several
+surfaces) is found from frames without noise of the traced light, solved with factors without noise: of the same light
+without one cause after another, less what lambda alone removes. What is left of E is not explained. Noise is drawn
+once, so every V, and what is left, scatter by chance. A source costs ``10 log10(E / (E - V))``, the gain of the image
+without the source; these decibels do not add up. A drift that adds the squared error A costs ``10 log10((E + A) / E)``.
+Any share of what is not explained may belong to any source; the uncertainty is what that changes, and chance.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, TypeVar, get_args
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, TypeVar, get_args
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mitsim.api.bench import Bench
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.request import Exposure, Request
+from mitsim.bench.request import Exposure
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.calibrate.lit_session import LitSession
@@ -31,6 +40,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import SIDES as FACTORS
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import (
     DRIFT_WORDS,
@@ -40,83 +50,313 @@ from mitsim.devices.session import (
     Model,
     Modelling,
     SessionRecipe,
+    amount_in_words,
     load_recipe,
 )
 from mitsim.light.light import SampledLight
 from mitsim.reconstruct.factors import Estimate, Factors, decibels
-from mitsim.report import plots
-from mitsim.report.lit_scene import LINE, IdealCamera, LitScene, ShadowRow, lights, point_profiles, shadow_row
-from mitsim.report.pages import Mean, with_error
-from mitsim.report.plots import grouped_bars
-from mitsim.studies import error_budget
-from mitsim.studies.causes import ablations, reform
-from mitsim.studies.drift_study import SESSION, DriftStand, squared_error
-from mitsim.studies.error_budget import LossRow
-from mitsim.studies.framework.campaign import Findings
-from mitsim.studies.framework.panels import Part
+from mitsim.report.lit_scene import LINE, SPECKLE, IdealCamera, LitScene, lights, point_profiles, shadow_row
+from mitsim.report.pages import Value
+from mitsim.studies import causes
+from mitsim.studies.causes import Ablation, Noise, Scatter, ablations, reform
+from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, Prediction, squared_error
+from mitsim.studies.framework.claims import Judged, measured
+from mitsim.studies.framework.experiment import Found, Point, Results, Scope, Study
+from mitsim.studies.framework.panels import Bars, Images, Lines, Part
+from mitsim.studies.framework.studio import Studio, single_precision
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 AnyBench = TypeVar("AnyBench", bound=Apparatus)
-OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}
-"""Differences of a camera and its plan: as of a mask that is glued on by hand, under a microscope."""
-_MODEL_FRAMES = (2, 16)
-"""Frames that models are fitted to: uniform light alone, and a few stripes."""
-_FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
-"""Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
+Row = dict[str, Value]
+
+# -------- What each source costs an image
+
+CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"
+"""Where a loss comes from, beside the session."""
+RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
+"""Sampling of simulated light; what the solver takes away of the scene itself; and what no named cause has."""
+ERROR_SOURCES = MappingProxyType(
+    {
+        causes.DETAIL: "detail inside projector pixels",
+        causes.DEPTH: "depth beside the board's",
+        causes.OCCLUSION: "edges that hide pixels from part of the sensor",
+        causes.INTERREFLECTION: "light over several surfaces",
+        causes.MIRRORS: "light over mirrors",
+        causes.GLOSS: "gloss over the sensor",
+        causes.BLACK_LEVEL: "light that black pixels leak",
+    }
+)
+"""Effects of the scene's light that factors do not hold, in the order in which they are taken out, in words. The others
+are in the light of the white board as well."""
+SURE = 3.0
+"""Standard errors from which what is not explained is no chance: 1 of 370 studies has more of normal scatter."""
+_LEAST_LEFT = 1e-9
+"""Part of an image's error that is left without a source, at least: 90 dB, for images that one source explains."""
 
 
-# ---- A session and the image made with it ----
+@dataclass(frozen=True)
+class LossRow:
+    """Loss of an image [dB] by a ``source`` of noise, or by a drift of an ``amount``, and its standard error.
+
+    ``of`` is capture, session, scene, drift, solver or unexplained. ``squared_error`` is that of the source, mean over
+    the image, below 0 where the image has more without the source, and ``deviation`` its standard error by chance.
+    """
+
+    of: str
+    source: str
+    amount: str
+    lost_db: float
+    error_db: float
+    squared_error: float = 0.0
+    deviation: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Name of the row in words."""
+        if self.of == UNEXPLAINED:
+            return self.source
+        what = DRIFT_WORDS.get(self.source, self.source) if self.of == DRIFT else f"{self.of}: {self.source}"
+        return f"{what}, {self.amount}" if self.amount else what
 
 
-def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | None = None) -> CalibrationFindings:
-    """Run a session and judge it.
+@dataclass(frozen=True)
+class Share:
+    """A part of an image's squared error, mean over the image, and the deviation by chance."""
+
+    square: float
+    deviation: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """Parts of one image's squared error.
+
+    Attributes
+    ----------
+    parts
+        shares by where they come from and by source.
+    scatter, drawn
+        scatter of images by factors without noise, and all noise that is drawn.
+    steady
+        (n, n') error that is no noise.
+    """
+
+    parts: dict[tuple[str, str], Share]
+    scatter: Scatter
+    drawn: Noise
+    steady: FloatArray
+
+
+def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[LossRow], list[str]]:
+    """Return the rows of noise, scene, every drift of the recipe and the unexplained rest, and reasons why some drifts
+    could not be predicted.
 
     Parameters
     ----------
-    bench, request, job
-        whose camera, seed and accuracy; clock, progress and limits.
-    recipe
-        how the session is run; None: the shipped one.
-
-    Raises
-    ------
-    MitsimError
-        for a recipe with depths, and for light beyond what is allowed.
-
-    Notes
-    -----
-    The session is taken without its drift: what that costs is predicted, as of all other drifts.
+    stand
+        scene in its light, camera and patterns; its recipe states the drift.
+    lit, clear
+        session that the stand's factors are of, and its factors without noise.
     """
-    recipe = recipe or load_recipe()
-    if recipe.depths:
-        raise MitsimError(
-            f"study calibration: the recipe has {len(recipe.depths)} depths, and a report is of one session; leave "
-            "depths out, and move the board's plane by -D or the scene's scene_distance"
+    budget = _budget(stand, lit, clear)
+    measured, explained = squared_error(stand.before_db), sum(part.square for part in budget.parts.values())
+    found = [
+        LossRow(
+            of, source, "", *gain_without(part.square, measured, explained, part.deviation), part.square, part.deviation
         )
-    family = bench.family(request.patterns, request.seed)
-    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
-    session = Session(bench, recipe.model_copy(update={"drift": Drift()}), request.seed)
-    plan = session.plan(request.accuracy, job)
-    lit = LitSession.of(session, session.trace(plan, job), job)
-    (noisy, clean), _, _ = estimates(lit, job, (NOISY, NOISE_FREE))
-    found = judge_session(lit, noisy, clean, tuple(_by_source(lit, noisy, clean, job)))
-    scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
-    stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
-    rows, refused = error_budget.losses(stand, lit, _factors(lit, clean))
-    explained = sum(row.squared_error for row in rows if row.of != error_budget.UNEXPLAINED)
-    shadows, profiles = compare_shadows(bench)
-    left, right = IdealCamera(bench, bench.geometry.mask).calibrated(scene.board_flux)
-    geometric = replace(stand, factors=replace(stand.factors, left=left, right=right))
-    image = _image(stand, explained) | {"geometric_psnr_db": geometric.before_db}
-    models, unfitted = fit_models(lit, stand)
-    return replace(
-        found,
-        image=image,
-        losses=tuple(rows),
-        not_predicted=(*refused, *unfitted),
-        models=models,
-        shadows=shadows,
-        profiles=profiles,
-    )
+        for (of, source), part in budget.parts.items()
+    ]
+    pixels = budget.steady.size
+    found.append(_unexplained_row(measured, explained, budget.scatter.deviation(budget.drawn, budget.steady) / pixels))
+    rows, refused = _drifts(stand, budget, measured)
+    return found + rows, refused
+
+
+def _drifts(stand: DriftStand, budget: Budget, measured: float) -> tuple[list[LossRow], list[str]]:
+    """Return rows of drifts for the squared error that is ``measured``, and why some could not be predicted.
+
+    The error that a drift adds, and what that has in common with the error without drift, are those of the model. But
+    the model's drift does not move what the model leaves out of the scene's light, as the true one does. Therefore the
+    uncertainty is all that these have in common, and chance.
+    """
+    still, found, refused = stand.expected_image(Drift()), list[LossRow](), list[str]()
+    target, scene, pixels = still.image - budget.steady, stand.lit.truth, budget.steady.size
+    for kind in stand.recipe.drift.kinds:
+        drift = stand.recipe.drift.alone(kind)
+        try:
+            moved = stand.expected_image(drift)
+        except MitsimError as error:
+            refused.append(f"{kind}: {error}")
+            continue
+        lost, apart = (
+            Prediction(stand.before_db, still.psnr_db(truth), moved.psnr_db(truth)).predicted_lost_db
+            for truth in (target, scene)
+        )
+        # Noise that happens to look like what the drift does, and the draw of what drifts at random.
+        alike = budget.scatter.common(budget.drawn, moved.image - still.image) / pixels
+        chance = math.hypot(alike, math.sqrt(stand.scatter(drift, budget.steady))) / measured
+        sure = math.hypot(lost - apart, 10 * math.log10(1 + chance / 10 ** (lost / 10)))
+        amount = amount_in_words(kind, getattr(stand.recipe.drift, kind))
+        found.append(LossRow(DRIFT, kind, amount, lost, sure))
+    return found, refused
+
+
+def _unexplained_row(measured: float, explained: float, chance: float) -> LossRow:
+    """Return the row of squared error that is ``measured`` and not ``explained``, whose deviation is ``chance``."""
+    left = measured - explained
+    lost = _decibels(left / measured)
+    error = abs(_decibels((left + chance) / measured) - lost)
+    return LossRow(UNEXPLAINED, "not explained", "", lost, error, left, chance)
+
+
+def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> Budget:
+    scene, noises = stand.lit.truth, _noises(stand, lit)
+    pixels, found = scene.size, dict[tuple[str, str], Share]()
+    exact = replace(stand.linear, left=clear.left, right=clear.right)
+    sampled = sum((noise for (_, name), noise in noises.items() if name == RENDERING), Noise())
+    drawn = sum(noises.values(), Noise()) - sampled
+    seen = dict(_clear_images(stand, clear))
+    whole = next(iter(seen.values()))
+    steady = whole + sum(stand.fixed.values(), np.zeros_like(scene)) - scene
+    scatter = Scatter(exact, scene)
+    for source, noise in noises.items():
+        among = drawn + (noise if source[1] == RENDERING else Noise())
+        found[source] = Share(
+            stand.linear.variance(scene, noise) / pixels, scatter.share(noise, among, steady) / pixels
+        )
+    off = whole - scene
+    for name, error in stand.fixed.items():
+        found[CAPTURE, name] = Share(_square(off + error) - _square(off))
+        off = off + error
+    found |= _of_scene(scatter, seen, sampled)
+    return Budget(found, scatter, drawn, off)
+
+
+def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]:
+    """Yield images without noise of the scene's light, and of this light without one cause after another."""
+    scene_ablation, off = Ablation.of(stand.lit.light), frozenset[str]()
+    yield "", stand.clear(clear, stand.lit.light)
+    for name in ERROR_SOURCES:
+        if name in scene_ablation.effects:
+            off |= {name}
+            yield name, stand.clear(clear, scene_ablation.without(off))
+
+
+def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) -> dict[tuple[str, str], Share]:
+    """Return the shares of a scene's light beside that of a white board, by cause, and of lambda.
+
+    ``seen`` are images of the light with its causes, then without one after another; ``sampled`` is the noise of its
+    rendering, which all of these images share.
+    """
+    exact, scene, found = scatter.solver, scatter.scene, {(SCENE, ERROR_SOURCES[causes.DETAIL]): Share(0.0)}
+    (_, last), *others = seen.items()
+    for name, image in others:
+        moved = scatter.common(sampled, last - image) / scene.size
+        found[SCENE, ERROR_SOURCES[name]] = Share(_square(last - scene) - _square(image - scene), moved)
+        last = image
+    bias = _square(exact.expected_image(scene).image - scene)
+    rest = _square(last - scene) - bias - exact.variance(scene, sampled) / scene.size
+    found[SCENE, REST] = Share(rest, scatter.deviation(sampled, last - scene) / scene.size)
+    found[SOLVER, LAMBDA] = Share(bias)
+    return found
+
+
+def _square(error: FloatArray) -> float:
+    return float(np.square(error).mean())
+
+
+def gain_without(part: float, measured: float, explained: float, deviation: float = 0.0) -> tuple[float, float]:
+    """Return the decibels that an image would gain without a source, and their standard error.
+
+    Parameters
+    ----------
+    part, deviation
+        predicted squared error of the source, and its deviation by chance.
+    measured, explained
+        squared error of the image as it is, and as predicted of all sources together.
+    """
+    most = max(measured, explained)
+    lost = _decibels(part / most)
+    chance = abs(_decibels((part + deviation) / most) - lost)
+    if measured >= explained:
+        return lost, math.hypot(chance, _decibels(part / explained if explained else 0.0) - lost)
+    # More is predicted than there is: at most, all of what is too much is this source's.
+    return lost, math.hypot(chance, _decibels(max(part - (explained - measured), 0.0) / measured) - lost)
+
+
+def _decibels(part: float) -> float:
+    """Return the gain of an image without a ``part`` of its squared error."""
+    return -10 * math.log10(max(1 - part, _LEAST_LEFT)) if part else 0.0
+
+
+def _noises(stand: DriftStand, lit: LitSession) -> Mapping[tuple[str, str], Noise]:
+    """Return noise by where it comes from and by source."""
+    found = dict[tuple[str, str], Noise]()
+    for name, noise in stand.noises.items():
+        if name != SESSION and (name not in (AMBIENT, SPECKLE) or noise != Noise()):
+            found[CAPTURE, name] = noise
+    light, factors = stand.lit.light, (stand.factors.left, stand.factors.right)
+    # The truth's own sampling is in the error as much as that of the light.
+    sampled = light.apparent.error_of(light.flux_error) ** 2 + light.apparent.error**2
+    found[CAPTURE, RENDERING] = Noise(light=sampled)
+    left, right = (entry_variances(lit, factors, side) for side in SIDES)
+    for source, variance in left.items():
+        found[SESSION, source] = Noise(left=float(variance.mean()), right=float(right[source].mean()))
+    found[SESSION, RENDERING] = session_rendering(lit.light.flux, lit.light.flux_error, factors)
+    return found
+
+
+def session_rendering(flux: FloatArray, flux_error: FloatArray, factors: tuple[FloatArray, FloatArray]) -> Noise:
+    """Return the noise that sampling of a session's light leaves in its ``factors``.
+
+    Where pixel (x, y) of the board is lit by 1 + e_xy of its light, column x of the left factor is multiplied by
+    1 + sum_y e_xy w_y, w_y = Phi_R(y) . v / |v|^2, v the sum of all columns of Phi_R.
+
+    Parameters
+    ----------
+    flux, flux_error
+        (n^2,) of each projector pixel, and its standard error.
+    factors
+        left and right, (m, n) and (m', n').
+    """
+    lit = flux > 0
+    error = float(np.mean(np.square(flux_error[lit] / flux[lit]))) if lit.any() else 0.0
+    spread = []
+    for factor in factors:
+        common = factor.sum(axis=1)
+        spread.append(float(np.square(common @ factor / np.dot(common, common)).sum()))
+    return Noise(left_light=error * spread[1], right_light=error * spread[0])
+
+
+def entry_variances(lit: LitSession, factors: tuple[FloatArray, FloatArray], side: str) -> dict[str, FloatArray]:
+    """Return the predicted variance (m, n) of the entries of a factor by source.
+
+    u_i = Y_i v / |v|^2 has the variance sum_c V_rc v_c^2 / |v|^4 in row r, V being that of a response's pixels, and
+    U H^T / N averages N of them with signs. Noise that all responses share comes into column p by the mean of its
+    signs: all of it where they are all +1, and nothing elsewhere.
+
+    Parameters
+    ----------
+    lit, factors
+        the session, and left and right factor.
+    side
+        whose stripes give the factor.
+    """
+    signs, common = lit.session.signs, (factors[1] if side == SIDES[0] else factors[0]).sum(axis=1)
+
+    def spread(part: FloatArray) -> FloatArray:
+        variance = np.broadcast_to(part, lit.uniform_rate.shape)
+        weights = np.square(common) / np.dot(common, common) ** 2
+        return np.asarray((variance if side == SIDES[0] else variance.T) @ weights)
+
+    own, shared = lit.response_variances(side)
+    even, first = np.full(len(signs), 1 / signs.shape[1]), np.square(signs.mean(axis=1))
+    return {source: np.outer(spread(own[source]), even) + np.outer(spread(shared[source]), first) for source in own}
+
+
+# -------- The study
 
 
 def as_built(bench: AnyBench) -> AnyBench:
@@ -126,37 +366,48 @@ def as_built(bench: AnyBench) -> AnyBench:
     return replace(bench, devices=replace(bench.devices, camera=changed))
 
 
-def fit_models(lit: LitSession, stand: DriftStand) -> tuple[tuple[ModelRow, ...], tuple[str, ...]]:
-    """Return the quality of images with factors of models that are fitted to a few frames of a session, and the reasons
-    why some can't be fitted.
+OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}
+"""Differences of a camera and its plan, as of a mask that is glued on by hand, under a microscope."""
+_MODEL_FRAMES = (2, 16)
+"""Frames that models are fitted to: uniform light alone, and a few stripes."""
+_FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
+"""Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
+_PROFILE_MM, _SAID_DB = 0.7, 0.005
+"""Half of the range of a point's shadow that is kept: a dozen mask features; loss from which a bar is drawn."""
 
-    Parameters
-    ----------
-    lit, stand
-        session, and the frames of the scene. The models start from a plan that the camera differs from.
+
+def measure_session(
+    bench: Bench, recipe: SessionRecipe, patterns: str, seed: int, accuracy: float
+) -> tuple[list[Row], dict[str, FloatArray]]:
+    """Return the rows of a session and of an image that is made with its factors, and maps of the factors' errors.
+
+    The session is taken without the drift of its ``recipe``, whose cost is predicted.
     """
-    rows, refused, planned = [], [], as_built(lit.session.bench)
-    for model, wanted in product(get_args(Model), _MODEL_FRAMES):
-        modelling = Modelling(model, wanted)
-        try:
-            camera, (shown, frames) = model_of(planned, model), simulate_responses(lit, modelling)
-            fitted = fit_placement(camera, shown, modelling.free)
-        except MitsimError as error:  # no model is of this mask, or the frames can't tell its parameters apart
-            refused.append(f"image of a {model} model of {wanted} frames ({error})")
-            continue
-        factors = modelled_factors(camera, fitted, frames, stand.factors.manifest, Job())
-        unexplained = float(factors.manifest.result["unexplained_residual"])
-        rows.append(ModelRow(model, frames, replace(stand, factors=factors).before_db, unexplained))
-    return tuple(rows), tuple(refused)
-
-
-def compare_shadows(bench: Bench) -> tuple[tuple[ShadowRow, ...], dict[str, FloatArray]]:
-    """Return the shadow of the mask of a ``bench`` in each light against the geometric one, and a point's shadows down
-    the rows of the sensor [1] by light, with the rows' places [mm]."""
-    cameras = {name: IdealCamera(bench, bench.geometry.mask, spectrum) for name, spectrum in lights(bench).items()}
-    profiles = {_PLACES: np.asarray(bench.geometry.centres(0)), **point_profiles(bench)}
-    del profiles[LINE]  # it coincides with that of the projector's lines, to the width of a plotted line
-    return tuple(shadow_row(name, cameras) for name in cameras), profiles
+    job, family = Job(), bench.family(patterns, seed)
+    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
+    session = Session(bench, recipe.model_copy(update={"drift": Drift()}), seed)
+    lit = LitSession.of(session, session.trace(session.plan(accuracy, job), job), job)
+    (noisy, clean), _, _ = estimates(lit, job, (NOISY, NOISE_FREE))
+    rows, maps = judge_session(lit, noisy, clean)
+    rows += residuals(lit, noisy, clean, job)
+    scene = LitScene(bench.light(patterns, job, accuracy=accuracy, seed=seed))
+    stand = DriftStand(scene, _factors(lit, noisy), recipe, family, seed)
+    lost, refused = losses(stand, lit, _factors(lit, clean))
+    rows += [{"kind": "losses", **asdict(row), "name": row.name} for row in lost]
+    left, right = IdealCamera(bench, bench.geometry.mask).calibrated(scene.board_flux)
+    geometric = replace(stand, factors=replace(stand.factors, left=left, right=right)).before_db
+    explained = sum(row.squared_error for row in lost if row.of != UNEXPLAINED)
+    doubts = [f"losses: {verdict_of(row)}" for row in lost if row.of == UNEXPLAINED and _is_missing(row)]
+    frames, electrons = len(family.shots), stand.electrons
+    rows.append({
+        "kind": "image", "psnr_db": stand.before_db, "predicted_psnr_db": -decibels(np.sqrt(explained)),
+        "geometric_psnr_db": geometric, "frames": frames, "exposure_seconds": frames * stand.exposure_s,
+        "photoelectrons": electrons, "photons": electrons / (bench.sensor.quantum_efficiency or np.nan),
+        "flagged": bool(doubts), "reason": "; ".join(doubts),
+    })  # fmt: skip
+    models, unfitted = fit_models(lit, stand)
+    rows += models + compare_shadows(bench)
+    return rows + [{"kind": "not predicted", "reason": text} for text in (*refused, *unfitted)], maps
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:
@@ -171,79 +422,68 @@ def _factors(lit: LitSession, estimate: Estimate) -> Factors:
     return Factors.of(estimate, manifest)
 
 
-def _image(stand: DriftStand, explained: float) -> dict[str, Any]:
-    """PSNR of the image without a drift, that of the squared error which is ``told`` of all sources, and what its
-    capture takes."""
-    frames = len(stand.family.shots)
-    electrons = stand.electrons
-    return {
-        "patterns": stand.family.name,
-        "psnr_db": stand.before_db,
-        "predicted_psnr_db": -decibels(np.sqrt(explained)),
-        "frames": frames,
-        "exposure_seconds": frames * stand.exposure_s,
-        "photoelectrons": electrons,
-        "photons": electrons / (stand.lit.bench.sensor.quantum_efficiency or np.nan),
-    }
+def fit_models(lit: LitSession, stand: DriftStand) -> tuple[list[Row], list[str]]:
+    """Return rows of images with factors of models that are fitted to a few frames of a session, starting from a plan
+    that the camera differs from, and the reasons why some can't be fitted."""
+    rows: list[Row] = []
+    refused, planned = [], as_built(lit.session.bench)
+    for model, wanted in product(get_args(Model), _MODEL_FRAMES):
+        modelling = Modelling(model, wanted)
+        try:
+            camera, (shown, frames) = model_of(planned, model), simulate_responses(lit, modelling)
+            placement = fit_placement(camera, shown, modelling.free)
+        except MitsimError as error:  # no model is of this mask, or the frames can't tell its parameters apart
+            refused.append(f"image of a {model} model of {wanted} frames ({error})")
+            continue
+        factors = modelled_factors(camera, placement, frames, stand.factors.manifest, Job())
+        psnr_db = replace(stand, factors=factors).before_db
+        unexplained = float(factors.manifest.result["unexplained_residual"])
+        rows.append(
+            {"kind": "models", "model": model, "frames": frames, "psnr_db": psnr_db, "unexplained": unexplained}
+        )
+    return rows, refused
 
 
-# ---- Noisy factors against clean ones ----
+def compare_shadows(bench: Bench) -> list[Row]:
+    """Return rows of the shadow of the mask of a ``bench`` in each light against the geometric one, and of a point's
+    shadow down the rows in the middle of the sensor, relative to the open sensor's irradiance."""
+    cameras = {name: IdealCamera(bench, bench.geometry.mask, spectrum) for name, spectrum in lights(bench).items()}
+    rows: list[Row] = [{"kind": "shadows", **asdict(shadow_row(name, cameras))} for name in cameras]
+    places = np.asarray(bench.geometry.centres(0))
+    inside = np.abs(places - places.mean()) <= _PROFILE_MM
+    for name, values in point_profiles(bench).items():
+        if name != LINE:  # it coincides with that of the projector's lines, to the width of a plotted line
+            rows += [
+                {"kind": "profile", "light": name, "place_mm": float(place), "irradiance": float(value)}
+                for place, value in zip(places[inside], values[inside], strict=True)
+            ]
+    return rows
 
 
 @single_threaded_blas()
-def judge_session(
-    lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[ErrorSourceRow, ...] = ()
-) -> CalibrationFindings:
-    """Errors of ``noisy`` factors of a session against ``clean`` ones, beside their prediction.
-
-    Parameters
-    ----------
-    lit
-        the session.
-    noisy, clean
-        estimates from noisy and from expected frames.
-    causes
-        of its residual.
-    """
-    entries, singular, maps = [], [], {}
+def judge_session(lit: LitSession, noisy: Estimate, clean: Estimate) -> tuple[list[Row], dict[str, FloatArray]]:
+    """Return rows of a session: errors of ``noisy`` factors against ``clean`` ones beside their prediction, and its
+    cost; and maps (m, n) of the entries' errors in predicted deviations, by factor."""
+    rows, maps = [session_cost(lit, noisy, clean)], {}
     pairs = zip(FACTORS, SIDES, (clean.left, clean.right), (noisy.left, noisy.right), strict=True)
     for name, side, exact, found in pairs:
         # Factors are known up to a common scale and sign; this one is not drawn towards zero by the noise.
         found = found * (np.vdot(exact, exact) / np.vdot(found, exact))
-        deviation = entry_deviation(lit, clean, side)
-        off = (found - exact) / deviation
-        maps[name] = off
+        variances = entry_variances(lit, (clean.left, clean.right), side)
+        deviation = np.asarray(np.sqrt(sum(variances.values(), np.zeros(1))))
+        off = maps[name] = (found - exact) / deviation
         norm = float(np.linalg.norm(exact))
-        predicted = float(np.linalg.norm(deviation)) / norm
-        error = float(np.linalg.norm(found - exact)) / norm
-        entries.append(EntryRow(name, error, predicted, float(np.abs(off).max()), float(np.square(off).mean())))
-        singular += list(singular_rows(name, exact, found, deviation))
-    return CalibrationFindings(
-        tuple(entries),
-        tuple(singular),
-        causes,
-        maps,
-        (clean.separability_residual, noisy.separability_residual),
-        session_cost(lit),
-    )
+        rows.append({
+            "kind": "entries", "factor": name, "error": float(np.linalg.norm(found - exact)) / norm,
+            "predicted_error": float(np.linalg.norm(deviation)) / norm, "largest": float(np.abs(off).max()),
+            "chi_square": float(np.square(off).mean()),
+        })  # fmt: skip
+        rows += [{"kind": "singular", "factor": name, **row} for row in singular_rows(exact, found, deviation)]
+    return rows, maps
 
 
-def entry_deviation(lit: LitSession, clean: Estimate, side: str) -> FloatArray:
-    """(m, n) predicted standard deviation of the entries of a factor, from all sources.
-
-    Parameters
-    ----------
-    lit, clean
-        the session, and the estimate from its expected frames.
-    side
-        whose stripes give the factor.
-    """
-    variances = error_budget.entry_variances(lit, (clean.left, clean.right), side)
-    return np.asarray(np.sqrt(sum(variances.values(), np.zeros(1))))
-
-
-def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: FloatArray) -> Iterator[SingularRow]:
-    """Singular values and vectors of a factor with noise beside those without.
+def singular_rows(exact: FloatArray, found: FloatArray, deviation: FloatArray) -> Iterator[Row]:
+    """Yield singular values and vectors of a factor with noise beside those without.
 
     With a_jk = u_j^T E v_k, to first order s_k moves by a_kk, to second order by the mean of sum_j (s_k (a_jk^2 +
     a_kj^2) + 2 s_j a_jk a_kj) / (2 (s_k^2 - s_j^2)) + |(1 - U U^T) E v_k|^2 / (2 s_k), and v_k turns by the root of
@@ -252,8 +492,6 @@ def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: 
 
     Parameters
     ----------
-    factor
-        its name.
     exact, found
         (m, n) without and with noise.
     deviation
@@ -276,431 +514,190 @@ def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: 
             bias = float(np.sum((value * (to + back) + 2 * rest * both) / (2 * gaps)) + beyond[number] / (2 * value))
             turns = (value**2 * back + rest**2 * to + 2 * value * rest * both) / np.square(gaps)
             angle = float(np.sqrt(turns.sum()))
-        cosine = min(abs(float(np.dot(right[number], turned[number]))), 1.0)
         error = float(np.sqrt(squares[number, number]))
-        yield SingularRow(
-            factor=factor,
-            number=number,
-            value=float(value),
-            noisy=float(noisy[number]),
-            standard_error=error,
-            bias=bias,
-            off=float((noisy[number] - value - bias) / error),
-            predicted_angle=min(angle, float(np.pi / 2)),
-            angle=float(np.arccos(cosine)),
-        )
+        yield {
+            "number": number, "value": float(value), "noisy": float(noisy[number]), "standard_error": error,
+            "bias": bias, "off": float((noisy[number] - value - bias) / error),
+            "predicted_angle": min(angle, float(np.pi / 2)),
+            "angle": float(np.arccos(min(abs(float(np.dot(right[number], turned[number]))), 1.0))),
+        }  # fmt: skip
 
 
-# ---- Cost of a session ----
-
-
-def session_cost(lit: LitSession) -> dict[str, float]:
-    """Frames, seconds of exposure, expected photoelectrons and photons of a session ``lit``, without its read-out."""
+def session_cost(lit: LitSession, noisy: Estimate, clean: Estimate) -> Row:
+    """Return the row of a session: frames, seconds of exposure without read-out, expected photoelectrons and photons,
+    and the separability residuals of its frames with noise and without."""
     recipe, order = lit.session.recipe, len(lit.session.order)
     lit_s = sum(lit.exposures_s) * recipe.repeats
     # Shots of uniform light: both of a pair together are one.
     uniform = order / 2 if lit.session.pairs else 2 + (order - 2) * lit.session.lit_lines
     electrons = float(lit.uniform_rate.sum()) * uniform * lit_s
     return {
+        "kind": "session",
         "frames": lit.session.shots,
         "exposure_seconds": order * lit_s + recipe.dark_frames * sum(lit.exposures_s),
         "photoelectrons": electrons,
         "photons": electrons / (lit.session.bench.sensor.quantum_efficiency or np.nan),
+        "separability_residual": noisy.separability_residual,
+        "noise_free_residual": clean.separability_residual,
     }
 
 
-# ---- What is not separable, by cause ----
+def residuals(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[Row]:
+    """Yield rows of the separability residual of expected frames without each cause, and of what noise adds to it."""
+    whole, simulation, session = clean.separability_residual, lit.light.simulation, lit.session
 
+    def without(session: Session, light: SampledLight) -> float:
+        return estimate(LitSession.of(session, light, job), job, noise_free=True)[0].separability_residual
 
-def _by_source(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[ErrorSourceRow]:
-    """Residual of a session's expected frames without each cause, and what noise adds to it."""
-    residual = clean.separability_residual
-    yield _row("noise", noisy.separability_residual, residual)
-    simulation, session = lit.light.simulation, lit.session
+    yield residual_row("noise", noisy.separability_residual, whole)
     for name, settings in ablations(simulation.settings, simulation.settings.effects):
         if name in _FORMED:
             light = reform(lit.light, frozenset({name}))
         else:
             light = session.trace(replace(lit.light.plan, settings=settings), job)
-        yield _row(name, residual, _residual(session, light, job))
+        yield residual_row(name, whole, without(session, light))
     if session.recipe.board != BoardShape():
         flat = replace(session, recipe=session.recipe.model_copy(update={"board": BoardShape()}))
-        yield _row("board", residual, _residual(flat, flat.trace(lit.light.plan, job), job))
+        yield residual_row("board", whole, without(flat, flat.trace(lit.light.plan, job)))
 
 
-def _residual(session: Session, light: SampledLight, job: Job) -> float:
-    return estimate(LitSession.of(session, light, job), job, noise_free=True)[0].separability_residual
-
-
-def _row(cause: str, residual: float, left: float) -> ErrorSourceRow:
+def residual_row(cause: str, residual: float, left: float) -> Row:
+    """Return the row of a ``cause`` without which so much of a residual is ``left``; ``part`` is the root of the
+    difference of the squares, below 0 where the residual grows without the cause."""
     less = residual**2 - left**2
-    return ErrorSourceRow(cause, left, float(np.copysign(np.sqrt(abs(less)), less)))
+    return {"kind": "causes", "cause": cause, "residual": left, "part": float(np.copysign(np.sqrt(abs(less)), less))}
 
 
-# ---- Rows of the findings, and their words ----
-
-_APART = 0.3
-"""Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
-and bias and angle to first order do not hold."""
-_WHERE = {
-    error_budget.CAPTURE: "noise of the capture",
-    error_budget.SCENE: "light of the scene",
-    error_budget.DRIFT: "drift, not in this image",
-    error_budget.SOLVER: "the solver",
-    error_budget.UNEXPLAINED: "anywhere",
-    SESSION: "noise of the session",
-}
-"""Where a loss comes from, in words."""
-_HAS, _WOULD = "has lost by noise, light and solver", "would lose by a drift"
-"""What becomes of the image, as the figure calls it."""
-_LOSS_NOTES = (
-    "Noise, light of the scene and solver: what the image would gain without that source alone, and the source's "
-    "part of the squared error. These parts add up to the whole, decibels do not. Below 0: the image would be worse "
-    "without it.",
-    "Drift between calibration and capture, by the amounts of the recipe: what the image would lose, each alone.",
-    "Noise and drift are predicted in closed form with lambda as it is. Light of the scene is what factors, measured "
-    "on an even white board, do not hold of it, found from frames without noise.",
-    "The uncertainty is one standard error: noise is drawn once, and the part that is not explained may belong to "
-    "any source; none is told where it is below 0.005.",
-    "Nonuniformity: the session has seen the same pixels, so its factors hold what the pixels of a row or of a "
-    "column have alike, and the image loses by the rest. Rendering is the simulation's own sampling, which no camera "
-    "has.",
-)
-"""How the table of losses is to be read."""
-_ERROR_SOURCES = {
-    "noise": "noise of the sensor",
-    "black-level": "light that black pixels leak",
-    "diffraction": "diffraction at the mask",
-    "anchors": "light that changes over the sensor",
-    "layers": "shadows that change with depth",
-    "cells": "light that changes inside projector pixels",
-}
-"""Causes of what is not separable, in words; others have names that say it."""
-_PLACES = "places"
-"""Name of the places of pixels among profiles of shadows."""
-_PROFILE_MM = 0.7
-"""Half of the range of a point's shadow that is shown: a dozen mask features, whose fringes can be seen."""
-_NO_DRIFT = " The recipe has no table [drift]: calibration/drift.toml is one that has."
-_SAID_DB = 0.005
-"""Loss from which it is told in text: less is 0.00 there."""
-_SHOWN_DEVIATIONS = 4.0
-"""Range of the maps: one of 16 000 entries lies beyond."""
+def _is_missing(row: LossRow) -> bool:
+    return abs(row.squared_error) > SURE * row.deviation
 
 
-@dataclass(frozen=True)
-class EntryRow:
-    """Error of a factor's entries [its rms]: found, predicted from the noise, and the largest in predicted deviations;
-    ``chi_square`` is the mean square of all in these."""
-
-    factor: str
-    error: float
-    predicted_error: float
-    largest: float
-    chi_square: float
-
-
-@dataclass(frozen=True)
-class SingularRow:
-    """A singular value of a factor and of the same with noise, its predicted standard error and bias, how far it is
-    off in standard errors beyond the bias; and the angle [rad] of its two vectors, predicted and found."""
-
-    factor: str
-    number: int
-    value: float
-    noisy: float
-    standard_error: float
-    bias: float
-    off: float
-    predicted_angle: float
-    angle: float
-
-
-@dataclass(frozen=True)
-class ErrorSourceRow:
-    """Separability residual without one cause; ``part`` is the root of what it takes away from the squared residual,
-    below 0 where the residual grows without it."""
-
-    cause: str
-    residual: float
-    part: float
-
-
-@dataclass(frozen=True)
-class ModelRow:
-    """PSNR [dB] of the image with factors of a ``model`` that was fitted to some ``frames`` of the session, and the
-    part of these frames that it leaves ``unexplained``."""
-
-    model: str
-    frames: int
-    psnr_db: float
-    unexplained: float
-
-
-# ---- Findings as text, figures and tables ----
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationFindings(Findings):
-    """What a session came to.
-
-    Attributes
-    ----------
-    entries, singular, causes
-        rows of the report.
-    maps
-        (m, n) error of each factor's entries in predicted deviations, by factor.
-    residual
-        separability residual of the expected frames, and of the noisy ones.
-    session
-        frames, seconds of exposure, photoelectrons and photons.
-    image
-        of a capture with these factors: ``patterns``, ``psnr_db``, ``predicted_psnr_db`` of all sources together, and
-        ``frames``, ``exposure_seconds``, ``photoelectrons`` and ``photons`` of the capture; empty where none was made.
-    losses
-        what each source of noise, the scene's light and each drift costs it, and what is not explained.
-    not_predicted
-        drifts whose cost is not, each with the reason.
-    models
-        images with factors of models that are fitted to a few frames of the session.
-    shadows, profiles
-        the mask's shadow in each light against its geometric one; a point's shadow by light, with the places of the
-        sensor's rows.
-    """
-
-    entries: tuple[EntryRow, ...]
-    singular: tuple[SingularRow, ...]
-    causes: tuple[ErrorSourceRow, ...]
-    maps: dict[str, FloatArray]
-    residual: tuple[float, float]
-    session: dict[str, float]
-    image: dict[str, Any] = field(default_factory=dict)
-    losses: tuple[LossRow, ...] = ()
-    not_predicted: tuple[str, ...] = ()
-    models: tuple[ModelRow, ...] = ()
-    shadows: tuple[ShadowRow, ...] = ()
-    profiles: dict[str, FloatArray] = field(default_factory=dict)
-    title: ClassVar[str] = "What limits a calibration session and its image"
-
-    def payload(self) -> dict[str, Any]:
-        """The JSON of the command line."""
-        return {
-            "separability_residual": self.residual[1],
-            "noise_free_residual": self.residual[0],
-            "entries": [asdict(row) for row in self.entries],
-            "singular": [asdict(row) for row in self.singular],
-            "causes": [asdict(row) for row in self.causes],
-            "session": self.session,
-            "image": self.image,
-            "losses": [asdict(row) for row in self.losses],
-            "not_predicted": self.not_predicted,
-            "models": [asdict(row) for row in self.models],
-            "shadows": [asdict(row) for row in self.shadows],
-            "warnings": self.warnings,
-        }
-
-    @property
-    def warnings(self) -> list[str]:
-        """That the sources do not make the image's squared error, where chance does not either."""
-        return [
-            f"losses: {_verdict(row)}, {100 * row.squared_error / squared_error(self.image['psnr_db']):+.1f} % of its "
-            "squared error, which may have a share in every other row; look for what the scene or the camera has that "
-            "no row names"
-            for row in self.losses
-            if row.of == error_budget.UNEXPLAINED and abs(row.squared_error) > error_budget.SURE * row.deviation
-        ]
-
-    @property
-    def message(self) -> str:
-        """What costs the image the most; without an image, how good the factors are."""
-        lost = [row for row in self.losses if row.of not in (error_budget.UNEXPLAINED, error_budget.DRIFT)]
-        if not lost:
-            errors = " and ".join(f"{row.error:.1e} ({row.factor})" for row in self.entries)
-            return f"The factors' relative errors are {errors}"
-        most = max(lost, key=lambda row: row.lost_db)
-        return f"{most.name} costs the image most: {most.lost_db:.2f} of {self.image['psnr_db']:.1f} dB"
-
-    def figures(self) -> dict[str, Figure]:
-        """Maps of the entries' errors, singular values with their errors, and the residual by cause."""
-        parts = {_cause(row): row.part for row in self.causes if row.part > 0}
-        found = {
-            f"{name}.png": plots.deviations(values, _SHOWN_DEVIATIONS, f"Errors of the {name} factor")
-            for name, values in self.maps.items()
-        }
-        rows = {
-            name: np.array(
-                [(row.value, row.noisy - row.bias, row.standard_error) for row in self.singular if row.factor == name]
-            )
-            for name in self.maps
-        }
-        found["singular.png"] = plots.singular_errors(rows)
-        if parts:
-            found["causes.png"] = plots.error_bars(parts)
-        rated: dict[str, dict[str, Mean]] = {_HAS: {}, _WOULD: {}}
-        for row in self.losses:
-            if abs(row.lost_db) >= _SAID_DB:
-                rated[_WOULD if row.of == error_budget.DRIFT else _HAS][row.name] = Mean(row.lost_db, row.error_db, 1)
-        if any(rated.values()):
-            groups = {name: {kind: mean} for kind, means in rated.items() for name, mean in means.items()}
-            found["losses.png"] = grouped_bars(groups, "PSNR lost [dB]", ordered=True)
-        if self.profiles:
-            found["shadow.png"] = shadow_profiles(self.profiles, _PROFILE_MM)
-        return found
-
-    def parts(self) -> Sequence[Part]:
-        """Of the page: what an image loses, light and time, errors of the factors, what is not separable."""
-        entries = [
-            (row.factor, *(f"{each:.2e}" for each in (row.error, row.predicted_error)),
-             f"{row.chi_square:.3f}", f"{row.largest:.1f}")
-            for row in self.entries
-        ]  # fmt: skip
-        offs = np.array([row.off for row in self.singular if row.predicted_angle < _APART])
-        rms = f", rms {np.sqrt(np.mean(offs**2)):.2f} standard errors off" if len(offs) else ""
-        causes = [
-            (_cause(row), f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}")
-            for row in self.causes
-        ]
-        return [
-            *([self._losses_part()] if self.losses else []),
-            self._light_part(),
-            Part(
-                "Errors of the factors",
-                "The left factor takes rows of the scene to rows of the sensor, the right one columns. Noisy factors "
-                "against those of frames without noise of the same light: relative error, found and predicted "
-                "from the sensor's closed form; mean square (1 if the prediction holds) and largest error of an entry, "
-                "in predicted standard deviations. Then each singular value's error, beside its predicted standard "
-                f"error: {len(offs)} of {len(self.singular)} stand apart from others{rms}.",
-                ("Factor", "Relative error", "Predicted", "Chi-square an entry", "Largest [deviations]"),
-                tuple(entries),
-                (*(f"{name}.png" for name in self.maps), "singular.png"),
-            ),
-            Part(
-                "What is not separable",
-                f"No separable camera explains {self.residual[1]:.2e} of the noisy responses, {self.residual[0]:.2e} "
-                "of those without noise (relative rms). Without each cause alone, so much is left; its part is the "
-                "root of the difference of the squares, below 0 where more is left without it.",
-                ("Cause", "Residual without it", "Part"),
-                tuple(causes),
-                ("causes.png",),
-            ),
-            *([self._models_part()] if self.models else []),
-            *([self._shadows_part()] if self.shadows else []),
-        ]
-
-    def _models_part(self) -> Part:
-        rows = [(row.model, f"{row.frames}", f"{row.psnr_db:.1f}", f"{row.unexplained:.1e}") for row in self.models]
-        measured = ("measured", f"{self.session['frames']:.0f}", f"{self.image['psnr_db']:.1f}", "")
-        return Part(
-            "How few frames suffice",
-            "The image with factors of a model whose mask and projector are fitted to a few frames of the session: the "
-            "closed-form shadow with diffraction (wave) and without (geometric). The fit starts from a plan whose mask "
-            "is 50 um too far off, and 37 and 21 um beside its place. Frames are simulated with the very shadow that "
-            "the wave model has: what a real mask has beside it only measured factors hold.",
-            ("Factors", "Frames", "PSNR [dB]", "Not explained [1]"),
-            (*rows, measured),
-        )
-
-    def _shadows_part(self) -> Part:
-        rows = [
-            (row.light, *(f"{100 * each:.1f}" for each in (row.point_source, row.scene_pixel)),
-             *(f"{each:.1e}" for each in (row.separability, row.separability_centred)))
-            for row in self.shadows
-        ]  # fmt: skip
-        return Part(
-            "Diffraction at the mask",
-            f"Factors of the mask's geometric shadow, as if light did not diffract, give the image a PSNR of "
-            f"{self.image['geometric_psnr_db']:.1f} dB in place of {self.image['psnr_db']:.1f} dB. The mask's shadow "
-            "in each light against the geometric one, of a point and of a pixel of the scene; and what one separable "
-            "term leaves of it, of frames as they are and centred.",
-            ("Light", "Point [%]", "Pixel [%]", "Not separable [1]", "The same, centred [1]"),
-            tuple(rows),
-            ("shadow.png",),
-        )
-
-    def _losses_part(self) -> Part:
-        whole, image = sum(row.squared_error for row in self.losses) or np.nan, self.image
-        rest = [row for row in self.losses if row.of == error_budget.UNEXPLAINED]
-        ordered = sorted((row for row in self.losses if row not in rest), key=lambda row: -row.lost_db)
-        rows = [
-            (
-                _WHERE[row.of],
-                DRIFT_WORDS.get(row.source, row.source),
-                row.amount,
-                with_error(row.lost_db, row.error_db),
-                ""
-                if row.of == error_budget.DRIFT
-                else with_error(100 * row.squared_error / whole, 100 * row.deviation / whole, " %"),
-            )
-            for row in [*(row for row in ordered if abs(row.lost_db) >= _SAID_DB), *rest]
-        ]
-        small = ", ".join(row.name for row in ordered if abs(row.lost_db) < _SAID_DB)
-        untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
-        others = "".join(f" {_verdict(row).capitalize()}." for row in rest)
-        return Part(
-            "What an image loses",
-            f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
-            f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{others}"
-            + ("" if any(row.of == error_budget.DRIFT for row in self.losses) else _NO_DRIFT)
-            + untold,
-            ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
-            tuple(rows),
-            ("losses.png",),
-            (*_LOSS_NOTES, *([f"Below {_SAID_DB:g} dB each: {small}."] if small else [])),
-        )
-
-    def _light_part(self) -> Part:
-        columns = {"session": self.session, "capture": self.image}
-        names = ("frames", "exposure_seconds", "photoelectrons", "photons")
-        rows = [
-            (where, *(f"{facts[name]:.4g}" for name in names)) for where, facts in columns.items() if "frames" in facts
-        ]
-        return Part(
-            "Light and time",
-            "Frames, their exposure without read-out, and what the whole sensor gets in all of them. How much a wanted "
-            "PSNR needs: mitsim calibrate SCENE --plan --psnr DB.",
-            ("", "Frames", "Exposure [s]", "Photoelectrons", "Photons"),
-            tuple(rows),
-        )
-
-    def tables(self) -> dict[str, list[dict[str, Any]]]:
-        """By file name."""
-        return {
-            "singular.csv": [asdict(row) for row in self.singular],
-            "causes.csv": [asdict(row) for row in self.causes],
-            "losses.csv": [asdict(row) for row in self.losses],
-        }
-
-
-# ---- Losses and causes in words ----
-
-
-def _verdict(row: LossRow) -> str:
-    """What is to be said of what is not explained."""
+def verdict_of(row: LossRow) -> str:
+    """Return the verdict on the part of an image's squared error that is not explained."""
     errors = abs(row.squared_error) / row.deviation if row.deviation else 0.0
     if errors <= 1:
         return "what is not explained is within its standard error"
     size = f"what is not explained is {errors:.1f} of its standard errors"
-    if errors <= error_budget.SURE:
+    if errors <= SURE:
         return f"{size}, of which chance makes {math.erfc(errors / math.sqrt(2)):.1%} of all studies see as much"
     return f"{size}: the sources do not make the image's error, and a cause is missing"
 
 
-def _cause(row: ErrorSourceRow) -> str:
-    return _ERROR_SOURCES.get(row.cause, row.cause.replace("-", " "))
+def _points(scope: Scope) -> list[Point]:
+    read_name(scope.patterns)
+    recipe = load_recipe(None if scope.recipe is None else Path(scope.recipe))
+    if recipe.depths:
+        raise MitsimError(
+            f"study calibration: the recipe has {len(recipe.depths)} depths, and a report is of one session; leave "
+            "depths out, and move the board's plane by -D or the scene's scene_distance"
+        )
+    return [Point.of(scope.setup, recipe=scope.recipe, patterns=scope.patterns, seed=scope.seeds[0])]
 
 
-def shadow_profiles(profiles: Mapping[str, FloatArray], reach_mm: float) -> Figure:
-    """Draw a point's shadows in the middle of the sensor.
+def _measure(studio: Studio, point: Point) -> Found:
+    recipe = load_recipe(None if point["recipe"] is None else Path(point["recipe"]))
+    asked = str(point["patterns"]), int(point["seed"]), point.setup.accuracy
+    rows, maps = measure_session(studio.bench(point.setup), recipe, *asked)
+    shown = {name: 0.5 + off / (2 * _SHOWN_DEVIATIONS) for name, off in maps.items()}
+    return Found(tuple(point.row(**row) for row in rows), single_precision(shown))
 
-    Parameters
-    ----------
-    profiles, reach_mm
-        (pixels,) relative irradiance by light, and the pixels' places [mm]; half of the range that is shown.
-    """
-    figure, axes = plots.figure_of(0.4 * plots.WIDTH)
-    places = profiles[_PLACES]
-    inside = np.abs(places - places.mean()) <= reach_mm
-    for index, (name, values) in enumerate((name, values) for name, values in profiles.items() if name != _PLACES):
-        axes.plot(places[inside], values[inside], lw=1.8, label=name, **plots.line_style(index))
-    plots.label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
-    axes.legend(fontsize=plots.FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    return figure
+
+_SHOWN_DEVIATIONS = 4.0
+"""Range of the maps: one of 16 000 entries lies beyond."""
+_TABLES = {
+    "losses": ("What an image loses", "of source amount lost_db error_db squared_error deviation"),
+    "session": (
+        "Light and time of the session",
+        "frames exposure_seconds photoelectrons photons separability_residual",
+    ),
+    "image": (
+        "Light and time of the image",
+        "psnr_db predicted_psnr_db geometric_psnr_db frames exposure_seconds photons",
+    ),
+    "entries": ("Errors of the factors", "factor error predicted_error chi_square largest"),
+    "causes": ("What is not separable", "cause residual part"),
+    "models": ("How few frames suffice", "model frames psnr_db unexplained"),
+    "shadows": ("Diffraction at the mask", "light point_source scene_pixel separability separability_centred"),
+    "not predicted": ("Not predicted", "reason"),
+}
+
+
+def _tables(results: Results) -> list[Part]:
+    """Return the rows of each kind as a table, the dearest losses first."""
+    rows = sorted(results.rows, key=lambda row: -float(str(row.get("lost_db") or 0)))
+    shown = {
+        kind: [tuple(_text(row.get(name)) for name in columns.split()) for row in rows if row["kind"] == kind]
+        for kind, (_, columns) in _TABLES.items()
+    }
+    return [
+        Part(title, "", tuple(name.replace("_", " ") for name in columns.split()), tuple(shown[kind]))
+        for kind, (title, columns) in _TABLES.items()
+        if shown[kind]
+    ]
+
+
+def _text(value: Value) -> str:
+    return (
+        f"{value:.4g}" if isinstance(value, float) else DRIFT_WORDS.get(str(value), "" if value is None else str(value))
+    )
+
+
+def _explained(rows: DataFrame) -> tuple[str, bool | None]:
+    (row,) = (LossRow(*(row[name] for name in _LOSS)) for row in rows.to_dict("records"))
+    return verdict_of(row), not _is_missing(row)
+
+
+_LOSS = ("of", "source", "amount", "lost_db", "error_db", "squared_error", "deviation")
+
+
+def _as_predicted(rows: DataFrame) -> tuple[str, bool]:
+    chi = rows["chi_square"].astype(float)
+    return f"chi-square of an entry {chi.min():.3f} to {chi.max():.3f}", bool((abs(chi - 1) < 0.1).all())
+
+
+STUDY = Study(
+    "calibration",
+    "What limits a calibration session and its image",
+    "How far off are a session's factors, and what does each source of error cost an image?",
+    points=_points,
+    measure=_measure,
+    claims=(
+        Judged(
+            "All sources together make the image's squared error", _explained,
+            where={"kind": "losses", "of": UNEXPLAINED},
+        ),
+        Judged("Errors of the factors are as large as the noise predicts", _as_predicted, where={"kind": "entries"}),
+    ),
+    panels=(
+        Bars(
+            "name", file="losses", x="lost_db", x_label="PSNR lost [dB]", colour="of", ordered=True,
+            where={"kind": "losses", "lost_db": lambda lost: measured(lost) and abs(lost) >= _SAID_DB},
+            errors={"lost_db": "error_db"},
+        ),
+        Images(
+            {name: (f"{name} factor", "") for name in FACTORS}, file="entries", down=("kind",),
+            where={"kind": "session"},
+            title=f"Errors of the factors' entries, black to white: {_SHOWN_DEVIATIONS:g} predicted deviations",
+        ),
+        Lines(
+            "number", "number of the singular value [1]", file="singular", y="off", colour="factor", facet="",
+            y_label="error beyond the bias [standard errors]", where={"kind": "singular"}, ticks=False,
+        ),
+        Bars(
+            "cause", file="causes", x="part", colour="kind", x_label="part of the separability residual [1]",
+            where={"kind": "causes", "part": lambda part: measured(part) and part > 0},
+        ),
+        Lines(
+            "place_mm", "position on the sensor [mm]", file="shadow", y="irradiance", colour="light", facet="",
+            y_label="irradiance, open sensor = 1 [1]", where={"kind": "profile"}, ticks=False,
+        ),
+    ),
+    tables=_tables,
+    about="Losses by noise, light of the scene and solver are the image's gain without that source; below 0, the "
+    "image would be worse without it. Squared errors add up, decibels do not. Losses by drift between calibration and "
+    "capture, by the amounts of the recipe's table [drift], are of each drift alone. Noise and drift are predicted "
+    "with lambda as it is; light of the scene is found from frames without noise. Noise is drawn once, and what is not "
+    "explained may belong to any source. Rendering is the simulation's own sampling, which no camera has. Models start "
+    "from a plan whose mask is off by 50, 37 and -21 um; their frames have the wave model's shadow.",
+    heads=("", "", "Found"),
+)  # fmt: skip

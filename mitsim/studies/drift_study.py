@@ -1,14 +1,14 @@
-"""A scene in its light, a calibrated camera and a drift in; what the drift costs out, measured and predicted [dB].
+"""Loss of an image by each kind of drift between calibration and capture, measured and predicted [dB].
 
-*Measured*: frames of the traced light through the camera as it is after the drift, exposed with noise, and solved with
-the factors from before it, with the lambda that the solver chose without the drift, and with its own.
+*Measured*: frames of the traced light through the camera after the drift are exposed with noise, and solved with the
+factors from before the drift, by the lambda that the solver chose without the drift, and by a lambda of their own.
 
-*Predicted*: :mod:`mitsim.studies.perturbation`, from the same factors and the closed-form shadow of the paper's
-model before and after the drift. No frame of the simulation, no draw of noise and nothing solved is in it: only the
-truth, the mean noise of a datum and, for lamps, the frame of their light.
+*Predicted* (:mod:`mitsim.studies.causes`): from the same factors and the closed-form shadow of the paper's model before
+and after the drift. The prediction uses the truth, the mean noise of a datum and, for lamps, the frame of their light;
+no frame of the simulation, no drawn noise and no solution.
 
-The study takes amounts of a recipe's table [drift] (``--recipe``, by default calibration/drift.toml), or those of
-``--over``, of which the first is shown beside the other kinds. The paper has no such figure.
+Amounts are those of a recipe's table [drift] (``--recipe``, by default calibration/drift.toml), or those of ``--over``,
+whose first is shown beside the other kinds. The paper has no such figure.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
 from mitsim.report.pages import Value
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response, specimen
+from mitsim.studies.causes import Changed, Expected, Gains, LinearImage, Noise
 from mitsim.studies.framework.claims import Gain, choose_rows, distinct, mean_of
 from mitsim.studies.framework.experiment import (
     IMAGE,
@@ -61,7 +62,6 @@ from mitsim.studies.framework.experiment import (
     Point,
     Results,
     Scope,
-    Setup,
     Study,
     group_by_setup,
     number_of,
@@ -71,24 +71,23 @@ from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-from mitsim.studies.perturbation import Changed, Expected, Gains, LinearImage, Noise
 
 AMBIENT, SESSION = "ambient frame", "session"
-"""Sources of noise beside those of frames."""
+"""Sources of noise in addition to those of frames."""
 OFFSETS = "offset nonuniformity"
-"""Of pixels: what they read without light, their dark currents' too."""
+"""Differences of pixels in what they read without light, dark currents included."""
 _SPLITS = 4
-"""Rounds in which what all pixels of a row, and of a column, respond alike is found. Each leaves (s2 / s1)^2 of what is
-left, s1 and s2 the map's largest singular values: 2e-3 for 24 x 24 pixels that differ by a tenth, less for more."""
+"""Rounds that find the common response of the pixels of each row and column. Each leaves (s2 / s1)^2 of what is left,
+where s1 and s2 are the map's largest singular values: 2e-3 for 24 x 24 pixels that differ by a tenth."""
 _STEP_MM = 5e-4
-"""Shift over which a shadow's slope is taken either way: half a micrometre, a twentieth of a pixel."""
+"""Shift over which a shadow's slope is computed either way: half a micrometre, a twentieth of a pixel."""
 _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 """Places [deviations] and weights of the Gauss-Hermite rule that is exact for a normal law up to the fifth power."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a drift is predicted to cost.
+    """Predicted loss by a drift.
 
     Attributes
     ----------
@@ -104,17 +103,14 @@ class Prediction:
 
     @property
     def predicted_lost_db(self) -> float:
-        """The squared error that the drift adds, beside that of the image without it."""
+        """Return the predicted loss: the squared error that the drift adds to that of the image without drift."""
         added = squared_error(self.predicted_db) - squared_error(self.predicted_before_db)
         return 10 * math.log10(1 + added / squared_error(self.before_db))
 
     @property
     def predicted_error_db(self) -> float:
-        """How sure that is: what changes if the image without the drift is as predicted as well.
-
-        What the model leaves out of it, such as detail inside projector pixels, may have any share in the error that
-        the drift adds.
-        """
+        """Return the uncertainty of the loss: the change if the image without drift is as predicted, too, because
+        what the model leaves out, such as detail inside projector pixels, may have any share in the added error."""
         return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
 
 
@@ -136,12 +132,12 @@ class Outcome(Prediction):
 
     @property
     def lost_db(self) -> float:
-        """What the drift costs, measured."""
+        """Return the measured loss."""
         return self.before_db - self.after_db
 
     @property
     def lost_auto_db(self) -> float:
-        """The same where the solver chooses lambda again."""
+        """Return the measured loss where the solver chooses lambda again."""
         return self.before_db - self.auto_db
 
 
@@ -166,9 +162,7 @@ class DriftStand:
     seed: int
 
     def outcome(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> Outcome:
-        """What a drift does.
-
-        MitsimError for one that the bench cannot have.
+        """Return the effect of a drift; MitsimError for a drift that the bench cannot have.
 
         Parameters
         ----------
@@ -177,21 +171,31 @@ class DriftStand:
         session
             factors of a session that drifted by it; None: those from before the drift.
         lit
-            the scene in light of the projector that moved; None: its light as it was.
+            scene in light of the projector that moved; None: its light as it was.
         """
-        truth, images = (lit or self.lit).truth, self.images(drift, session, lit)
+        scene, model = lit or self.lit, self._model
+        if session is not None:
+            model = scene.rendered_frames(session, self.family, self.seed).prepare()
+        bench, truth = scene.bench, scene.truth
+        moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
+        expected = scene.expected_frames(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
+        base = self._frames.exposer(self.exposure_s)
+        ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
+        exposer = DriftedExposer(bench.devices, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
+        (sums,) = accumulate(exposer, self.family, expected, [model])
+        images = [model.solve(sums, self._before.lam).image, model.solve(sums, "auto").image]
         after, auto = (psnr(image, truth) for image in images)
         return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto, image=images[0])
 
     def predict(self, drift: Drift) -> Prediction:
-        """What a ``drift`` is predicted to do; MitsimError for one that the bench cannot have."""
+        """Return the predicted effect of a ``drift``; MitsimError for one that the bench cannot have."""
         return Prediction(
             self.before_db, *(self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
         )
 
     @property
     def image(self) -> FloatArray:
-        """(n, n) without a drift."""
+        """Image (n, n) without a drift."""
         return self._before.image
 
     @property
@@ -204,29 +208,6 @@ class DriftStand:
     def before_db(self) -> float:
         """PSNR [dB] without a drift."""
         return psnr(self.image, self.lit.truth)
-
-    def images(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> list[FloatArray]:
-        """Both images (n, n) after a drift, with the lambda from before it and with the solver's own.
-
-        Parameters
-        ----------
-        drift, session, lit
-            as for :meth:`outcome`.
-        """
-        scene, model = lit or self.lit, self._model
-        if session is not None:
-            model = scene.rendered_frames(session, self.family, self.seed).prepare()
-        return [solution.image for solution in self._solve(drift, scene, model)]
-
-    def _solve(self, drift: Drift, scene: LitScene, model: Prepared) -> tuple[Solution, Solution]:
-        bench = scene.bench
-        moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
-        expected = scene.expected_frames(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
-        base = self._frames.exposer(self.exposure_s)
-        ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
-        exposer = DriftedExposer(bench.devices, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
-        (sums,) = accumulate(exposer, self.family, expected, [model])
-        return model.solve(sums, self._before.lam), model.solve(sums, "auto")
 
     @cached_property
     def _frames(self) -> Unexposed:
@@ -257,7 +238,7 @@ class DriftStand:
         return float(sum(exposer.electrons(frame).sum() for frame in self._expected))
 
     def session_mixes(self, drift: Drift) -> tuple[FloatArray, FloatArray]:
-        """(n, n) that each factor of a session is multiplied by, on the right, as its power drifts by a ``drift``.
+        """Return the matrices (n, n) that the factors are multiplied by, on the right, as a session's power drifts.
 
         The response to stripes h_i is a difference of shots of powers a and b, so that it is one to
         ``h_i (a + b) / 2 + (a - b) / 2``: the factor is Phi C with ``C = (H diag((a + b) / 2) + 1 ((a - b) / 2)^T)
@@ -278,53 +259,40 @@ class DriftStand:
         scale = float(np.mean(first)) ** -0.5
         return scale * found[0], scale * found[1]
 
-    # ---- the prediction ----------------------------------------------------------------------------------------------
-
     def expected_image(self, drift: Drift) -> Expected:
-        """What the image is expected to be after a ``drift``, as the model has it; MitsimError as :meth:`predict`."""
+        """Return the image that the model expects after a ``drift``; MitsimError as :meth:`predict`."""
         image, changed = self.linear, self._frame_changes(drift)
         if drift.session_ramp or drift.session_flicker:
             left, right = self.session_mixes(drift)
             image = replace(image, left=self.factors.left @ left, right=self.factors.right @ right)
             others = [(self.factors.left, self.factors.right), (-image.left, image.right)]
             changed = replace(changed, terms=[*changed.terms, *others])
-        return image.expected_image(self.lit.truth, changed, self._noise)
+        return image.expected_image(self.lit.truth, changed, sum(self.noises.values(), Noise()))
 
     @cached_property
     def fixed(self) -> Mapping[str, FloatArray]:
-        """(n, n) what each difference of the sensor's pixels adds to the image."""
+        """What each difference of the sensor's pixels adds to the image (n, n)."""
         still = self.linear.expected_image(self.lit.truth).image
         alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
         return {name: self.linear.expected_image(self.lit.truth, each).image - still for name, each in alone.items()}
 
     def clear(self, factors: Factors, light: SampledLight) -> FloatArray:
-        """(n, n) image of frames without noise, with the lambda of the image without a drift.
-
-        Parameters
-        ----------
-        factors
-            that it is made with.
-        light
-            of the scene.
-        """
+        """Return the image (n, n) of frames without noise of a ``light``, by ``factors`` and the lambda of the image
+        without a drift."""
         return LitScene(light).rendered_frames(factors, self.family, self.seed).clear(self.linear.lam)
 
     @cached_property
     def linear(self) -> LinearImage:
-        """The solver, its lambda that of the image without a drift."""
+        """Solver with the lambda of the image without a drift."""
         factors = self.factors
         return LinearImage(factors.left, factors.right, self.family, self._before.lam, factors.manifest.centre)
 
-    @property
-    def _noise(self) -> Noise:
-        return sum(self.noises.values(), Noise())
-
     @cached_property
     def noises(self) -> Mapping[str, Noise]:
-        """The same by source: those of the frames by name, ``ambient frame`` and ``session``."""
+        """Noise by source: sources of the frames by name, ``ambient frame`` and ``session``."""
         frames = self._frames.noises(self.exposure_s)
         found = {name: Noise(datum=variance) for name, variance in frames.items() if name != NONUNIFORMITY}
-        if self._takes_ambient:
+        if takes_ambient_frame("auto", self.family, self._expected):
             exposer = self._frames.exposer(self.exposure_s)
             off = exposer.electrons(self._expected.projector_off)
             variance = (exposer.sensor_noise(off) / self.exposure_s) ** 2 / ambient_shots(self.family)
@@ -333,18 +301,15 @@ class DriftStand:
             found[SESSION] = Noise(left=known.left**2, right=known.right**2)
         return found
 
-    @property
-    def _takes_ambient(self) -> bool:
-        return takes_ambient_frame("auto", self.family, self._expected)
-
     def _frame_changes(self, drift: Drift) -> Changed:
-        """What a ``drift`` changes in the frames, to first order where several things drift at once."""
+        """Return the changes of the frames by a ``drift``, to first order where several things drift at once."""
         count = self.family.left.shape[1], self.family.right.shape[1]
+        black = self.lit.light.simulation.physics.black_level
         ramp = levels(self.seed, "power", len(self.family.shots), drift.power_ramp).reshape(*count, -1)
         gain = (1 + drift.exposure) * (1 + drift.power) * ramp
         changed = Changed(
             terms=self._terms(drift),
-            leak=self._leak,
+            leak=black / (1 - black),  # as a part of a session's light, which lacks what black pixels leak
             gain=gain.mean(axis=2),
             gain_apart=(gain[:, :, 0] - gain[:, :, -1]) / 2,
             flicker=self._gains(drift, "power", drift.power_flicker),
@@ -356,13 +321,16 @@ class DriftStand:
             each = self._gains(drift, "lamp", drift.lamp_flicker)
             common = [rms / ambient_shots(self.family) ** 0.5 for rms in each]
             return replace(changed, added=lamps, added_gain=drift.lamp, added_flicker=each, added_common=common)
-        frame = np.full(self.lit.bench.geometry.frame_shape, self._offset(drift))
+        sensor = self.lit.bench.sensor
+        dark = warmer(sensor, drift.temperature_k).superpixel_dark_current_e_per_s * (1 + drift.exposure)
+        offset = drift.black_level_dn * sensor.codes / sensor.gain_dn_per_e / self.exposure_s
+        frame = np.full(self.lit.bench.geometry.frame_shape, offset + dark - sensor.superpixel_dark_current_e_per_s)
         return replace(changed, added=frame if self._fixed_frame is None else frame + self._fixed_frame)
 
     @cached_property
     def _response(self) -> FloatArray | None:
-        """(m, m') what pixels' responses differ by from what factors know: these were measured behind the same pixels,
-        and hold what all pixels of a row, and of a column, have alike."""
+        """Relative differences (m, m') of pixels' responses from the factors, which are of the same pixels and therefore
+        contain what all pixels of a row, or of a column, have alike."""
         response = specimen(self.lit.bench.sensor, self.lit.bench.geometry.frame_shape).response
         if response is None:
             return None
@@ -375,7 +343,7 @@ class DriftStand:
 
     @cached_property
     def _fixed_frame(self) -> FloatArray | None:
-        """(m, m') what pixels read beyond what a user takes off without an ambient frame [electrons/s]."""
+        """What pixels read (m, m') beyond what a user subtracts without an ambient frame [electrons/s]."""
         sensor, shape = self.lit.bench.sensor, self.lit.bench.geometry.frame_shape
         own = specimen(sensor, shape)
         if (own.offset_e is None and own.dark_e_per_s is None) or self._expected.has_ambient:
@@ -384,7 +352,7 @@ class DriftStand:
         return frame if own.dark_e_per_s is None else frame + own.dark_e_per_s - sensor.superpixel_dark_current_e_per_s
 
     def _gains(self, drift: Drift, source: str, rms: float) -> Gains:
-        """Gains of a ``source`` from frame to frame: a flicker of ``rms``, and the cosine and sine of its ripple."""
+        """Return gains of a ``source`` from frame to frame: a flicker of ``rms``, and cosine and sine of its ripple."""
         found: list[float | FloatArray] = [rms] if rms else []
         if source in drift.ripples:
             amplitude, hertz = drift.ripples[source]
@@ -393,26 +361,13 @@ class DriftStand:
             found += [wave.real, wave.imag]
         return found
 
-    @property
-    def _leak(self) -> float:
-        """What black pixels leak, as a part of the light that a session sees: white pixels lose it there."""
-        black = self.lit.light.simulation.physics.black_level
-        return black / (1 - black)
-
-    def _offset(self, drift: Drift) -> float:
-        """What every datum reads beyond its light [electrons/s]."""
-        sensor = self.lit.bench.sensor
-        black = drift.black_level_dn * sensor.codes / sensor.gain_dn_per_e / self.exposure_s
-        dark = warmer(sensor, drift.temperature_k).superpixel_dark_current_e_per_s * (1 + drift.exposure)
-        return black + dark - sensor.superpixel_dark_current_e_per_s
-
     def scatter(self, drift: Drift, error: FloatArray) -> float:
-        """Variance that the draw of a random ``drift`` brings into the mean squared error, beside an ``error`` (n, n')
-        of the image without it."""
+        """Return the variance that the draw of a random ``drift`` brings into the mean squared error, for an ``error``
+        (n, n') of the image without drift."""
         return self.linear.scatter(self.lit.truth, self._frame_changes(drift), error) / error.size**2
 
     def _terms(self, drift: Drift) -> SeparableTerms:
-        """What a ``drift`` of mask or projector adds to the camera's operator, in the unit of its factors."""
+        """Return what a ``drift`` of mask or projector adds to the camera's operator, in the unit of its factors."""
         bench = self.lit.bench
         best = IdealCamera(bench, bench.geometry.mask, self._spectrum).factors
         at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
@@ -428,7 +383,7 @@ class DriftStand:
         return [(float(rate) * left, right) for left, right in found]
 
     def _turn(self, angle: float) -> SeparableTerms:
-        """Change of the shadow to first order in the ``angle``: theta (s_col d/d s_row - s_row d/d s_col)."""
+        """Return the shadow's change to first order in the ``angle``: theta (s_col d/d s_row - s_row d/d s_col)."""
         camera = IdealCamera(self.lit.bench, self.lit.bench.geometry.mask)
         shadow = ShadowGeometry.of(camera.bench.geometry, camera.bench.geometry.scene_distance)
         row, column = (
@@ -445,7 +400,7 @@ class DriftStand:
         return found
 
     def _shift(self, by_mm: float) -> SeparableTerms:
-        """The shadow with every profile shifted ahead: of the mask moved back."""
+        """Return the shadow with every profile shifted ahead, as by a mask that moved back."""
         back = Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)
         return self._shadow(drift_mask(self.lit.bench, back))
 
@@ -458,7 +413,7 @@ class DriftStand:
 
 
 def squared_error(db: float) -> float:
-    """Mean squared error of a PSNR ``db``, peak 1."""
+    """Return the mean squared error of a PSNR ``db``, peak 1."""
     return float(10 ** (-db / 10))
 
 
@@ -467,7 +422,7 @@ def _minus(terms: SeparableTerms) -> SeparableTerms:
 
 
 def _weigh(parts: list[tuple[SeparableTerms, float]]) -> SeparableTerms:
-    """Means of terms whose two factors vary on their own, factor by factor."""
+    """Return the means of terms whose two factors vary independently, factor by factor."""
     found: SeparableTerms = []
     for index in range(len(parts[0][0])):
         left, right = (sum(weight * terms[index][side] for terms, weight in parts) for side in (0, 1))
@@ -497,15 +452,19 @@ AGREE_DB = 0.5
 def _points(scope: Scope) -> Sequence[Point]:
     drift, first = recipe_of(scope.recipe).drift, scope.seeds[0]
     read_name(scope.patterns)
-    amounts = _amounts(scope, drift)
+    amounts = {kind: [getattr(drift, kind)] for kind in drift.kinds} if not scope.sweep else {
+        kind: [getattr(drift.alone(kind, number_of(kind, text)), kind) for text in texts] for kind, texts in scope.sweep
+    }  # fmt: skip
     if not amounts:
         raise MitsimError(f"study drift: the table [drift] of {scope.recipe} moves nothing; give amounts in it")
     if any(kind in _RIPPLES for kind in amounts):  # refused before any light is traced
         load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml", CAMERA)).known_line_time_s()
+    sheet = scope.setup.with_print(TEST_IMAGES[0])
+    lamp, own = replace(sheet, scene=_LAMP_SCENE).with_parameters(lamp=_LAMP), scope.pictures == (None,)
     found = [
         Point.of(
-            _setup(scope, kind), recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=DRIFT_UNITS[kind],
-            amount=amount, seed=seed,
+            scope.setup if own else lamp if kind in _LAMPS else sheet,
+            recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=DRIFT_UNITS[kind], amount=amount, seed=seed,
         )
         for seed in scope.choose(range(first, first + _SEEDS), scope.seeds)
         for kind, each in amounts.items()
@@ -514,25 +473,8 @@ def _points(scope: Scope) -> Sequence[Point]:
     return group_by_setup(found)
 
 
-def _amounts(scope: Scope, drift: Drift) -> Mapping[str, Sequence[float]]:
-    """Amounts of each kind: those that the scope asks for, else the one that a ``drift`` states."""
-    if not scope.sweep:
-        return {kind: (getattr(drift, kind),) for kind in drift.kinds}
-    return {
-        kind: [getattr(drift.alone(kind, number_of(kind, text)), kind) for text in texts] for kind, texts in scope.sweep
-    }
-
-
-def _setup(scope: Scope, kind: str) -> Setup:
-    """The scope's own scene, or a sheet with one print; before a lamp where a lamp is to drift."""
-    if scope.pictures == (None,):
-        return scope.setup
-    setup = scope.setup.with_print(TEST_IMAGES[0])
-    return replace(setup, scene=_LAMP_SCENE).with_parameters(lamp=_LAMP) if kind in _LAMPS else setup
-
-
 def recipe_of(path: str | None) -> SessionRecipe:
-    """The recipe at ``path``, or the shipped one with a drift; MitsimError as :func:`load_recipe`."""
+    """Return the recipe at ``path``, or the shipped one with a drift; MitsimError as :func:`load_recipe`."""
     return load_recipe(shipped_path("calibration", "drift.toml") if path is None else Path(path))
 
 
@@ -564,7 +506,7 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) -> Factors:
-    """What a session by a ``recipe`` finds whose power drifts by ``drift``."""
+    """Return the factors of a session by a ``recipe`` whose power drifts by ``drift``."""
     seed, own = int(point["seed"]), recipe.model_copy(update={"drift": drift})
     if own.model_copy(update={"source": ""}) == load_recipe().model_copy(update={"source": ""}):
         return studio.factors(point.setup, seed)
@@ -574,21 +516,18 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
 
 
 def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
-    """The scene in light of a projector that moved, as coarse as its light before: another plan's errors would be in
-    one image alone, and would pass for the drift's."""
+    """Return the scene in light of a projector that moved, by the plan of its light before, because errors of another plan
+    would be in one image alone and would pass for the drift's."""
     return LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan))
 
 
 def _by_kind(results: Results) -> Results:
-    """Return results whose rows name kind and amount (``what``) and tell the ``first`` amount of each kind."""
-    first: dict[Value, Value] = {}
-    for row in results.rows:
-        first.setdefault(row["kind"], row["amount"])
-    rows = []
+    """Return results whose rows name kind and amount (``what``), True in ``first`` for the first amount of a kind."""
+    first, rows = dict[Value, Value](), list[dict[str, Value]]()
     for row in results.rows:
         kind, amount = str(row["kind"]), float(str(row["amount"]))
         what = f"{DRIFT_WORDS[kind]}, {amount_in_words(kind, amount)}"
-        rows.append({**row, "what": what, "first": row["amount"] == first[row["kind"]]})
+        rows.append({**row, "what": what, "first": row["amount"] == first.setdefault(kind, row["amount"])})
     return replace(results, rows=rows)
 
 

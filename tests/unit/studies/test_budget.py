@@ -17,7 +17,7 @@ from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import causes, error_budget
 from mitsim.studies.drift_study import AMBIENT, SESSION
 from mitsim.studies.error_budget import ERROR_SOURCES, LAMBDA, RENDERING, REST, LossRow
-from mitsim.studies.perturbation import Expected, LinearImage, Noise
+from mitsim.studies.causes import Expected, LinearImage, Noise
 
 N = 4
 RNG = np.random.default_rng(2)

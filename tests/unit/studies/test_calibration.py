@@ -33,8 +33,8 @@ from mitsim.studies.calibration_study import (
     singular_rows,
 )
 from mitsim.studies.error_budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gain_without, session_rendering
-from mitsim.studies.framework.panels import build_findings
-from mitsim.studies.perturbation import Expected, Noise
+from mitsim.studies.framework.page import build_findings
+from mitsim.studies.causes import Expected, Noise
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 SEEDS = 40

@@ -11,7 +11,7 @@ import pytest
 
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.studies.perturbation import Changed, LinearImage, Noise
+from mitsim.studies.causes import Changed, LinearImage, Noise
 
 N, PIXELS, LAM = 4, 5, 0.3
 RNG = np.random.default_rng(4)

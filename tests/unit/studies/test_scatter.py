@@ -7,7 +7,7 @@ import pytest
 
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.solver import prepare
-from mitsim.studies.perturbation import LinearImage, Noise, Scatter
+from mitsim.studies.causes import LinearImage, Noise, Scatter
 
 N, PIXELS, LAM, SIZE, DRAWS = 6, 9, 0.3, 0.02, 600
 RNG = np.random.default_rng(4)
