@@ -56,7 +56,7 @@ from mitsim.core.manifests import MOSAIC as MOSAIC_RUN
 from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
-from mitsim.studies import EXPOSED, OF_CAPTURES, OF_NO_SCENE
+from mitsim.studies import OF_CAPTURES, OF_NO_SCENE
 from mitsim.studies.emva_options import Procedure
 from mitsim.studies.twin_files import TwinFiles
 
@@ -368,7 +368,7 @@ def prepare_study(
     name, scene, output, asked, job
         as there.
     """
-    from mitsim.studies.framework.experiment import is_experiment
+    from mitsim.studies.framework.experiment import is_experiment, no_such_study
 
     if name == MERGE:
         asked.refuse(asked.without("experiment", "variant"), "on parts, which say themselves what they are of")
@@ -385,8 +385,9 @@ def prepare_study(
     if len(named) > 1:
         raise MitsimError(f"study {name}: got {len(named)} scenes, {' '.join(map(str, named))}; give one scene")
     place = str(named[0]) if named else None
-    prepare = _study_of_points if is_experiment(name) else _study_of_a_bench
-    return prepare(name, place, Path(output), request, job or Job(), asked)
+    if not is_experiment(name):
+        raise no_such_study(name)
+    return _study_of_points(name, place, Path(output), request, job or Job(), asked)
 
 
 def _scenes_of(scene: Path | str | Sequence[Path | str] | None) -> list[Path | str]:
@@ -488,22 +489,6 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     from mitsim.devices.projector import ProjectorModel  # last: it imports numpy
 
     load_model(projector, ProjectorModel)
-
-
-def _study_of_a_bench(
-    name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions
-) -> Study:
-    from mitsim.studies.framework.campaign import check_study_folder, find_study
-
-    settings: dict[str, Any] = {} if asked.recipe is None else {"recipe": load_recipe(asked.recipe)}
-    run_study = find_study(name, **settings)
-    if asked.over or asked.measure != "psnr" or asked.shard != WHOLE or asked.jobs or asked.scheduler:
-        raise MitsimError(f"study {name}: is measured whole, here; leave out over, measure, shard, jobs and scheduler")
-    asked.refuse(["quick"], f"on the study {name}, which has no points to leave out")
-    check_study_folder(output, name)
-    place = scene or "photograph"
-    asked.check(place, request.patterns, request.timing if name in EXPOSED else None)
-    return lambda: run_study(open_as(place, asked, job), output, request, job)
 
 
 # ---- sessions --------------------------------------------------------------------------------------------------------

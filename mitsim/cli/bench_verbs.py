@@ -33,7 +33,7 @@ from mitsim.core.manifests import MONO, RUN, read_colours
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.requests import PairOptions
-from mitsim.studies import ALL, EXPERIMENTS, STUDIES
+from mitsim.studies import ALL, EXPERIMENTS
 from mitsim.verbs import DemoRequest, RunOptions, StudyOptions, capture_in, open_as, plan_in
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class Studying(StudyOptions, Common):
         ...,
         "of the study, all or merge; of one of your own its file, or its module with a dot",
         "NAME",
-        complete=lambda: (*EXPERIMENTS, *STUDIES, ALL, "merge"),
+        complete=lambda: (*EXPERIMENTS, ALL, "merge"),
     )
     scenes: list[str] | None = scene_named(
         None, "scene XML, or the name of a shipped scene; of merge, folders", kind=list[str]

@@ -63,15 +63,13 @@ def _masks() -> Iterator[Entry]:
 
 def _studies() -> Iterator[Entry]:
     """Read the studies from their source, because importing all of them takes three seconds."""
-    from mitsim.studies import EXPERIMENTS, SHARED, STUDIES
+    from mitsim.studies import EXPERIMENTS, SHARED
 
     for name in EXPERIMENTS:
         tree = _source(f"mitsim.studies.{SHARED.get(name, f'{name}_study')}")
         calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and len(node.args) > 2)
         named = next(call for call in calls if isinstance(call.args[0], ast.Constant) and call.args[0].value == name)
         yield Entry(name, ast.literal_eval(named.args[2]))
-    for name in STUDIES:
-        yield Entry(name, _first_line(_source(f"mitsim.studies.{name}_study")).partition("`: ")[2].removesuffix("."))
 
 
 def _effects() -> Iterator[Entry]:

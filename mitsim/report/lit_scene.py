@@ -344,27 +344,6 @@ class IdealCamera:
         return FrameOptics(self._geometry, *self.directions, (self.bench.geometry.scene_distance,), 1, self.spectrum)
 
 
-@dataclass(frozen=True)
-class ShadowRow:
-    """A mask in one light compared with its geometric shadow: relative rms differences of operators.
-
-    ``terms`` counts separable terms. ``point_source`` and ``scene_pixel`` are differences from the geometric shadow,
-    for point sources at the centres of projector pixels and averaged over these pixels; ``factor`` is the difference
-    of the factor that a solver uses on one side. ``separability`` is the remainder of the operator without its best
-    separable term, and ``separability_centred`` the same after row and column means are subtracted.
-    """
-
-    mask: str
-    light: str
-    wavelengths: int
-    terms: int
-    point_source: float
-    scene_pixel: float
-    factor: float
-    separability: float
-    separability_centred: float
-
-
 def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
     """Return the lights that are compared, by name; None is light without diffraction."""
     edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
@@ -376,23 +355,29 @@ def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
     }
 
 
-def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
-    """Compare the camera in one ``light`` with the geometric one among the ``systems`` of a mask."""
+def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> dict[str, str | int | float]:
+    """Return relative rms differences of a mask in one ``light`` from its geometric shadow, among ``systems`` by light.
+
+    ``terms`` counts separable terms. ``point_source`` and ``scene_pixel`` are differences of operators, for point
+    sources at the centres of projector pixels and averaged over these pixels; ``factor`` is the difference of the
+    factor that a solver uses on one side. ``separability`` is the remainder of the operator without its best separable
+    term, and ``separability_centred`` the same after row and column means are subtracted.
+    """
     system, geometric = systems[light], systems[GEOMETRIC]
     factor, assumed = system.factors[0], geometric.factors[0]
     # (left, right) and (-left, -right) are one camera.
     sign = 1.0 if np.vdot(factor, assumed) >= 0 else -1.0
-    return ShadowRow(
-        mask=system.mask,
-        light=light,
-        wavelengths=len(system.spectrum.weights) if system.spectrum else 0,
-        terms=len(system.terms),
-        point_source=relative_difference(system.points(), geometric.points()),
-        scene_pixel=relative_difference(system.terms, geometric.terms),
-        factor=relative_error(sign * factor, assumed),
-        separability=best_term(system.terms).residual,
-        separability_centred=best_term(centre_terms(system.terms)).residual,
-    )
+    return {
+        "mask": system.mask,
+        "light": light,
+        "wavelengths": len(system.spectrum.weights) if system.spectrum else 0,
+        "terms": len(system.terms),
+        "point_source": relative_difference(system.points(), geometric.points()),
+        "scene_pixel": relative_difference(system.terms, geometric.terms),
+        "factor": relative_error(sign * factor, assumed),
+        "separability": best_term(system.terms).residual,
+        "separability_centred": best_term(centre_terms(system.terms)).residual,
+    }
 
 
 def point_profiles(bench: Apparatus) -> dict[str, FloatArray]:

@@ -103,17 +103,6 @@ def reflectance(value: float) -> str:
     return f"{value:.4f}" if value >= 1e-3 else scientific(value)
 
 
-def with_error(value: float, error: float, unit: str = "") -> str:
-    """Print a number and its standard error to the second digit of the error, but not finer than 0.01.
-
-    An error that rounds to 0 is left out.
-    """
-    places = min(max(1 - math.floor(math.log10(error)), 0), 2) if error > 0 else 2
-    deviation = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
-    # Zero has no sign.
-    return f"{value:z.{places}f}".replace("-", "\N{MINUS SIGN}") + deviation + unit
-
-
 def sentence(text: str) -> str:
     """Turn a warning of the command line into a sentence with a capital and a full stop."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."

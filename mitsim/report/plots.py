@@ -232,6 +232,7 @@ def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
     return figure
 
 
+<<<<<<< HEAD
 def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
     """Draw errors of the singular values of ``factors``, and their standard errors as lines.
 
@@ -270,6 +271,23 @@ def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
     bar = figure.colorbar(drawn, ax=axes, extend="both")
     bar.set_label("error [predicted deviations]", fontsize=FONT - 1)
     bar.ax.tick_params(labelsize=FONT - 2)
+=======
+def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> Figure:
+    """Draw the PSNR [dB] by family in the idealised model and with rendered light, with one standard error."""
+    figure, axes = figure_of(0.36 * WIDTH)
+    place = np.arange(len(quality), dtype=np.float64)
+    looks = (-0.2, PALE, "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
+    for means, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
+        values, errors = (np.array([getattr(mean, part) for mean in means]) for part in ("value", "error"))
+        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label, yerr=_bar_errors(errors), capsize=3)
+        axes.bar_label(bars, fmt="%.1f", fontsize=FONT - 1, padding=2)
+    if title:
+        figure.suptitle(title, fontsize=FONT)
+    axes.set_xticks(place, list(quality), fontsize=FONT)
+    axes.margins(y=0.14)
+    label_axes(axes, "", "PSNR [dB]", grid="y")
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", ncols=2, bbox_to_anchor=(0, 1.16))
+>>>>>>> 542a910a (Docs and tests of the study of a calibration as a declaration; maps and charts that it alone drew are gone)
     return figure
 
 

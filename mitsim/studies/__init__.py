@@ -5,15 +5,10 @@ This file has their names alone. The study NAME is the module ``mitsim.studies.N
 
 from __future__ import annotations
 
-STUDIES: tuple[str, ...] = ()
-"""Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
-:class:`mitsim.studies.framework.campaign.Findings`."""
 OF_NO_SCENE = ("twin",)
 """Those whose bench is None."""
 OF_CAPTURES = ("learned", "twin")
 """Those of real captures (`--data`)."""
-EXPOSED = ("calibration",)
-"""Those whose frames fill a part of the camera's full well."""
 PAPER = (
     "patterns",
     "distance",

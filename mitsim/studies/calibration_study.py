@@ -448,7 +448,7 @@ def compare_shadows(bench: Bench) -> list[Row]:
     """Return rows of the shadow of the mask of a ``bench`` in each light against the geometric one, and of a point's
     shadow down the rows in the middle of the sensor, relative to the open sensor's irradiance."""
     cameras = {name: IdealCamera(bench, bench.geometry.mask, spectrum) for name, spectrum in lights(bench).items()}
-    rows: list[Row] = [{"kind": "shadows", **asdict(shadow_row(name, cameras))} for name in cameras]
+    rows: list[Row] = [{"kind": "shadows", **shadow_row(name, cameras)} for name in cameras]
     places = np.asarray(bench.geometry.centres(0))
     inside = np.abs(places - places.mean()) <= _PROFILE_MM
     for name, values in point_profiles(bench).items():

@@ -329,8 +329,8 @@ class DriftStand:
 
     @cached_property
     def _response(self) -> FloatArray | None:
-        """Relative differences (m, m') of pixels' responses from the factors, which are of the same pixels and therefore
-        contain what all pixels of a row, or of a column, have alike."""
+        """Relative differences (m, m') of pixels' responses from the factors, which are of the same pixels and
+        therefore contain what all pixels of a row, or of a column, have alike."""
         response = specimen(self.lit.bench.sensor, self.lit.bench.geometry.frame_shape).response
         if response is None:
             return None
@@ -516,8 +516,8 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
 
 
 def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
-    """Return the scene in light of a projector that moved, by the plan of its light before, because errors of another plan
-    would be in one image alone and would pass for the drift's."""
+    """Return the scene in light of a projector that moved, by the plan of its light before, because errors of another
+    plan would be in one image alone and would pass for the drift's."""
     return LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan))
 
 

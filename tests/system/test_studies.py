@@ -59,7 +59,7 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
         (
             "weather",
             (),
-            "there is no such study; use calibration, patterns",
+            "there is no such study; use patterns, distance",
         ),
         ("models", (), "use `mitsim study calibration SCENE`"),
         ("diffraction", (), "use `mitsim study calibration SCENE`"),

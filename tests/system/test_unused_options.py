@@ -63,7 +63,6 @@ CASES = [
     ("study distance -o {out}", "--experiment a.b"),
     ("study distance -o {out}", "--patterns dots:7"),
     ("study distance --scheduler tcp://a:1 -o {out}", "--jobs 1"),
-    ("study calibration -o {out}", "--quick"),
     ("study twin -o {out}", "--camera imx249"),
     ("study twin -o {out}", "-D a=1"),
 ]

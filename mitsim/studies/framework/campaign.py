@@ -6,7 +6,6 @@ dies loses the point that it was measuring, and another process tries it again.
 
 from __future__ import annotations
 
-import importlib
 import json
 import multiprocessing
 import shutil
@@ -18,16 +17,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatch
-from functools import cache, partial
+from functools import cache
 from itertools import groupby
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import TypeAdapter, ValidationError
 
 from mitsim.bench.apparatus import check_scene, open_apparatus
-from mitsim.bench.request import Request
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import (
@@ -42,7 +40,7 @@ from mitsim.core.files import (
 )  # fmt: skip
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
-from mitsim.studies import ALL, EXPERIMENTS, PAPER, STUDIES
+from mitsim.studies import ALL, EXPERIMENTS, PAPER
 from mitsim.studies.framework.experiment import (
     HEADS,
     Claim,
@@ -53,62 +51,15 @@ from mitsim.studies.framework.experiment import (
     Setup,
     Study,
     find_experiment,
-    no_such_study,
 )  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from mitsim.api.bench import Bench
-    from mitsim.studies.framework.panels import Part, Section
+    from mitsim.studies.framework.panels import Section
     from mitsim.studies.framework.studio import Studio
 
 # -------- Results of studies
-
-
-class Findings:
-    """Findings of a study of one bench, as its folder and the command line show them."""
-
-    title: ClassVar[str] = ""
-    """Title of its page; without one it has none."""
-
-    def payload(self) -> dict[str, Any]:
-        """Return the findings as JSON has them."""
-        raise NotImplementedError
-
-    def lines(self) -> list[str]:
-        """Return the findings as text: the page's parts, unless the study has something shorter."""
-        return [line for part in self.parts() for line in part.lines()]
-
-    def figures(self) -> Mapping[str, Figure]:
-        """Return figures by file name."""
-        raise NotImplementedError
-
-    def tables(self) -> Mapping[str, Sequence[Mapping[str, Any]]]:
-        """Return rows of tables by file name."""
-        return {}
-
-    def parts(self) -> Sequence[Part]:
-        """Return the parts of the page."""
-        return ()
-
-    def records(self) -> list[dict[str, Any]]:
-        """Return what was measured, a dictionary a row: the first table, or the first list of such in the JSON."""
-        for table in self.tables().values():
-            return [dict(row) for row in table]
-        lists = (value for value in self.payload().values() if isinstance(value, list | tuple))
-        found = ([dict(row) for row in each if isinstance(row, Mapping)] for each in lists)
-        return next((rows for rows in found if rows), [])
-
-    @property
-    def message(self) -> str:
-        """First sentence of the page; empty for its title alone."""
-        return ""
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Reasons why the findings may not be trusted, and what to do."""
-        return ()
 
 
 @dataclass(frozen=True)
@@ -123,21 +74,16 @@ class StudyResult:
         rows of its table.
     warnings
         reasons why it may not be trusted.
-    findings, scene, patterns
-        of a study of one bench: findings, and the scene and patterns that they are of; None: of none.
     points, missing, seconds
-        of a study of many points: measured points, those of other parts that are missing, and the time of measuring.
+        measured points, those of other parts that are missing, and the time of measuring.
     claims, figures, section
-        of a whole study of many points: judged claims, files of figures, and its section of a page.
+        of a whole study: judged claims, files of figures, and its section of a page.
     """
 
     study: str
     output: str
     rows: tuple[Any, ...] = field(default=(), repr=False)
     warnings: tuple[str, ...] = ()
-    findings: Findings | None = None
-    scene: str | None = None
-    patterns: str | None = None
     points: int = 0
     missing: int = 0
     seconds: float = 0.0
@@ -147,15 +93,11 @@ class StudyResult:
 
     def payload(self) -> dict[str, Any]:
         """Return the result as JSON has it."""
-        if self.findings is not None:
-            return {**self.findings.payload(), "scene": self.scene, "patterns": self.patterns, "output": self.output}
         names = ("study", "output", "points", "missing", "seconds", "rows", "claims", "figures", "warnings")
         return {name: getattr(self, name) for name in names} | {"claims": [asdict(claim) for claim in self.claims]}
 
     def lines(self) -> list[str]:
         """Return the result as text."""
-        if self.findings is not None:
-            return [f"JSON and plots: {self.output}", *self.findings.lines()]
         if self.missing:
             return [
                 f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
@@ -238,71 +180,8 @@ def _is_earlier(place: Path, name: str) -> bool:
         ALL: (*PAPER, "*.html"),
         "characterise": ("*.png", "camera.toml", "characterise.html"),
         "demo": (*DEMO_FOLDERS, DEMO_PAGE),
-        **{study: ("*.png", "*.csv", f"{study}.html") for study in STUDIES},
     }.get(name, ("*.png", "*.csv", "*.html", POINTS, KEPT))
     return all(any(fnmatch(item.name, known) for known in (head.name, ".*", *written)) for item in place.iterdir())
-
-
-# -------- A study of one bench
-
-
-def run_study(
-    name: str,
-    measure: Callable[[Any, Request, Job], Findings],
-    bench: Bench | None,
-    output: Path | str,
-    request: Request | None = None,
-    job: Job | None = None,
-) -> StudyResult:
-    """Measure, and write NAME.json, and figures, tables and a page if there are any, to a folder.
-
-    MitsimError for an output that cannot be written or holds something else, and for anything that the study refuses.
-
-    Parameters
-    ----------
-    name, measure
-        name of the study, and its function.
-    bench, request, job
-        bench, or None for a study of no scene; patterns and seed; clock, progress and limits.
-    output
-        new or empty folder, or one with an earlier study of that name, which is replaced.
-    """
-    request = request or Request.of()
-    with study_folder(output, name) as folder:
-        findings = measure(bench, request, job or Job())
-        scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
-        warned = tuple(findings.warnings)
-        result = StudyResult(name, str(folder), tuple(findings.records()), warned, findings, scene, patterns)
-        provenance = {"kind": name, "seed": request.seed, "versions": versions()}
-        write_json(folder / f"{name}.json", {**result.payload(), **provenance})
-        figures = write_figures(folder, findings.figures())
-        if findings.title:
-            from mitsim.report.pages import page_figure
-            from mitsim.studies.framework.panels import build_findings
-
-            scene_name = f"Scene {bench.loaded.path.parent.name}, patterns {patterns}, seed" if bench else "Seed"
-            where, titles = f"{scene_name} {request.seed}.", (findings.title, findings.message)
-            pictures = {file: page_figure(figure) for file, figure in figures.items()}
-            write_text(folder / f"{name}.html", build_findings(name, titles, where, findings.parts(), pictures, warned))
-        for file, table in findings.tables().items():
-            write_table(folder / file, table)
-        return result
-
-
-def find_study(name: str, **settings: object) -> Callable[..., StudyResult]:
-    """Return the study ``name`` as a function of (bench, output, request, job); ``settings`` are further arguments.
-
-    MitsimError for another name, with the names of all studies. Nothing heavy is imported before the name is known and
-    the folder is free.
-    """
-    if name not in STUDIES:
-        raise no_such_study(name)
-
-    def measure(bench: Bench | None, request: Request, job: Job) -> Findings:
-        module: Any = importlib.import_module(f"mitsim.studies.{name}_study")
-        return cast(Findings, module.measure(bench, request, job, **settings))
-
-    return partial(run_study, name, measure)
 
 
 # -------- Points of a study on disk

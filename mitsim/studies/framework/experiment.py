@@ -26,7 +26,7 @@ from mitsim.devices.patterns import read_name
 from mitsim.devices.session import Drift
 from mitsim.reconstruct.request import METHODS
 from mitsim.report import CONVENTIONS
-from mitsim.studies import ALL, EXPERIMENTS, GONE, SHARED, STUDIES
+from mitsim.studies import ALL, EXPERIMENTS, GONE, SHARED
 
 if TYPE_CHECKING:
     import numpy as np
@@ -401,7 +401,7 @@ def no_such_study(name: str) -> MitsimError:
     """Return the refusal of a ``name`` that is no study's, with the replacement of one that there was."""
     if name in GONE:
         return MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
-    return MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+    return MitsimError(f"study {name!r}: there is no such study; use {', '.join(EXPERIMENTS)}")
 
 
 @cache

@@ -26,7 +26,7 @@ from mitsim.exchange.capture_list import load_capture_list
 from mitsim.learn.requests import METHODS as LEARNED
 from mitsim.reconstruct.request import METHODS
 from mitsim.sessions.session_file import read_session
-from mitsim.studies import EXPERIMENTS, STUDIES
+from mitsim.studies import EXPERIMENTS
 from mitsim.studies.framework.experiment import Scope, Setup, find_experiment
 
 PROGRAM: Any = typer.main.get_command(app)
@@ -41,7 +41,7 @@ def test_a_list_has_all_that_there_is() -> None:
     shelf = {path.stem for path in shipped_path("calibration").glob("*.toml")}
     assert shelf - {"session", "drift", "flatcam", "diffusercam"} == {*names["cameras"], *names["projectors"]}
     assert names["effects"] == [*SWITCHES] and names["methods"] == [*METHODS, *LEARNED]
-    assert {*names["studies"]} == {*EXPERIMENTS, *STUDIES}
+    assert {*names["studies"]} == {*EXPERIMENTS}
     assert all(each.serves.endswith("?") == (each.name in EXPERIMENTS) for each in listed["studies"])
     for entry in (entry for entries in listed.values() for entry in entries):
         assert len(entry.serves) > 12 and "\n" not in entry.serves + entry.what, entry

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas
@@ -100,15 +99,8 @@ def test_a_studys_rows_are_a_table(tmp_path: Path) -> None:
     """(Planted: a table of the first row alone.)"""
     from mitsim.studies.framework.campaign import StudyResult
 
-    class Toy:
-        """Findings."""
-
-        def lines(self) -> list[str]:
-            return ["It is 1."]
-
-    findings: Any = Toy()
     rows = ({"x": 1, "psnr_db": 20.5}, {"x": 2, "psnr_db": 21.5})
-    found = StudyResult("toy", str(tmp_path), rows, findings=findings)
+    found = StudyResult("toy", str(tmp_path), rows, points=2)
     (tmp_path / "toy.png").write_bytes(b"\x89PNG")
-    assert found.pictures == {"toy.png": tmp_path / "toy.png"} and "It is 1." in found._repr_html_()
+    assert found.pictures == {"toy.png": tmp_path / "toy.png"} and "2 points in" in found._repr_html_()
     assert found.to_pandas().equals(pandas.DataFrame([*rows]))

@@ -101,11 +101,6 @@ def test_no_pyplot_is_loaded() -> None:
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
-def test_maps_of_errors_say_of_which_factor() -> None:
-    axes, _ = plots.deviations([[1.0, -2.0]], 4.0, "left factor").axes
-    assert axes.get_title() == "left factor" and axes.images[0].get_clim() == (-4.0, 4.0)
-
-
 # ---- results on axes -------------------------------------------------------------------------------------------------
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mitsim.report.pages import round_to_error, scientific, sentence, typeset, with_error
+from mitsim.report.pages import round_to_error, scientific, sentence, typeset
 
 TIMES, MICRO = "\N{MULTIPLICATION SIGN}", "\N{GREEK SMALL LETTER MU}"
 
@@ -49,21 +49,6 @@ def test_a_number_keeps_its_digits(value: float | None, printed: str) -> None:
 def test_a_measured_number_ends_where_its_error_does(value: float, error: float, printed: str) -> None:
     """No digits of a number whose first one is not known."""
     assert round_to_error(value, error) == printed
-
-
-@pytest.mark.parametrize(
-    ("value", "error", "printed"),
-    [
-        (81.72, 2.1, "81.7 \N{PLUS-MINUS SIGN} 2.1 %"),
-        (7.384, 0.53, "7.38 \N{PLUS-MINUS SIGN} 0.53 %"),
-        (0.46, 0.0004, "0.46 %"),
-        (-0.004, 0.09, "0.00 \N{PLUS-MINUS SIGN} 0.09 %"),
-        (-310.2, 40.0, "\N{MINUS SIGN}310 \N{PLUS-MINUS SIGN} 40 %"),
-    ],
-)
-def test_an_error_that_rounds_to_nothing_is_not_told(value: float, error: float, printed: str) -> None:
-    """(Planted: 0.46 with an error of 0.00.)"""
-    assert with_error(value, error, " %") == printed
 
 
 def test_a_warning_is_a_sentence_on_a_page() -> None:

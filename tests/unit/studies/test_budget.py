@@ -14,10 +14,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.session import Drift
 from mitsim.report.lit_scene import SPECKLE
-from mitsim.studies import causes, error_budget
-from mitsim.studies.drift_study import AMBIENT, SESSION
-from mitsim.studies.error_budget import ERROR_SOURCES, LAMBDA, RENDERING, REST, LossRow
+from mitsim.studies import calibration_study as budget
+from mitsim.studies import causes
+from mitsim.studies.calibration_study import ERROR_SOURCES, LAMBDA, RENDERING, REST, LossRow, Share
 from mitsim.studies.causes import Expected, LinearImage, Noise
+from mitsim.studies.drift_study import AMBIENT, SESSION
 
 N = 4
 RNG = np.random.default_rng(2)
@@ -53,16 +54,16 @@ def test_noise_is_told_by_source_and_by_factor() -> None:
     stand: Any = SimpleNamespace(
         noises=empty, factors=SimpleNamespace(left=factors[0], right=factors[1]), lit=SimpleNamespace(light=sampled)
     )
-    found = dict(error_budget._noises(stand, session))
+    found = dict(budget._noises(stand, session))
     common = factors[1].sum(axis=1)
     reported = found.pop((SESSION, "shot noise"))
     # Of noise of its own a mean over N responses; what these share is in the first of N columns.
     assert reported.left == pytest.approx(6 / 3 / (common @ common) * (1 / N + 0.5 / N)) and reported.right == 0
-    rendering = error_budget.session_rendering(np.ones(1), np.full(1, 0.1), factors)
+    rendering = budget.session_rendering(np.ones(1), np.full(1, 0.1), factors)
     assert amounts(found.pop((SESSION, RENDERING))) == pytest.approx(amounts(rendering))
     assert found == {("capture", "read noise"): Noise(), ("capture", RENDERING): Noise(light=36.25)}, "no speckle"
     stand.noises = {name: Noise(datum=1.0) for name in empty}
-    found = error_budget._noises(stand, session)
+    found = budget._noises(stand, session)
     assert {name for of, name in found if of == "capture"} == {AMBIENT, SPECKLE, "read noise", RENDERING}
 
 
@@ -70,7 +71,7 @@ def test_sampled_light_of_a_board_multiplies_columns() -> None:
     """By the mean square of its relative errors where it is lit, and the squares of the other side's weights. (Planted:
     dark pixels; the mean of the weights' squares.)"""
     left, right = 1 + RNG.random((3, N)), 1 + RNG.random((5, N))
-    found = error_budget.session_rendering(np.array([0.5, 0.0, 2.0]), np.array([0.05, 9.0, 0.4]), (left, right))
+    found = budget.session_rendering(np.array([0.5, 0.0, 2.0]), np.array([0.05, 9.0, 0.4]), (left, right))
     for factor, reported in ((right, found.left_light), (left, found.right_light)):
         common = factor.sum(axis=1)
         weights = [float(column @ common) / float(common @ common) for column in factor.T]
@@ -80,10 +81,10 @@ def test_sampled_light_of_a_board_multiplies_columns() -> None:
 
 def test_what_is_not_explained_is_a_loss_of_its_own() -> None:
     """A quarter of an error is told: 6.02 dB are left, and 3.01 dB more if chance took half of what is told."""
-    row = error_budget._unexplained_row(4.0, 1.0, 0.5)
+    row = budget._unexplained_row(4.0, 1.0, 0.5)
     assert row == LossRow("unexplained", "not explained", "", row.lost_db, row.error_db, 3.0, 0.5)
     assert (row.lost_db, row.error_db) == pytest.approx((6.0206, 3.0103), abs=1e-4)
-    assert error_budget._unexplained_row(4.0, 4.0, 1.0).error_db == pytest.approx(1.2494, abs=1e-4)
+    assert budget._unexplained_row(4.0, 4.0, 1.0).error_db == pytest.approx(1.2494, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -105,9 +106,9 @@ def test_causes_are_taken_out_one_after_another(monkeypatch: pytest.MonkeyPatch)
     (Planted: each alone.)"""
     effects = ("falloff", causes.GLOSS, causes.DETAIL, causes.DEPTH)
     scene_ablation = SimpleNamespace(effects=effects, without=lambda off: sorted(off))
-    monkeypatch.setattr(error_budget.Ablation, "of", lambda light: scene_ablation)
+    monkeypatch.setattr(budget.Ablation, "of", lambda light: scene_ablation)
     stand: Any = SimpleNamespace(lit=SimpleNamespace(light="all"), clear=lambda factors, light: (factors, light))
-    assert list(error_budget._clear_images(stand, "exact")) == [  # type: ignore[arg-type]
+    assert list(budget._clear_images(stand, "exact")) == [  # type: ignore[arg-type]
         ("", ("exact", "all")),
         (causes.DETAIL, ("exact", [causes.DETAIL])),
         (causes.DEPTH, ("exact", sorted([causes.DETAIL, causes.DEPTH]))),
@@ -128,12 +129,12 @@ def test_a_cause_has_what_the_image_gains_without_it() -> None:
         common=lambda noise, error: noise.light * float(np.abs(error).sum()),
         deviation=lambda noise, error: 3 * noise.light * float(np.abs(error).sum()),
     )
-    found = error_budget._of_scene(scatter, dict(zip(("", causes.DEPTH, causes.GLOSS), images, strict=True)), sampled)
+    found = budget._of_scene(scatter, dict(zip(("", causes.DEPTH, causes.GLOSS), images, strict=True)), sampled)
     squares, whole = [mean_square(image - SCENE) for image in images], float(np.abs(STEADY).sum()) / SCENE.size
     depth, gloss = (found["scene", ERROR_SOURCES[name]] for name in (causes.DEPTH, causes.GLOSS))
     assert (depth.square, depth.deviation) == pytest.approx((squares[0] - squares[1], 2 * whole))
     assert (gloss.square, gloss.deviation) == pytest.approx((squares[1] - squares[2], 2 * 1.5 * whole))
-    assert found["scene", ERROR_SOURCES[causes.DETAIL]] == error_budget._Part(0.0)
+    assert found["scene", ERROR_SOURCES[causes.DETAIL]] == Share(0.0)
     bias, rest = found["solver", LAMBDA], found["scene", REST]
     assert (bias.square, bias.deviation) == (pytest.approx(mean_square(0.1 * SCENE)), 0.0)
     assert rest.square == pytest.approx(squares[2] - bias.square - 2e-3 / SCENE.size)
@@ -151,17 +152,15 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
         ("session", RENDERING): Noise(left_light=4e-4),
     }
     asked: list[Any] = []
-    monkeypatch.setattr(error_budget, "_noises", lambda *given: asked.append(given) or noises)
-    monkeypatch.setattr(
-        error_budget, "_clear_images", lambda *given: asked.append(given) or {"": SCENE + STEADY}.items()
-    )
-    monkeypatch.setattr(error_budget, "_of_scene", lambda scatter, seen, sampled: {("scene", "light"): (seen, sampled)})
+    monkeypatch.setattr(budget, "_noises", lambda *given: asked.append(given) or noises)
+    monkeypatch.setattr(budget, "_clear_images", lambda *given: asked.append(given) or {"": SCENE + STEADY}.items())
+    monkeypatch.setattr(budget, "_of_scene", lambda scatter, seen, sampled: {("scene", "light"): (seen, sampled)})
     left, right = RNG.standard_normal((6, N)) + 0.3, RNG.standard_normal((7, N)) + 0.3
     fixed = {"response": RNG.standard_normal((N, N)), "offsets": RNG.standard_normal((N, N))}
     linear = LinearImage(left, right, parse_patterns("dots:2", N), 0.1)
     stand: Any = SimpleNamespace(lit=SimpleNamespace(truth=SCENE), linear=linear, fixed=fixed)
     clear: Any = SimpleNamespace(left=2 * left, right=3 * right)
-    found = error_budget._budget(stand, "session", clear)  # type: ignore[arg-type]
+    found = budget._budget(stand, "session", clear)  # type: ignore[arg-type]
     assert asked == [(stand, "session"), (stand, clear)]
     steps = [STEADY, STEADY + fixed["response"], STEADY + fixed["response"] + fixed["offsets"]]
     assert found.steady == pytest.approx(steps[2])
@@ -173,9 +172,7 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
         assert part.square == pytest.approx(linear.variance(SCENE, noise) / N**2)
         assert part.deviation == pytest.approx(found.scatter.share(noise, among, steps[2]) / N**2)
     for name, before, after in zip(fixed, steps, steps[1:], strict=False):
-        assert found.parts["capture", name] == error_budget._Part(
-            pytest.approx(mean_square(after) - mean_square(before))
-        )
+        assert found.parts["capture", name] == Share(pytest.approx(mean_square(after) - mean_square(before)))
     seen, sampled = found.parts["scene", "light"]  # type: ignore[misc]
     assert [*seen] == [""] and amounts(sampled) == amounts(Noise(light=3e-4, left_light=4e-4))
     assert sum(found.parts[name].square for name in [("capture", "response"), ("capture", "offsets")]) == (
@@ -206,7 +203,7 @@ def test_a_drift_costs_what_it_adds_to_the_error_that_is_there() -> None:
         scatter=lambda drift, error: 1e-6 * (error == STEADY).all(),
     )
     scatter: Any = SimpleNamespace(common=lambda drawn, error: drawn.datum * float(np.abs(error).sum()))
-    rows, refused = error_budget._drifts(stand, error_budget._Budget({}, scatter, Noise(datum=noise), STEADY), measured)
+    rows, refused = budget._drifts(stand, budget.Budget({}, scatter, Noise(datum=noise), STEADY), measured)
     assert refused == ["exposure: no time"]
     assert [row.name for row in rows] == ["mask down the rows, 0.4 um", "projector's power, 10 %"]
     row, none = rows
@@ -223,21 +220,21 @@ def test_a_drift_costs_what_it_adds_to_the_error_that_is_there() -> None:
 def test_rows_are_all_parts_then_what_is_left_then_drifts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an image that 0.06 is told of and 0.05 measured; the chance of the whole is a mean over its pixels. (Planted:
     the sum over them; where it comes from in the place of the source.)"""
-    parts = {("capture", "shot noise"): error_budget._Part(0.04, 1e-3), ("scene", "depth"): error_budget._Part(0.02)}
+    parts = {("capture", "shot noise"): Share(0.04, 1e-3), ("scene", "depth"): Share(0.02)}
     asked: list[Any] = []
     scatter: Any = SimpleNamespace(deviation=lambda noise, error: asked.append((noise, error)) or 0.16)
-    whole = error_budget._Budget(parts, scatter, Noise(datum=1.0), STEADY)
+    whole = budget.Budget(parts, scatter, Noise(datum=1.0), STEADY)
     drift = LossRow("drift", "power", "10 %", 1.0, 0.1)
-    monkeypatch.setattr(error_budget, "_budget", lambda *given: asked.append(given) or whole)
-    monkeypatch.setattr(error_budget, "_drifts", lambda *given: asked.append(given) or ([drift], ["lamp: no"]))
+    monkeypatch.setattr(budget, "_budget", lambda *given: asked.append(given) or whole)
+    monkeypatch.setattr(budget, "_drifts", lambda *given: asked.append(given) or ([drift], ["lamp: no"]))
     stand: Any = SimpleNamespace(before_db=-10 * math.log10(0.05))
-    rows, refused = error_budget.losses(stand, "session", "exact")  # type: ignore[arg-type]
+    rows, refused = budget.losses(stand, "session", "exact")  # type: ignore[arg-type]
     shot, depth, left, last = rows
     assert refused == ["lamp: no"] and last is drift
     measured = pytest.approx(0.05)
     assert asked == [(stand, "session", "exact"), (whole.drawn, STEADY), (stand, whole, measured)]
-    assert (shot.lost_db, shot.error_db) == pytest.approx(error_budget.gain_without(0.04, 0.05, 0.06, 1e-3))
-    assert (depth.lost_db, depth.error_db) == pytest.approx(error_budget.gain_without(0.02, 0.05, 0.06))
+    assert (shot.lost_db, shot.error_db) == pytest.approx(budget.gain_without(0.04, 0.05, 0.06, 1e-3))
+    assert (depth.lost_db, depth.error_db) == pytest.approx(budget.gain_without(0.02, 0.05, 0.06))
     assert [(row.of, row.source, row.amount, row.deviation) for row in (shot, depth)] == [
         ("capture", "shot noise", "", 1e-3),
         ("scene", "depth", "", 0.0),
@@ -249,11 +246,11 @@ def test_rows_are_all_parts_then_what_is_left_then_drifts(monkeypatch: pytest.Mo
 
 def test_chance_is_in_how_sure_a_part_is() -> None:
     """A deviation as large as a part that is a quarter, 3.01 - 1.25 dB; with what is not explained as squares add."""
-    alone = error_budget.gain_without(1.0, 4.0, 4.0, 1.0)
+    alone = budget.gain_without(1.0, 4.0, 4.0, 1.0)
     assert alone == pytest.approx((1.2494, 3.0103 - 1.2494), abs=1e-4)
-    assert error_budget.gain_without(1.0, 4.0, 2.0, 1.0)[1] == pytest.approx(2**0.5 * alone[1])
-    more = error_budget.gain_without(1.0, 4.0, 8.0, 1.0)
+    assert budget.gain_without(1.0, 4.0, 2.0, 1.0)[1] == pytest.approx(2**0.5 * alone[1])
+    more = budget.gain_without(1.0, 4.0, 8.0, 1.0)
     assert more[1] == pytest.approx(math.hypot(1.2494 - 0.5799, 0.5799), abs=1e-4)
     # A quarter too much is told: it may all be this part's, of which half of the error is left.
-    assert error_budget.gain_without(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
-    assert error_budget.gain_without(4.0, 4.0, 4.0)[0] == pytest.approx(90)
+    assert budget.gain_without(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
+    assert budget.gain_without(4.0, 4.0, 4.0)[0] == pytest.approx(90)

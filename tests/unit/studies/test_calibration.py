@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from mitsim.studies.framework.page import flag_warnings
 
 from mitsim.api.bench import open_bench
-from mitsim.bench.request import Request
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import shipped_path
@@ -23,24 +23,33 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.studies.calibration_study import (
-    CalibrationFindings,
-    ModelRow,
-    _row,
+    LAMBDA,
+    REST,
+    SCENE,
+    SOLVER,
+    STUDY,
+    LossRow,
+    _of_scene,
     as_built,
+    gain_without,
     judge_session,
-    measure,
+    measure_session,
+    residual_row,
     session_cost,
+    session_rendering,
     singular_rows,
+    verdict_of,
 )
-from mitsim.studies.error_budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gain_without, session_rendering
-from mitsim.studies.framework.page import build_findings
 from mitsim.studies.causes import Expected, Noise
+from mitsim.studies.framework.experiment import Results, Scope, Setup
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 SEEDS = 40
-IMAGE = {"patterns": "dots:7", "psnr_db": 40.0, "predicted_psnr_db": 43.9794, "frames": 49,
-         "exposure_seconds": 4.0, "photoelectrons": 1e9, "photons": 2e9}  # fmt: skip
-SPENT = {"frames": 512.0, "exposure_seconds": 3.0, "photoelectrons": 1e10, "photons": 2e10}
+Rows = list[dict[str, Any]]
+
+
+def of_kind(rows: Rows, kind: str) -> Rows:
+    return [row for row in rows if row["kind"] == kind]
 
 
 class SampledLight(ToyLight):
@@ -67,12 +76,12 @@ def test_errors_of_factors_are_those_that_are_predicted(mode: str) -> None:
     for seed in range(SEEDS):
         own = replace(lit, session=replace(lit.session, seed=seed))
         (noisy, clean), _, _ = estimates(own, Job(), (NOISY, NOISE_FREE))
-        report = judge_session(own, noisy, clean)
-        columns.append(np.square(report.maps["left"]).mean(axis=0))
-        for row in report.entries:
-            squares[row.factor].append(row.chi_square)
-            found_errors.append(row.error)
-            stated_errors.append(row.predicted_error)
+        rows, maps = judge_session(own, noisy, clean)
+        columns.append(np.square(maps["left"]).mean(axis=0))
+        for row in of_kind(cast(Rows, rows), "entries"):
+            squares[row["factor"]].append(row["chi_square"])
+            found_errors.append(row["error"])
+            stated_errors.append(row["predicted_error"])
     for values in squares.values():
         assert np.mean(values) == pytest.approx(1, abs=0.06)
     # 40 x 24 squares of unit variance: 5 standard errors.
@@ -89,16 +98,15 @@ def test_singular_values_and_vectors_move_as_their_perturbation_says() -> None:
     right, _ = np.linalg.qr(rng.standard_normal((4, 4)))
     exact = left * [40.0, 25.0, 12.0, 6.0] @ right.T
     deviation = np.outer(rng.uniform(0.3, 0.5, 40), [1.0, 1.0, 2.5, 1.0])
-    draws = [
-        list(singular_rows("left", exact, exact + deviation * rng.standard_normal(exact.shape), deviation))
-        for _ in range(300)
+    draws: list[Rows] = [
+        list(singular_rows(exact, exact + deviation * rng.standard_normal(exact.shape), deviation)) for _ in range(300)
     ]
     for rows in zip(*draws, strict=True):
-        moved = np.array([row.noisy - row.value for row in rows])
-        assert moved.std() == pytest.approx(rows[0].standard_error, rel=0.2)
-        assert moved.mean() == pytest.approx(rows[0].bias, abs=5 * rows[0].standard_error / np.sqrt(300))
-        angles = np.array([row.angle for row in rows])
-        assert np.sqrt(np.mean(angles**2)) == pytest.approx(rows[0].predicted_angle, rel=0.2)
+        moved, first = np.array([row["noisy"] - row["value"] for row in rows]), rows[0]
+        assert moved.std() == pytest.approx(first["standard_error"], rel=0.2)
+        assert moved.mean() == pytest.approx(first["bias"], abs=5 * first["standard_error"] / np.sqrt(300))
+        angles = np.array([row["angle"] for row in rows])
+        assert np.sqrt(np.mean(angles**2)) == pytest.approx(first["predicted_angle"], rel=0.2)
 
 
 def test_bias_and_angle_are_second_derivatives_by_every_entry() -> None:
@@ -122,22 +130,24 @@ def test_bias_and_angle_are_second_derivatives_by_every_entry() -> None:
         for number, vector in enumerate(vectors):
             slope = ahead[number] * np.sign(ahead[number] @ vector) - behind[number] * np.sign(behind[number] @ vector)
             turn[number] += deviation[place] ** 2 * float(np.square(slope / (2 * step)).sum())
-    rows = list(singular_rows("left", exact, exact, deviation))
-    assert [row.bias for row in rows] == pytest.approx(bias, rel=1e-4)
-    assert [row.predicted_angle for row in rows] == pytest.approx(np.sqrt(turn), rel=1e-4)
+    rows: Rows = list(singular_rows(exact, exact, deviation))
+    assert [row["bias"] for row in rows] == pytest.approx(bias, rel=1e-4)
+    assert [row["predicted_angle"] for row in rows] == pytest.approx(np.sqrt(turn), rel=1e-4)
 
 
 def test_light_and_time_of_a_session_are_counted() -> None:
     """8 patterns of either side, two halves, three repeats at 0.02 and 0.08 s; each pair is a uniform frame's light."""
     lit = lit_session(7, devices=CLIPPED, repeats=3, exposure_ladder=(1.0, 4.0))
-    found = session_cost(lit)
+    residual: Any = SimpleNamespace(separability_residual=0.1)
+    found: dict[str, Any] = session_cost(lit, residual, residual)
     assert found["frames"] == 2 * 16 * 3 * 2 and found["exposure_seconds"] == pytest.approx(2 * 16 * 3 * 0.1)
     assert found["photoelectrons"] == pytest.approx(float(lit.uniform_rate.sum()) * 16 * 3 * 0.1)
     assert found["photons"] == pytest.approx(2 * found["photoelectrons"])
     dark = lit_session(7, "uniform", devices=CLIPPED, dark_frames=5)
-    assert session_cost(dark)["exposure_seconds"] == pytest.approx((18 + 5) * 0.02)
+    without: dict[str, Any] = session_cost(dark, residual, residual)
+    assert without["exposure_seconds"] == pytest.approx((18 + 5) * 0.02)
     shown = 2 + 2 * float((1 + dark.session.signs).sum()) / 2 / 7
-    assert session_cost(dark)["photoelectrons"] == pytest.approx(float(dark.uniform_rate.sum()) * shown * 0.02)
+    assert without["photoelectrons"] == pytest.approx(float(dark.uniform_rate.sum()) * shown * 0.02)
 
 
 def test_a_part_of_the_error_gains_what_is_left_without_it() -> None:
@@ -217,20 +227,27 @@ def test_all_sources_together_are_what_the_image_is_off(
     stated = shipped_path("calibration", "imx249.toml").read_text().splitlines()
     kept = [line for line in stated if line.partition(" =")[0] not in camera]
     own.write_text("\n".join([*(f"{name} = {value}" for name, value in camera.items()), *kept]))
-    bench = open_bench(str(small_scene(name="even")), variant, camera=own)
-    found = measure(bench, Request.of(patterns="dots:4", accuracy=2e-3, seed=1), Job())
-    assert found.image["predicted_psnr_db"] == pytest.approx(found.image["psnr_db"], abs=0.5)
-    reported = {(row.of, row.source): row.squared_error for row in found.losses}
+    found, rows = losses_of(small_scene(name="even"), variant, camera=own)
+    (image,) = of_kind(found, "image")
+    assert image["predicted_psnr_db"] == pytest.approx(image["psnr_db"], abs=0.5)
+    reported = {(row.of, row.source): row.squared_error for row in rows.values()}
     left = reported.pop(("unexplained", "not explained"))
     assert reported["capture", largest] > 0.7 * sum(reported.values()) and reported["session", "rendering"] > 0
-    assert found.image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values())))
-    assert found.image["psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values()) + left)) and not found.warnings
-    assert found.image["geometric_psnr_db"] < found.image["psnr_db"] - 2, "the mask diffracts"
-    assert found.parts()[-1].title == "Diffraction at the mask" and "shadow.png" in found.figures()
+    assert image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values())))
+    assert image["psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values()) + left)) and not image["flagged"]
+    assert image["geometric_psnr_db"] < image["psnr_db"] - 2, "the mask diffracts"
     # Responses of 16 lines do not tell the mask's distance from the projector's magnification.
-    assert {row.model for row in found.models} <= {"wave", "geometric"} and len(found.models) + sum(
-        "cannot be told apart" in text for text in found.not_predicted
+    models = of_kind(found, "models")
+    assert {row["model"] for row in models} <= {"wave", "geometric"} and len(models) + sum(
+        "cannot be told apart" in row["reason"] for row in of_kind(found, "not predicted")
     ) == 4
+    results = Results(
+        [{**row, "point": "p"} for row in found], {("p", side): np.ones((4, 4)) for side in ("left", "right")}
+    )
+    assert STUDY.judge(results)[0].verdict == "confirmed"
+    assert {"losses.png", "entries.png", "singular.png", "causes.png", "shadow.png"} <= STUDY.draw(results).keys()
+    titles = [part.title for part in STUDY.tables(results)]
+    assert titles[0] == "What an image loses" and "Diffraction at the mask" in titles
 
 
 def print_of_squares(pixels: float) -> FloatArray:
@@ -239,14 +256,12 @@ def print_of_squares(pixels: float) -> FloatArray:
     return 25 + 200 * np.not_equal.outer(place.astype(int) % 2, place.astype(int) % 2)
 
 
-def losses_of(
-    scene: Path, variant: str, seed: int = 1, **devices: Path
-) -> tuple[CalibrationFindings, dict[str, LossRow]]:
-    """Findings of a session of 16 patterns, and losses by name."""
-    found = measure(
-        open_bench(str(scene), variant, **devices), Request.of(patterns="dots:4", accuracy=2e-3, seed=seed), Job()
-    )
-    return found, {row.name: row for row in found.losses}
+def losses_of(scene: Path, variant: str, seed: int = 1, **devices: Path) -> tuple[Rows, dict[str, LossRow]]:
+    """Rows of a session of 16 patterns, and losses by name."""
+    bench = open_bench(str(scene), variant, **devices)
+    found: Rows = measure_session(bench, load_recipe(), "dots:4", seed, 2e-3)[0]
+    names = [each.name for each in fields(LossRow)]
+    return found, {row["name"]: LossRow(*(row[name] for name in names)) for row in of_kind(found, "losses")}
 
 
 def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Callable[..., Path], variant: str) -> None:
@@ -254,11 +269,12 @@ def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Calla
     is within three of its standard errors; an even print loses a tenth of a decibel at most. (Planted: detail left in
     the light.)"""
     found, rows = losses_of(small_scene("squares", reflectance=print_of_squares(1.5)), variant)
-    whole = 10 ** (-found.image["psnr_db"] / 10)
+    (image,) = of_kind(found, "image")
+    whole = 10 ** (-image["psnr_db"] / 10)
     detail, left = rows["scene: detail inside projector pixels"], rows["not explained"]
     assert 0.95 < detail.squared_error / whole < 1 and detail.lost_db > 13
-    assert abs(left.squared_error) < 3 * left.deviation < 0.03 * whole and not found.warnings
-    assert found.image["predicted_psnr_db"] == pytest.approx(found.image["psnr_db"], abs=0.1)
+    assert abs(left.squared_error) < 3 * left.deviation < 0.03 * whole and not image["flagged"]
+    assert image["predicted_psnr_db"] == pytest.approx(image["psnr_db"], abs=0.1)
     assert abs(rows["scene: all else"].squared_error) < 0.01 * whole
     even = losses_of(small_scene("even"), variant)[1]
     assert abs(even["scene: detail inside projector pixels"].lost_db) < 0.1
@@ -273,56 +289,45 @@ def test_a_cause_without_a_row_is_said_to_be_missing(
     own.write_text(f"linearity = [0.03]\n{shipped_path('calibration', 'imx249.toml').read_text()}")
     found, rows = losses_of(small_scene("even"), variant, camera=own)
     assert rows["not explained"].squared_error > 10 * rows["not explained"].deviation
-    (warning,) = found.warnings
-    assert "a cause is missing" in warning and found.payload()["warnings"] == found.warnings
-    assert "a cause is missing" in " ".join(found.lines())
+    (warning,) = flag_warnings("calibration", Results(found))
+    assert "a cause is missing" in warning and of_kind(found, "image")[0]["flagged"]
 
 
 @pytest.mark.parametrize(
     ("errors", "message"), [(0.9, "within its standard error"), (-2.0, "chance makes 4.6% of all")]
 )
 def test_what_is_not_explained_is_said_by_its_standard_errors(errors: float, message: str) -> None:
-    row = LossRow("unexplained", "not explained", "", 0.0, 0.0, errors * 1e-6, 1e-6)
-    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, (row,))
-    assert message in " ".join(found.lines()) and message in found.parts()[0].lead.lower() and not found.warnings
+    assert message in verdict_of(LossRow("unexplained", "not explained", "", 0.0, 0.0, errors * 1e-6, 1e-6))
 
 
 def test_the_page_has_every_loss_in_one_table() -> None:
-    """With its uncertainty, the largest first; losses of 0.00 are named in a sentence, and what could not be predicted.
-    (Planted: the order of the rows; parts of the error that is measured.)"""
-    rows = (
+    """With its uncertainty, the largest first, and what could not be predicted. (Planted: the order of the rows.)"""
+    lost = (
         LossRow("capture", "shot noise", "", 2.0, 0.1, 3e-5, 2e-7),
         LossRow("drift", "mask_rows_um", "0.4 um", 3.0, 0.2),
         LossRow("session", "read noise", "", 0.0, 0.0, 1e-5),
     )
-    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, rows, ("vibration_um: no",))
-    part = found.parts()[0]
-    assert [row[3] for row in part.rows] == ["3.00 \N{PLUS-MINUS SIGN} 0.20", "2.00 \N{PLUS-MINUS SIGN} 0.10"]
-    assert [row[4] for row in part.rows] == ["", "75.00 \N{PLUS-MINUS SIGN} 0.50 %"]
-    assert "together say 43.98 dB" in part.lead and "Below 0.005 dB each: session: read noise." in part.notes
-    assert (
-        part.rows[0][:3] == ("drift, not in this image", "mask down the rows", "0.4 um")
-        and "vibration_um: no" in part.lead
-    )
-    assert set(found.figures()) >= {"losses.png"} and len(found.tables()["losses.csv"]) == 3
-    (line,) = [line for line in found.lines() if "mask down the rows" in line]
-    assert line.split("  ")[0] == "drift, not in this image" and line.endswith("3.00 \N{PLUS-MINUS SIGN} 0.20")
-    assert "read noise" not in " ".join(found.lines())
-    assert "mask down the rows" in build_findings("calibration", (found.title, found.message), "toy", found.parts(), {})
-    assert not CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT).parts()[0].figures
+    rows: Rows = [{"kind": "losses", **asdict(row), "name": row.name} for row in lost]
+    results = Results([*rows, {"kind": "not predicted", "reason": "vibration_um: no"}])
+    losses, unpredicted = STUDY.tables(results)
+    assert losses.rows[0][:5] == ("drift", "mask down the rows", "0.4 um", "3", "0.2")
+    assert [row[1] for row in losses.rows[1:]] == ["shot noise", "read noise"]
+    assert unpredicted.rows == (("vibration_um: no",),)
 
 
-def test_a_recipe_with_depths_is_refused_before_anything_is_traced() -> None:
+def test_a_recipe_with_depths_is_refused_before_anything_is_traced(tmp_path: Path) -> None:
     """(Planted: let pass.)"""
-    recipe = load_recipe().model_copy(update={"depths": (350.0, 400.0)})
+    (tmp_path / "depths.toml").write_text(
+        f"depths = [350.0, 400.0]\n{shipped_path('calibration', 'session.toml').read_text()}"
+    )
     with pytest.raises(MitsimError, match="2 depths, and a report is of one session"):
-        measure(None, Request.of(), Job(), recipe)  # type: ignore[arg-type]
+        STUDY.points(Scope(Setup(), (None,), recipe=str(tmp_path / "depths.toml")))
 
 
 def test_a_cause_has_the_part_by_which_the_squared_residual_falls_without_it() -> None:
-    assert _row("board", 0.05, 0.03).part == pytest.approx(0.04)
-    assert _row("board", 0.03, 0.05).part == pytest.approx(-0.04)
-    assert _row("board", 0.03, 0.03).part == 0
+    assert residual_row("board", 0.05, 0.03)["part"] == pytest.approx(0.04)
+    assert residual_row("board", 0.03, 0.05)["part"] == pytest.approx(-0.04)
+    assert residual_row("board", 0.03, 0.03)["part"] == 0
 
 
 @dataclass(frozen=True)
@@ -345,15 +350,3 @@ def test_the_camera_as_built_has_its_mask_off_its_place() -> None:
     built = as_built(cast(Any, ToyBench(ToyDevices(camera)))).devices.camera
     assert built.mask_distance == pytest.approx(2.05)
     assert (built.mask_offset_row, built.mask_offset_column) == pytest.approx((0.047, -0.021))
-
-
-def test_images_of_models_stand_beside_that_of_the_session() -> None:
-    models = (ModelRow("wave", 3, 50.04, 1e-3), ModelRow("geometric", 15, 29.1, 0.2))
-    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, models=models)
-    part = next(each for each in found.parts() if each.title == "How few frames suffice")
-    assert part.rows == (
-        ("wave", "3", "50.0", "1.0e-03"),
-        ("geometric", "15", "29.1", "2.0e-01"),
-        ("measured", "512", "40.0", ""),
-    )
-    assert found.payload()["models"][1]["frames"] == 15
