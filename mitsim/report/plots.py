@@ -232,65 +232,6 @@ def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
     return figure
 
 
-<<<<<<< HEAD
-def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
-    """Draw errors of the singular values of ``factors``, and their standard errors as lines.
-
-    Rows are (value without noise, value with noise less its bias, standard error).
-    """
-    figure, axes = figure_of(0.45 * WIDTH)
-    for index, (name, rows) in enumerate(factors.items()):
-        exact, noisy, error = rows.T
-        # Dashes over a line: the two may coincide.
-        style = {"color": _PALETTE[index + 1], "ls": _STYLES[index], "lw": 3.0 - 1.2 * index}
-        axes.plot(np.arange(len(rows)), error / exact, label=f"{name}: standard error", **style)
-        axes.plot(
-            np.arange(len(rows)),
-            np.abs(noisy - exact) / exact,
-            MARKERS[index],
-            ms=4,
-            mfc="none",
-            color=_PALETTE[index + 1],
-            label=f"{name}: found, less bias",
-        )
-    axes.set_yscale("log")
-    label_axes(axes, "number of the singular value [1]", "relative error [1]")
-    legend_below(figure, *axes.get_legend_handles_labels())
-    return figure
-
-
-def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
-    """Draw a map of a factor's errors (m, n) in predicted deviations, on a scale to ``largest`` of either sign."""
-    figure, axes = figure_of(0.5 * WIDTH, 0.5 * WIDTH)
-    axes.set_title(title, fontsize=FONT)
-    drawn = axes.imshow(
-        np.asarray(values), vmin=-largest, vmax=largest, cmap="RdBu_r", interpolation="none", aspect="auto"
-    )
-    axes.set_xlabel("scene line [projector pixel]", fontsize=FONT - 1)
-    axes.set_ylabel("sensor line [pixel]", fontsize=FONT - 1)
-    bar = figure.colorbar(drawn, ax=axes, extend="both")
-    bar.set_label("error [predicted deviations]", fontsize=FONT - 1)
-    bar.ax.tick_params(labelsize=FONT - 2)
-=======
-def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> Figure:
-    """Draw the PSNR [dB] by family in the idealised model and with rendered light, with one standard error."""
-    figure, axes = figure_of(0.36 * WIDTH)
-    place = np.arange(len(quality), dtype=np.float64)
-    looks = (-0.2, PALE, "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
-    for means, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
-        values, errors = (np.array([getattr(mean, part) for mean in means]) for part in ("value", "error"))
-        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label, yerr=_bar_errors(errors), capsize=3)
-        axes.bar_label(bars, fmt="%.1f", fontsize=FONT - 1, padding=2)
-    if title:
-        figure.suptitle(title, fontsize=FONT)
-    axes.set_xticks(place, list(quality), fontsize=FONT)
-    axes.margins(y=0.14)
-    label_axes(axes, "", "PSNR [dB]", grid="y")
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", ncols=2, bbox_to_anchor=(0, 1.16))
->>>>>>> 542a910a (Docs and tests of the study of a calibration as a declaration; maps and charts that it alone drew are gone)
-    return figure
-
-
 def error_bars(
     errors: Mapping[str, float],
     limit: float | None = None,
