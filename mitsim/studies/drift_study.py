@@ -85,6 +85,9 @@ _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 """Places [deviations] and weights of the Gauss-Hermite rule that is exact for a normal law up to the fifth power."""
 
 
+# -------- A drift between calibration and capture: its measured and its predicted effect
+
+
 @dataclass(frozen=True)
 class Prediction:
     """Predicted loss by a drift.
