@@ -219,7 +219,7 @@ def test_options_of_the_study() -> None:
     assert scope_of("drift", scope, "dots:7", StudyOptions(over=["lamp_ripple=0.3"]).varied, "psnr").sweep == (
         ("lamp_ripple", ("0.3",)),
     )
-    with pytest.raises(MitsimError, match="over and patterns for drift and sweep"):
+    with pytest.raises(MitsimError, match="over for drift and sweep, patterns for these"):
         scope_of("patterns", scope, "dots:7", [("power", ("0.1",))], "psnr")
     with pytest.raises(MitsimError, match="a recipe is for calibration and drift"):
         study("sweep", recipe=Path("any.toml"))
