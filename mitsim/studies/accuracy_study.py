@@ -529,8 +529,8 @@ STUDY = Study(
             where={"estimator": (RUN, REFERENCE)}, colour="estimator", facet="", ticks=False,
         ),
         Bars(
-            "setting", file="stages", title="Stages of whole runs", where={"estimator": RUN, "extrapolated": False},
-            colour={f"{name}_s".replace(" ", "_"): name for name in _STAGES}, x_label=_TIME,
+            {f"{name}_s".replace(" ", "_"): name for name in _STAGES}, file="stages", title="Stages of whole runs",
+            where={"estimator": RUN, "extrapolated": False}, colour="setting", x_label=_TIME,
         ),
         Bars(
             "setting", file="effects", title="Error without each part of the light", where={"estimator": PART},

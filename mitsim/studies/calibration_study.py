@@ -692,7 +692,7 @@ STUDY = Study(
             y_label="irradiance, open sensor = 1 [1]", where={"kind": "profile"}, ticks=False,
         ),
     ),
-    tables=_tables,
+    tables=(_tables,),
     about="Losses by noise, light of the scene and solver are the image's gain without that source; below 0, the "
     "image would be worse without it. Squared errors add up, decibels do not. Losses by drift between calibration and "
     "capture, by the amounts of the recipe's table [drift], are of each drift alone. Noise and drift are predicted "

@@ -30,6 +30,7 @@ from mitsim.studies.calibration_study import (
     STUDY,
     LossRow,
     _of_scene,
+    _tables,
     as_built,
     gain_without,
     judge_session,
@@ -246,7 +247,7 @@ def test_all_sources_together_are_what_the_image_is_off(
     )
     assert STUDY.judge(results)[0].verdict == "confirmed"
     assert {"losses.png", "entries.png", "singular.png", "causes.png", "shadow.png"} <= STUDY.draw(results).keys()
-    titles = [part.title for part in STUDY.tables(results)]
+    titles = [part.title for part in _tables(results)]
     assert titles[0] == "What an image loses" and "Diffraction at the mask" in titles
 
 
@@ -309,7 +310,7 @@ def test_the_page_has_every_loss_in_one_table() -> None:
     )
     rows: Rows = [{"kind": "losses", **asdict(row), "name": row.name} for row in lost]
     results = Results([*rows, {"kind": "not predicted", "reason": "vibration_um: no"}])
-    losses, unpredicted = STUDY.tables(results)
+    losses, unpredicted = _tables(results)
     assert losses.rows[0][:5] == ("drift", "mask down the rows", "0.4 um", "3", "0.2")
     assert [row[1] for row in losses.rows[1:]] == ["shot noise", "read noise"]
     assert unpredicted.rows == (("vibration_um: no",),)
