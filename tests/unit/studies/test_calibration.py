@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from mitsim.studies.framework.page import flag_warnings
 
 from mitsim.api.bench import open_bench
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
@@ -43,6 +42,7 @@ from mitsim.studies.calibration_study import (
 )
 from mitsim.studies.causes import Expected, Noise
 from mitsim.studies.framework.experiment import Results, Scope, Setup
+from mitsim.studies.framework.panels import flag_warnings
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 SEEDS = 40
