@@ -36,7 +36,6 @@ SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
 """Okabe and Ito's palette, distinct in all common forms of colour blindness and in grey."""
 _PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 _GRID, LINK, GREY, PALE = "#e5e7eb", "#d1d5db", "#6b7280", "#c7d2de"
 """Colours of grid lines, lines between data, lines beside data, and bars for comparison."""
 FONT = 11.0
