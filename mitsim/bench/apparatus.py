@@ -276,10 +276,8 @@ class Apparatus:
     def identity(self) -> dict[str, Any]:
         """Return all that must be equal for a calibration to fit a capture."""
         grid, lines = self.loaded.pixels, self.projector.lines
-        of_lines: dict[str, Any] = {
-            "lines_nm": list(lines.wavelengths_nm),
-            "radiant_shares": [round(share, 7) for share in lines.shares],
-        }
+        shares = [round(share, 7) for share in lines.shares]
+        of_lines: dict[str, Any] = {"lines_nm": list(lines.wavelengths_nm), "radiant_shares": shares}
         if self.filters and self.lines and self.lines.several:
             of_lines = {}  # colour.json has them
         return {
@@ -398,9 +396,7 @@ def check_scene(
 def check_devices(camera: Path | str | None, projector: Path | str | None) -> tuple[Path, Path]:
     """Return the files of a ``camera`` and a ``projector``; raise MitsimError if one is missing."""
     found = ((camera, DEFAULT_CAMERA, CAMERA), (projector, "mp_cl1", PROJECTOR))
-    first, second = (
-        locate(default if name is None else name, "calibration", ".toml", field) for name, default, field in found
-    )
+    first, second = (locate(name or default, "calibration", ".toml", field) for name, default, field in found)
     if camera is None:
         return first, second
     from mitsim.devices.sensor import SensorModel, sensor_table

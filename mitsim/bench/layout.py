@@ -149,9 +149,8 @@ def layout_of(bench: Apparatus) -> Layout:
         else:
             continue
         lamps[f"{name}, line {tag.line}"] = (place - origin) @ turn
-    return Layout(
-        _surfaces(bench, turn, origin), projector, window, lamps, seen, depths, (row, column), obstacles(bench)
-    )
+    surfaces = _surfaces(bench, turn, origin)
+    return Layout(surfaces, projector, window, lamps, seen, depths, (row, column), obstacles(bench))
 
 
 # -------- Surfaces as triangles
@@ -165,9 +164,8 @@ def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[S
         if not name or name.startswith("_"):
             kind = tags[number].attributes.get("type", "shape") if tags else shape.class_name().lower()
             name = f"{kind} {number + 1}"
-        points, triangles, reflectance = (
-            _of_mesh(shape, area) if shape.is_mesh() else _of_rays(bench.loaded.scene, shape)
-        )
+        parts = _of_mesh(shape, area) if shape.is_mesh() else _of_rays(bench.loaded.scene, shape)
+        points, triangles, reflectance = parts
         if len(triangles):
             found.append(Surface(name, (points - origin) @ turn, triangles, reflectance, bool(shape.is_emitter())))
     return tuple(found)
@@ -431,10 +429,8 @@ def mask_fault(bench: Apparatus) -> Fault | None:
         return Fault(f"{problem} mask leaves {own:.0%} of it, which images lack", remedy, residual)
     needed = 2 * max(float(np.abs(each).max()) for each in crossings)
     if mask.flaws.turn_deg:
-        turned = (
-            f"the mask ({geometry.mask_words}) has no two factors as it is mounted, because the best separable one "
-        )
-        return Fault(f"{turned}leaves {residual:.0%} of it", "mount it straight", residual)
+        turned = f"the mask ({geometry.mask_words}) has no two factors as it is mounted, because the best separable"
+        return Fault(f"{turned} one leaves {residual:.0%} of it", "mount it straight", residual)
     least, feature = math.ceil(needed / mask.feature_mm), f"{mask.feature_mm * 1e3:g} um"
     order = least.bit_length()
     larger = f"use order {order} ({2**order - 1} features of {feature}), or larger features"
@@ -471,10 +467,8 @@ def shortage(bench: Apparatus, family: PatternFamily) -> Fault | None:
     """
     geometry, n = bench.geometry, bench.n
     half = geometry.build_mask().extent_mm / 2
-    lit = [
-        int(np.count_nonzero((each.min(axis=1) <= half) & (each.max(axis=1) >= -half))) - geometry.centred
-        for each in _crossings(bench)
-    ]
+    crossed = [(each.min(axis=1) <= half) & (each.max(axis=1) >= -half) for each in _crossings(bench)]
+    lit = [int(np.count_nonzero(each)) - geometry.centred for each in crossed]
     patterns = family.left.shape[1], family.right.shape[1]
     lines = len(bench.lines.wavelengths_nm) if bench.filters and bench.lines else 1
     needed = [int(np.count_nonzero(side.any(axis=1))) for side in (family.left, family.right)]

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Literal
 
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -113,10 +114,8 @@ class PatternFamily:
     @property
     def shots(self) -> tuple[Shot, ...]:
         """Return every frame to project, row-major over (i, j); a positive half is followed by its negative half."""
-        signs = (1, -1) if self.signed else (0,)
-        return tuple(
-            Shot(i, j, sign) for i in range(self.left.shape[1]) for j in range(self.right.shape[1]) for sign in signs
-        )
+        places = product(range(self.left.shape[1]), range(self.right.shape[1]), (1, -1) if self.signed else (0,))
+        return tuple(Shot(*place) for place in places)
 
     def light(self, shot: Shot) -> FloatArray:
         """Return the (n, n) fraction 0..1 of full power that each projector pixel emits in one ``shot``."""

@@ -468,22 +468,18 @@ Plane = Literal["R", "G", "B"]
 """Colour of a filter over a pixel."""
 Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 """Filters of 2 x 2 pixels, row by row from the frame's first pixel (Bayer, US patent 3 971 065)."""
-_MOST_POINTS = 1024
-"""The visible and near infrared in steps of a nanometre have 800."""
+_POINTS = Field(strict=False, min_length=2, max_length=1024)
+"""Points of a curve: the visible and near infrared in steps of a nanometre have 800."""
 
 
 class EfficiencyCurve(Configuration):
     """Electrons per photon over wavelength, linear between its points and unknown outside them."""
 
-    wavelengths_nm: tuple[Annotated[float, Field(ge=1, le=1e6)], ...] = Field(
-        strict=False, min_length=2, max_length=_MOST_POINTS
-    )
+    wavelengths_nm: Annotated[tuple[Annotated[float, Field(ge=1, le=1e6)], ...], _POINTS]
     """Wavelengths of its points, rising [nm].
 
     As a projector's."""
-    efficiency: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(
-        strict=False, min_length=2, max_length=_MOST_POINTS
-    )
+    efficiency: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], _POINTS]
     """Electrons per photon at each."""
 
     @model_validator(mode="after")
@@ -506,9 +502,8 @@ class EfficiencyCurve(Configuration):
             raise MitsimError(f"{problem}; use light of these")
         # Without numpy, which would be half the time of a refusal.
         above = max(1, bisect_left(self.wavelengths_nm, wavelength_nm))
-        part = (wavelength_nm - self.wavelengths_nm[above - 1]) / (
-            self.wavelengths_nm[above] - self.wavelengths_nm[above - 1]
-        )
+        below, beyond = self.wavelengths_nm[above - 1 : above + 1]
+        part = (wavelength_nm - below) / (beyond - below)
         return self.efficiency[above - 1] * (1 - part) + self.efficiency[above] * part
 
 

@@ -122,9 +122,8 @@ class EdgeWaves:
             waves = scipy.fft.ifft(spectrum, overwrite_x=True)
         else:  # in double precision scipy's are no faster, and take 0.02 s to import
             half = np.fft.rfft(jumps, size)
-            waves = np.fft.ifft(
-                np.concatenate((half, np.conj(half[:, (size - 1) // 2 : 0 : -1])), axis=1) * self._kernel
-            )
+            whole = np.concatenate((half, np.conj(half[:, (size - 1) // 2 : 0 : -1])), axis=1)
+            waves = np.fft.ifft(whole * self._kernel)
         # The first 2 reach - 1 values lack jumps on their left, or hold what wrapped around the end.
         waves = waves[:, 2 * reach - 1 : 2 * reach - 1 + count]
         return np.asarray(waves + profiles[:, reach : reach + count])

@@ -161,9 +161,8 @@ class ExpectedFrames:
         if self._mixed or shots < 2 or 2 * np.count_nonzero(self._weights == least) < self._weights.size:
             least = np.zeros(classes)
         self._leak = sparse.csr_array(sparse.csr_array(least[None]) @ indicator) if least.any() else None
-        self._basis = (
-            indicator if self._mixed else sparse.csr_array(sparse.csr_array(self._weights - least) @ indicator)
-        )
+        own = sparse.csr_array(self._weights - least)
+        self._basis = indicator if self._mixed else sparse.csr_array(own @ indicator)
         self._probed = probed if self._mixed else None
         self._noise: FloatArray | None = None
 

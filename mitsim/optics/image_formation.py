@@ -145,10 +145,8 @@ class _Raster:
         (near, far), (rows, columns) = sorted((len(lit.rows), len(lit.columns))), map(len, self.weights)
         across = columns if vectors is None else vectors.shape[1]
         held = 8 * len(summed.terms) * (near + far) * max(rows, columns)
-        pairs = math.prod(
-            len(np.unique(places // len(each.centres)))
-            for places, each in zip((lit.rows, lit.columns), both, strict=True)
-        )
+        sides = zip((lit.rows, lit.columns), both, strict=True)
+        pairs = math.prod(len(np.unique(places // len(each.centres))) for places, each in sides)
         correlation = CORRELATION_PRODUCTS * pairs * cells_per_pixel(geometry) ** 2 * math.prod(geometry.frame_shape)
         return 0 < held <= SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
 

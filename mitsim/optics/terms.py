@@ -266,17 +266,14 @@ def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
 
 
 def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], SeparableTerm]]:
-    (left, small_left), (right, small_right) = (
-        np.linalg.qr(np.stack([np.ravel(pair[side]) for pair in terms], axis=1)) for side in (0, 1)
-    )
+    sides = [np.stack([np.ravel(pair[side]) for pair in terms], axis=1) for side in (0, 1)]
+    (left, small_left), (right, small_right) = map(np.linalg.qr, sides)
     turn_left, values, turn_right = np.linalg.svd(small_left @ small_right.T)
 
     def split_term(number: int) -> SeparableTerm:
         root = np.sqrt(values[number])
-        return (
-            (root * left @ turn_left[:, number]).reshape(terms[0][0].shape),
-            (root * right @ turn_right[number]).reshape(terms[0][1].shape),
-        )
+        parts = root * left @ turn_left[:, number], root * right @ turn_right[number]
+        return parts[0].reshape(terms[0][0].shape), parts[1].reshape(terms[0][1].shape)
 
     return values, split_term
 

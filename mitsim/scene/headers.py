@@ -122,11 +122,9 @@ def check_obj(path: Path) -> tuple[bool, str]:
         for number, line in enumerate(map(bytes.strip, file), 1):
             found = _LINE.fullmatch(line)
             if not found or line.endswith(b"\\"):
-                rule = (
-                    "no line may end in a backslash, vertices have three numbers, and faces have three or more corners"
-                )
+                rule = "no line may end in a backslash, vertices have three numbers, and faces have three or more"
                 shown = cut(line.decode("latin-1"))
-                raise ValueError(f"has a line that is not understood, {number} ({shown!r}); {rule}, which count from 1")
+                raise ValueError(f"has a line that is not understood, {number} ({shown!r}); {rule} corners from 1 on")
             if found["vertex"]:
                 vertices.append(found["vertex"].split())
             elif found["face"]:
