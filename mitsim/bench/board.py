@@ -41,35 +41,30 @@ def before_board(
     if not 0 <= reflectance <= 1:
         raise ArgumentError("reflectance", f"{reflectance:g}: give a number from 0 to 1")
     where, shape = bench.geometry.scene_distance if depth is None else check_depth(depth), shape or BoardShape()
-    board = board_object(bench, reflectance, shape, where)
-    loaded = bench.loaded
-    scene = mi.load_dict({"type": "scene", "camera": loaded.camera, "projector": loaded.projector, "board": board})
-    bare = replace(loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False, in_view=False)
-    alone = replace(bare, unfit=Unfit(), shapes=(), coloured=(), parting=())
-    stated = {"reflectance": reflectance, "depth_mm": where, **shape.model_dump()}
-    return replace(bench, loaded=alone, board=stated)
-
-
-def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth: float) -> Any:
-    """Return a diffuse board of the given ``reflectance`` and ``shape`` at ``depth`` [mm] for Mitsuba."""
-    geometry = bench.geometry
-    half = _BEYOND * (geometry.tan_half_fov * depth + geometry.half_width)
+    geometry, loaded = bench.geometry, bench.loaded
+    half = _BEYOND * (geometry.tan_half_fov * where + geometry.half_width)
     steep = math.hypot(*(math.tan(math.radians(tilt)) for tilt in (shape.tilt_row_deg, shape.tilt_column_deg)))
     if shape.size_mm is not None:
         half = shape.size_mm / 2
     elif steep:  # along the slope a ray of tan-angle u meets the board at u z / (cos - u sin) from its middle
-        angle, corner = math.atan(steep), math.sqrt(2) * half / depth
+        angle, corner = math.atan(steep), math.sqrt(2) * half / where
         half = half * math.sqrt(2) / max(math.cos(angle) - corner * math.sin(angle), _GRAZING)
     bsdf = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
     turned, camera = np.eye(4), np.eye(4)
     turned[:3, :3] = turn_of(shape)
     camera[:3, :3], camera[:3, 3] = camera_place(bench)
-    middle = mi.ScalarAffineTransform4f().translate([0, 0, depth])
+    middle = mi.ScalarAffineTransform4f().translate([0, 0, where])
     place = middle @ mi.ScalarAffineTransform4f(turned.tolist())
     world = mi.ScalarAffineTransform4f(camera.tolist())
+    to_world = world @ place.rotate([0, 1, 0], 180).scale([half, half, 1])
+    board: Any = {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
     if shape.bow_mm:
-        return _bowed_mesh(shape, half, np.array((world @ place).matrix, dtype=np.float64), bsdf)
-    return {"type": "rectangle", "to_world": world @ place.rotate([0, 1, 0], 180).scale([half, half, 1]), "bsdf": bsdf}
+        board = _bowed_mesh(shape, half, np.array((world @ place).matrix, dtype=np.float64), bsdf)
+    scene = mi.load_dict({"type": "scene", "camera": loaded.camera, "projector": loaded.projector, "board": board})
+    bare = replace(loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False, in_view=False)
+    alone = replace(bare, unfit=Unfit(), shapes=(), coloured=(), parting=())
+    stated = {"reflectance": reflectance, "depth_mm": where, **shape.model_dump()}
+    return replace(bench, loaded=alone, board=stated)
 
 
 def turn_of(shape: BoardShape) -> FloatArray:

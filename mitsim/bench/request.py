@@ -226,12 +226,14 @@ class Family(Options):
     patterns: Annotated[str, validated_by(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
 
 
+Accuracy = Annotated[float, validated_by(check_accuracy)]
+Effects = Annotated[Any, validated_by(_switches)]
+
+
 class Accurate(Options):
     """How well light is known."""
 
-    accuracy: Annotated[float, validated_by(check_accuracy)] = option(
-        1e-3, "relative rms error of the expected frames", panel=QUALITY
-    )
+    accuracy: Accuracy = option(1e-3, "relative rms error of the expected frames", panel=QUALITY)
 
 
 class Sampled(Seeded, Accurate):
@@ -266,9 +268,7 @@ class Planned(Sampled, Family):
     seconds: float | None = option(
         None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
     )
-    effects: Annotated[Any, validated_by(_switches)] = option(
-        {}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY
-    )
+    effects: Effects = option({}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY)
 
     def model_post_init(self, context: object) -> None:
         """Refuse an accuracy beside the seconds that decide it."""
