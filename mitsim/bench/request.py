@@ -158,9 +158,8 @@ def check_samples(estimator: str, spp: int | None) -> None:
 def check_untimed(seconds: float | None) -> None:
     """Refuse ``seconds`` for a run in colour."""
     if seconds is not None:
-        raise ArgumentError(
-            "seconds", f"{seconds:g}: runs in colour are not planned by time; give an accuracy, or leave colour out"
-        )
+        problem = f"{seconds:g}: runs in colour are not planned by time"
+        raise ArgumentError("seconds", f"{problem}; give an accuracy, or leave colour out")
 
 
 def _switches(effects: object) -> dict[str, bool]:
@@ -274,9 +273,8 @@ class Planned(Sampled, Family):
         """Refuse an accuracy beside the seconds that decide it."""
         super().model_post_init(context)
         if self.seconds is not None and "accuracy" in self.model_fields_set:
-            raise ArgumentError(
-                "seconds", f"{self.seconds:g}: the accuracy is what they buy; give seconds or an accuracy, not both"
-            )
+            problem = f"{self.seconds:g}: the accuracy is what they buy"
+            raise ArgumentError("seconds", f"{problem}; give seconds or an accuracy, not both")
 
 
 class Request(Timed, Planned):
@@ -553,6 +551,5 @@ def check_ending(path: Path, sensor: SensorModel) -> None:
         raise MitsimError(f"output {path}: give a name that ends in {', '.join(ENDINGS)}")
     if ending == ".png" and (sensor.largest_dn is None or sensor.largest_dn > _LARGEST_PNG):
         numbers = "real numbers" if sensor.largest_dn is None else f"numbers up to {sensor.largest_dn}"
-        raise MitsimError(
-            f"output {path}: sensor {sensor.name!r} gives {numbers}, 16 bits end at {_LARGEST_PNG}; use .exr"
-        )
+        problem = f"output {path}: sensor {sensor.name!r} gives {numbers}, 16 bits end at {_LARGEST_PNG}"
+        raise MitsimError(f"{problem}; use .exr")

@@ -154,9 +154,8 @@ class FrameList(Configuration):
     @model_validator(mode="after")
     def _saturation_is_known(self) -> FrameList:
         if len(self.exposure_ladder) > 1 and self.digital.saturation_dn is None:
-            raise ValueError(
-                "digital.saturation_dn: is not given; an exposure_ladder needs it, to leave out what is saturated"
-            )
+            problem = "digital.saturation_dn: is not given"
+            raise ValueError(f"{problem}; an exposure_ladder needs it, to leave out what is saturated")
         return self
 
 

@@ -43,9 +43,8 @@ class BoardShape(Configuration):
         if self.bow_mm and self.size_mm is None:
             raise ValueError(f"bow_mm: got {self.bow_mm:g} without size_mm, from whose edges it is measured; give both")
         if self.size_mm is not None and abs(self.bow_mm) > 0.1 * self.size_mm:
-            raise ValueError(
-                f"bow_mm: got {self.bow_mm:g} on a board of {self.size_mm:g} mm; allowed is up to a tenth of it"
-            )
+            problem = f"bow_mm: got {self.bow_mm:g} on a board of {self.size_mm:g} mm"
+            raise ValueError(f"{problem}; allowed is up to a tenth of it")
         return self
 
     @property

@@ -183,9 +183,8 @@ class _Tree:
             if plugin == "mitsim_lensless":
                 self._check_camera(node)
         for tag in self.tags_of(_ON_SHAPES):
-            raise tag.refusal(
-                "emitter", repr(tag.attributes.get("type")), "it is the light of a shape; put it into one"
-            )
+            problem = "it is the light of a shape"
+            raise tag.refusal("emitter", repr(tag.attributes.get("type")), f"{problem}; put it into one")
         self._check_sizes()
 
     def tags_of(self, plugins: Sequence[str]) -> Iterator[Tag]:

@@ -59,9 +59,8 @@ def check_image(path: Path) -> tuple[int, bool]:
         header = exr.read_header(path)
         width, height, grey = header.width, header.height, header.channels < 3
         if header.types not in ({"half"}, {"float"}):  # Mitsuba converts all to the first one, in silence
-            raise ValueError(
-                f"its channels are {' and '.join(sorted(header.types))}; save all as float, or all as half"
-            )
+            problem = f"its channels are {' and '.join(sorted(header.types))}"
+            raise ValueError(f"{problem}; save all as float, or all as half")
     elif start.startswith(b"#?"):
         # The first line that Mitsuba could take for the size.
         size = next((line for line in start.split(b"\n") if b"-Y" in line), b"")

@@ -99,9 +99,8 @@ class Outline:
         self._opened = self._elements = 0
         for name, value in defines.items():
             if "$" in value or "\\" in value or not value.isprintable():
-                raise MitsimError(
-                    f"parameter {cut(name)}={cut(value)!r}: give a plain value without $, backslash or line breaks"
-                )
+                problem = f"parameter {cut(name)}={cut(value)!r}: give a plain value without $"
+                raise MitsimError(f"{problem}, backslash or line breaks")
         self._read(files.scene(path), path.parent, ())
         known = ", ".join(sorted(self._defaults)) or "none"
         unknown = [
@@ -238,9 +237,8 @@ def _content(path: Path) -> bytes:
     except OSError as error:
         raise MitsimError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     if len(content) > _MOST_BYTES:
-        raise MitsimError(
-            f"{path}: over {_MOST_BYTES >> 20} MiB; a scene is smaller, its meshes have files of their own"
-        )
+        problem = f"{path}: over {_MOST_BYTES >> 20} MiB"
+        raise MitsimError(f"{problem}; a scene is smaller, its meshes have files of their own")
     try:
         content.decode("utf-8")
         wrong = content.find(b"\0")  # where Mitsuba's parser would end

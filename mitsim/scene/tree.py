@@ -203,9 +203,8 @@ def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -
                 _replace(state.nodes, index, Path(folder) / f"thin shape {index}.ply")
         except OSError as error:
             rule = "free some space there, or set TMPDIR to another folder"
-            raise MitsimError(
-                f"{outline.path}: meshes of its thin cylinders and small lamps: {error}; {rule}"
-            ) from None
+            problem = f"{outline.path}: meshes of its thin cylinders and small lamps: {error}"
+            raise MitsimError(f"{problem}; {rule}") from None
         yield
 
 

@@ -162,9 +162,8 @@ def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window
     mapped = np.stack([columns, rows, np.ones(4)], axis=1) @ homography.T
     points = mapped[:, :2] / mapped[:, 2:]
     if not np.isfinite(points).all():
-        raise MitsimError(
-            f"{where}: the projector does not light the plane at {z:g} mm from the camera; aim it at the scene"
-        )
+        problem = f"{where}: the projector does not light the plane at {z:g} mm from the camera"
+        raise MitsimError(f"{problem}; aim it at the scene")
     return np.stack([-points[:, 1] / z, -points[:, 0] / z], axis=1)
 
 
