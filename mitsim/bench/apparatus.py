@@ -239,10 +239,8 @@ class Apparatus:
     def field_stop_cuts(self) -> bool:
         """Return True if a sensor point does not see the whole projector window through the field stop."""
         geometry = self.geometry
-        return any(
-            max(map(abs, window)) + half / geometry.scene_distance > geometry.tan_half_fov
-            for window, half in zip(self.windows, geometry.half_sides, strict=True)
-        )
+        sides = zip(self.windows, geometry.half_sides, strict=True)
+        return any(max(map(abs, tan)) + half / geometry.scene_distance > geometry.tan_half_fov for tan, half in sides)
 
     @check_arguments
     def family(self, patterns: str, seed: int = 0) -> PatternFamily:
@@ -458,11 +456,11 @@ def open_apparatus(
     devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
     # By their whole paths: who repeats this from another folder finds them.
     whole = {**defines, **{name: path for path, name in loaded.own.items()}}
-    opened = {
+    named = {
         "camera": camera and str(sensor_path.absolute()),
         "projector": projector and str(projector_path.absolute()),
-        "allow_outside_files": allow_outside_files,
     }
+    opened = {**named, "allow_outside_files": allow_outside_files}
     return Apparatus(loaded, devices, variant, whole, opened=opened)
 
 

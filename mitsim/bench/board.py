@@ -194,9 +194,8 @@ def show_picture(bench: Apparatus, reflectance: npt.NDArray[np.float64]) -> None
                 raise MitsimError(f"{problem}; give one its texture")
             shape, turned = np.shape(held[name]), held[name.replace(".data", ".to_uv")]
             if shape[2] != 1 or not np.array_equal(np.array(turned.matrix), np.eye(3)):
-                raise MitsimError(
-                    f"{bench.loaded.path}: a print has {shape[2]} channels, or a turned bitmap; give a raw grey one"
-                )
+                problem = f"{bench.loaded.path}: a print has {shape[2]} channels, or a turned bitmap"
+                raise MitsimError(f"{problem}; give a raw grey one")
             row, column = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
             texel = mi.Point2f(*((np.stack([column, row]) + 0.5) / [[shape[1]], [shape[0]]]).astype(np.float32))
             places = sheet.eval_parameterization(texel).p

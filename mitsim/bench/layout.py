@@ -450,10 +450,8 @@ def _crossings(bench: Apparatus) -> list[FloatArray]:
     """Where rays from each sensor row, and column, to both ends of the window cross the mask, from its centre [mm]."""
     geometry = bench.geometry
     shadow = ShadowGeometry.of(geometry, geometry.scene_distance)
-    return [
-        shadow.along(axis).crossings(Directions(np.array(edges), 0.0)) - geometry.mask_offset[axis]
-        for axis, edges in enumerate(bench.windows)
-    ]
+    rays = [shadow.along(k).crossings(Directions(np.array(edges), 0.0)) for k, edges in enumerate(bench.windows)]
+    return [each - own for each, own in zip(rays, geometry.mask_offset, strict=True)]
 
 
 # ---- Data and unknowns ----

@@ -324,12 +324,11 @@ def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float
     finer = finer[(finer >= lines[0]) & (finer <= lines[-1])]
     place = np.searchsorted(lines, (finer[1:] + finer[:-1]) / 2) - 1
     result, radius = np.asarray(values[np.ix_(place, place)]), dust.radius_mm
+    edges: list[tuple[float, Literal["left", "right"]]] = [(-radius, "right"), (radius, "left")]
     for centre in centres:
         row_lines, column_lines = (finer - at for at in centre)
-        rows, columns = (  # cells that the disc meets
-            slice(max(int(np.searchsorted(at, -radius, side="right")) - 1, 0), int(np.searchsorted(at, radius)))
-            for at in (row_lines, column_lines)
-        )
+        near = [[int(np.searchsorted(at, end, side)) for end, side in edges] for at in (row_lines, column_lines)]
+        rows, columns = (slice(max(start - 1, 0), stop) for start, stop in near)  # cells that the disc meets
         r, c = row_lines[rows.start : rows.stop + 1], column_lines[columns.start : columns.stop + 1]
         chords = r[:-1, None] + np.diff(r)[:, None] * ((np.arange(_CHORDS) + 0.5) / _CHORDS)
         half = np.sqrt(np.maximum(radius**2 - chords**2, 0))[:, :, None]

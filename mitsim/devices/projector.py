@@ -383,10 +383,8 @@ class Response(ByValue):
         if sensor.mosaic is None:
             return (cls.of(sensor),)
         colours = {name: getattr(sensor.mosaic_curves, name) for name in dict.fromkeys(sensor.mosaic)}
-        return tuple(
-            cls._along(curve, sensor, tuple(plane for plane in _PLANES if sensor.mosaic[plane] == name))
-            for name, curve in colours.items()
-        )
+        planes = {name: tuple(plane for plane in _PLANES if sensor.mosaic[plane] == name) for name in colours}
+        return tuple(cls._along(curve, sensor, planes[name]) for name, curve in colours.items())
 
     @classmethod
     def _along(cls, curve: EfficiencyCurve, sensor: SensorModel, planes: tuple[int, ...] = _PLANES) -> Response:

@@ -240,16 +240,11 @@ def _check_different(depths: tuple[float, ...]) -> tuple[float, ...]:
     return depths
 
 
-Exposures = Annotated[
-    tuple[Annotated[float, Field(ge=1, le=LONGEST)], ...],
-    Field(strict=False, min_length=1, max_length=MOST_RUNGS),
-    AfterValidator(_check_rising),
-]
-Depths = Annotated[
-    tuple[Annotated[float, Field(ge=1e-6, le=1e10)], ...],
-    Field(strict=False, max_length=64),
-    AfterValidator(_check_different),
-]
+_Ladder = tuple[Annotated[float, Field(ge=1, le=LONGEST)], ...]
+_RUNGS = Field(strict=False, min_length=1, max_length=MOST_RUNGS)
+Exposures = Annotated[_Ladder, _RUNGS, AfterValidator(_check_rising)]
+_Distances = tuple[Annotated[float, Field(ge=1e-6, le=1e10)], ...]
+Depths = Annotated[_Distances, Field(strict=False, max_length=64), AfterValidator(_check_different)]
 """As `scene_distance`; 64 sessions of the shipped scenes take ten minutes."""
 
 

@@ -140,9 +140,8 @@ def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
     if not isinstance(mask, Plate) or mask.irradiance or not geometry.is_drawn(waves=True):
         return
     step = geometry.pixel_pitch / cells_per_pixel(geometry)
-    points = cells_a_side(geometry, spectrum) * max(
-        points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm
-    )
+    lines = [float(line) for line in spectrum.wavelengths_nm]
+    points = cells_a_side(geometry, spectrum) * max(points_per_cell(nm, geometry.mask_distance, step) for nm in lines)
     terms = mask.amplitude.most_terms
     if terms * float(points) ** 2 * mask.amplitude.uneven_part > _MOST_WAVE_TERMS:
         problem = f"{mask.words}: waves of {len(mask.values)} features a side, in {terms} terms, take minutes a line"

@@ -417,10 +417,8 @@ def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArra
         within = 1 / np.sqrt(1 + np.square(8 * np.pi * height * coherence.linewidth_nm / np.square(wavelengths)))
         np.fill_diagonal(pairs, within)
     pairs *= np.outer(spectrum.weights, spectrum.weights)
-    spaces = {
-        wavelength: _space(devices, pixels_mm, lit, wavelength * 1e-6)
-        for wavelength in np.unique(2 / (inverse[:, None] + inverse)[pairs > 0])
-    }
+    together = np.unique(2 / (inverse[:, None] + inverse)[pairs > 0])
+    spaces = {wavelength: _space(devices, pixels_mm, lit, wavelength * 1e-6) for wavelength in together}
     # Of two lines, grains at their mean wave number; where lines are coherent at all they are close to it.
     both = np.array([[spaces.get(2 / (k + other), 0.0) for other in inverse] for k in inverse])
     return float(np.sqrt((1 + coherence.polarisation**2) / 2 * (pairs * both).sum()))
@@ -443,9 +441,8 @@ def _space(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray, wa
 
     seen: list[tuple[float, Kernel]] = [(1.0, lambda distance: 1 + one_feature(distance))]
     if camera.mask != "separable":
-        open_part = {"open": 1.0, "flatcam": 0.5}.get(camera.mask) or float(
-            sum(weight * rows.mean() * columns.mean() for weight, rows, columns in camera.build_mask().terms)
-        )
+        means = [weight * rows.mean() * columns.mean() for weight, rows, columns in camera.build_mask().terms]
+        open_part = {"open": 1.0, "flatcam": 0.5}.get(camera.mask) or float(sum(means))
         seen = [(1.0, np.ones_like), (1 / open_part - 1, one_feature)]
     sizes = [2 * side for side in lit.shape]
     spectrum = np.square(np.abs(np.fft.rfft2(lit, sizes)))

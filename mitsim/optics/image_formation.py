@@ -151,10 +151,8 @@ class _Raster:
         return 0 < held <= SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
 
     def _image(self, lit: _Lit, light: FloatArray) -> FloatArray:
-        (row_anchor, row), (column_anchor, column) = (
-            np.divmod(places, len(each.centres))
-            for places, each in zip((lit.rows, lit.columns), self.shadow[1:3], strict=True)
-        )
+        cells = [len(each.centres) for each in self.shadow[1:3]]
+        (row_anchor, row), (column_anchor, column) = map(np.divmod, (lit.rows, lit.columns), cells)
         by_row, by_column = self.weights
         total = np.zeros((len(by_row), len(by_column)))
         for first, second in product(np.unique(row_anchor), np.unique(column_anchor)):

@@ -181,11 +181,8 @@ def load_scene(
                 raise
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
     mirrors, glossy = _mirrors_and_gloss(scene, unfit)
-    bsdfs = [shape.bsdf() for shape in shapes]
-    one_sided = all(
-        shape.class_name() in _FLAT and bsdf and not mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
-        for shape, bsdf in zip(shapes, bsdfs, strict=True)
-    )
+    flat = all(shape.class_name() in _FLAT and shape.bsdf() for shape in shapes)
+    one_sided = flat and not any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.BackSide) for shape in shapes)
     normals = [np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n).ravel() for shape in shapes if one_sided]
     devices = cameras[0], projectors[0] if grid else None, grid
     lamps = tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector")
