@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 import pydantic
 
+from mitsim.core.configuration import limits_of
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.scene import limits
@@ -284,7 +285,9 @@ class _Tree:
                 name = str((*problem["loc"], "mask_distance")[0])
                 got = values.get(name, "its default")
                 shown = repr(got) if isinstance(got, str) else f"{got:g}"
-                found.append(self.outline.tag(node, name).refusal(name, shown, problem["msg"]))
+                ranged = problem["type"].startswith(("greater", "less"))
+                rule = f"give a number {limits_of(CameraGeometry.model_fields[name])}" if ranged else problem["msg"]
+                found.append(self.outline.tag(node, name).refusal(name, shown, rule))
             if len(found) == 1:
                 raise found[0] from None
             head = f"{self.outline.path}: the camera has {len(found)} mistakes:"
