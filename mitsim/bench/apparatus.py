@@ -209,20 +209,16 @@ class Apparatus:
             raise ArgumentError("depth", f"{depth:g}: the mask is at {self.geometry.mask_distance:g} mm; give more")
         if depth > FARTHEST:
             raise ArgumentError("depth", f"{depth:g}: give at most {FARTHEST:g} mm")
-        window = self.windows_at(depth)
-        farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
-        shift = 1 / (2 * depth) - 1 / depth
+        import numpy as np
+
+        # At twice the depth, which is in 1/z halfway to infinity: far enough that rounding of uv does not show.
+        near, far = (np.array(self.windows_at(z)) for z in (depth, 2 * depth))
         # Seen from the frames' middle, c off the axis: tangents are c / z less.
-        centres = [0.0, 0.0]
+        centres, slope = np.zeros((2, 1)), (far - near) / (1 / (2 * depth) - 1 / depth)
         if self.geometry.roi is not None:
-            centres = [float(each[0] + each[-1]) / 2 for each in map(self.geometry.centres, (0, 1))]
-        rows, columns = (
-            ((far[0] - near[0]) / shift - centre, (far[1] - near[1]) / shift - centre)
-            for near, far, centre in zip(window, farther, centres, strict=True)
-        )
-        (top, bottom), (left, right) = window
-        row_tan = top - centres[0] / depth, bottom - centres[0] / depth
-        column_tan = left - centres[1] / depth, right - centres[1] / depth
+            centres[:, 0] = [(each[0] + each[-1]) / 2 for each in map(self.geometry.centres, (0, 1))]
+        row_tan, column_tan = map(tuple, (near - centres / depth).tolist())
+        rows, columns = map(tuple, (slope - centres).tolist())
         return Parallax(
             depth_mm=depth,
             row_tan=row_tan,

@@ -249,12 +249,9 @@ def _bilinear(corners: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _gradients(corners: FloatArray, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    along = (corners[:, 1] - corners[:, 0])[:, None]
-    across = (corners[:, :, 1] - corners[:, :, 0])[:, :, None]
-    return (
-        along[:, :, None, 0] + (along[:, :, None, 1] - along[:, :, None, 0]) * b[:, None],
-        across[:, None, 0] + (across[:, None, 1] - across[:, None, 0]) * a[:, None, None],
-    )
+    along, across = (corners[:, 1] - corners[:, 0])[:, None], (corners[:, :, 1] - corners[:, :, 0])[:, :, None]
+    along = along[:, :, None, 0] + (along[:, :, None, 1] - along[:, :, None, 0]) * b[:, None]
+    return along, across[:, None, 0] + (across[:, None, 1] - across[:, None, 0]) * a[:, None, None]
 
 
 def _slope(sensor: FloatArray, tangent: FloatArray) -> FloatArray:

@@ -388,10 +388,9 @@ def emit_by_faces(checked: CheckedScene) -> tuple[str, ...]:
         props["face_normals"] = True
         if behind:
             props["flip_normals"] = not props.get("flip_normals", False)
-        notes.append(
-            f"{tag.path.name}:{tag.line}: this lamp emits by its faces (face_normals), for its vertex normals are up "
-            f"to {np.degrees(np.arcsin(sines.max())):.3g} degrees off them"
-        )
+        off = f"{np.degrees(np.arcsin(sines.max())):.3g} degrees off them"
+        note = "this lamp emits by its faces (face_normals), for its vertex normals are up to"
+        notes.append(f"{tag.path.name}:{tag.line}: {note} {off}")
     return tuple(notes)
 
 
