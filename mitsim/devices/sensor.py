@@ -19,9 +19,8 @@ EXPOSURE_S = 1e-12, 1e6
 """Shortest and longest exposure [s]: gated avalanche diodes open for 1e-10 s; cooled CCDs collect for some 1e4 s."""
 EXPOSURE_FRACTION = 1e-6, 1.0
 """Mean of the brightest pixel as a part of the full well; a millionth is less than an electron of most wells."""
-ExposureFraction = Annotated[
-    float, Field(strict=True, ge=EXPOSURE_FRACTION[0], le=EXPOSURE_FRACTION[1], allow_inf_nan=False)
-]
+_PART = Field(strict=True, ge=EXPOSURE_FRACTION[0], le=EXPOSURE_FRACTION[1], allow_inf_nan=False)
+ExposureFraction = Annotated[float, _PART]
 MOST_PIXELS = 1 << 20
 """Along a side of a sensor, before binning: frames are of at most 16 384, binned up to 64 times."""
 PITCH_TOLERANCE = 1e-3

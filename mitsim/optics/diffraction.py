@@ -177,11 +177,8 @@ def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, sp
         return both_axes(shadow, rows, columns, partial(means, nm=float(wavelength)))
 
     lines = in_threads(of_line, spectrum.wavelengths_nm)
-    return [
-        (share * weight * a, b)
-        for (left, right), share in zip(lines, spectrum.weights, strict=True)
-        for weight, a, b in zip(weights, left, right, strict=True)
-    ]
+    by_line = [(share, zip(weights, *both, strict=True)) for both, share in zip(lines, spectrum.weights, strict=True)]
+    return [(share * weight * a, b) for share, terms in by_line for weight, a, b in terms]
 
 
 def wave_profiles(

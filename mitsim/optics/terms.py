@@ -91,10 +91,8 @@ def shadow_terms(
         first, second = nodes_between(by_column, nodes[0]), nodes_between(by_row, nodes[1])
         # One look at both axes serves a node of each; the last of fewer nodes is looked at again.
         padded = [np.pad(each, (0, max(nodes) - len(each)), "edge") for each in (first, second)]
-        seen = [
-            form(replace(shadow, tilt=((along, across * float(row)), (across, along * float(column)))))
-            for row, column in zip(*padded, strict=True)
-        ]
+        tilts = [((along, across * float(i)), (across, along * float(j))) for i, j in zip(*padded, strict=True)]
+        seen = [form(replace(shadow, tilt=tilt)) for tilt in tilts]
         row_weights, column_weights = lagrange_weights(by_column, first), lagrange_weights(by_row, second)
         for i, j in product(range(nodes[0]), range(nodes[1])):
             both = zip(seen[i], seen[j], strict=True)
