@@ -368,7 +368,7 @@ def prepare_study(
     name, scene, output, asked, job
         as there.
     """
-    from mitsim.studies.framework.experiment import is_experiment, no_such_study
+    from mitsim.studies.framework.experiment import check_study
 
     if name == MERGE:
         asked.refuse(asked.without("experiment", "variant"), "on parts, which say themselves what they are of")
@@ -385,8 +385,7 @@ def prepare_study(
     if len(named) > 1:
         raise MitsimError(f"study {name}: got {len(named)} scenes, {' '.join(map(str, named))}; give one scene")
     place = str(named[0]) if named else None
-    if not is_experiment(name):
-        raise no_such_study(name)
+    check_study(name)
     return _study_of_points(name, place, Path(output), request, job or Job(), asked)
 
 

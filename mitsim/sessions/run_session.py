@@ -55,7 +55,6 @@ from mitsim.sessions.session_file import (
     sweep_options,
     swept_values,
 )
-from mitsim.studies.framework.experiment import is_experiment
 from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, open_as, prepare_study
 
 if TYPE_CHECKING:
@@ -283,7 +282,7 @@ class _Steps:
 
     def prepare(self, step: Step) -> Work:
         """Return the work of a ``step``, whose request is checked."""
-        shared = step.verb == "sweep" or (step.verb == "study" and is_experiment(step.values["name"]))
+        shared = step.verb in ("sweep", "study")
         if not shared:
             idle = self.asked.without("resume", "pictures")
             given = [name for name in idle if idle[name] != RunOptions.model_fields[name].default]

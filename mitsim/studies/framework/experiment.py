@@ -269,8 +269,6 @@ class Results:
 
 # -------- What a study declares
 
-_PYTHON = ".py"
-"""End of the name of a study in a file."""
 KNOBS = "{knobs}"
 """In the title of a study that sweeps: the names of its knobs."""
 HEADS = "Paper", "Idealised", "Rendered"
@@ -383,11 +381,10 @@ def find_experiment(name: str) -> Study:
 
     MitsimError for another name, with the names of all studies, and for a module without a ``STUDY``.
     """
-    if not is_experiment(name) or name == ALL:
-        raise no_such_study(name)
+    check_study(name)
     module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
     try:
-        loaded = _load_file(module) if module.endswith(_PYTHON) else importlib.import_module(module)
+        loaded = _load_file(module) if module.endswith(".py") else importlib.import_module(module)
         found: Study = loaded.STUDIES[name] if name in SHARED else loaded.STUDY
     except (ImportError, AttributeError, OSError, SyntaxError) as error:
         raise MitsimError(
@@ -397,11 +394,12 @@ def find_experiment(name: str) -> Study:
     return found
 
 
-def no_such_study(name: str) -> MitsimError:
-    """Return the refusal of a ``name`` that is no study's, with the replacement of one that there was."""
+def check_study(name: str) -> None:
+    """Raise MitsimError for a ``name`` of no study, with the replacement of one that there was."""
     if name in GONE:
-        return MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
-    return MitsimError(f"study {name!r}: there is no such study; use {', '.join(EXPERIMENTS)}")
+        raise MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
+    if name not in (*EXPERIMENTS, ALL) and "." not in name:
+        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join(EXPERIMENTS)}")
 
 
 @cache
@@ -413,11 +411,6 @@ def _load_file(path: str) -> Any:
     sys.modules[found.name] = module  # dataclasses of the file look for it there
     found.loader.exec_module(module)
     return module
-
-
-def is_experiment(name: str) -> bool:
-    """Return True if ``name`` is that of a study of many points."""
-    return name in (*EXPERIMENTS, ALL) or "." in name
 
 
 # -------- What a sweep varies and shows, in the words of a command line
