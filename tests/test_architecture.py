@@ -571,10 +571,10 @@ SIZES = {
     "report": (9, 2220),
     "scene": (8, 1739),
     "sensor": (5, 1195),
-    "sessions": (4, 1020),
-    "studies": (25, 7013),
+    "sessions": (4, 1019),
+    "studies": (25, 7010),
     "transport": (21, 4489),
-    "verbs": (1, 357),
+    "verbs": (1, 356),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
