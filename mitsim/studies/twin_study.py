@@ -483,19 +483,23 @@ class Spread(NamedTuple):
     brightest: float
 
 
+def radial_power(values: FloatArray) -> FloatArray:
+    """Return the mean power (bands,) a pixel of ``values`` (rows, columns), windowed and without their mean."""
+    window = np.outer(*(np.hanning(side) for side in values.shape))
+    window /= np.sqrt(np.square(window).mean())
+    power = np.square(np.abs(np.fft.fft2((values - (values * window**2).mean()) * window))) / values.size
+    radius = np.hypot(*np.meshgrid(*(np.fft.fftfreq(side) for side in values.shape), indexing="ij"))
+    which = np.digitize(radius.ravel(), _EDGES)
+    sums, counts = (np.bincount(which, weights, len(_EDGES) + 1) for weights in (power.ravel(), None))
+    return np.asarray(sums[1:-1] / np.maximum(counts[1:-1], 1))
+
+
 def spread_of(light: FloatArray) -> Spread:
     """Return the statistics of a square of ``light``."""
     even = light / light.mean()
     ordered = np.sort(even.ravel())
     count = max(1, round(0.05 * even.size))
-    window = np.outer(*(np.hanning(side) for side in even.shape))
-    window /= np.sqrt(np.square(window).mean())
-    power = np.square(np.abs(np.fft.fft2((even - (even * window**2).mean()) * window))) / even.size
-    radius = np.hypot(*np.meshgrid(*(np.fft.fftfreq(side) for side in even.shape), indexing="ij"))
-    which = np.digitize(radius.ravel(), _EDGES)
-    sums, counts = (np.bincount(which, weights, len(_EDGES) + 1) for weights in (power.ravel(), None))
-    spectrum = np.asarray(sums[1:-1] / np.maximum(counts[1:-1], 1))
-    return Spread(spectrum, float(even.std()), float(ordered[-count:].sum() / ordered.sum()))
+    return Spread(radial_power(even), float(even.std()), float(ordered[-count:].sum() / ordered.sum()))
 
 
 def read_spread(path: Path) -> FloatArray:
@@ -561,7 +565,7 @@ def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[Fl
     for (row, correlated), each in product(enumerate(CORRELATIONS_MM), range(_SEEDS)):
         relief = random_relief(side, float(correlated), _SLOPE, seed + each)
         for column, move in enumerate(MOVES_MM):
-            spectrum = spread_of(land(relief, float(move), count, each)).spectrum
+            spectrum = radial_power(land(relief, float(move), count, each))
             grids[each, row, column] = np.maximum(spectrum - floor, spectrum / 10)
     grid = grids.mean(axis=0)
     row, column, blur, haze = fit(spread_of(square).spectrum, grid)
