@@ -238,13 +238,6 @@ def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Ge
     return None if offset is None else offset.reshape(-1)
 
 
-def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Draw Poisson electrons."""
-    flat = np.reshape(expected, -1)
-    drawn = by_pixel(lambda _, *values: _electron_counts(*values), {}, (flat, _few(flat, 0.0, rng)), (rng,))
-    return np.asarray(drawn.reshape(np.shape(expected)))
-
-
 def _few(light: FloatArray, dark: FloatArray | float, rng: np.random.Generator) -> FloatArray | None:
     """Draw the electrons of pixels that expect few; NaN elsewhere, None without such pixels."""
     if not light.size or light.min() + np.min(dark) >= _MANY:

@@ -20,7 +20,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain, moments
-from tests.invented import sensor
+from tests.invented import draw_electrons, sensor
 from tests.robustness import Recorder
 
 pytestmark = pytest.mark.robustness("Sensor")
@@ -46,7 +46,7 @@ def test_drawn_electrons_are_poisson_from_a_millionth_to_1e17(mean: float) -> No
     Significance: 1e-6 over three statistics for each of the means.
     """
     share = SIGNIFICANCE / (3 * len(MEANS))
-    drawn = chain.draw_electrons(np.full(DRAWS, mean), stream(SEED, "poisson", str(mean)))
+    drawn = draw_electrons(np.full(DRAWS, mean), stream(SEED, "poisson", str(mean)))
     assert drawn.dtype == np.float64 and np.array_equal(drawn, np.rint(drawn))
     # Beyond 1e11 a sum of counts rounds; deviations from the mean do not.
     z = math.fsum(drawn - mean) / math.sqrt(DRAWS * mean)

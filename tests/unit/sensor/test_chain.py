@@ -14,7 +14,7 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor import chain, moments
 from mitsim.sensor import chain as compiled
-from tests.invented import sensor
+from tests.invented import draw_electrons, sensor
 
 
 def exposed(model: SensorModel, mean: float, size: int, seed: int = 0, exposure_s: float = 0.0) -> np.ndarray:
@@ -242,15 +242,15 @@ def test_counts_of_normal_deviates_have_poisson_s_law(mean: float, apart: float)
 
 def test_bright_pixels_draw_the_same_counts_whatever_dim_ones_do() -> None:
     bright = np.full(200, 5e4)
-    alone = chain.draw_electrons(np.append(bright, 64.0), stream(3, "shot"))
-    beside = chain.draw_electrons(np.append(bright, 63.99), stream(3, "shot"))
+    alone = draw_electrons(np.append(bright, 64.0), stream(3, "shot"))
+    beside = draw_electrons(np.append(bright, 63.99), stream(3, "shot"))
     assert np.array_equal(alone[:-1], beside[:-1])
 
 
 def test_dim_pixels_of_a_bright_frame_are_poisson_themselves() -> None:
     """Mean and variance of 40 000 counts of mean 3 beside as many of 1e6, to six deviations; none below zero."""
     light = np.tile([3.0, 1e6], 40_000)
-    drawn = chain.draw_electrons(light, stream(4, "shot"))
+    drawn = draw_electrons(light, stream(4, "shot"))
     dim, bright = drawn[::2], drawn[1::2]
     for counts, mean in ((dim, 3.0), (bright, 1e6)):
         assert counts.mean() == pytest.approx(mean, abs=6 * math.sqrt(mean / 40_000))
@@ -260,8 +260,8 @@ def test_dim_pixels_of_a_bright_frame_are_poisson_themselves() -> None:
 
 @pytest.mark.parametrize("mean", [0.0, 1e-9])
 def test_no_light_draws_no_electrons(mean: float) -> None:
-    assert not chain.draw_electrons(np.full(1000, mean), stream(5, "shot")).any()
-    beside = chain.draw_electrons(np.append(np.full(1000, mean), 1e9), stream(5, "shot"))
+    assert not draw_electrons(np.full(1000, mean), stream(5, "shot")).any()
+    beside = draw_electrons(np.append(np.full(1000, mean), 1e9), stream(5, "shot"))
     assert not beside[:-1].any() and beside[-1] == pytest.approx(1e9, abs=6 * math.sqrt(1e9))
 
 
