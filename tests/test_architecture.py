@@ -570,7 +570,7 @@ SIZES = {
     "reconstruct": (23, 6967),
     "report": (9, 2220),
     "scene": (8, 1739),
-    "sensor": (5, 1195),
+    "sensor": (5, 1191),
     "sessions": (4, 1019),
     "studies": (25, 7011),
     "transport": (21, 4489),
