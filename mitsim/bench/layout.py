@@ -324,26 +324,21 @@ def _picture(scene: mi.Scene, place: FloatArray, angle: float) -> FloatArray:
     integrator = mi.load_dict({"type": "path", "max_depth": _TURNS, "hide_emitters": True})
     light = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=_SAMPLES, seed=0), dtype=np.float64)
     light = np.nan_to_num(light.reshape(_PIXELS, _PIXELS, -1))
-    by_lamp, empty = _by_own_lamp(scene, sensor)
-    white = float(np.percentile(light[light > 0], _WHITE)) if light.any() else 1.0
-    shown = np.clip(light / white, 0, 1) * (1 - _FILL) + _FILL * by_lamp if light.any() else by_lamp
-    return np.asarray(shown * (1 - empty) + empty)
-
-
-def _by_own_lamp(scene: mi.Scene, sensor: mi.Sensor) -> tuple[FloatArray, FloatArray]:
     side = _PIXELS * _EDGES
     column, row = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
-    place = mi.Point2f(*(mi.Float(axis.ravel().astype(np.float32)) for axis in (column, row)))
-    ray, _ = sensor.sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5))
+    places = mi.Point2f(*(mi.Float(axis.ravel().astype(np.float32)) for axis in (column, row)))
+    ray, _ = sensor.sample_ray_differential(0.0, 0.5, places, mi.Point2f(0.5))
     met = scene.ray_intersect(ray)
     hit = host_values(met.is_valid(), side * side).astype(float)[:, None]
     cosine = np.abs(host_values(dr.dot(met.sh_frame.n, ray.d), side * side))[:, None]
-    light = _reflectance(met.bsdf(ray), met, side * side) * cosine * hit
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(values.reshape(_PIXELS, _EDGES, _PIXELS, _EDGES, -1).mean(axis=(1, 3)))
-
-    return mean(light), 1 - mean(hit)
+    lamp = _reflectance(met.bsdf(ray), met, side * side) * cosine * hit
+    by_lamp, full = (
+        np.asarray(values.reshape(_PIXELS, _EDGES, _PIXELS, _EDGES, -1).mean(axis=(1, 3))) for values in (lamp, hit)
+    )
+    empty = 1 - full
+    white = float(np.percentile(light[light > 0], _WHITE)) if light.any() else 1.0
+    shown = np.clip(light / white, 0, 1) * (1 - _FILL) + _FILL * by_lamp if light.any() else by_lamp
+    return np.asarray(shown * (1 - empty) + empty)
 
 
 # -------- Whether frames can give an image, from geometry alone and before any light is simulated

@@ -18,18 +18,7 @@ from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import Devices, side_of
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Coherence
-from mitsim.optics.forming import (
-    AccumulatedLight,
-    Formed,
-    Mixture,
-    bound_of,
-    form_frames,
-    mix_frames,
-    noise_of_groups,
-    pair_shots,
-    probe_frames,
-    probe_vectors,
-)
+from mitsim.optics import forming
 from mitsim.optics.image_formation import IntArray
 
 _AT_ONCE, _BYTES_AT_ONCE = 32, 2**27
@@ -140,10 +129,10 @@ class ExpectedFrames:
 
     def __init__(
         self,
-        lights: Sequence[AccumulatedLight],
+        lights: Sequence[forming.AccumulatedLight],
         lighting: Lighting,
         seed: int,
-        ambient: Sequence[AccumulatedLight] = (),
+        ambient: Sequence[forming.AccumulatedLight] = (),
         specular: ClassFrames | None = None,
         probed: FloatArray | None = None,
         restated: float = 1.0,
@@ -156,8 +145,8 @@ class ExpectedFrames:
         self._mixed = mixes(classes, shots, side_of(self._shape))
         self._shares = np.eye(classes) if self._mixed else self._weights
         least = self._weights.min(axis=0)
-        self._of_classes = Mixture(self._weights, least, sparse.csr_array(self._weights - least))
-        self._pairs = pair_shots(self._weights) if self._mixed and not self._of_classes.sparse else None
+        self._of_classes = forming.Mixture(self._weights, least, sparse.csr_array(self._weights - least))
+        self._pairs = forming.pair_shots(self._weights) if self._mixed and not self._of_classes.sparse else None
         if self._mixed or shots < 2 or 2 * np.count_nonzero(self._weights == least) < self._weights.size:
             least = np.zeros(classes)
         self._leak = sparse.csr_array(sparse.csr_array(least[None]) @ indicator) if least.any() else None
@@ -208,7 +197,7 @@ class ExpectedFrames:
         Random signs estimate the frames' energy too, to a few percent.
         """
         parts, energy, _ = self._energies
-        return (float(np.sqrt(np.trace(parts) / energy)), bound_of(parts, energy)) if energy else (0.0, 0.0)
+        return (float(np.sqrt(np.trace(parts) / energy)), forming.bound_of(parts, energy)) if energy else (0.0, 0.0)
 
     @property
     def noise(self) -> tuple[FloatArray, FloatArray]:
@@ -230,7 +219,7 @@ class ExpectedFrames:
             noise += of_lights
             for probed in shots:
                 energy += float(np.square(probed.reshape(self._shape[0], count, -1).mean(axis=1)).sum())
-                parts += noise_of_groups(probed, self._shape[0], count)
+                parts += forming.noise_of_groups(probed, self._shape[0], count)
         return parts * (self._restated**2 / (count * (count - 1))), energy, noise
 
     @property
@@ -240,7 +229,7 @@ class ExpectedFrames:
         The value is None if shots are formed one by one.
         """
         if self._mixed and self._probed is None:
-            self._probed, self._noise = probe_frames(self._lights, self._basis, self._probes)
+            self._probed, self._noise = forming.probe_frames(self._lights, self._basis, self._probes)
         return self._probed
 
     def _shots_probed(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
@@ -251,7 +240,7 @@ class ExpectedFrames:
             of_classes = unknown if self._noise is None else self._noise
             noise = (np.square(weights).sum(axis=0)[:, None, None, None] * of_classes).sum(axis=0)
         else:
-            probed, of_shots = probe_frames(self._lights, self._basis[start:stop], self._probes)
+            probed, of_shots = forming.probe_frames(self._lights, self._basis[start:stop], self._probes)
             noise = of_shots.sum(axis=0)
             if self._leaked_light is not None:
                 probed += self._leaked_light[1][0]
@@ -259,7 +248,7 @@ class ExpectedFrames:
             brought = np.repeat((self._specular.irradiance @ self._probes)[:, :, None], self._groups, axis=2)
             probed += weights[:, self._specular.classes] @ brought.reshape(len(brought), -1)
         if self._ambient:
-            seen, of_one = probe_frames(self._ambient, _ALL, self._probes)
+            seen, of_one = forming.probe_frames(self._ambient, _ALL, self._probes)
             probed += seen
             noise = np.concatenate([noise, len(weights) * of_one[0]])
         return probed, noise
@@ -267,11 +256,11 @@ class ExpectedFrames:
     # ---- Forming, once for all iterations ----
 
     @cached_property
-    def _ambient_light(self) -> Formed | None:
+    def _ambient_light(self) -> forming.Formed | None:
         return self._form_with_probes(self._ambient, _ALL) if self._ambient else None
 
     @cached_property
-    def _leaked_light(self) -> Formed | None:
+    def _leaked_light(self) -> forming.Formed | None:
         return None if self._leak is None else self._form_with_probes(self._lights, self._leak)
 
     @cached_property
@@ -280,14 +269,14 @@ class ExpectedFrames:
         if self._pairs is None:
             return irradiance, probed
         chosen = self._pairs[0]  # the probes stay, which may be another's
-        return mix_frames(chosen, irradiance, irradiance[: len(chosen)]), mix_frames(chosen, probed)
+        return forming.mix_frames(chosen, irradiance, irradiance[: len(chosen)]), forming.mix_frames(chosen, probed)
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         basis = self._basis[start:stop]
         if self._probed is None:
             frames, probed = self._form_with_probes(self._lights, basis)
         else:
-            frames, probed = form_frames(self._lights, basis, None)[0], self._probed[start:stop]
+            frames, probed = forming.form_frames(self._lights, basis, None)[0], self._probed[start:stop]
         if not self._mixed and self._leaked_light is not None:
             frames += self._leaked_light[0]
             probed += self._leaked_light[1]
@@ -297,12 +286,12 @@ class ExpectedFrames:
                     frame += share[index] * self._specular.irradiance[index]
         return frames, probed
 
-    def _form_with_probes(self, lights: Sequence[AccumulatedLight], basis: sparse.csr_array) -> Formed:
-        return form_frames(lights, basis, self._probes if self._groups > 1 else None)
+    def _form_with_probes(self, lights: Sequence[forming.AccumulatedLight], basis: sparse.csr_array) -> forming.Formed:
+        return forming.form_frames(lights, basis, self._probes if self._groups > 1 else None)
 
     @cached_property
     def _probes(self) -> FloatArray:
-        return probe_vectors(self._shape[1], self._seed)
+        return forming.probe_vectors(self._shape[1], self._seed)
 
     @property
     def _groups(self) -> int:
@@ -320,7 +309,7 @@ class ExpectedFrames:
             frame, probed = light[row], probes[row]
             if ambient is not None:
                 frame, probed = frame + ambient[0][0], probed + ambient[1][0]
-            products = noise_of_groups(probed, self._shape[0], count) if pairs else np.zeros((1, 1))
+            products = forming.noise_of_groups(probed, self._shape[0], count) if pairs else np.zeros((1, 1))
             spread = float(np.trace(products))
             scale = self._restated**2 / max(pairs, 1) / frame.size
             variance, parts = spread * scale, products * scale
@@ -354,7 +343,7 @@ def monte_carlo_bound(frames: Sequence[Frame] | ExpectedFrames) -> float:
     for frame in frames:
         parts = parts + frame.by_group * frame.irradiance.size
         energy += float(np.square(frame.irradiance).sum())
-    return bound_of(parts, energy)
+    return forming.bound_of(parts, energy)
 
 
 # -------- Speckle
