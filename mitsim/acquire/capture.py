@@ -1,7 +1,6 @@
 """Capture of a pattern family: one noisy frame for each shot, in memory or in a folder.
 
-One path serves mono light, the lines of a projector one after the other, and all lines at once behind colour filters:
-:class:`mitsim.acquire.spectral.SpectralBench` determines which lines are traced and how they are read.
+:class:`mitsim.acquire.spectral.SpectralBench` determines which lines are traced, and which runs they are read in.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ _NEGLIGIBLE = 0.1
 
 
 class Light(SampledLight):
-    """Sampled light of one scene, ready to be exposed; attributes as :class:`mitsim.light.light.SampledLight`."""
+    """Sampled light of one scene, ready to be exposed."""
 
     @takes(Request, without="patterns")
     def expose(
@@ -78,12 +77,10 @@ class Light(SampledLight):
         job: Job | None = None,
         **request: Unpack[ExposureKeys],
     ) -> Capture:
-        """Expose one noisy frame for each shot of a family in this light.
+        """Expose one noisy frame for each shot of the family ``patterns``.
 
         Parameters
         ----------
-        patterns
-            Name of the family.
         output
             Folder for the frames; None keeps them in memory.
         job
@@ -98,7 +95,7 @@ class Light(SampledLight):
 
     @check_arguments
     def check_serves(self, patterns: str) -> None:
-        """Raise ArgumentError for ``patterns`` that light fewer pixels than planned: their error is unknown."""
+        """Raise ArgumentError for ``patterns`` that light fewer pixels than planned, because their error is unknown."""
         sparser = _sparser(self, self.bench.family(patterns, self.seed).lighting)
         if sparser:
             raise ArgumentError("patterns", f"{patterns!r}: {sparser}; trace light for {patterns}, which serves both")
@@ -106,19 +103,10 @@ class Light(SampledLight):
     @staticmethod
     @check_arguments
     def load(path: Path | str, bench: Apparatus) -> Light:
-        """Load light that :meth:`save` or ``mitsim transport`` wrote, in single precision.
+        """Load light from a file of :meth:`save` or ``mitsim transport``, in single precision.
 
-        Parameters
-        ----------
-        path
-            HDF5 file.
-        bench
-            Bench on which the light was traced.
-
-        Raises
-        ------
-        MitsimError
-            If the file cannot be read or holds other data, and for light of another bench, with the difference.
+        Raises MitsimError if the file cannot be read or has other data, and for light of another bench, with the
+        difference.
         """
         light = read_light(Path(path), bench)
         return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
@@ -134,10 +122,6 @@ class Light(SampledLight):
 
 
 def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None, seed: int | None = None) -> Light:
-    """Trace light by projector pixel as a plan asks; ``seed`` None takes the plan's.
-
-    Raises MitsimError for work beyond the limits of the job.
-    """
     job, request = job or Job(), plan.known_request
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)
@@ -156,10 +140,6 @@ def expose(
     resume: bool = False,
     **request: Any,
 ) -> Capture:
-    """Expose one noisy frame for each shot of a family in given light; see :meth:`Light.expose`.
-
-    ``resume`` continues an interrupted capture of the same light in ``output``.
-    """
     if request.get("noise_fraction") is not None:
         raise ArgumentError("noise_fraction", f"{request['noise_fraction']}: light is traced already; leave it out")
     own = replace(light.plan, request=light.plan.known_request.with_values(patterns=patterns, seed=light.seed))
@@ -168,10 +148,7 @@ def expose(
 
 
 def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
-    """Return the request of a ``plan`` or a family's name, with ``changes`` by field.
-
-    Raises MitsimError for an invalid value, or a change that needs another plan.
-    """
+    """Return the request of a ``plan`` or a family's name, with ``changes`` by field; raise MitsimError if one is invalid."""
     if isinstance(plan, str):
         if "patterns" in changes:
             raise ArgumentError("patterns", f"{cut(repr(changes['patterns']))}: beside the plan {plan!r}; give one")
@@ -180,10 +157,9 @@ def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
 
 
 def check_plan(plan: Plan, bench: SpectralBench, request: Request) -> None:
-    """Refuse a plan of another bench or request, because its frames would be wrong in silence.
+    """Raise ArgumentError, with the difference, for a plan of another bench or request.
 
-    Another seed, and other patterns that light the same classes of pixels alike, are accepted. Raises ArgumentError
-    with the difference.
+    Another seed, and other patterns that light the same classes of pixels alike, are accepted.
     """
     plan.check_made_of(bench.whole.deciding)
     planned = plan.known_request
@@ -196,8 +172,6 @@ def check_plan(plan: Plan, bench: SpectralBench, request: Request) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Captured:
-    """Result of a capture: a run of each reading, and the truth of each line."""
-
     runs: tuple[Capture, ...]
     truths: tuple[Truth, ...]
 
@@ -212,16 +186,7 @@ def capture(
 ) -> Captured:
     """Render and expose every shot of a pattern family; see :meth:`mitsim.api.bench.Bench.capture`.
 
-    Nothing is written before all input has been checked.
-
-    Parameters
-    ----------
-    bench, request, task
-        Bench, request and output: a RUN folder for one reading, else a folder of those.
-    plan
-        Existing plan.
-    lights
-        Light of each line, traced by pixel or for this family.
+    Nothing is written before all input has been checked. ``lights`` has each line's light by pixel or for this family.
     """
     task = task or Task()
     job, spent = task.job, task.job.clock.seconds()
@@ -355,10 +320,8 @@ def _run(
 def _close(
     light: SampledLight, shooting: exposure.Shooting, expected: ExpectedFrames, request: Request
 ) -> manifests.ClosingFile | None:
-    """Record the closing frame of a run if requested, and return its manifest entry.
-
-    The first shot has the same expectation again, speckle included. A uniform frame is exposed for a shorter time if it
-    would be brighter than frames of an automatic exposure.
+    """Record the closing frame of a run if requested: the first shot again, exposed for a shorter time if it is too
+    bright.
     """
     if request.closing_frame is None:
         return None
@@ -381,7 +344,7 @@ def _close(
 
 @contextmanager
 def colour_folder(task: Task, manifest: manifests.ColourManifest) -> Iterator[Path | None]:
-    """Claim the folder of the lines' folders; colour.json is written when all of them are finished."""
+    """Claim the folder of the lines' folders; write colour.json when all of them are finished."""
     if task.output is None:
         yield None
         return
@@ -392,13 +355,11 @@ def colour_folder(task: Task, manifest: manifests.ColourManifest) -> Iterator[Pa
 
 
 def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> dict[str, Capture]:
-    """Capture a run for each line, by its name; see :meth:`mitsim.api.bench.Bench.capture_lines`."""
     lines = SpectralBench.of(bench, manifests.RUN)
     return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
 def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> MosaicCapture:
-    """Capture a run of all lines at once; see :meth:`mitsim.api.bench.Bench.capture_mosaic`."""
     lines = SpectralBench.of(bench, manifests.MOSAIC)
     assert isinstance(lines.manifest, manifests.MosaicManifest)
     captured, board = capture(lines, request, task, plan), load_recipe().board_reflectance

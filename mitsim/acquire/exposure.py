@@ -1,4 +1,4 @@
-"""Exposure of a camera, at rest or drifted: noisy digital numbers from expected irradiance, and back to electrons/s."""
+"""Exposure of a camera, at rest or drifted: digital numbers from expected irradiance, and back to electrons/s."""
 
 from __future__ import annotations
 
@@ -46,10 +46,7 @@ Item = TypeVar("Item", bound=tuple[Any, ...])
 
 @dataclass(frozen=True)
 class Exposer:
-    """A camera at one exposure time, with speckle of a contrast (0 for none).
-
-    Every frame has random streams of its own, which its names select.
-    """
+    """A camera at one exposure time; every frame has random streams of its own."""
 
     devices: Devices
     exposure_s: float
@@ -57,37 +54,30 @@ class Exposer:
     speckle: float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
-        """Return the expected photoelectrons (m, m') of ``frame`` without dark current."""
         wavelength = self.devices.projector.effective_wavelength_nm
         return electrons_from_irradiance(frame.irradiance, self.exposure_s, self.devices.sensor, wavelength)
 
     def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
-        """Return the expected photoelectrons of ``frame`` with its own speckle."""
         return add_speckle(self.electrons(frame), self.speckle, stream(self.seed, "speckle", *names))
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
-        """Draw noisy digital numbers of expected ``electrons``."""
         shot, read = (stream(self.seed, noise, *names) for noise in ("shot", "read"))
         return expose(electrons, self.exposure_s, self.devices.sensor, shot, read)
 
     def rate(self, digital: Digital) -> FloatArray:
-        """Return photoelectrons per second, as a user computes them from ``digital`` numbers."""
         sensor = self.devices.sensor
         return dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
 
     def rendering_noise(self, frame: Frame) -> float:
-        """Return the rms Monte Carlo error of ``frame`` [electrons]."""
         wavelength = self.devices.projector.effective_wavelength_nm
         unit = electrons_from_irradiance(1.0, self.exposure_s, self.devices.sensor, wavelength)
         return float(np.sqrt(frame.variance) * unit)
 
     def sensor_noise(self, electrons: FloatArray) -> float:
-        """Return the closed-form rms noise of the sensor for expected ``electrons`` [electrons]."""
         variance = mean_variance(electrons, self.exposure_s, self.devices.sensor)
         return math.sqrt(variance) / self.devices.sensor.gain_dn_per_e
 
     def saturates(self, digital: Digital, electrons: FloatArray) -> bool:
-        """Return True if a pixel of the frame reached the full well or the end of the ADC."""
         return saturated_pixels(digital, electrons, self.exposure_s, self.devices.sensor) > 0
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
@@ -109,7 +99,6 @@ class Exposer:
 
 
 def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
-    """Split ``items`` into lists of as many as :func:`frames_at_once` allows."""
     remaining = iter(items)
     for first in remaining:
         yield [first, *islice(remaining, frames_at_once(first[-1].irradiance.size) - 1)]
@@ -117,14 +106,13 @@ def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
 
 @dataclass(frozen=True)
 class NoiseTarget:
-    """Monte Carlo error below which more sampling gains nothing: a ``fraction`` of the sensor's own relative noise."""
+    """Monte Carlo error below which more sampling gains nothing: a ``fraction`` of the sensor's relative noise."""
 
     devices: Devices
     exposure: Exposure
     fraction: float
 
     def __call__(self, expected: ExpectedFrames) -> float:
-        """Return the relative error at which sampling stops."""
         peak = peak_irradiance(expected)
         if peak <= 0:
             return np.inf
@@ -138,12 +126,10 @@ class NoiseTarget:
 
 
 def peak_irradiance(expected: ExpectedFrames) -> float:
-    """Return the irradiance [W m^-2] of the brightest pixel of ``expected`` frames."""
     return max(float(frame.irradiance.max()) for frame in expected)
 
 
 def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str]:
-    """Yield effects of a ``sensor`` that the model of an image does not contain."""
     if sensor.has_defects:
         own = specimen(sensor, (shape[0], shape[1]))
         yield (
@@ -178,20 +164,16 @@ _PART = 1 / 16
 
 
 def takes_ambient_frame(choice: AmbientChoice, family: PatternFamily, expected: ExpectedFrames) -> bool:
-    """Return True if a capture takes an ambient frame.
-
-    With ``auto`` it does if lamps are on and the family is unsigned: in the difference of two shots ambient light
-    cancels.
-    """
+    """Return True if an ambient frame is taken; ``auto``: if lamps are on and differences of shots do not cancel them."""
     return choice == "yes" or (choice == "auto" and expected.has_ambient and not family.signed)
 
 
 def ambient_shots(family: PatternFamily) -> int:
     """Return the shots of an ambient frame that add at most a sixteenth of the image's noise variance.
 
-    An ambient frame is no noisier than others, but its noise is common to all frames of a ``family``. With disjoint
-    patterns p_i such as shifting dots, every scene pixel contains it once, like the noise of its own frame. With
-    overlapping patterns it adds up by |sum_i p_i|^2 / sum_i |p_i|^2 on either side.
+    The noise of an ambient frame is common to all frames. With disjoint patterns p_i, every scene pixel contains it
+    once;
+    overlapping patterns add it up by |sum_i p_i|^2 / sum_i |p_i|^2 on either side.
     """
     alike = 1.0
     for side in (family.left, family.right):
@@ -204,16 +186,7 @@ def ambient_shots(family: PatternFamily) -> int:
 class AmbientFrame:
     """Mean of several shots with the projector off.
 
-    Attributes
-    ----------
-    shots
-        Number of shots.
-    electrons
-        (rows, columns) expected electrons of each, without dark current.
-    digital
-        (rows, columns) mean digital numbers.
-    saturated
-        True if a pixel saturated in a shot.
+    ``electrons`` (rows, columns) are expected in each shot, without dark current.
     """
 
     shots: int
@@ -223,7 +196,6 @@ class AmbientFrame:
 
     @classmethod
     def expose(cls, exposer: Exposer, expected: ExpectedFrames, shots: int) -> AmbientFrame:
-        """Average noisy shots, each with random streams of its own."""
         electrons = exposer.electrons(expected.projector_off)
         total, saturated = np.zeros_like(electrons), False
         step = frames_at_once(electrons.size)
@@ -236,7 +208,6 @@ class AmbientFrame:
 
 
 def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames) -> FloatArray | float:
-    """Return the ambient light [electrons/s] that a user subtracts from each frame, from an ambient frame if needed."""
     if not takes_ambient_frame("auto", family, expected):
         return 0.0
     return exposer.rate(AmbientFrame.expose(exposer, expected, ambient_shots(family)).digital)
@@ -249,8 +220,7 @@ def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames)
 class Totals:
     """Brightest pixel [W m^-2], relative Monte Carlo error and largest negative light over all expected frames.
 
-    ``heaviest`` is the largest part of the Monte Carlo variance from one group of the light; ``mc_bound`` the 95 %
-    bound.
+    ``heaviest`` is the largest part of the Monte Carlo variance from one group.
     """
 
     peak: float
@@ -261,12 +231,10 @@ class Totals:
 
     @property
     def noise(self) -> Estimate:
-        """Return the Monte Carlo error and its bound."""
         return Estimate(self.mc_error, self.mc_bound)
 
     @classmethod
     def of(cls, expected: ExpectedFrames) -> Totals:
-        """Form all ``expected`` frames and return their totals."""
         peak = energy = variance = removed = heaviest = 0.0
         parts = np.zeros((1, 1))
         for chunk in in_chunks((frame,) for frame in expected):
@@ -283,8 +251,6 @@ class Totals:
 
 
 class _Exposed(NamedTuple):
-    """A shot with its noise [electrons]; ``sums`` are squares of noise, light and projector's light, and the light."""
-
     number: int
     shot: Shot
     electrons: FloatArray
@@ -298,16 +264,8 @@ class _Exposed(NamedTuple):
 class Shooting:
     """Exposes expected frames and records them; frames that a resumed run already has are kept.
 
-    Attributes
-    ----------
-    family, recorder, exposer
-        Shots, storage and camera.
-    ambient
-        Light that is subtracted from the frames.
-    always
-        (m, m') expected electrons of ambient light.
-    saturated, noise_ratio
-        Frames with saturated pixels, and the largest ratio of rendering noise to sensor noise.
+    ``ambient`` is the light that is subtracted from the frames; ``always`` (m, m') are expected electrons of ambient
+    light.
     """
 
     def __init__(
@@ -324,23 +282,19 @@ class Shooting:
 
     @property
     def sensor_noise(self) -> float:
-        """Return the sensor's closed-form relative noise ||noise|| / ||expected|| over all frames."""
         noise, energy = self._sums[:2]
         return math.sqrt(noise / energy) if energy else 0.0
 
     @property
     def dilution(self) -> float:
-        """Return ||frames|| / ||projector's light||: the factor by which lamps dilute a relative error."""
         return math.sqrt(self._sums[1] / self._sums[2]) if self._sums[2] else 1.0
 
     @property
     def ambient_part(self) -> float:
-        """Return the part of ambient light in the frames."""
         return float(self.always.sum()) * len(self.family.shots) / float(self._sums[3]) if self._sums[3] else 0.0
 
     @property
     def noise_to_signal(self) -> float:
-        """Return ||noise|| / ||light of the projector|| over all frames less the ambient frame."""
         own, (noise, _, signal, _) = 0.0, self._sums
         if self.ambient is not None and not self.family.signed:
             own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
@@ -348,10 +302,7 @@ class Shooting:
         return math.sqrt((noise + own) / signal) if signal else math.inf
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
-        """Expose and record the ``expected`` frames in chunks, one thread per processor.
-
-        Files are written while the next chunk is formed; the stage ``write`` is the time that work waits for them.
-        """
+        """Expose and record ``expected`` frames in chunks; a chunk is written while the next one is formed."""
         chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
         job.progress("frames", 0.0)
         with Behind(self._record) as writing:
@@ -399,7 +350,6 @@ class Shooting:
 
 
 def frame_channels(digital: Digital, electrons: FloatArray) -> dict[str, Channel]:
-    """Return the channels of a frame's file."""
     # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
     whole = digital.dtype == np.uint32
     dn: Channel = digital.astype(np.uint32, copy=False) if whole else digital.astype(np.float32)
@@ -418,16 +368,9 @@ _OF_TERMS = ("mask_rotation_mrad", "mask_tilt_rows_mrad", "mask_tilt_columns_mra
 
 
 def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float = 0.0) -> FloatArray:
-    """Return the (count,) relative light of a source in successive frames; 1 at their begin.
+    """Return the (count,) relative light of a source in successive frames.
 
-    Parameters
-    ----------
-    seed, name
-        Random stream.
-    count
-        Number of frames; each takes the value at its middle.
-    ramp, flicker
-        Linear change from the begin of the first frame to the end of the last, and normal deviation of each.
+    ``ramp`` is the linear change from the first frame's begin to the last one's end, ``flicker`` the deviation of each.
     """
     changed = 1 + ramp * (np.arange(count) + 0.5) / count
     if flicker:
@@ -439,7 +382,8 @@ def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
     """Return a ``bench`` whose mask has moved by a ``drift``, for light that was traced before.
 
     Raises MitsimError for a mask that turns, tilts or shakes before mirrors or is drawn on a raster, for a thick mask
-    that tilts or one that tilts too far, and for one that moves into the sensor or the scene.
+    that
+    tilts, and for one that tilts too far or moves into the sensor or the scene.
     """
     row, column, axis = drift.mask_mm
     camera, kinds = bench.geometry, " and ".join(kind for kind in drift.kinds if kind in _OF_TERMS)
@@ -474,7 +418,6 @@ def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
 
 
 def drift_projector(bench: Apparatus, drift: Drift) -> Apparatus:
-    """Return a ``bench`` whose projector's picture has moved by a ``drift``; its light must be traced anew."""
     if not (drift.projector_rows or drift.projector_columns):
         return bench
     loaded, grid = bench.loaded, bench.loaded.pixels
@@ -497,14 +440,7 @@ def warmer(sensor: SensorModel, kelvin: float) -> SensorModel:
 class DriftedExposer(Exposer):
     """A camera that has drifted: frames are exposed in its true state and interpreted in its known one.
 
-    Attributes
-    ----------
-    drift
-        The drift.
-    family
-        Patterns in the order of the shots.
-    ambient
-        (m, m') light of lamps [W m^-2] when the ambient frame was taken.
+    ``family`` has patterns in the order of the shots; ``ambient`` is lamps' light [W m^-2] in the ambient frame.
     """
 
     drift: Drift = field(default_factory=Drift)
@@ -512,11 +448,9 @@ class DriftedExposer(Exposer):
     ambient: FloatArray | float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
-        """Return the expected photoelectrons (m, m') of ``frame`` while the shutter is open."""
         return self._open.electrons(frame)
 
     def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
-        """Return the expected photoelectrons of ``frame`` with projector and lamps at their level."""
         rows = len(frame.irradiance)
         power, lamp = (
             level * self._ripple(source, rows, *names)
@@ -526,7 +460,6 @@ class DriftedExposer(Exposer):
         return super().shot_electrons(replace(frame, irradiance=light + (lamp - 1) * self.ambient), *names)
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
-        """Draw noisy digital numbers of expected ``electrons``."""
         if names[0] == "ambient":
             level = self.ambient_levels[int(names[1])] * self._ripple("lamp", len(electrons), *names)
             electrons = level * electrons
@@ -549,7 +482,6 @@ class DriftedExposer(Exposer):
 
     @cached_property
     def levels(self) -> dict[tuple[str | int, ...], tuple[float, float]]:
-        """Return the relative level of projector and lamps in each shot, by its names."""
         assert self.family is not None
         shots, drift = self.family.shots, self.drift
         power = (1 + drift.power) * levels(self.seed, "power", len(shots), drift.power_ramp, drift.power_flicker)
@@ -559,6 +491,5 @@ class DriftedExposer(Exposer):
 
     @cached_property
     def ambient_levels(self) -> FloatArray:
-        """Return the (shots,) relative level of the lamps in each shot of the ambient frame."""
         assert self.family is not None
         return levels(self.seed, "ambient", ambient_shots(self.family), flicker=self.drift.lamp_flicker)

@@ -53,9 +53,8 @@ class Rendered:
     mean, error
         (m, m', channels) irradiance and its standard error.
     facts
-        estimator, spp (None for factored), seconds, variant, seed, notes (changes of the scene's objects, and effects
-        that the reference neglects), and mc_error_bound (95 % bound of the factored estimator's relative Monte Carlo
-        error).
+        estimator, spp (None for factored), seconds, variant, seed, notes (changes of objects, and neglected effects),
+        and mc_error_bound (95 % bound of the factored estimator's relative Monte Carlo error).
     warnings
         Reasons why the frame is flagged.
     """
@@ -73,7 +72,6 @@ class Rendered:
         return math.sqrt(noise / energy) if energy > 0 else math.inf
 
     def summary(self) -> dict[str, Any]:
-        """Return the values that the command line reports."""
         return {**self.facts, "mean": float(self.mean.mean()), "mc_error": self.mc_error, "warnings": self.warnings}
 
     @check_arguments
@@ -107,32 +105,13 @@ class Rendered:
 
 
 def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) -> tuple[FloatArray, FloatArray]:
-    """Render with the scene's own integrator in independent passes, summed in float64.
+    """Return (m, m', channels) irradiance [W m^-2] and its standard error, by the scene's own integrator.
 
-    The paths of a pixel start from Owen-scrambled Sobol points within a pass (position in the pixel, opening of the
-    mask). Passes are scrambled anew, so that their spread gives the error.
-
-    Parameters
-    ----------
-    loaded
-        The scene.
-    spp
-        Samples per pixel, at least 4, because passes are compared to estimate the noise.
-    seed
-        Root of the passes' random streams.
-    job
-        Progress, and limits that the first pass is compared with.
-
-    Returns
-    -------
-    tuple
-        (m, m', channels) irradiance [W m^-2] and its standard error.
-
+    Passes of Owen-scrambled Sobol points are scrambled anew, and their spread gives the error; ``spp`` is at least 4.
     Raises
-    ------
-    MitsimError
-        For too few or too many samples, an integrator that cannot render this sensor or loses light of this scene, or
-        work beyond the limits.
+    MitsimError for an unsuitable number of samples, an integrator that cannot render this sensor or loses light, or
+    work
+    beyond the limits.
     """
     import mitsuba as mi
 
@@ -190,7 +169,7 @@ def _samples(bench: Apparatus, estimator: str, spp: int | None) -> int:
 
 @contextmanager
 def show_pattern(bench: Apparatus, pattern: FloatArray) -> Iterator[None]:
-    """Show a ``pattern`` (n, n) of 0..1 on the projector within the context, for the reference."""
+    """Show a ``pattern`` (n, n) of 0..1 on the projector within the context."""
     import mitsuba as mi
 
     parameters = mi.traverse(bench.loaded.projector)
@@ -218,10 +197,7 @@ def render(
     effects: Mapping[str, bool] | None = None,
     job: Job | None = None,
 ) -> Rendered:
-    """Render one frame of a bench under its own light; see :meth:`mitsim.api.bench.Bench.render`.
-
-    The reference renders any scene with a ``mitsim_lensless`` sensor; the factored estimator needs a projector too.
-    """
+    """Render one frame of a bench under its own light; see :meth:`mitsim.api.bench.Bench.render`."""
     job = job or Job()
     spp = _samples(bench, estimator, spp)
     check_accuracy(accuracy)
@@ -281,17 +257,7 @@ def render(
 def rendered_psf(
     shape: tuple[int, int], pitch_mm: float, variant: str = DEFAULT_VARIANT, rays: int = 4096, seed: int = 0
 ) -> FloatArray:
-    """Return the light of a distant point behind the default diffuser, normalised to a sum of 1.
-
-    Parameters
-    ----------
-    shape, pitch_mm
-        Rows and columns of the sensor, and pixel pitch.
-    variant
-        Variant of Mitsuba, which is selected for the process.
-    rays, seed
-        As for :func:`mitsim.transport.plugins.diffuser.point_spread`.
-    """
+    """Return the light of a distant point behind the default diffuser, with a sum of 1; this selects the ``variant``."""
     load_variant(variant)
     from mitsim.transport.plugins.diffuser import Diffuser, point_spread
 

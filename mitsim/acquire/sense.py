@@ -1,7 +1,4 @@
-"""Response of a camera's sensor to an image of irradiance or radiance from any program.
-
-Image pixels are the sensor's (binned) pixels; nothing is resampled.
-"""
+"""Response of a camera's sensor to an image of irradiance or radiance, whose pixels are the (binned) sensor's."""
 
 from __future__ import annotations
 
@@ -36,17 +33,7 @@ _PIXEL_BYTES = 100
 
 @dataclass(frozen=True, eq=False)
 class Sensed:
-    """One frame.
-
-    Attributes
-    ----------
-    digital
-        (rows, columns) digital numbers.
-    electrons
-        (rows, columns) expected photoelectrons without dark current.
-    notes
-        Assumptions about the image.
-    """
+    """One frame: (rows, columns) digital numbers, and expected photoelectrons without dark current."""
 
     digital: Digital
     electrons: FloatArray
@@ -65,13 +52,11 @@ class Sensed:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return the reasons why the frame is flagged."""
         if not self.saturated:
             return ()
         return (f"saturation: {self.saturated} pixels are at the full well or the ADC's end; expose for less",)
 
     def summary(self) -> dict[str, Any]:
-        """Return the values that the command line reports."""
         return {
             "camera": self.sensor.name,
             "shape": list(self.digital.shape),
@@ -103,7 +88,8 @@ class Sensed:
         """Write the numbers to ``path`` and return it.
 
         ``.exr`` has channels DN and electrons with metadata, ``.npy`` the numbers, ``.png`` 16 bits of grey. Raises
-        MitsimError for another ending, for numbers beyond 16 bits in a PNG, or if the file cannot be written.
+        MitsimError
+        for another ending, numbers beyond 16 bits in a PNG, or an unwritable file.
         """
         path = Path(path)
         check_ending(path, self.sensor)
@@ -139,8 +125,6 @@ def sense(
     ----------
     irradiance
         (rows, columns) mean over each (binned) pixel [W m^-2].
-    sensor
-        The camera.
     exposure
         Seconds, or the part of the full well that the brightest pixel fills; default 0.8.
     seed
@@ -148,13 +132,13 @@ def sense(
     wavelength_nm
         Wavelength that converts watts to photons.
     notes
-        Assumptions about the image, for the result.
+        Assumptions about the image.
 
     Raises
     ------
     MitsimError
-        For an image with other than finite numbers >= 0, no light although the exposure depends on it, or a camera
-        without quantum efficiency.
+        For values that are negative or not finite, no light although the exposure depends on it, or a camera without
+        quantum efficiency.
     """
     Irradiance(wavelength=wavelength_nm)
     if sensor.mosaic is not None:
@@ -187,9 +171,9 @@ def sense(
 def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray, tuple[str, ...]]:
     """Return the image (rows, columns) in an OpenEXR or NPY file, and the assumptions about it.
 
-    Without ``channel``, the only channel is read, or Y, or the luminance of R, G and B. Channels "error.*" of `mitsim
-    render` are ignored. Raises MitsimError for a file that is missing, damaged or of another kind, or a missing
-    channel.
+    Without ``channel``, the only channel is read, or Y, or the luminance of R, G and B. Raises MitsimError for a file
+    that
+    is missing, damaged or of another kind, or a missing channel.
     """
     path = Path(path)
     check_image(path)
@@ -225,12 +209,7 @@ def _light_of(channels: Mapping[str, Channel], channel: str | None, path: Path) 
 def irradiance_behind_lens(radiance: FloatArray, f_number: float) -> FloatArray:
     """Return the irradiance [W m^-2] on the axis behind a lens: E = pi L / (4 N^2), for a distant object.
 
-    Parameters
-    ----------
-    radiance
-        (rows, columns) [W m^-2 sr^-1].
-    f_number
-        N, at least 0.5; ArgumentError otherwise.
+    ``radiance`` is in W m^-2 sr^-1. Raises ArgumentError for an f-number N below 0.5.
     """
     Irradiance(f_number=f_number)
     return np.asarray(radiance * (math.pi / (4 * f_number**2)))

@@ -1,15 +1,12 @@
 """A bench by the spectral lines of its light: the plan of all lines together, and light of each.
 
-Wavelength is an axis of light. Paths carry a wavelength for each line (:func:`mitsim.light.light.trace_lines`); from
-there on every line is a bench of its own, with the line's power, diffraction and photons. Mono light is one line. A
-camera without colours sees one line of the projector at a time, each in a run of its own; a camera behind colour
-filters reads all of them in one run.
+Paths carry a wavelength for each line (:func:`mitsim.light.light.trace_lines`); from there on every line is a bench of
+its own. A camera without colours records one run for each line; one behind colour filters reads all lines in one run.
 
 With w_pl the electrons that a pixel of plane p of the 2 x 2 filters makes of a photon of line l, its expected electrons
 are e_p = t A sum_l w_pl E_l lambda_l / (h c). They equal those of a pixel without filter, one electron per photon, in
-an irradiance sum_l w_pl E_l lambda_l / lambda at the projector's effective wavelength lambda. Frames of that irradiance
-pass the sensor like any other. Lamps have wavelengths of their own, which each colour of filters counts by itself
-(:mod:`mitsim.devices.projector`): a count c is an irradiance c / lambda.
+an irradiance sum_l w_pl E_l lambda_l / lambda at the projector's effective wavelength lambda. Each colour of filters
+counts lamps' light itself (:mod:`mitsim.devices.projector`): a count c is an irradiance c / lambda.
 """
 
 from __future__ import annotations
@@ -54,12 +51,7 @@ _RAYS, _ALIKE = 4, 0.9
 class SpectralBench:
     """A bench by the lines of its projector.
 
-    Attributes
-    ----------
-    whole
-        All lines, which paths carry together.
-    manifest
-        Names of the lines; None if ``whole`` is the one line of mono light.
+    ``whole`` has all lines; ``manifest`` names them, and is None for mono light.
     """
 
     whole: Apparatus
@@ -90,14 +82,12 @@ class SpectralBench:
 
     @cached_property
     def benches(self) -> tuple[Apparatus, ...]:
-        """Return the bench of each line alone."""
         if self.manifest is None or self.whole.lines is None:
             return (self.whole,)
         return tuple(line_alone(self.whole, line) for line in self.whole.lines.single)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names of the lines; empty for mono light."""
         return self.manifest.names if self.manifest else ()
 
     @property
@@ -112,13 +102,11 @@ class SpectralBench:
         return [MosaicLight.of(self.whole, lights, self.manifest.wavelengths_nm)]
 
     def sampling(self, request: Request) -> Sampling:
-        """Return the sampling of light for the frames of a ``request``."""
         fraction = request.noise_fraction
         target = NoiseTarget(self.whole.devices, request.timing, fraction) if fraction else None
         return Sampling(by_pixel=False, target=target, excess=excess_behind_filters if self.whole.filters else None)
 
     def check(self, request: Request) -> None:
-        """Raise MitsimError for options of a ``request`` that the camera lacks or that are not simulated in colour."""
         request.timing.check(self.whole.sensor, self.whole.devices.camera_file)
         if self.manifest is None:
             return
@@ -133,13 +121,11 @@ class SpectralBench:
             )
 
     def lit_by_lamps(self, effects: Mapping[str, bool], seed: int) -> SpectralBench:
-        """Return a copy whose lamps have wavelengths of their own, if they shine and light is traced by line."""
         if self.manifest is None or self.whole.counted_lamps is not None:
             return self
         return replace(self, whole=lit_by_lamps(self.whole, effects, seed))
 
     def plan(self, request: Request) -> Plan:
-        """Return the plan of all lines together for a ``request``, which is that of the roughest line."""
         if self.manifest is None:
             return plan_request(self.whole, request)
         self.check(request)
@@ -156,7 +142,8 @@ class SpectralBench:
         """Return the line that is planned for: the one whose light differs most between neighbouring projector pixels.
 
         Discretisation errs most for such light. Of equal lines the longest is the worst because its fringes are the
-        widest. ``lit`` is the part of the pixels that a shot lights on average.
+        widest.
+        ``lit`` is the part of the pixels that a shot lights on average.
         """
         bench, count = self.whole, len(self.benches)
         simulation = Simulation(bench, Settings(bench.geometry.scene_distance, effects=frozenset({"ambient"})))
@@ -176,23 +163,20 @@ class SpectralBench:
         return max(alike, key=lambda each: each.projector.effective_wavelength_nm)
 
     def with_truths(self, lights: Sequence[SampledLight], seed: int) -> list[SampledLight]:
-        """Return the ``lights`` of the lines with their truths, traced on the same paths."""
         errors = np.stack([light.flux_error for light in lights])
         truths = trace_truths(self.whole, lights[0].plan.settings, seed, errors)
         return [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
 
 
 def line_alone(bench: Apparatus, line: Lines) -> Apparatus:
-    """Return the ``bench`` whose projector shows a ``line`` alone."""
     devices = replace(bench.devices, projector=bench.projector.at(line.wavelengths_nm[0]))
     return replace(bench, devices=devices, lines=line)
 
 
 def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
-    """Return the plan of a capture with its request and predicted cost.
+    """Return the plan of a capture with its request and predicted cost, for ``lines`` that share the paths.
 
-    ``lines`` is the number of lines that share the paths. Raises MitsimError if the request does not fit the bench, or
-    no light of the projector reaches the camera.
+    Raises MitsimError if the request does not fit the bench, or no light of the projector reaches the camera.
     """
     family, effects = bench.family(request.patterns, request.seed), request.effects
     lighting = family.lighting
@@ -235,12 +219,7 @@ def without_filters(bench: Opened) -> Opened:
 class MosaicLight(SampledLight):
     """Light of all lines together behind the filters.
 
-    Attributes
-    ----------
-    by_line
-        Light of each line, traced on the same paths.
-    passed
-        (lines, m, m') part of each line's irradiance that counts, at the effective wavelength.
+    ``passed`` (lines, m, m') is the part of each line's irradiance that counts, at the effective wavelength.
     """
 
     by_line: tuple[SampledLight, ...] = ()
@@ -248,7 +227,6 @@ class MosaicLight(SampledLight):
 
     @classmethod
     def of(cls, bench: Apparatus, lights: Sequence[SampledLight], wavelengths_nm: Sequence[float]) -> MosaicLight:
-        """Combine the ``lights`` of all lines of a bench from :func:`without_filters`."""
         weights = np.array(bench.counting.planes(wavelengths_nm))
         counted = weights * np.asarray(wavelengths_nm) / bench.projector.effective_wavelength_nm
         first, truths = lights[0], [light.apparent for light in lights]
@@ -275,11 +253,9 @@ class MosaicLight(SampledLight):
 
     @property
     def lost(self) -> float:
-        """Return the largest loss of any line."""
         return max(light.lost for light in self.by_line)
 
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
-        """Return the expected frames of all lines together; see :meth:`Light.frames`."""
         assert self.passed is not None, "made by of()"
         lines = [light.frames(lighting, seed, leaking).of_projector for light in self.by_line]
         return MosaicFrames(lines, self.passed, self._lamps(seed), self.by_line[0].simulation.lamps_apart)
@@ -306,7 +282,6 @@ class MosaicLight(SampledLight):
         return Frame(irradiance, variance, max(each.removed for each in frames), heaviest, parts)
 
     def speckle(self, family: PatternFamily | None = None) -> float:
-        """Return None: a projector with speckle is refused."""
         return 0.0
 
 
@@ -320,7 +295,7 @@ def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames
 def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
     """Return the ratio of the error of lamps' light behind filters to that of their mean over all pixels.
 
-    The few wavelengths of a filter are sampled worse than all. Frames are weighted by their energy.
+    The few wavelengths of a filter are sampled worse than all.
     """
     light, counted_lamps = lights[0], lights[0].bench.counted_lamps
     if counted_lamps is None or counted_lamps.shares is None:
@@ -336,21 +311,11 @@ def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
 
 
 class MosaicFrames(ExpectedFrames):
-    """Frames of every shot behind the filters; iterate as often as needed.
+    """Frames of every shot behind the filters.
 
-    Lines share their paths, so that their errors are correlated: that of the sum is at most the sum of theirs. The same
-    holds for lamps' light unless no other light is on its paths.
-
-    Parameters
-    ----------
-    lines
-        Frames of each line, of the projector's light alone.
-    passed
-        (lines, m, m') part of its irradiance that counts.
-    lamps
-        Light of lamps in every frame.
-    independent
-        True if no other light is on the lamps' paths.
+    Lines share their paths, so that their errors are correlated: the error of the sum is at most the sum of the errors.
+    The
+    same holds for lamps' light unless it is ``independent``: no other light is on its paths.
     """
 
     def __init__(
@@ -364,12 +329,10 @@ class MosaicFrames(ExpectedFrames):
 
     @property
     def has_ambient(self) -> bool:
-        """Return True if lamps shine."""
         return self._lamps is not None
 
     @property
     def projector_off(self) -> Frame:
-        """Return the frame of lamps alone, with the Monte Carlo error of all frames."""
         if self._lamps is None:
             return self._lines[0].projector_off
         return replace(self._lamps, variance=0.0, by_group=np.zeros((1, 1)))
@@ -404,19 +367,9 @@ _END_NM = 10.0
 def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Apparatus:
     """Return the bench with lamps at wavelengths of their own, or unchanged without lamps.
 
-    Parameters
-    ----------
-    bench
-        Bench of a spectral variant.
-    effects
-        Effects that the user switched on or off.
-    seed
-        Root of the random streams.
-
-    Raises
-    ------
-    MitsimError
-        For a camera whose efficiency is unknown in the lamps' spectra, or that is blind to the projector's lines.
+    Raises MitsimError for a camera whose efficiency is unknown in the lamps' spectra, or that is blind to the
+    projector's
+    lines.
     """
     if not bench.loaded.lamps or not effects.get("ambient", True):
         return bench
@@ -495,14 +448,9 @@ _ONCE, _TRACED = ("start", "plan"), ("transport", "truth")
 
 @dataclass(frozen=True)
 class Coloured(Generic[Opened]):
-    """The choice, ready for a capture.
+    """The choice, ready for a capture: ``bench`` is in its variant and has its bands.
 
-    Attributes
-    ----------
-    plan
-        Plan of the frames, with the alternatives (:attr:`Plan.colour`); its accuracy is reduced by the colours' error.
-    bench
-        Bench in the variant in which the choice is traced, with its projector in the chosen bands.
+    The plan lists the alternatives (:attr:`Plan.colour`); its accuracy is reduced by the colours' error.
     """
 
     plan: Plan
@@ -510,7 +458,6 @@ class Coloured(Generic[Opened]):
 
     @property
     def mono(self) -> bool:
-        """Return True if wavelengths are not distinguished."""
         return self.plan.colour is not None and self.plan.colour.chosen == manifests.MONO
 
 
