@@ -108,7 +108,9 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     """Return (m, m', channels) irradiance [W m^-2] and its standard error, by the scene's own integrator.
 
     Passes of Owen-scrambled Sobol points are scrambled anew, and their spread gives the error; ``spp`` is at least 4.
+
     Raises
+    ------
     MitsimError for an unsuitable number of samples, an integrator that cannot render this sensor or loses light, or
     work
     beyond the limits.
