@@ -148,7 +148,10 @@ def expose(
 
 
 def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
-    """Return the request of a ``plan`` or a family's name, with ``changes`` by field; raise MitsimError if one is invalid."""
+    """Return the request of a ``plan`` or a family's name, with ``changes`` by field.
+
+    Raises MitsimError for an invalid value, or a change that needs another plan.
+    """
     if isinstance(plan, str):
         if "patterns" in changes:
             raise ArgumentError("patterns", f"{cut(repr(changes['patterns']))}: beside the plan {plan!r}; give one")
@@ -320,9 +323,7 @@ def _run(
 def _close(
     light: SampledLight, shooting: exposure.Shooting, expected: ExpectedFrames, request: Request
 ) -> manifests.ClosingFile | None:
-    """Record the closing frame of a run if requested: the first shot again, exposed for a shorter time if it is too
-    bright.
-    """
+    """Record the closing frame of a run if requested: the first shot again, for a shorter time if it is too bright."""
     if request.closing_frame is None:
         return None
     names: tuple[str | int, ...] = ("closing",)

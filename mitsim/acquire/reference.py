@@ -108,12 +108,8 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     """Return (m, m', channels) irradiance [W m^-2] and its standard error, by the scene's own integrator.
 
     Passes of Owen-scrambled Sobol points are scrambled anew, and their spread gives the error; ``spp`` is at least 4.
-
-    Raises
-    ------
-    MitsimError for an unsuitable number of samples, an integrator that cannot render this sensor or loses light, or
-    work
-    beyond the limits.
+    MitsimError is raised for an unsuitable number of samples, an integrator that cannot render this sensor or loses
+    light, or work beyond the limits.
     """
     import mitsuba as mi
 
@@ -259,7 +255,10 @@ def render(
 def rendered_psf(
     shape: tuple[int, int], pitch_mm: float, variant: str = DEFAULT_VARIANT, rays: int = 4096, seed: int = 0
 ) -> FloatArray:
-    """Return the light of a distant point behind the default diffuser, with a sum of 1; this selects the ``variant``."""
+    """Return the light of a distant point behind the default diffuser, with a sum of 1.
+
+    The ``variant`` of Mitsuba is selected for the process.
+    """
     load_variant(variant)
     from mitsim.transport.plugins.diffuser import Diffuser, point_spread
 
