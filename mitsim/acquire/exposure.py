@@ -164,7 +164,7 @@ _PART = 1 / 16
 
 
 def takes_ambient_frame(choice: AmbientChoice, family: PatternFamily, expected: ExpectedFrames) -> bool:
-    """Return True if an ambient frame is taken; by default if lamps are on and differences of shots do not cancel them."""
+    """Return True if an ambient frame is taken; by default if lamps are on and shots are not subtracted in pairs."""
     return choice == "yes" or (choice == "auto" and expected.has_ambient and not family.signed)
 
 

@@ -1,7 +1,7 @@
 """Predicted seconds, memory and disk of a capture, before anything is simulated.
 
-Plans compare their choices at the :data:`FIXED` unit costs, not at those of this machine and moment, because the same
-seed must give the same settings. Measured costs only scale the prediction that people read.
+Plans compare their choices at the :data:`FIXED` unit costs, because the same seed must give the same settings. Measured
+costs only scale the prediction that people read.
 """
 
 from __future__ import annotations
@@ -84,18 +84,8 @@ gift_card 0.3)."""
 class UnitCosts:
     """Seconds of single things.
 
-    Attributes
-    ----------
-    passes
-        a path, or a connection, by pass.
-    frame, product
-        a frame, and a multiplication in forming it.
-    entry, accumulated
-        an entry of a wave-optical shadow, and one of accumulated light.
-    ray
-        a ray of the truth.
-    pixel
-        a pixel of a shot that is searched for its brightest value and its energy.
+    ``passes`` are by path or connection, ``product`` by multiplication in forming a frame; ``entry`` is one of a
+    wave-optical shadow, ``accumulated`` one of light.
     """
 
     passes: Mapping[str, float]
@@ -115,11 +105,7 @@ FIXED = UnitCosts(
 
 @dataclass(frozen=True)
 class Numbers:
-    """Numbers of settings that cost depends on, of one choice or of (m,) choices; the first six are chosen.
-
-    ``coarse_layers`` is 1 if coarse light has all layers; ``occluded`` counts pixels with anchors of their own;
-    ``raster_cells`` along a pixel are chosen for frames by correlation, 0 for sums or the fewest cells.
-    """
+    """Numbers of settings that cost depends on, of one choice or of (m,) choices; the first six are chosen."""
 
     anchors: Number
     layers: Number
@@ -135,32 +121,27 @@ class Numbers:
 
     @property
     def coarse(self) -> tuple[FloatArray, FloatArray]:
-        """Cells a side of a projector pixel, and layers, of coarse light."""
         several = np.asarray(self.coarse_layers) > 0
         cells = np.where(several, np.maximum(self.cells // CELLS_OF_COARSE, 1.0), 1.0)
         return cells, np.where(several, self.layers, 1.0)
 
     @property
     def cells_of_followed(self) -> FloatArray:
-        """Cells a side of a projector pixel for followed light beyond its mean, which has one layer."""
         return self.coarse[0] / FOLLOWED_WIDTH
 
     @classmethod
     def coarsest(cls) -> Numbers:
-        """Return one of everything, and a wave-optical shadow."""
         return cls(*[1.0] * 6)
 
     @classmethod
     def of_counts(
         cls, counts: Sequence[Number], effects: frozenset[str], occluded: int = 0, raster_cells: int = 0
     ) -> Numbers:
-        """Return the numbers of the six ``counts`` with ``effects`` on."""
         on = in_waves(effects), "interreflection" in effects, MIXING in effects
         return cls(*counts, *map(float, (*on, occluded, raster_cells)))  # type: ignore[arg-type]
 
     @classmethod
     def of(cls, settings: Settings) -> Numbers:
-        """Return the numbers of ``settings``."""
         direct = settings.anchors, len(settings.depths), settings.subdivision
         counts = *direct, settings.followed_anchors, settings.occluded_anchors, settings.coarse_layers
         occluded, each = len(settings.with_own_anchors), [float(count) for count in counts]
@@ -168,12 +149,11 @@ class Numbers:
 
 
 def in_waves(effects: frozenset[str]) -> bool:
-    """Return True if the mask's shadow is wave-optical with these ``effects``."""
     return bool(effects & names(lambda effect: effect.in_shadow))
 
 
 def sample_costs(pilot_result: PilotResult, effects: frozenset[str]) -> dict[str, SampleCost]:
-    """Return the cost of each pass that ``effects`` call for; connections are those to one anchor."""
+    """Return the cost of each pass that ``effects`` require; connections are those to one anchor."""
     found = ((name, pilot_result.sample_costs[name]) for name in PASSES if name in pilot_result.sample_costs)
     return {name: sample_cost for name, sample_cost in found if PASSES[name].called_for(effects)}
 
@@ -182,18 +162,16 @@ def sample_costs(pilot_result: PilotResult, effects: frozenset[str]) -> dict[str
 
 
 def _by_fft(forming: Forming, numbers: Numbers) -> float:
-    """Return the raster cells of a pixel where frames are correlations, as they must be or by choice, else 0."""
+    """Return the raster cells of a pixel where frames are correlations, else 0."""
     if not (numbers.raster_cells or forming.correlated[bool(numbers.waves)]):
         return 0.0
     return numbers.raster_cells**2 or forming.phases
 
 
 def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: UnitCosts) -> Number:
-    """Return seconds of forming so many ``frames`` of each line, at the ``costs`` of this machine or the fixed ones."""
     phases, pixels, waves = _by_fft(forming, numbers), forming.pixels, bool(numbers.waves)
 
     def multiplications(lit: Sequence[Number], cells: Number, layers: Number, anchors: Number) -> Number:
-        """Return those of a frame, whose ``lit`` rows and columns of cells hold light, and of its probes."""
         rows, columns = (part * forming.cells * cells * anchors for part in lit)
         # The shorter side is multiplied out first.
         one_term = layers * (pixels * rows * columns + pixels**2 * np.minimum(rows, columns))
@@ -227,7 +205,6 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: U
 
 
 def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
-    """Return seconds of all frames of the family, with the shadows that form them."""
     phases, waves = _by_fft(forming, numbers), bool(numbers.waves)
     # Entries of all shadows, in wave-optical ones.
     coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
@@ -257,7 +234,6 @@ def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Numb
 
 
 def checking_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
-    """Return seconds of checking the Monte Carlo error while light is traced."""
     rounds = ROUNDS + numbers.indirect
     if tells_all(forming.classes, forming.shots, forming.pixels):
         # What the last check finds is used again when frames are formed.
@@ -275,7 +251,6 @@ def tells_all(classes: int, shots: int, pixels: float) -> bool:
 
 
 def tracing_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
-    """Return seconds of tracing the samples in ``settings``, by pass."""
     found, lines = {}, traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
     for name, cost in sample_costs(pilot_result, settings.effects).items():
         row = PASSES[name]
@@ -295,8 +270,7 @@ def traced_for(lines: int, parted: bool = False) -> float:
 def predicted_rays(pixels: int, samples: float, rate: float) -> float:
     """Return the rays of the truth for both fluxes (:mod:`mitsim.light.truth`).
 
-    ``samples`` are those of each group of the frames' direct light for a pixel; its error falls with their power
-    ``rate``.
+    ``samples`` are those of each group of direct light for a pixel; its error falls with their power ``rate``.
     """
     first = TRUTH_GROUPS * pixels * (TRUTH_SAMPLES + BOARD_SAMPLES)
     wanted = _ALLOTTED * GROUPS * pixels * samples * float(TRUTH_PART ** (-1 / rate))
@@ -304,7 +278,6 @@ def predicted_rays(pixels: int, samples: float, rate: float) -> float:
 
 
 def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> float:
-    """Return seconds of tracing what a perfect image would show."""
     row, direct = PASSES["direct"], pilot_result.sample_costs["direct"]
     rate = (pilot_result.spread if settings.anchors > 1 else direct).noise.rate
     ray = traced_for(pilot_result.forming.lines, pilot_result.forming.parted) * costs.ray
@@ -314,8 +287,7 @@ def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCost
 def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Mapping[str, Number]) -> Number:
     """Return the most entries of one group's light.
 
-    A projector pixel's direct light lies in its own cells, indirect light in all. ``samples`` are by pass, or those of
-    settings.
+    A projector pixel's direct light lies in its own cells, indirect light in all.
     """
 
     def of(name: str) -> Number:
@@ -344,7 +316,6 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
 
 
 def accumulation_seconds(forming: Forming, numbers: Numbers, entries_of_group: Number, costs: UnitCosts) -> Number:
-    """Return seconds of accumulating the light of each line, of which a group has so many entries."""
     cells, layers = numbers.coarse
     accumulator = forming.classes * np.square(forming.cells * cells) * layers
     passed = numbers.indirect * _PASSED * np.where(accumulator < MOST_PLACES, accumulator, 0.0)
@@ -389,10 +360,10 @@ def frames_bytes(classes: int, shots: int, pixels: float) -> float:
 def frames_cost(
     bench: Apparatus, settings: Settings, lighting: Lighting, seconds: float = 0.0, on_disk: float = 0.0, lines: int = 1
 ) -> Cost:
-    """Return memory, disk and time of a capture.
+    """Return memory, disk and time of a capture; frames of ``lines`` are formed one after another.
 
-    Measured runs take a third to all of the memory (tests/hard/test_memory.py). `on_disk` bytes of frames exist
-    already; frames of `lines` are formed one after another.
+    Measured runs take a third to all of the memory (tests/hard/test_memory.py). ``on_disk`` bytes of frames exist
+    already.
     """
     (shots, classes), geometry = lighting.weights.shape, bench.geometry
 
@@ -407,7 +378,6 @@ def frames_cost(
 
 
 def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int = 1) -> float:
-    """Return the memory of tracing and accumulating light by classes; the light of each of `lines` is held."""
     held = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
     paths = Simulation(bench, settings).paths_at_once
     followed = bool(settings.effects & names(lambda effect: effect.followed))
@@ -441,7 +411,7 @@ _MOST_BYTES = 2.0**32
 
 
 def cells_to_choose(geometry: CameraGeometry, spectrum: Spectrum | None) -> tuple[int, ...]:
-    """Return the raster cells for each pixel, fewest first, that a plan may choose."""
+    """Return the raster cells for each pixel that a plan may choose, fewest first."""
     fewest = cells_per_pixel(geometry)
 
     def holds(cells: int) -> bool:
@@ -451,7 +421,6 @@ def cells_to_choose(geometry: CameraGeometry, spectrum: Spectrum | None) -> tupl
 
 
 def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
-    """Return the time of drawing the shadow of one depth; 0 if the mask is never drawn."""
     mask = geometry.mask_plate
     waves = spectrum is not None
     if mask is None or not (geometry.is_drawn(waves) or geometry.may_be_drawn(waves)):

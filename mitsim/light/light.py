@@ -1,4 +1,4 @@
-"""Light of a scene: sampled to an accuracy, with its frames and their error."""
+"""Light of a scene, sampled to an accuracy, with its frames and their error."""
 
 from __future__ import annotations
 
@@ -46,18 +46,9 @@ _BY_CHANCE = 1.5
 
 @dataclass(frozen=True)
 class Sampling:
-    """Options of sampling.
+    """Options of sampling; lights for two purposes share no random streams.
 
-    Attributes
-    ----------
-    purpose
-        Name of the random streams: lights for two purposes share none.
-    by_pixel
-        Keep the light of every projector pixel apart, for any family; by the lighting's classes is faster.
-    target
-        Error at which to stop, instead of the plan's.
-    excess
-        Returns the ratio of the error of frames made of all lines to that of the lines' frames.
+    ``excess`` returns the ratio of the error of frames made of all lines to that of the lines' frames.
     """
 
     purpose: str = "scene"
@@ -68,38 +59,29 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False)
 class FrameCheck:
-    """Result of a check of the frames' error, for reuse when frames are formed."""
-
     groups: tuple[LightEstimate, ...]
     simulation: Simulation
     rows: Labels
     probed: FloatArray
 
     def at(self, light: SampledLight, rows: Labels, classes: int) -> FloatArray | None:
-        """Return ``probed`` if it belongs to a light whose rows belong to these classes; else None."""
         same = light.groups is self.groups and light.simulation is self.simulation and len(self.probed) == classes
         return self.probed if same and np.array_equal(rows, self.rows) else None
 
 
 @dataclass(frozen=True, eq=False)
 class SampledLight:
-    """Sampled light of one scene.
+    """Sampled light of one scene, in independent groups.
 
     Attributes
     ----------
-    groups
-        Independent estimates.
     labels
         (n^2,) row of each projector pixel: its class, or the pixel itself if any family is to be formed.
     flux, flux_error
         (n^2,) irradiance of each pixel's direct light without the mask, mean over the sensor, and its standard error.
-    sampling_error
-        Relative Monte Carlo error of the checked frames; ``reached`` tells whether it met the target.
-    samples
-        Samples of each group by pass; empty if not kept.
     restated
         Factor of the Monte Carlo error over that from the groups' differences. Sampling stops where these happen to be
-        small; therefore a larger error that an earlier check predicted counts too.
+        small; therefore a larger error that an earlier check predicted is used.
     """
 
     groups: tuple[LightEstimate, ...]
@@ -143,7 +125,7 @@ class SampledLight:
 
     @property
     def error_bound(self) -> float:
-        """Upper limit (95 %) of the frames' relative error from sampling and from the plan's omissions."""
+        """Return the upper limit (95 %) of the frames' relative error from sampling and from the plan's omissions."""
         target = self.plan.sampling_target
         sampling = max(self.sampling_error, target) if self.reached else self.sampling_error
         return self.plan.total(Estimate(self.sampling_error, sampling)).bound
@@ -153,10 +135,7 @@ class SampledLight:
         return self.simulation.bench
 
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
-        """Return the expected frames of some shots; raise ValueError if they split a class of the light.
-
-        `seed` is that of the probes that measure the error.
-        """
+        """Return the expected frames of some shots; raise ValueError if they split a class of the light."""
         rows = self.rows_of(lighting)
         probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
         return expected_of([(self.simulation, self.groups)], rows, lighting, seed, leaking, probed, self.restated)
@@ -186,7 +165,6 @@ class SampledLight:
 
     @check_arguments
     def behind(self, bench: Apparatus) -> SampledLight:
-        """Return the same light before the camera of another bench, of which only the mask may differ."""
         return replace(self, simulation=Simulation(bench, self.simulation.settings))
 
     @check_arguments
@@ -204,7 +182,7 @@ class SampledLight:
 
     @property
     def truth(self) -> FloatArray:
-        """Apparent reflectance (n, n), relative to the session's board: a board of reflectance 0.99 counts as 1."""
+        """Return the apparent reflectance (n, n), where a calibration board of reflectance 0.99 counts as 1."""
         return self.apparent.reflectance
 
 
@@ -219,10 +197,6 @@ def trace_light(
     sampling: Sampling | None = None,
     progress: Progress = silent,
 ) -> SampledLight:
-    """Trace until the Monte Carlo error of the lighting's frames meets its target, or to 2^32 paths.
-
-    Each group gets the same samples. After each round the error of all shots, or of a few, is checked.
-    """
     (light,) = trace_lines(bench, (bench,), plan, lighting, seed, sampling, progress)
     return light
 
@@ -239,7 +213,7 @@ def trace_lines(
 ) -> list[SampledLight]:
     """Trace each line's light from shared paths until the frames of every line meet the target.
 
-    `benches` has the bench with each line alone, or `bench` itself if lines are not separated.
+    ``benches`` has the bench with each line alone, or ``bench`` itself if lines are not separated.
     """
     sampling = sampling or Sampling()
     simulation = Simulation(bench, plan.settings)
@@ -292,7 +266,6 @@ def trace_lines(
 
 @single_threaded_blas()
 def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "scene") -> SampledLight:
-    """Trace the paths of a light again and accumulate them by another simulation of the same scene."""
     groups = Group.all_of(simulation, light.labels, light.seed, purpose)
     trace_groups(groups, light.samples)
     estimates = tuple(group.light() for group in groups)
@@ -347,10 +320,7 @@ def _checks(
     enough: float,
     predicted: Mapping[int, float],
 ) -> dict[int, _Check]:
-    """Check the noisiest line first, and the others once its bound meets `enough`.
-
-    No error counts for less than the previous check predicted.
-    """
+    """Check the noisiest line first, and the others once its bound meets ``enough``."""
     noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
     checks = {}
     for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
@@ -389,7 +359,7 @@ def _some(lighting: Lighting, count: int) -> Lighting:
 
 
 def _error_growth(light: SampledLight, lighting: Lighting, checked: Lighting) -> tuple[float, float]:
-    """Return how much the error of all shots, and its bound, exceed those of the checked shots.
+    """Return the growth of the error, and of its bound, from the checked shots to all shots.
 
     The groups' differences in total light show a heavy path that no checked shot sees. Growth within chance counts as
     1.
@@ -415,8 +385,6 @@ Accumulation = Callable[[], None]
 
 
 class Group:
-    """One independent estimate of the light by line and pass: the mean over its samples so far."""
-
     def __init__(self, simulation: Simulation, labels: Labels, seed: int, lines: int = 1) -> None:
         self.simulation, self.labels = simulation, labels
         self.seed, self._lines = seed, lines
@@ -429,7 +397,6 @@ class Group:
         return [cls(simulation, labels, integer(seed, "transport", purpose, group), lines) for group in range(GROUPS)]
 
     def trace(self, wanted: Mapping[str, int], accumulating: Behind[Accumulation]) -> None:
-        """Trace until each pass has the wanted samples; `accumulating` adds light meanwhile."""
         at_once = min(PATHS_AT_ONCE, self.simulation.paths_at_once)
         for name, each in self.simulation.passes.items():
             samples = wanted.get(name, 0)
@@ -469,7 +436,6 @@ class Group:
 def trace_groups(
     groups: Sequence[Group], wanted: Mapping[str, int], report: Callable[[float], None] = lambda part: None
 ) -> None:
-    """Trace and accumulate until all groups have the wanted samples."""
     with Behind[Accumulation](lambda accumulation: accumulation()) as accumulating:
         for number, group in enumerate(groups):
             if number:
@@ -506,10 +472,7 @@ def first_samples(simulation: Simulation) -> dict[str, int]:
 def next_samples(
     simulation: Simulation, done: Mapping[str, int], variances: Mapping[str, float], excess: float
 ) -> dict[str, int]:
-    """Return the samples of a group after the next round.
-
-    `variances` are those by each pass, up to one factor; `excess` is the ratio by which the error must fall.
-    """
+    """Return the samples of a group after the next round, which is to reduce the error by the ratio ``excess``."""
     work = {
         name: PASSES[name].unit_cost
         * each.tracer.paths_per_sample
@@ -523,7 +486,6 @@ def next_samples(
 
 
 def error_left(done: Mapping[str, int], samples: Mapping[str, int], variances: Mapping[str, float]) -> float:
-    """Return the ratio of the errors after and before more samples."""
     left = [SampledPass(name, done[name], variances[name], 1.0).variance_left(samples[name]) for name in done]
     return math.sqrt(sum(left) / (sum(variances.values()) or 1.0))
 
@@ -546,7 +508,6 @@ class SampledPass:
 
     @property
     def gain(self) -> float:
-        """Return the reduction of the variance by one more sample, over its work."""
         return self.variance / (self.done * self.work)
 
     @property
@@ -558,7 +519,7 @@ class SampledPass:
 
 
 def cheapest_samples(lights: Sequence[SampledPass], allowed: float) -> dict[str, int]:
-    """Return the samples of least work whose joint variance is `allowed`, or all that a round may take."""
+    """Return the samples of least work whose joint variance is ``allowed``, or all that a round may take."""
     stepped = [light for light in lights if light.name in EVEN]
     others = [light for light in lights if light.name not in EVEN]
     best, least = {light.name: light.steps[-1] for light in stepped}, math.inf
@@ -578,8 +539,7 @@ def cheapest_samples(lights: Sequence[SampledPass], allowed: float) -> dict[str,
 def _shared_out(lights: Sequence[SampledPass], allowed: float) -> dict[str, int] | None:
     """Return the cheapest samples if any number serves.
 
-    By Lagrange, samples that grow go with sqrt(variance of one / work of one). A light whose next sample gains less
-    rests.
+    By Lagrange, samples that grow go with sqrt(variance of one / work of one).
     """
     found = {light.name: light.done for light in lights}
     if sum(light.variance for light in lights) <= allowed:

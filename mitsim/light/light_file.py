@@ -1,7 +1,7 @@
 """Light by projector pixel in an HDF5 file, from which NumPy and SciPy form the frame of any pattern.
 
-Frames are dense, but light before the mask is sparse. The file has sparse matrices for the light, dense factors for the
-mask's shadow, and the plan for exposing the light again. docs/exchange.md has the layout.
+The file has sparse matrices for the light, dense factors for the mask's shadow, and the plan for exposing the light
+again. docs/exchange.md has the layout.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _SPECULAR_BYTES = 2**31
 def write_light(path: Path, light: SampledLight) -> None:
     """Write light by projector pixel to one file as a whole.
 
-    Raise MitsimError for light by class, too many projector pixels with light over mirrors, or an unwritable file.
+    Raises MitsimError for light by class, too many projector pixels with light over mirrors, or an unwritable file.
     """
     count = light.bench.n**2
     if not np.array_equal(light.labels, np.arange(count)):
@@ -83,7 +83,7 @@ def _keep(group: h5py.Group, light: SampledLight) -> None:
 def read_light(path: Path, bench: Apparatus) -> SampledLight:
     """Read a file of :func:`write_light`, to single precision, for the bench on which the light was traced.
 
-    Raise MitsimError for an unreadable or other file, and for light of another bench or version of mitsim.
+    Raises MitsimError for an unreadable or other file, and for light of another bench or version of mitsim.
     """
     with hdf5_errors(path), checked_hdf5(path, lambda _: _COPIES) as file:
         if _KEPT not in file:

@@ -1,7 +1,7 @@
 """Grids that accumulate light, and passes that trace it: for each pass its tracer, its grid and its cost.
 
-A grid has cells, anchors and layers, and the optics that form frames; frames are added in the order of :data:`GRIDS`.
-Everything that enumerates light reads :data:`PASSES`. A new pass is a row there, and its tracer.
+A grid has cells, anchors, layers and optics; frames are added in the order of :data:`GRIDS`. A new pass is a row of
+:data:`PASSES`, which all code that enumerates light reads, and its tracer.
 """
 
 from __future__ import annotations
@@ -41,8 +41,6 @@ _MOST_ROWS = 2**12
 
 
 class Grid:
-    """Cells that accumulate light, with optics for a spectrum (None: a geometric shadow) and some places."""
-
     def __init__(
         self, bundle: Bundle, geometry: CameraGeometry, spectrum: Spectrum | None, places: Places | None = None
     ) -> None:
@@ -75,17 +73,8 @@ class GridRow:
 class Grids:
     """Grids of a bench with settings.
 
-    Parameters
-    ----------
-    pixels
-        Cells along an axis of the projector's window, if not one for each pixel.
-    one_line
-        Use the light's mean wavelength alone for diffraction: a third of the time where diffraction matters little.
-    places
-        Rows and columns whose frames are formed; None for all.
-    judging_cells
-        Cells a side of a projector pixel for indirect light and for what anchors see beyond their mean, by which the
-        pilot judges those of a run; 0 for those of a run.
+    ``one_line`` uses the mean wavelength alone for diffraction, in a third of the time. ``places`` are rows and columns
+    whose frames are formed. ``judging_cells`` a side of a projector pixel judge the coarse cells of a run in the pilot.
     """
 
     def __init__(
@@ -133,16 +122,14 @@ class Grids:
 
     @property
     def reach(self) -> float:
-        """Largest tan-angle from the sensor's centre that the sensor's edge sees at the light's depth."""
+        """Return the largest tan-angle from the sensor's centre that the sensor's edge sees at the light's depth."""
         return self.physics.geometry.reach(self.settings.depth)
 
     def cells(self, subdivision: int = 1, width: int = 1, reach: float | None = None) -> CellGrid:
-        """Return the cells that the sensor's edge sees through the field stop, or to the tan-angle `reach`."""
         depth, farthest = self.settings.depth, max(self.reach, reach or 0.0)
         return aligned_grid(*self.bench.windows_at(depth), -(-self._pixels // width), subdivision, farthest)
 
     def mean_weights(self, anchors: int) -> FloatArray:
-        """Return the weight (anchors,) of each anchor in the mean over the sensor."""
         edges = self.physics.geometry.pixel_edges
         positions = anchor_positions(anchors, self.physics.geometry.half_width)
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
@@ -157,7 +144,6 @@ def _fine(made: Grids) -> Bundle:
 
 
 def _coarse(made: Grids, anchors: int, width: int = 1) -> Bundle:
-    """Return cells of coarse light, or cells of several pixels in one layer; the pilot judges by cells of its own."""
     settings, wide = made.settings, width > 1 and not made.judging_cells
     depths = settings.depths if settings.coarse_layers and not wide else (settings.depth,)
     cells = 1 if wide else made.judging_cells or settings.coarse_cells
@@ -212,13 +198,8 @@ MEAN_GRIDS = ("fine", "indirect")
 class LightEstimate:
     """Light by grid, (classes + 1, places) each [W m^-2]; the last row, or one for each band, is ambient light.
 
-    Attributes
-    ----------
-    received, outside
-        Mean of all light over the sensor without its mask, and the part beyond all cells, which is in no frame [W
-        m^-2].
-    flux
-        (n^2,) mean irradiance of each projector pixel's direct light without the mask [W m^-2], if measured.
+    ``received`` is the mean of all light over the sensor without its mask, ``outside`` the part beyond all cells, which
+    is in no frame [W m^-2]. ``flux`` (n^2,) is each projector pixel's direct part, if measured.
     """
 
     light: Mapping[str, sparse.csr_array]
@@ -276,11 +257,8 @@ PassTracer = DirectTracer | IndirectTracer | FromCamera
 class Tracers(Grids):
     """Tracers of a bench with settings.
 
-    Attributes
-    ----------
-    divides
-        Divide light that shading normals make heavy between both sides. Off for a short pilot, which would meet few
-        paths of the camera's part.
+    ``divides`` divides light that shading normals make heavy between both sides. It is off for a short pilot, which
+    would meet few paths of the camera's part.
     """
 
     divides = True
@@ -293,7 +271,6 @@ class Tracers(Grids):
 
     @cached_property
     def direct(self) -> DirectTracer:
-        """Direct light to the sensor's centre, or to all of the sensor where anchors are used."""
         return self._direct(1, spread=self.settings.anchors > 1)
 
     @property
@@ -307,7 +284,7 @@ class Tracers(Grids):
 
     @cached_property
     def anchored_occluded(self) -> DirectTracer | None:
-        """Direct light of occluded pixels to anchors of their own."""
+        """Return the tracer of direct light of occluded pixels to anchors of their own."""
         settings = self.settings
         others = np.setdiff1d(np.arange(self.bench.n**2), settings.with_own_anchors)
         return self._direct(settings.occluded_anchors, others) if settings.with_own_anchors else None
@@ -327,18 +304,15 @@ class Tracers(Grids):
 
     @cached_property
     def indirect(self) -> IndirectTracer | None:
-        """Light over several surfaces, to the points of :attr:`direct`."""
         tracer, repeats = self._indirect(self._mean_points, self.settings.shared), self.settings.repeats
         return tracer.with_adaptive_counts(repeats) if tracer and repeats else tracer
 
     @cached_property
     def from_camera(self) -> FromCamera | None:
-        """All other light, from the same points."""
         return self._from_camera(self._mean_points)
 
     @cached_property
     def at_anchors(self) -> tuple[IndirectTracer | None, FromCamera | None]:
-        """Both to every anchor of followed light."""
         points = self._points(self.settings.followed_anchors)
         return self._indirect(points), self._from_camera(points)
 
@@ -359,7 +333,6 @@ class Tracers(Grids):
 
     @property
     def lamps_apart(self) -> bool:
-        """True if lamps' paths carry no light of the projector."""
         return not self._from_camera_of_projector
 
     @property
@@ -430,14 +403,8 @@ class Pass:
         True if samples are points of a Sobol sequence alone, so that their number matters.
     variance_rate
         Power of the samples with which the variance falls.
-    flux
-        True if the pass measures the flux of each projector pixel.
     device
-        Add light on the device: ``room`` if the sums fit, ``pays`` if it also saves time; None for the host.
-    pilot
-        Run of the pilot that measures its noise.
-    key
-        Key of its samples in plans, if not its name.
+        ``room`` to add light on the device if the sums fit, ``pays`` if it also saves time; None for the host.
     """
 
     name: str
@@ -461,7 +428,6 @@ class Pass:
 
     @property
     def grids(self) -> tuple[str, ...]:
-        """All grids of its light; the last is the one on the device."""
         return tuple(filter(None, (self.grid, self.indirect_grid)))
 
     def called_for(self, effects: frozenset[str]) -> bool:
@@ -475,7 +441,6 @@ class Pass:
         return even(least) if self.even else np.ceil(least)
 
     def connections(self, counts: object) -> Number:
-        """Return the connections of each path; 0 for a residual over one anchor."""
         if not self.anchors:
             return 1.0
         count = np.asarray(getattr(counts, self.anchors), dtype=np.float64)

@@ -38,18 +38,6 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class PlanRow:
-    """One row of a plan.
-
-    Attributes
-    ----------
-    name, state, reason
-        Effect or number, its state, and a sentence; the sentence may be empty.
-    error_if_off
-        Relative change of the frames without the effect, or with one of it; None if not predicted.
-    seconds
-        Time that it adds.
-    """
-
     name: str
     state: State
     reason: str
@@ -59,17 +47,10 @@ class PlanRow:
 
 @dataclass(frozen=True)
 class ColourCandidate:
-    """One way to simulate the colours of a projector's light.
+    """One way to simulate colours: ``mono``, ``bands:K`` or ``lines``.
 
-    Attributes
-    ----------
-    name
-        ``mono``, ``bands:K`` or ``lines``.
-    error
-        Relative rms error of the noise-free frames in electrons, of direct light in the worst band; None if not
-        measured.
-    seconds
-        Predicted time from start to finish.
+    ``error`` is the relative rms error of the noise-free frames in electrons, of direct light in the worst band; None
+    if not measured.
     """
 
     name: str
@@ -79,23 +60,18 @@ class ColourCandidate:
 
 @dataclass(frozen=True)
 class ColourChoice:
-    """The ``chosen`` way to simulate colours, by name, and all ``candidates``, the cheapest first."""
-
     chosen: str
     candidates: tuple[ColourCandidate, ...]
 
     @property
     def taken(self) -> ColourCandidate:
-        """Return the chosen candidate."""
         return next(each for each in self.candidates if each.name == self.chosen)
 
     def later(self, seconds: float) -> ColourChoice:
-        """Return a copy in which every way takes so many ``seconds`` longer."""
         return replace(self, candidates=tuple(replace(e, seconds=e.seconds + seconds) for e in self.candidates))
 
     @property
     def words(self) -> str:
-        """Return the choice in one line."""
         errors = ", ".join(
             f"{each.name} {'not known' if each.error is None else f'{each.error:.1e}' if each.error else '0'}"
             for each in self.candidates
@@ -109,35 +85,22 @@ class Plan:
 
     Attributes
     ----------
-    accuracy
-        Relative error that is to be kept.
     effects
         A row for each effect and each number.
-    predicted_seconds
-        Time from start to finish, the sum of ``predicted``.
-    settings
-        Effects that are simulated, and numbers of anchors, layers, cells and samples.
-    sampling_target
-        Relative Monte Carlo error at which sampling stops.
-    systematic_error, systematic_bound
-        Predicted relative error of all that is left out or made coarse, with signs, and its 95 % bound.
-    warnings
-        Reasons why a result will be flagged.
-    predicted
-        Seconds by stage.
+    predicted_seconds, predicted
+        Time from start to finish, and seconds by stage.
     predicted_range
         Seconds between which nine of ten runs end, if few heavy paths bring most of the noise; else None.
-    request, cost
-        Request that the plan is for, and its predicted cost; None if it was made without them.
-    made_of
-        Properties of the bench that the plan depends on (:attr:`mitsim.bench.apparatus.Apparatus.deciding`); None if it
-        was made without a request.
+    accuracy, sampling_target
+        Relative error that is to be kept, and the Monte Carlo error at which sampling stops.
+    systematic_error, systematic_bound
+        Predicted relative error of all that is left out or made coarse, with signs, and its 95 % bound.
+    warnings, notes
+        Reasons why a result will be flagged, and choices that were made safely instead of measured more closely.
+    request, cost, made_of
+        Request, predicted cost, and properties of the bench that the plan depends on; None without a request.
     asked_seconds
         Time of the whole run, for which the accuracy is the best possible; None if the accuracy was asked for.
-    colour
-        Choice of colours; None if it was not asked for.
-    notes
-        Choices that were made safely instead of measured more closely, with reasons.
     """
 
     accuracy: float
@@ -172,7 +135,6 @@ class Plan:
 
     @check_arguments
     def taking(self, **seconds: float) -> Plan:
-        """Return a copy with the ``seconds`` of more stages in its prediction."""
         stages = {**self.predicted, **seconds}
         more = sum(stages.values()) - sum(self.predicted.values())
         colour = self.colour and self.colour.later(more)
@@ -183,7 +145,6 @@ class Plan:
         )
 
     def block(self) -> dict[str, Any]:
-        """Return the plan as JSON."""
         from mitsim.light.passes import PASSES  # with what traces them: a plan that is read needs no renderer
 
         samples = {row.samples_key: row.predicted_samples(self.settings) for row in PASSES.values()}
@@ -199,7 +160,7 @@ class Plan:
     def save(self, path: Path | str) -> Path:
         """Write the plan to the JSON file ``path``, which is replaced as a whole, and return it.
 
-        Raises MitsimError for a plan that was made without a request, or if the file cannot be written.
+        Raises MitsimError for a plan without a request, or if the file cannot be written.
         """
         text = self.as_text()
         if len(text) > MOST_BYTES:
@@ -212,13 +173,11 @@ class Plan:
     def load(path: Path | str) -> Plan:
         """Load the plan in the file ``path`` that :meth:`save` or ``mitsim plan -o`` wrote.
 
-        Raises MitsimError for a file that cannot be read, contains no plan, was written by another version of mitsim,
-        breaks a rule of the format, or was changed.
+        Raises MitsimError for a file that cannot be read, contains no plan, was changed or written by another version.
         """
         return Plan.of_data(read_json(path), f"plan {path}")
 
     def as_text(self) -> str:
-        """Return the text of the plan's file; raise ArgumentError for a plan that was made without a request."""
         known = self.known_request
         asked = {name: getattr(known, name) for name in ("patterns", "seconds", "seed", "effects")}
         asked |= known.model_dump(mode="json", exclude_unset=True)
@@ -228,7 +187,6 @@ class Plan:
 
     @staticmethod
     def of_data(data: Any, where: str) -> Plan:
-        """Return the plan of a file's JSON ``data``; messages name the file as ``where``."""
         if not isinstance(data, dict) or data.get("kind") != "plan":
             raise MitsimError(f"{where}: is no file of a plan; give one that `mitsim plan -o` wrote")
         writer: Any = data
@@ -253,14 +211,13 @@ class Plan:
 
     @property
     def known_request(self) -> Request:
-        """Return the request; raise ArgumentError for a plan that was made without one."""
         if self.request is None:
             raise ArgumentError("plan", "was decided without a request; make it by bench.plan")
         return self.request
 
     @check_arguments
     def request_with(self, changes: Mapping[str, Any]) -> Request:
-        """Return the request with other values of some fields of :class:`mitsim.bench.request.Request`.
+        """Return the request with other values of some fields.
 
         Raises MitsimError for an invalid value, or one that needs another plan.
         """
@@ -275,15 +232,11 @@ class Plan:
         return request
 
     def made_for(self, name: str) -> str:
-        """Return a message that another value of the request's field ``name`` needs another plan."""
         return f"the plan was made for {_words(getattr(self.known_request, name))}; plan anew"
 
     @check_arguments
     def check_made_of(self, deciding: Mapping[str, Any], argument: str = "plan") -> None:
-        """Refuse a plan of another bench than the one with these ``deciding`` properties.
-
-        Raises ArgumentError for the ``argument`` that brought the plan, with the difference.
-        """
+        """Raise ArgumentError, with the difference, for a plan of a bench with other ``deciding`` properties."""
         if self.made_of is None:
             raise ArgumentError(argument, "was decided without a bench; make it by bench.plan")
         for what, here in deciding.items():
@@ -300,7 +253,6 @@ class Plan:
                 )
 
     def payload(self) -> dict[str, Any]:
-        """Return the JSON of the command line."""
         block = {**self.block(), "warnings": self.warnings}
         cost = {"memory": self.cost.memory_bytes, "disk": self.cost.disk_bytes} if self.cost else {}
         return {
@@ -310,7 +262,6 @@ class Plan:
 
     @property
     def range_words(self) -> str:
-        """Return the range of seconds in one line, or an empty text."""
         if self.predicted_range is None:
             return ""
         least, most = self.predicted_range
@@ -321,7 +272,6 @@ class Plan:
 
     @property
     def _uncoloured(self) -> ColourChoice | None:
-        """Return the choice of monochrome frames if no colours were asked for; None for light of some lines."""
         row = next((row for row in self.effects if row.name == "spectrum"), None)
         if row is None or row.state != "off":
             return None
@@ -329,15 +279,7 @@ class Plan:
 
     @check_arguments
     def plot(self, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
-        """Draw the error of omitting each effect, or the seconds of each stage, and return the axes.
-
-        Parameters
-        ----------
-        quantity
-            ``error`` or ``seconds``.
-        ax
-            Matplotlib axes; None for a new figure.
-        """
+        """Draw the error of omitting each effect, or the seconds of each stage, and return the axes."""
         return from_above("report.plots", "draw_plan")(self, quantity, ax)
 
     def __repr__(self) -> str:
@@ -370,8 +312,6 @@ class Plan:
 
 
 class PlanFile(Configuration, defer_build=True):
-    """File of a plan."""
-
     kind: Literal["plan"]
     """Kind of file."""
     format: int = pydantic.Field(ge=1, le=FORMAT)

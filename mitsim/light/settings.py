@@ -49,16 +49,8 @@ class Estimate(NamedTuple):
 class SharpPixels:
     """Projector pixels whose direct light comes over lobes too sharp for the anchors of all others.
 
-    Attributes
-    ----------
-    pixels
-        Numbers of the pixels, increasing.
-    anchors
-        Points along an axis of the sensor that their light is connected to.
-    window
-        First and last tan-angle of their light along rows, then along columns.
-    left
-        Error of interpolation between these points, relative to all light.
+    ``window`` has first and last tan-angle of their light along rows, then along columns; ``left`` is the error of
+    interpolation between their anchors, relative to all light.
     """
 
     pixels: tuple[Index, ...]
@@ -71,43 +63,30 @@ class SharpPixels:
 class Settings:
     """Effects that are simulated, and the numbers of anchors, layers, cells and samples.
 
+    Anchors are points along an axis of the sensor to which light is followed; ``occluded`` pixels have anchors of their
+    own.
+
     Attributes
     ----------
     depth
         Mean depth of the light, 1 / mean(1/z) [mm], at which cells are aligned with the projector's pixels.
-    anchors
-        Points along an axis of the sensor at which radiance is evaluated.
     layers
         Depths [mm], far to near, between which light is split; one for a flat scene.
     subdivision
         Cells along a projector pixel.
-    effects
-        Names of the simulated effects (:mod:`mitsim.bench.effects`).
     samples
-        Predicted samples of each group by pass (:mod:`mitsim.light.passes`), for each projector pixel, or for each cell
-        of light followed from the camera. One is traced if the number is below 1 or missing.
-    followed_anchors
-        Points along an axis of the sensor to which light over several surfaces, or in mirrors, is followed.
+        Predicted samples of each group by pass, for each projector pixel, or for each cell of light followed from the
+        camera. One is traced if the number is below 1 or missing.
     coarse_layers
-        True if coarse light has all layers and finer cells: indirect light, and direct light beyond its mean over the
-        anchors.
+        True if indirect light, and direct light beyond its mean over the anchors, has all layers and finer cells.
     shared
         True if neighbouring pixels share the second points of indirect light (:mod:`mitsim.transport.path_reuse`).
     repeats
-        (blocks^2,) paths of each block of pixels in a sample of indirect light (:mod:`mitsim.transport.indirect`);
-        empty for one path of each pixel.
+        (blocks^2,) paths of each block of pixels in a sample of indirect light; empty for one path of each pixel.
     reach
-        Largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None for that of
-        light at ``depth``.
-    sharp
-        Pixels whose direct light is traced apart.
-    occluded, occluded_anchors
-        Projector pixels whose light is hidden from part of the sensor, increasing, and points along an axis at which
-        their light beyond the mean is evaluated. With one point they are treated like other pixels.
-    raster
-        True if frames are correlations with a mask's shadow on a raster, by FFT, instead of sums of separable terms.
-    raster_cells
-        Cells of that raster along a pixel; 0 for the fewest.
+        Largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received, or None.
+    raster, raster_cells
+        True if frames are correlations with a mask's shadow on a raster, by FFT; its cells along a pixel, or 0.
     """
 
     depth: Positive
@@ -129,22 +108,18 @@ class Settings:
 
     @property
     def depths(self) -> tuple[float, ...]:
-        """Return the depth of each layer [mm]."""
         return self.layers or (self.depth,)
 
     @property
     def coarse_cells(self) -> int:
-        """Return the cells along a projector pixel for coarse light."""
         return max(self.subdivision // CELLS_OF_COARSE, 1) if self.coarse_layers else 1
 
     @property
     def followed_width(self) -> int:
-        """Return the projector pixels along a cell for followed light beyond its mean, which has one layer."""
         return max(FOLLOWED_WIDTH // self.coarse_cells, 1) if self.followed_anchors > 1 else 1
 
     @property
     def with_own_anchors(self) -> tuple[int, ...]:
-        """Return the occluded pixels, if they have anchors of their own."""
         return self.occluded if self.occluded_anchors > 1 else ()
 
 
@@ -183,18 +158,9 @@ class Noise:
 
     @classmethod
     def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
-        """Measure the noise of one of several replicates, by random paths of which few may be heavy.
+        """Measure the noise of one of several replicates ``seen`` (replicates, ...), relative to the norm ``light``.
 
-        Parameters
-        ----------
-        seen
-            (replicates, ...) frames.
-        light
-            Norm of the frames of all light, which the error is relative to.
-        samples
-            Samples of a replicate.
-        paths
-            Light of each path of all replicates.
+        ``paths`` has the light of each path of all replicates, of which few may be heavy.
         """
         energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
         mean = float(energies.mean())
@@ -204,13 +170,11 @@ class Noise:
         return cls(math.sqrt(float(energies.sum()) / (len(seen) - 1)) / light, samples, 0.5, spread, heavy)
 
     def samples_for(self, target: Number) -> Number:
-        """Return the samples a cell at which the error is ``target``."""
         if self.error <= 0:
             return _FEWEST_SAMPLES + 0 * target
         return self.samples * (self.error / target) ** (1 / self.rate)
 
     def error_left(self, samples: Number) -> Number:
-        """Return the error at so many ``samples`` a cell."""
         return self.error * (samples / self.samples) ** -self.rate
 
 
@@ -224,16 +188,10 @@ class SampleCost:
 
     @classmethod
     def none(cls) -> SampleCost:
-        """Return the cost of absent light."""
         return cls(Noise(0.0, 1, 0.5), 0)
 
     @classmethod
     def relative(cls, error: float, light: float, samples: int, paths: int, rate: float = 0.5) -> SampleCost:
-        """Return the cost of light whose replicates of so many ``samples`` have an ``error``.
-
-        ``light`` is the norm of the frames of all light; ``rate`` is the power of the samples with which the error
-        falls.
-        """
         return cls(Noise(error / light if light else 0.0, samples, rate), paths)
 
     @property
@@ -244,8 +202,6 @@ class SampleCost:
 
 @dataclass(frozen=True, order=True)
 class Approximation:
-    """An omitted effect (``count`` 0), or a chosen number of anchors, layers or cells."""
-
     name: str
     count: int = 0
 
@@ -258,15 +214,9 @@ WIDE = Approximation("followed_width", FOLLOWED_WIDTH)
 class ErrorCovariance:
     """Changes of the frames by approximations, as inner products between independent replicates.
 
-    They give the change by any sum of approximations, with signs and without the replicates' noise.
-
-    Attributes
-    ----------
-    parts
-        Approximations.
-    products
-        (replicates, replicates, parts, parts) inner products of the changes, relative to the squared norm of all light;
-        those of a replicate with itself contain its noise and are not used.
+    They give the change by any sum of approximations, without the replicates' noise. ``products`` (replicates,
+    replicates, parts, parts) are relative to the squared norm of all light; those of a replicate with itself are not
+    used.
     """
 
     parts: tuple[Approximation, ...]
@@ -274,7 +224,6 @@ class ErrorCovariance:
 
     @classmethod
     def between(cls, seen: Mapping[Approximation, FloatArray], energy: float) -> ErrorCovariance:
-        """Multiply changes (replicates, ...) of frames whose squared norm is ``energy``."""
         flat = [change.reshape(REPLICATES, -1) for change in seen.values()]
 
         def multiply(first: int) -> FloatArray:
@@ -288,10 +237,6 @@ class ErrorCovariance:
         return cls(tuple(seen), products / energy if energy > 0 else products)
 
     def squared_errors(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (m,) squared changes by m sums of parts, with standard errors, from ``chosen`` (m, parts) weights.
-
-        These are the mean product of two different replicates, and its jackknife over replicates.
-        """
         replicates, places = len(self.products), np.arange(len(self.products))
         others = [self.products[place, places != place].sum(axis=0) for place in places]
         of_look = np.array([np.einsum("mp,mp->m", chosen @ products, chosen) for products in others])
@@ -302,7 +247,6 @@ class ErrorCovariance:
         return total / kept, spread
 
     def estimate(self, parts: Collection[Approximation]) -> Estimate:
-        """Return the relative change by all ``parts`` together; parts that were not measured change nothing."""
         chosen = np.array([[part in parts for part in self.parts]], dtype=np.float64)
         squared, spread = (float(values[0]) for values in self.squared_errors(chosen))
         least = max(squared, 0.0)
@@ -313,34 +257,24 @@ class ErrorCovariance:
 class Forming:
     """Quantities that determine the cost of forming frames, besides settings.
 
-    Pairs are without diffraction and with it.
+    Pairs are without diffraction and with it; pixels and cells are along an axis.
 
     Attributes
     ----------
-    pixels, cells
-        Along an axis of the sensor, and of the grid with one cell a projector pixel.
     lit
         Part of the rows of cells that have light in a frame.
-    terms, geometric_terms
-        Terms of the wave-optical shadow, and of the geometric one.
-    shots, classes
-        Shots and classes of the family.
     product
-        Seconds of a multiplication in a large product of matrices, on all processors; 0 if not timed.
+        Seconds of a multiplication in a large product of matrices; 0 if not timed.
     correlated
         True if frames are always correlations with a shadow on a raster, and never sums of separable terms.
     phases
         Fewest raster cells of a pixel.
     largest_terms
-        Terms of a shadow that must be drawn on a raster; infinite if there are too many, or it need not be drawn.
+        Terms of a shadow that must be drawn on a raster; infinite if too many, or if it need not be drawn.
     drawing
         Seconds of drawing a shadow on the coarsest raster, for each layer.
-    lines
-        Lines, each with frames of its own.
     parted
         True if glass sends each line its own way, so that lines share no paths.
-    occluded
-        Parts of the projector's rows and columns that contain occluded pixels.
     """
 
     pixels: float
@@ -362,55 +296,40 @@ class Forming:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A mask's shadow on a raster.
-
-    ``error`` is that of the frames with the first number of ``cells`` along a pixel, None if a raster cannot be chosen;
-    ``needed`` is True if there is no other way.
-    """
+    """A mask's shadow on a raster: ``error`` of the frames with the first number of ``cells``, or None."""
 
     error: Estimate | None = None
     needed: bool = False
     cells: tuple[int, ...] = (4,)
 
     def error_left(self, cells: int) -> Estimate | None:
-        """Return the error of a raster of so many ``cells`` along a pixel (0: the fewest)."""
         finer = (cells or self.cells[0]) / self.cells[0]
         return self.error and Estimate(*(error * finer**-RASTER_RATE for error in self.error))
 
 
 @dataclass(frozen=True)
 class PilotResult:
-    """Measurements of short runs of a scene (:mod:`mitsim.planner.pilot`); all errors are relative.
+    """Measurements of short runs of a scene (:mod:`mitsim.planner.pilot`), with the fields of :class:`Settings`.
+
+    All errors are relative.
 
     Attributes
     ----------
-    depth, layers
-        Depth of the light [mm]; candidates for the layers' depths, by their number.
     changes
         Changes of the frames by omitting each effect, by each number of anchors, layers and cells that was tried, and
         by one coarse cell a pixel, or one layer, for light in coarse cells.
     sample_costs
-        Cost of each pass by name (:mod:`mitsim.light.passes`); that of light at anchors counts paths to one of them.
+        Cost of each pass by name; that of light at anchors counts paths to one of them.
     spread
         Cost of direct light to random points of the sensor instead of its centre.
-    forming
-        Quantities that determine the cost of frames.
     apart
         Error of omitting each effect that is drawn with the sensor's noise.
-    unresolved
-        Part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.missed`).
-    shared, repeats
-        As in :class:`Settings`, if they reduce the work for the same noise; the cost of indirect light includes them.
-    left_out
-        Part of all light that no tracer finds (:mod:`mitsim.transport.missed`).
+    unresolved, left_out
+        Parts of the direct light in lobes that sampling would miss, and of all light that no tracer finds.
     unresolved_specular
         Part of all light that comes over mirrors alone and whose place on the sensor is unknown.
     mirror
         Number, among the scene's shapes, of the one that most of the light left out comes over.
-    reach, sharp, occluded
-        As in :class:`Settings`.
-    raster
-        Error of a shadow on a raster, without diffraction and with it.
     hits
         Rays that bring all direct light if each projector pixel sends one, if these are few; else infinite.
     """
@@ -435,7 +354,6 @@ class PilotResult:
     hits: float = math.inf
 
     def with_sample_costs(self, found: Mapping[str, SampleCost]) -> PilotResult:
-        """Return a copy in which some passes have the costs ``found``."""
         return replace(self, sample_costs={**self.sample_costs, **found})
 
     def forms(self, waves: bool) -> tuple[int, ...]:
@@ -446,14 +364,12 @@ class PilotResult:
         return drawn.cells if drawn.needed else (0, *drawn.cells)
 
     def error(self, *parts: Approximation) -> Estimate:
-        """Return the relative change of the frames by all ``parts`` together."""
         apart = sum(self.apart.get(part.name, 0.0) ** 2 for part in parts)
         value, bound = self.changes.estimate(parts)
         return Estimate(math.hypot(value, math.sqrt(apart)), math.hypot(bound, math.sqrt(apart)))
 
     @cached_property
     def effects(self) -> dict[str, Estimate]:
-        """Return the error of omitting each effect of the bench."""
         measured = [part.name for part in self.changes.parts if part.count == 0]
         return {name: self.error(Approximation(name)) for name in (*measured, *self.apart)}
 

@@ -1,7 +1,6 @@
 """A bench under one choice of settings: trace its passes, accumulate their light, and form frames.
 
-An effect that is off takes its neutral value here and nowhere else: a pinhole for the lens, a thin mask, a geometric
-shadow.
+An effect that is off takes its neutral value here: a pinhole for the lens, a thin mask, a geometric shadow.
 """
 
 from __future__ import annotations
@@ -47,8 +46,6 @@ class TracedPass:
 
 
 class Simulation(Tracers):
-    """Tracers of a bench with settings, and frames of accumulated light."""
-
     @cached_property
     def passes(self) -> Mapping[str, TracedPass]:
         found = {}
@@ -60,7 +57,6 @@ class Simulation(Tracers):
 
     @cached_property
     def paths_at_once(self) -> int:
-        """Paths whose light is held at a time: those predicted, within limits."""
         most = max(each.whole * each.tracer.paths_per_sample for each in self.passes.values())
         paths_per_sample = max(each.tracer.paths_per_sample for each in self.passes.values())
         return max(min(max(most, _FEWEST_AT_ONCE), PATHS_AT_ONCE), paths_per_sample)
@@ -86,7 +82,6 @@ class Simulation(Tracers):
         return DeviceAccumulator(bundle, labels, each.tracer.board, lines)
 
     def accumulate(self, name: str, found: PathSamples | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
-        """Return the light of a pass per sample, by grid, as a residual over the anchors where the pass has one."""
         row = PASSES[name]
         if isinstance(found, DeviceSums):
             return self._of_sums(row, found, labels, samples)
@@ -132,7 +127,6 @@ class Simulation(Tracers):
         return np.asarray(np.bincount(mean.pixel, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
     def _estimate(self, light: Mapping[str, sparse.csr_array], *totals: Any) -> LightEstimate:
-        """Return an estimate with empty grids beside; ``totals`` are light received and outside, and flux."""
         rows = next(iter(light.values())).shape[0]
         every = {
             name: light[name] if name in light else sparse.csr_array((rows, grid.bundle.size))
@@ -145,7 +139,7 @@ class Simulation(Tracers):
     def with_optics(
         self, groups: Sequence[LightEstimate], first: int
     ) -> tuple[list[AccumulatedLight], list[AccumulatedLight]]:
-        """Return light of the projector and ambient light, whose first row is `first`, with their optics."""
+        """Return light of the projector and ambient light, whose first row is ``first``, with their optics."""
         lights = [
             AccumulatedLight(self.grids[row.name].optics, tuple(_rows(group[row.name], 0, first) for group in groups))
             for row in GRIDS.values()
@@ -164,7 +158,6 @@ class Simulation(Tracers):
         ]
 
     def specular_frames(self, labels: Labels) -> ClassFrames | None:
-        """Return frames of the specular chains by class; specular light is that of a pinhole."""
         if not self.physics.mirrors:
             return None
         found = self.bench.specular.frames(labels, self.physics.geometry, self.physics.spectrum)
@@ -190,17 +183,8 @@ def expected_of(
 ) -> ExpectedFrames:
     """Return expected frames of light in several parts, for simulations of the same devices.
 
-    Parameters
-    ----------
-    parts
-        Simulations with independent estimates of their light. Leakage is that of the first, specular chains are those
-        of the last.
-    rows
-        (groups' rows,) class of ``lighting`` of each row of the estimates.
-    leaking
-        True if black pixels leak, so that every shot lights all of them.
-    probed, restated
-        As for :class:`ExpectedFrames`.
+    Leakage is that of the first simulation, specular chains are those of the last; ``rows`` (groups' rows,) has the
+    class of each row of the estimates. ``leaking`` is True if every shot lights all black pixels.
     """
     light = emission(parts[0][0].physics, lighting, leaking)
     formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
@@ -210,6 +194,5 @@ def expected_of(
 
 
 def emission(physics: Physics, lighting: Lighting, leaking: bool = True) -> FloatArray:
-    """Return the light (shots, classes) of each class of pixels in each shot, over its full power."""
     black = physics.black_level if leaking else 0.0
     return np.asarray(black + (1 - black) * lighting.weights)

@@ -1,7 +1,7 @@
 """Apparent reflectance, the image that a perfect reconstruction shows, with its standard error.
 
 It is each projector pixel's flux of direct light toward the sensor over that of the calibration board. Both fluxes have
-random streams of their own, so that an error of the frames is never one of the truth too.
+random streams of their own, so that an error of the frames is never an error of the truth.
 """
 
 from __future__ import annotations
@@ -32,13 +32,7 @@ _DOUBLINGS, _AT_ONCE = 8, 4
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Apparent reflectance of every projector pixel, (n, n).
-
-    Attributes
-    ----------
-    board_flux
-        (n^2,) direct light of each projector pixel on the sensor from the board [W m^-2].
-    """
+    """Apparent reflectance of every projector pixel, (n, n), and its direct light from the board [W m^-2]."""
 
     reflectance: FloatArray
     standard_error: FloatArray
@@ -47,25 +41,23 @@ class Truth:
 
     @property
     def error(self) -> float:
-        """Standard error, rms over the image."""
         return float(np.sqrt(np.square(self.standard_error).mean()))
 
     def error_of(self, flux_error: FloatArray) -> float:
-        """Return the rms error that sampling leaves in any image, from the `flux_error` (n^2,) of the frames' light."""
+        """Return the rms error that sampling leaves in any image, from the frames' ``flux_error`` (n^2,)."""
         return float(_rms(_over(flux_error, self.board_flux)))
 
 
 def trace_truth(bench: Apparatus, settings: Settings, seed: int, flux_error: FloatArray) -> Truth:
     """Trace until the truth's standard error, rms over the image, is a sixth of the frames', or 1e-4.
 
-    `flux_error` (n^2,) is the standard error of each projector pixel's direct light in the frames [W m^-2].
+    ``flux_error`` (n^2,) is the standard error of each projector pixel's direct light in the frames [W m^-2].
     """
     (truth,) = trace_truths(bench, settings, seed, flux_error[None])
     return truth
 
 
 def trace_truths(bench: Apparatus, settings: Settings, seed: int, flux_errors: FloatArray) -> list[Truth]:
-    """Trace the truth of each line of a projector from shared paths."""
     effects = names(lambda effect: effect.in_truth) & settings.effects
     board = _Flux(before_board(bench, load_recipe().board_reflectance), effects, seed, "board", BOARD_SAMPLES)
     unit = board.mean
@@ -82,8 +74,6 @@ def trace_truths(bench: Apparatus, settings: Settings, seed: int, flux_errors: F
 
 
 class _Flux:
-    """Direct light of every projector pixel by line, in independent groups."""
-
     def __init__(self, bench: Apparatus, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
         physics, loaded, pixels = Physics.with_effects(bench, effects), bench.loaded, bench.n**2
         setup = replace(bench.setup, projector=physics.projector, geometry=physics.geometry)
@@ -109,7 +99,7 @@ class _Flux:
     def refine(self, unit: FloatArray, target: FloatArray, likely: FloatArray) -> None:
         """Trace more where that reduces the error most, until every line meets its target or needs too many rays.
 
-        Errors are in units `unit` (lines, n^2). `likely` (n^2,) has variances from other knowledge, because a pixel
+        Errors are in units ``unit`` (lines, n^2). ``likely`` (n^2,) has variances from other knowledge, because a pixel
         whose samples happen to agree would get no more of them.
         """
         # An edge goes on in the next pixel, where all samples so far may have missed it.

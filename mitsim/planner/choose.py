@@ -1,8 +1,7 @@
-"""The cheapest settings that keep an accuracy, with their predicted error and work.
+"""Choice of the cheapest settings that keep an accuracy, with their predicted error and work.
 
-Every combination of effects, anchors, layers and cells is predicted: the error of all that it leaves out or makes
-coarse, with signs; the samples that keep the rest of the budget; and the work at fixed unit costs. The cheapest
-combination that fits is chosen.
+For every combination of effects, anchors, layers and cells, the error of all that it leaves out or makes coarse is
+predicted with signs, then the samples that keep the rest of the budget, and the work at fixed unit costs.
 """
 
 from __future__ import annotations
@@ -60,16 +59,9 @@ _SETTLED = 8
 class Candidate:
     """Settings with their predicted error and work.
 
-    Attributes
-    ----------
-    systematic, lacking
-        error of all that is left out or made coarse, and light in it that is known to be missing, by its cause.
-    target, noise
-        Monte Carlo error at which sampling may stop, and the predicted one.
-    fits
-        True if the total is within the accuracy, apart from errors that no choice avoids.
-    work
-        seconds at fixed unit costs.
+    ``systematic`` is the error of all that is left out or made coarse, and ``lacking`` the light in it that is known to
+    be missing, by its cause. Sampling may stop at the Monte Carlo error ``target``. ``fits`` ignores errors that no
+    choice avoids. ``work`` is in seconds at fixed unit costs.
     """
 
     settings: Settings
@@ -82,13 +74,10 @@ class Candidate:
 
     @property
     def total(self) -> Estimate:
-        """Predicted total error of the frames."""
         return Estimate(*(math.hypot(error, self.noise) for error in self.systematic))
 
 
 class Candidates:
-    """All combinations that a pilot result permits. Their errors are added up once, for any accuracy."""
-
     def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool]) -> None:
         self.pilot_result, self.switches = pilot_result, switches
         self._chosen: dict[tuple[float, float], Candidate] = {}
@@ -142,7 +131,6 @@ class Candidates:
 def predicted_candidate(
     accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]
 ) -> Candidate:
-    """Predict the error and work of given ``settings``, with new sample counts for the rest of the budget."""
     return _table_of(pilot_result, settings, switches).candidate(accuracy, SURE)
 
 
@@ -169,10 +157,7 @@ def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, A
 
 @dataclass(frozen=True, eq=False)
 class _Prediction:
-    """Predictions (m,) of the rows of a table at an accuracy; ``needed`` and ``samples`` of a group are by pass.
-
-    ``needed`` may be below one; ``rank`` sorts the ``best`` rows of several tables.
-    """
+    """Predictions (m,) of the rows of a table at an accuracy; ``needed`` samples may be below one."""
 
     table: _Table
     target: FloatArray
@@ -185,7 +170,6 @@ class _Prediction:
 
     @property
     def settings(self) -> Settings:
-        """Settings of the best row."""
         table, result = self.table, self.table.pilot_result
         numbers = (int(number) for number in table.rows[self.best])
         anchors, layers, cells, followed, occluded, all_layers = numbers
@@ -231,7 +215,6 @@ class _Table:
 
     @property
     def unsure(self) -> dict[Approximation, float]:
-        """Variance that chance may add to the squared error of the only row, by part."""
         weights = {part: float(self._weight(part)[0]) for part in self.pilot_result.changes.parts}
         errors = {part: self.pilot_result.error(part) for part, weight in weights.items() if weight}
         return {part: weights[part] ** 2 * (each.bound**2 - each.value**2) for part, each in errors.items()}
@@ -284,7 +267,6 @@ class _Table:
     # ---- samples and work
 
     def predict(self, accuracy: float, sure: float) -> _Prediction:
-        """Predict samples and work of all rows, so that their errors keep the accuracy."""
         result, forming, numbers = self.pilot_result, self.pilot_result.forming, self.numbers
         avoidable, none = self._systematic(sure, self.given), np.zeros(len(self.rows))
 
@@ -339,7 +321,6 @@ class _Table:
         return _Prediction(self, target, found, samples, fits, work, best, rank)
 
     def candidate(self, accuracy: float, sure: float) -> Candidate:
-        """Return the only row with its errors."""
         result, found = self.pilot_result, self.predict(accuracy, sure)
         noise = np.zeros(len(self.rows))
         for name, count in found.samples.items():
@@ -374,7 +355,6 @@ class _Table:
 
 
 def _samples_for(kind: SampleCost, target: Number) -> Number:
-    """Return the samples at which the bound on the error reaches ``target``; fewer heavy paths need more."""
     noise = kind.noise
     light = needed = noise.samples_for(target)
     if noise.spread:
@@ -397,13 +377,11 @@ def _omissions(switches: Mapping[str, bool]) -> frozenset[Approximation]:
 
 
 def costly_effects() -> frozenset[str]:
-    """Return the names of effects that take time."""
     traced = frozenset[str]().union(*(row.effects for row in PASSES.values()))
     return traced | names(lambda effect: effect.in_shadow) | {cost_model.MIXING}
 
 
 def unit_costs_of(pilot_result: PilotResult) -> cost_model.UnitCosts:
-    """Return the measured unit costs, and the fixed ones where nothing was measured."""
     # All matrix work is as much slower or faster as the products.
     slower = (pilot_result.forming.product or cost_model.FIXED.product) / cost_model.FIXED.product
     measured = {name: cost.seconds for name, cost in pilot_result.sample_costs.items() if cost.seconds}
@@ -425,8 +403,6 @@ _STEPS, _DECADES = 10, 5
 
 @dataclass(frozen=True)
 class AccuracyForTime:
-    """An ``accuracy``, the predicted ``seconds`` of its run, and True if these fit the given time."""
-
     accuracy: float
     seconds: float
     fits: bool

@@ -1,4 +1,4 @@
-"""The pilot: short runs of a scene that measure what a plan depends on.
+"""Short runs of a scene that measure the quantities of a plan.
 
 Every error is relative, ``||a - b|| / ||b||``, over a few shots of the family.
 """
@@ -72,18 +72,9 @@ _ALIGNED = 1e-6
 
 
 class PilotRuns:
-    """Runs of the pilot at a scene. Each can be repeated with more samples.
+    """Runs of the pilot at a scene, each of which can be repeated with more samples.
 
-    Parameters
-    ----------
-    bench, lighting
-        the scene, and the lighting of the family.
-    accuracy
-        accuracy at which finer numbers are no longer tried.
-    seed
-        root of the random streams.
-    lines
-        lines that share the paths; the bench has one.
+    Finer numbers are tried until they keep ``accuracy``. ``lines`` share the paths; the bench has one of them.
     """
 
     def __init__(self, bench: Apparatus, lighting: Lighting, accuracy: float, seed: int, lines: int = 1) -> None:
@@ -135,13 +126,11 @@ class PilotRuns:
     # ---- More samples: their work, and where they are called for ----
 
     def refine(self, run: str) -> None:
-        """Repeat a ``run`` with more samples."""
         self.samples[run] = self.samples[run].finer
         self._measure(run)
         vars(self).pop("pilot_result", None)
 
     def work(self, run: str) -> float:
-        """Return the work of repeating a ``run`` [s]; infinite if it cannot take more samples."""
         now, finer = self.samples[run], self.samples[run].finer
         if (finer.fine, finer.direct) == (now.fine, now.direct):
             return math.inf
@@ -170,18 +159,15 @@ class PilotRuns:
 
     @property
     def seconds(self) -> float:
-        """Approximate seconds of the pilot at fixed unit costs."""
         repeats = [work / FINER for work in map(self.work, RUNS) if math.isfinite(work)]
         return max(_OVER_WORK * sum(repeats) - _LESS_S, 0.0)
 
     @property
     def _rough(self) -> bool:
-        """True if a few anchors may leave too much error."""
         few = ErrorCovariance.between(self.anchored.until(math.inf), self.switched.light**2)
         return few.estimate([Approximation("anchors", SMOOTH)]).bound > _ROUGH * self.accuracy
 
     def heavy(self, samples: int) -> dict[str, SampleCost]:
-        """Measure sample costs of light from the camera's side with more ``samples``, by pass."""
         found = {
             "from_camera": self.switched.with_more(samples),
             "camera_residual": self.followed.with_more(self.switched.light, samples),
@@ -229,12 +215,10 @@ class PilotRuns:
 
     @cached_property
     def forming(self) -> Forming:
-        """Return the quantities that determine the cost of forming frames."""
         return self.fine.forming(self.lighting)
 
     @cached_property
     def pilot_result(self) -> PilotResult:
-        """Result of all runs."""
         fine, switched, anchored = self.fine, self.switched, self.anchored
         seen = {**anchored.changes, **fine.changes, **switched.changes, **self.followed.changes}
         if self.occluded:
@@ -291,7 +275,6 @@ class PilotRuns:
 
 
 def run_of(part: Approximation) -> str:
-    """Return the run that measures the error of a ``part``."""
     light, _, _ = part.name.rpartition(" ")
     if light:
         return PASSES[light].pilot if PASSES[light].anchors else "effects"
@@ -342,7 +325,7 @@ _FLAT = 1e-4
 
 
 def light_reach(simulation: Simulation, seed: int) -> float | None:
-    """Return the largest tan-angle of direct light, seen from the sensor's centre; None: that of its depth.
+    """Return the largest tan-angle of direct light, seen from the sensor's centre, or None for that of its depth.
 
     At the edge of the field stop the sensor sees near surfaces outside the cells of a flat scene.
     """
@@ -375,7 +358,7 @@ _MOST = 1 / 16
 
 
 def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple[int, ...]:
-    """Return the pixels whose light is hidden from part of the sensor, increasing.
+    """Return the pixels whose light is hidden from part of the sensor, in increasing order.
 
     An object's edge hides light only along a line of projector pixels. All other light is smooth over the sensor.
     """
@@ -438,7 +421,6 @@ def sharp_pixels(
 
     A lobe of radius w on a sensor of half-width H is analytic except for poles at distance w, so interpolation between
     N Chebyshev nodes converges as exp(-N asinh(w / H)) (Trefethen, Approximation Theory, theorem 8.2).
-
     """
     if not sharp.irradiance:
         return None

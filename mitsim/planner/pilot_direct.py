@@ -1,7 +1,6 @@
 """Frames of a few independent replicates, and changes and noise of direct light.
 
-Replicates show the same change with independent noise, so the mean product of two different replicates estimates its
-square.
+Replicates show the same change with independent noise, so the mean product of two replicates estimates its square.
 """
 
 from __future__ import annotations
@@ -89,10 +88,6 @@ class Sample:
 
     @classmethod
     def of(cls, lighting: Lighting, shape: tuple[int, int], mirrors: bool) -> Sample:
-        """Choose shots of a family, and rows and columns of a frame of ``shape``, evenly spread.
-
-        In ``mirrors``, few pixels of a shot may be seen.
-        """
         shots = len(lighting.weights)
         lit = np.bincount(lighting.labels, minlength=lighting.weights.shape[1]) @ (lighting.weights[0] != 0)
         few = _MOST_SHOTS if mirrors else _SHOWN // max(int(lit), 1)
@@ -119,35 +114,28 @@ class Sample:
 
     @property
     def fine(self) -> int:
-        """Samples of a shown pixel for comparing cells and layers."""
         return self._within(4 * self.times * max(1, _PIXELS // len(self.shown)), len(self.shown))
 
     @property
     def anchored(self) -> int:
-        """Samples of a shown pixel for comparing anchors."""
         return max(1, self.fine // 4)
 
     @property
     def direct(self) -> int:
-        """Samples of a projector pixel for comparing effects."""
         pixels = len(self.lighting.labels)
         return self._within(2 * self.times * max(1, _PIXELS // pixels), pixels)
 
     @property
     def followed(self) -> int:
-        """Samples of a projector pixel of indirect light, and of a cell of light from the camera's side."""
         return max(1, self.direct // 2)
 
     def closer(self, paths: int) -> int:
-        """Return the most samples of a closer replicate, of so many ``paths`` each."""
         return self._within(_CLOSER * self.followed, paths)
 
     def samples_of_occluded(self, pixels: int) -> int:
-        """Return the samples of each of so many occluded ``pixels``."""
         return max(_FEWEST_OCCLUDED, min(self.times * _OCCLUDED, _MOST_OCCLUDED) // max(pixels, 1))
 
     def sharp(self, simulation: Simulation) -> int:
-        """Return the samples of each pixel that a ``simulation`` traces apart."""
         paths = simulation.sharp.paths_per_sample if simulation.sharp else 1
         return min(max(_SHARP_PATHS // paths, 4), _MOST_SHARP)
 
@@ -157,7 +145,6 @@ class Sample:
     def simulation(
         self, bench: Apparatus, settings: Settings, one_line: bool = False, judging_cells: int = 0
     ) -> Simulation:
-        """Make a simulation whose frames are formed at the sample's pixels (:class:`mitsim.light.passes.Grids`)."""
         made = Simulation(bench, settings, one_line=one_line, places=self.places, judging_cells=judging_cells)
         made.divides = False
         return made
@@ -172,7 +159,7 @@ class Sample:
     ) -> FloatArray:
         """Form (replicates, shots, rows, columns) frames; negative values are kept.
 
-        ``emitted`` (shots, classes) is what each class emits, if not what the shots show; ``known`` is a cache.
+        ``emitted`` (shots, classes) replaces the light of each class in the shots; ``known`` is a cache.
         """
         emitted = self.lighting.weights if emitted is None else emitted
         least, most = emitted.min(axis=1), emitted.max(axis=1)
@@ -188,7 +175,6 @@ class Sample:
     def lamps(
         self, grid: Grid, replicates: Sequence[PathSamples], samples: int, known: Known | None = None
     ) -> FloatArray:
-        """Form (replicates, 1, rows, columns) frames of lamps' light; arguments as for :meth:`frames`."""
         pattern = np.zeros((1, self.lighting.weights.shape[1] + 1))
         pattern[:, -1] = 1
         return self._class_frames(grid, replicates, pattern, known) / samples
@@ -196,7 +182,6 @@ class Sample:
     def _class_frames(
         self, grid: Grid, replicates: Sequence[PathSamples], patterns: FloatArray, known: Known | None
     ) -> FloatArray:
-        """Form frames of ``patterns`` (patterns, classes), of which lamps are the last class."""
         known = {} if known is None else known
         classes = self.lighting.weights.shape[1]
         patterns = np.pad(patterns, ((0, 0), (0, classes + 1 - patterns.shape[1])))
@@ -258,14 +243,12 @@ def ladder(
 def coarsening_changes(
     name: str, frames: Callable[[int, tuple[float, ...]], FloatArray], layers: tuple[float, ...]
 ) -> dict[Approximation, FloatArray]:
-    """Return the changes of the frames by one cell a pixel, and by one layer."""
     one, two = frames(1, ()), frames(2, ())
     changes = {Approximation(f"{name} cells", 1): (two - one) / (1 - EVEN_CELLS)}
     return {**changes, Approximation(f"{name} layers", 1): frames(1, layers) - one} if layers else changes
 
 
 def gather_places(places: Labels, values: FloatArray, size: int) -> Entries:
-    """Return the places that hold light, increasing, and their sums."""
     lit = values != 0
     places, values = places[lit], values[lit]
     if size > _SPARSE * len(places):
@@ -277,7 +260,6 @@ def gather_places(places: Labels, values: FloatArray, size: int) -> Entries:
 
 
 def product(one: FloatArray, other: FloatArray) -> float:
-    """Return the inner product of two sets of (replicates, ...) frames: the mean over pairs of different replicates."""
     replicates = len(one)
     # Sums by numpy: those of BLAS depend on the number of its threads in the last bits.
     whole = float((one.sum(axis=0) * other.sum(axis=0)).sum())
@@ -290,7 +272,6 @@ def norm(seen: FloatArray) -> float:
 
 
 def heavy_paths(tracer: FromCameraTracer | CombinedTracer, seeds: Sequence[int], samples: int) -> list[PathSamples]:
-    """Trace the projector's light of each replicate in parts, without the light of lamps."""
     each, found = max(1, _AT_ONCE // tracer.paths_per_sample), []
     for own in (integer(seed, "heavy") for seed in seeds):
         parts = [tracer.trace(own, first, min(each, samples - first)) for first in range(0, samples, each)]
@@ -307,10 +288,7 @@ def noise(seen: FloatArray) -> float:
 
 
 class DirectRuns:
-    """Direct light in many samples a cell, accumulated in different cells and layers.
-
-    ``first`` has the light of the first samples, by replicate.
-    """
+    """Direct light in many samples a cell, accumulated in different cells and layers; ``first`` is by replicate."""
 
     def __init__(self, bench: Apparatus, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
@@ -339,7 +317,6 @@ class DirectRuns:
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
-        """Change of the frames by each number of cells and layers that was tried."""
         found: dict[Approximation, FloatArray] = {}
         first, tolerance = _FIRST_JUDGES["cells"], GOOD_ENOUGH * self.accuracy * norm(self._whole)
         cells = ladder(CELL_LADDER, lambda count: self._frames((), count), first, tolerance, EVEN_CELLS)
@@ -352,7 +329,6 @@ class DirectRuns:
 
     @property
     def coarse(self) -> tuple[float, float]:
-        """Relative changes by one cell a pixel, and by one layer."""
         whole = norm(self._whole)
         cells, layer = (norm(self.changes[part]) if part in self.changes else 0.0 for part in (_CELL, _LAYER))
         return (cells / whole, layer / whole) if whole else (math.inf, math.inf)
@@ -362,10 +338,7 @@ class DirectRuns:
         return self._form(self._simulation, self._path_samples, self.sample.fine)
 
     def sample_cost(self, light: float, spread: bool = False) -> SampleCost:
-        """Return the sample cost of light at the sensor's centre, relative to all ``light``.
-
-        With ``spread`` it is that of light at random points of the sensor, where gloss makes noise.
-        """
+        """Return the sample cost, relative to ``light``, at the sensor's centre or with ``spread`` at random points."""
         spread = spread and not (self.bench.loaded.one_way and not self.bench.loaded.glossy)
         sample = self.sample
         if spread not in self._noises:
@@ -379,7 +352,6 @@ class DirectRuns:
         return SampleCost.relative(many, light, sample.fine, self.bench.n**2, min(max(rate, 0.5), _STEEPEST))
 
     def forming(self, family: Lighting) -> Forming:
-        """Return what the cost of forming frames of a ``family`` depends on."""
         geometry, waves = self.bench.geometry, self.bench.waves
         bundle, light = self._accumulated
         shots = (self.sample.lighting.weights @ (light[: len(self.sample.rows)] != 0)) != 0
@@ -414,7 +386,6 @@ class DirectRuns:
 
     @cached_property
     def raster(self) -> tuple[Drawn, Drawn]:
-        """Error of a shadow on a raster, without diffraction and with it."""
         geometry, lighting, (bundle, light) = self.bench.geometry, self.sample.lighting, self._accumulated
         shot = sparse.csr_array(lighting.weights[:1]) @ light[: lighting.weights.shape[1]]
         seen = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])[0, :, 0]
@@ -431,7 +402,6 @@ class DirectRuns:
         return without, draw_shadow(waves) if waves else without
 
     def _frames(self, layers: tuple[float, ...], subdivision: int, one_line: bool = False) -> FloatArray:
-        """Form frames in given layers and cells. One line suffices for layers, in a third of the time."""
         settings = replace(self.base, layers=layers, subdivision=subdivision)
         simulation = self.sample.simulation(self.bench, settings, one_line)
         frames = self._form(simulation, self._path_samples, self.sample.fine)
@@ -446,7 +416,6 @@ class DirectRuns:
 
 
 def _product_seconds() -> float:
-    """Measure the seconds of one multiplication in a large product."""
     matrix, best, last = np.ones((_SIDE, _SIDE)), math.inf, 2
     for trial in range(_MOST_TRIALS):
         started = time.perf_counter()
@@ -461,5 +430,4 @@ def _product_seconds() -> float:
 
 
 def shown_pixels(settings: Settings, sample: Sample) -> Labels:
-    """Return the projector pixels that the shots show, without those that ``settings`` trace apart."""
     return np.setdiff1d(sample.shown, settings.sharp.pixels) if settings.sharp else sample.shown

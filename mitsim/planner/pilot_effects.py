@@ -65,10 +65,10 @@ _OPEN = 0.15
 
 
 class AnchorRuns:
-    """Frames with fewer anchors. Each anchor is connected to the same points, so that differences have little noise.
+    """Frames with fewer anchors, each connected to the same points, so that differences have little noise.
 
-    Frames are compared, not radiance, because most of the falloff's error cancels in a frame. One wavelength is enough.
-    ``coarse`` has the changes of such light by one cell a pixel, and by one layer, over the tolerance.
+    Frames are compared, not radiance, because most of the falloff's error cancels in a frame. ``coarse`` has the
+    changes of such light by one cell a pixel, and by one layer, over the tolerance.
     """
 
     _pass = PASSES["anchor_residual"]
@@ -100,7 +100,6 @@ class AnchorRuns:
         self._samples, self._lanes = sample.anchored, self.bench.n**2 - len(self.base.occluded)
 
     def take_over(self, known: Mapping[int, Sequence[PathSamples]]) -> None:
-        """Use ``known`` light of the same samples, by number of anchors, instead of tracing it again."""
         for anchors, replicates in known.items():
             self.traced[anchors] = [light.where(np.isin(light.pixel, self.pixels)) for light in replicates]
 
@@ -110,12 +109,10 @@ class AnchorRuns:
 
     @property
     def connections(self) -> int:
-        """Connections of each path to all anchors that were tried."""
         return sum(part.count**2 for part in self.changes if part.name == self._pass.anchors)
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
-        """Change of the frames by each number of anchors, and by one cell and one layer."""
         changes, (cells, layers) = self.until(self.tolerance), self._worth_a_look
         if not (cells or layers):
             return changes
@@ -128,17 +125,15 @@ class AnchorRuns:
         return cells, self.layers if layer else ()
 
     def until(self, tolerance: float, judge: int = _JUDGE) -> dict[Approximation, FloatArray]:
-        """Return the change of the frames by each number of anchors, until it is below a tolerance."""
         found = ladder(self.ladder, self._frames, judge, tolerance)
         return {Approximation(self._pass.anchors, count): change for count, change in found.items()}
 
     def sample_costs(self, light: float) -> dict[str, SampleCost]:
-        """Return the sample cost of what a few anchors see beyond their mean, by pass."""
         beyond = noise(self._beyond_mean(1, ()))
         return {self._pass.name: SampleCost.relative(beyond, light, self._samples, self._lanes)}
 
     def _in_cells(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
-        """Form frames of what a few anchors see beyond their mean; 0 ``cells`` are those of a run."""
+        """Form frames of the light at a few anchors beyond their mean; 0 ``cells`` are those of a run."""
         known = self._frames(self.few) if cells == 1 and not layers else None
         return self._beyond(self._simulation(self.few, cells, layers), self._few, known)
 
@@ -197,8 +192,6 @@ class PenumbraRuns(AnchorRuns):
 
 
 class FollowedRuns(AnchorRuns):
-    """Frames with fewer anchors for followed light, from the projector's side and from the camera's side."""
-
     _pass = PASSES["indirect_residual"]
     _stream = "followed"
     ladder = (1, 2, 3, 5, 8, 12)
@@ -209,7 +202,6 @@ class FollowedRuns(AnchorRuns):
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
-        """Change of the frames by each number of anchors, and by wide cells."""
         if not self._lit or not any(self._simulation().at_anchors) or not norm(self._frames(1)):
             return {}
         found, one, (cells, layers) = (
@@ -222,7 +214,6 @@ class FollowedRuns(AnchorRuns):
         return {**found, WIDE: np.asarray(layered + missing - self._beyond_mean(0, ()))}
 
     def sample_costs(self, light: float) -> dict[str, SampleCost]:
-        """Return the sample costs from the projector's side and from the camera's side."""
         found, tracers = {}, self._simulation().at_anchors
         every = self._beyond_mean(1, ()) if self.changes else None
         for place, (name, tracer) in enumerate(zip(("indirect_residual", "camera_residual"), tracers, strict=True)):
@@ -239,7 +230,6 @@ class FollowedRuns(AnchorRuns):
         return self._beyond(self._simulation(self.few), self._few_by_tracer[1])
 
     def with_more(self, light: float, samples: int) -> SampleCost:
-        """Measure the sample cost from the camera's side with more ``samples``."""
         simulation = self._simulation(self.few)
         tracer, one = simulation.at_anchors[1], self._simulation().at_anchors[1]
         if tracer is None or one is None or not self.changes or not light:
@@ -285,8 +275,6 @@ def _join(traced: Sequence[list[PathSamples]]) -> list[PathSamples]:
 
 
 class Bounced(NamedTuple):
-    """Light from the projector's side and its indirect part, by replicate, and the samples of each."""
-
     replicates: list[PathSamples]
     indirect: list[PathSamples]
     samples: int
@@ -297,10 +285,7 @@ class Bounced(NamedTuple):
 
 
 class EffectRuns:
-    """Frames with all effects and without each. Light is traced once and reused where possible.
-
-    ``as_direct`` returns the changes of direct light by one cell a pixel and by one layer.
-    """
+    """Frames with all effects and without each; light is traced once and reused where possible."""
 
     def __init__(
         self,
@@ -327,7 +312,6 @@ class EffectRuns:
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
-        """Change of the frames by each effect, and by one cell and one layer for indirect light."""
         shown = [name for name in EFFECTS if name in self.everything.effects and EFFECTS[name].in_frames]
         found = {Approximation(name): self.frames - self._without(EFFECTS[name]) for name in shown}
         return {**found, **self._coarse}
@@ -344,7 +328,7 @@ class EffectRuns:
 
     @cached_property
     def _is_faint(self) -> bool:
-        """True if so little light is indirect that one cell a pixel and one layer certainly suffice."""
+        """Return True if so little light is indirect that one cell a pixel and one layer certainly suffice."""
         direct = sum(float(light.value.sum()) for light in self.direct) / (REPLICATES * self.sample.direct)
         part = self.received / (direct + self.received) if self.received else 0.0
         # Direct light that lies in its cells tells nothing of indirect light.
@@ -352,7 +336,6 @@ class EffectRuns:
 
     @property
     def coarse(self) -> tuple[float, float]:
-        """Relative changes of indirect light by one cell a pixel, and by one layer."""
         light = norm(self._indirect(1, ())) if self._coarse else 0.0
         if not light:
             return math.inf, math.inf
@@ -376,7 +359,7 @@ class EffectRuns:
 
     @cached_property
     def _looks(self) -> tuple[Bounced, Bounced]:
-        """First and closer replicates; closer ones if noise hides the change by one cell a pixel."""
+        """Return first and closer replicates; closer ones if noise hides the change by one cell a pixel."""
         first, tracer = Bounced.of(self.followed["indirect"], self.sample.followed), self.simulation.indirect
         if tracer is None or self._is_faint or not any(light.value.size for light in first.indirect):
             return first, first
@@ -395,18 +378,15 @@ class EffectRuns:
 
     @property
     def received(self) -> float:
-        """Followed light, as irradiance at the sensor's centre [W m^-2]."""
         light = sum(float(replicate.value.sum()) for replicates in self.followed.values() for replicate in replicates)
         return light / (REPLICATES * self.sample.followed)
 
     @property
     def apart(self) -> dict[str, float]:
-        """Error of leaving out effects that are drawn with the sensor's noise: the speckle contrast."""
         effects = self.everything.effects
         return {name: self.simulation.physics.speckle for name in effects if not EFFECTS[name].in_frames}
 
     def with_more(self, samples: int) -> SampleCost:
-        """Measure the sample cost of light from the camera's side with more ``samples``."""
         tracer = self.simulation.from_camera
         if tracer is None or not self.light:
             return SampleCost.none()
@@ -449,7 +429,6 @@ class EffectRuns:
 
     @cached_property
     def sample_costs(self) -> dict[str, SampleCost]:
-        """Sample costs of all passes to one point of the sensor, and of sharp pixels."""
         found = {}
         for name, each in self.simulation.passes.items():
             samples, paths, rate = self.sample.followed, each.tracer.paths_per_sample, 0.5

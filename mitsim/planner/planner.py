@@ -1,7 +1,7 @@
-"""Make the plan of a capture from a short pilot run, for a given accuracy or a given time.
+"""The plan of a capture, made from a short pilot run for a given accuracy or a given time.
 
-A plan is a table: a row for each effect and each number that is chosen. Accuracy is the relative rms error of the
-expected frames, ``||a - b|| / ||b||`` over all frames and pixels, from sampling, omissions and coarse numbers.
+Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels, from
+sampling, omissions and coarse numbers.
 """
 
 from __future__ import annotations
@@ -80,21 +80,6 @@ def make_plan(
     switches: Mapping[str, bool] | None = None,
     lines: int = 1,
 ) -> Plan:
-    """Run the pilot and choose what to simulate.
-
-    Parameters
-    ----------
-    bench, lighting
-        the scene, and the family's pixels and shots.
-    accuracy
-        relative rms error of the expected frames.
-    seed
-        root of the pilot's random streams.
-    switches
-        effects that the user switches on or off, by name.
-    lines
-        lines that share the paths; the bench has one.
-    """
     check_accuracy(accuracy)
     _refuse_unfit(bench, switches or {})
     started = time.perf_counter()
@@ -131,7 +116,7 @@ def _refine(
 def plan_within(
     bench: Apparatus, lighting: Lighting, seconds: float, seed: int, switches: Mapping[str, bool] | None = None
 ) -> Plan:
-    """Make the plan of the finest accuracy whose run is predicted to take at most ``seconds`` from the program's start.
+    """Make the plan of the finest accuracy that is predicted to take at most ``seconds`` from the program's start.
 
     Predictions use fixed unit costs, so that the same time gives the same plan.
     """
@@ -237,7 +222,6 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
 
 
 def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
-    """Measure the seconds of a path in the passes that take most, and scale the others."""
     own, spread = integer(seed, "pilot", "paces"), pilot_result.spread
     fixed = {name: 0.0 for name in simulation.passes} | cost_model.tracing_seconds(
         pilot_result, simulation.settings, cost_model.FIXED
@@ -326,7 +310,6 @@ def explain_plan(
     switches: Mapping[str, bool] | None = None,
     chosen: choose.Candidate | None = None,
 ) -> Plan:
-    """Choose effects, numbers and samples, and list them in a table; ``chosen`` is the choice if it is known."""
     check_accuracy(accuracy)
     switches = switches or {}
     chosen = chosen or choose.Candidates(pilot_result, switches).choice(accuracy)
@@ -359,7 +342,6 @@ def _stages(pilot_result: PilotResult, settings: Settings, costs: cost_model.Uni
 def _rows(
     result: PilotResult, settings: Settings, facts: SceneFacts, switches: Mapping[str, bool]
 ) -> Iterator[PlanRow]:
-    """Yield a row for each number, for how frames are formed, and for each effect."""
     costs, costly, waves = choose.unit_costs_of(result), choose.costly_effects(), cost_model.in_waves(settings.effects)
     now = _stages(result, settings, costs)
 
@@ -430,14 +412,13 @@ def _rows(
 
 
 def _words(error: Estimate) -> str:
-    """Return an error as text, as a bound if it cannot be told from zero."""
     if error.bound == 0:
         return "0"
     return f"{error.value:.1e}" if error.bound < _VAGUE * error.value else f"less than {error.bound:.1e}"
 
 
 def _shortfall(accuracy: float, result: PilotResult, chosen: choose.Candidate, facts: SceneFacts) -> list[str]:
-    """Return why the choice does not keep the accuracy, and what helps; nothing if it does."""
+    """Return the reasons why the choice misses the accuracy, with remedies; empty if it is kept."""
     if chosen.total.bound <= accuracy:
         return []
     settings, found = chosen.settings, list[str]()
@@ -501,12 +482,6 @@ _GREY = "no surface differs by wavelength; the mask's shadow is the mean over al
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """Facts about a bench that a plan reports.
-
-    ``keystone`` is the deviation of the projector's window from a square [projector pixels], ``mirrors`` are tags of
-    mirrors and curved glass, and ``spectrum`` is the row of colours.
-    """
-
     notes: Mapping[str, str]
     keystone: float
     warnings: tuple[str, ...] = ()
@@ -516,7 +491,6 @@ class SceneFacts:
 
     @classmethod
     def of(cls, bench: Apparatus, switches: Mapping[str, bool] | None = None) -> SceneFacts:
-        """Collect the facts of ``bench``, without those of effects that the user's ``switches`` turn off."""
         loaded, off = bench.loaded, {name for name, on in (switches or {}).items() if not on}
         warnings = (*known_losses(loaded, switches or {}), *_limits(bench, off))
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
