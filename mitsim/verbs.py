@@ -251,10 +251,6 @@ MERGE = "merge"
 """In the place of a study's name: joins the parts of one."""
 WHOLE = "1/1"
 """The only part of a study that is not shared."""
-_OF_SCENES = ("patterns", "camera", "projector", "parameters", "allow_outside_files")
-"""Options of studies of a scene."""
-_OF_POINTS = ("over", "measure", "shard", "jobs", "scheduler")
-"""Options of studies of many points."""
 
 
 class StudyOptions(Opening, Seeded):
@@ -350,125 +346,84 @@ def study(
     return prepare_study(name, scene, output, StudyOptions(**options), job)()
 
 
-Study = Callable[[], "StudyResult"]
-"""One that only has to be measured: what it is asked for was checked."""
-
-
 def prepare_study(
     name: str,
     scene: Path | str | Sequence[Path | str] | None,
     output: Path | str,
     asked: StudyOptions,
     job: Job | None,
-) -> Study:
-    """Check a study as :func:`study` does before work, and return the function that runs it.
+) -> Callable[[], StudyResult]:
+    """Check a study as :func:`study` does before the renderer is imported, and return the function that runs it.
 
-    Parameters
-    ----------
-    name, scene, output, asked, job
-        as there.
+    A study is measured on eight test images on the photograph's sheet (two if ``quick``), or on one ``scene``.
     """
-    from mitsim.studies.framework.experiment import check_study
+    from mitsim.studies.framework.experiment import QUICK_IMAGES, TEST_IMAGES, Scope, Setup, check_study
 
+    scenes: list[Any] = [] if scene is None else [*scene] if isinstance(scene, (list, tuple)) else [scene]
+    if wrong := [one for one in scenes if not isinstance(one, (str, Path))]:
+        raise ArgumentError("scene", f"{wrong[0]!r}: give a path")
     if name == MERGE:
         asked.refuse(asked.without("experiment", "variant"), "on parts, which say themselves what they are of")
         from mitsim.studies.framework.campaign import merge
 
-        return partial(merge, [Path(part) for part in _scenes_of(scene)], output, asked.experiment)
+        return partial(merge, [Path(part) for part in scenes], output, asked.experiment)
     asked.refuse(["experiment"], "but with merge; give the module as the study's name")
     if name not in OF_CAPTURES:
         asked.refuse(["data"], f"but on the studies {' and '.join(OF_CAPTURES)}")
     if asked.recipe is not None and name not in ("calibration", "drift"):
         raise MitsimError(f"study {name}: has no session of its own; a recipe is for calibration and drift")
-    request = Request(patterns=asked.patterns or "dots:7", seed=asked.seed)
-    named = _scenes_of(scene)
-    if len(named) > 1:
-        raise MitsimError(f"study {name}: got {len(named)} scenes, {' '.join(map(str, named))}; give one scene")
-    place = str(named[0]) if named else None
+    patterns = Request(patterns=asked.patterns or "dots:7", seed=asked.seed).patterns
+    if len(scenes) > 1:
+        raise MitsimError(f"study {name}: got {len(scenes)} scenes, {' '.join(map(str, scenes))}; give one scene")
     check_study(name)
-    return _study_of_points(name, place, Path(output), request, job or Job(), asked)
-
-
-def _scenes_of(scene: Path | str | Sequence[Path | str] | None) -> list[Path | str]:
-    each: list[Any] = [] if scene is None else [*scene] if isinstance(scene, (list, tuple)) else [scene]
-    if wrong := [one for one in each if not isinstance(one, (str, Path))]:
-        raise ArgumentError("scene", f"{wrong[0]!r}: give a path")
-    return each
-
-
-def _study_of_points(
-    name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions
-) -> Study:
-    """Prepare a study of many points, on eight test images on the photograph's sheet (two if ``quick``) or on one
-    scene."""
     from mitsim.studies.framework.campaign import Shard, Where, run_experiment
-    from mitsim.studies.framework.experiment import QUICK_IMAGES, TEST_IMAGES, Scope, Setup
 
-    camera = None if asked.camera is None else str(asked.camera)
-    projector = None if asked.projector is None else str(asked.projector)
+    place = str(scenes[0]) if scenes else None
+    camera, projector, recipe, data = (
+        None if each is None else str(each) for each in (asked.camera, asked.projector, asked.recipe, asked.data)
+    )
     parameters = tuple(sorted(asked.texts.items()))
-    setup = Setup(scene or "photograph", None, parameters, camera, projector, asked.variant, asked.allow_outside_files)
-    pictures: tuple[str | None, ...] = (None,) if scene else QUICK_IMAGES if asked.quick else TEST_IMAGES
-    recipe = None if asked.recipe is None else str(asked.recipe)
+    setup = Setup(place or "photograph", None, parameters, camera, projector, asked.variant, asked.allow_outside_files)
+    pictures: tuple[str | None, ...] = (None,) if place else QUICK_IMAGES if asked.quick else TEST_IMAGES
     if recipe is not None:
         load_recipe(recipe)
-    data = _captures(name, scene, asked)
+    if name in OF_NO_SCENE or data is not None:
+        if place is not None:
+            raise MitsimError(f"study {name} {place}: it is of no scene; leave the scene out")
+        of_scenes = "patterns", "camera", "projector", "parameters", "allow_outside_files"
+        asked.refuse(of_scenes, f"on the study {name}, which is of no scene")
+        TwinFiles.find(None if data is None else Path(data), name)
     scope = Scope(setup, pictures, seeds=(asked.seed,), quick=asked.quick, recipe=recipe, data=data)
-    scope = scope_of(name, scope, request.patterns, asked.varied, asked.measure)
+    scope = scope_of(name, scope, patterns, asked.varied, asked.measure)
     if name not in ("accuracy", "calibration", "sweep", "drift"):
         asked.refuse(["patterns"], f"on the study {name}, which has its own")
     if asked.scheduler is not None:
         asked.refuse(["jobs"], "with a scheduler, whose machines have processes of their own")
     where = Where(Shard.of(asked.shard), asked.jobs, asked.scheduler)
-    _check_setup(scope, scene)
-    return partial(run_experiment, name, scope, output, job, where)
-
-
-def _captures(name: str, scene: str | None, asked: StudyOptions) -> str | None:
-    """Return the folder of real captures that a study is of, if any; MitsimError for a scene beside them."""
-    if name in OF_NO_SCENE or asked.data is not None:
-        if scene is not None:
-            raise MitsimError(f"study {name} {scene}: it is of no scene; leave the scene out")
-        asked.refuse(_OF_SCENES, f"on the study {name}, which is of no scene")
-        TwinFiles.find(None if asked.data is None else Path(asked.data), name)
-    return None if asked.data is None else str(asked.data)
+    _check_setup(scope, place)
+    return partial(run_experiment, name, scope, Path(output), job or Job(), where)
 
 
 def scope_of(
     name: str, scope: Scope, patterns: str, varied: Sequence[tuple[str, tuple[str, ...]]], measure: str
 ) -> Scope:
-    """Return the ``scope`` of a study with what a sweep or a drift varies; other studies vary nothing.
-
-    Parameters
-    ----------
-    name, scope
-        of the study.
-    patterns, varied, measure
-        as :class:`StudyOptions` has them.
-
-    Raises
-    ------
-    MitsimError
-        for options that the study does not have, or that cannot be.
-    """
+    """Return the ``scope`` of a study with the ``varied`` names and values of a sweep or a drift; other studies vary
+    nothing. MitsimError for options that the study does not have, or that cannot be."""
     from mitsim.devices.patterns import read_name
     from mitsim.studies.framework.experiment import check_drifts, check_sweep, measures_of
 
     if name == "sweep":
         check_sweep(tuple(varied), len(scope.pictures))
-        read_name(patterns)
-        return replace(scope, sweep=tuple(varied), measures=measures_of(measure), patterns=patterns)
-    if name in ("accuracy", "calibration") and measure == "psnr" and not varied:
-        read_name(patterns)
-        return replace(scope, patterns=patterns)
-    if name == "drift" and measure == "psnr":
+        scope = replace(scope, measures=measures_of(measure))
+    elif name == "drift" and measure == "psnr":
         check_drifts(tuple(varied))
-        read_name(patterns)
-        return replace(scope, sweep=tuple(varied), patterns=patterns)
-    if varied or patterns != "dots:7" or measure != "psnr":
-        others = "measure is for sweep, over for drift and sweep, patterns for these, accuracy and calibration"
-        raise MitsimError(f"study {name}: has its own points and measures; {others}")
-    return scope
+    elif not (name in ("accuracy", "calibration") and measure == "psnr" and not varied):
+        if varied or patterns != "dots:7" or measure != "psnr":
+            others = "measure is for sweep, over for drift and sweep, patterns for these, accuracy and calibration"
+            raise MitsimError(f"study {name}: has its own points and measures; {others}")
+        return scope
+    read_name(patterns)
+    return replace(scope, sweep=tuple(varied), patterns=patterns)
 
 
 def _check_setup(scope: Scope, scene: str | None) -> None:
