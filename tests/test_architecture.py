@@ -574,7 +574,7 @@ SIZES = {
     "sessions": (4, 1019),
     "studies": (25, 7011),
     "transport": (21, 4489),
-    "verbs": (1, 356),
+    "verbs": (1, 340),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
