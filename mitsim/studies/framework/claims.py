@@ -320,6 +320,11 @@ class Gain(_Range):
     def _compared(self) -> frozenset[str]:
         return frozenset({*_chosen(self.one), *_chosen(self.other)})
 
+    def judge(self, results: Results) -> list[Claim]:
+        """Return the claim as other claims do; an optional one is left out where either side was not measured."""
+        one, other, _ = self._parts(choose_rows(results.frame, self.where))
+        return [] if self.optional and (one.empty or other.empty) else super().judge(results)
+
     def _parts(self, rows: DataFrame) -> tuple[DataFrame, DataFrame, str]:
         return choose_rows(rows, self.one), choose_rows(rows, self.other), self.other_column or self.column
 

@@ -96,6 +96,10 @@ def test_a_claim_without_rows_is_an_error_or_left_out() -> None:
     with pytest.raises(MitsimError, match="nothing was measured of the claim 'Nobody measured this'"):
         claim.judge(Results(ROWS))
     assert replace(claim, optional=True).judge(Results(ROWS)) == []
+    beside = Gain("Nobody measured the other", "dots:7", "dots:8", optional=True)
+    assert beside.judge(Results(ROWS)) == []
+    with pytest.raises(MitsimError, match="nothing was measured of psnr_db"):
+        replace(beside, optional=False).judge(Results(ROWS))
 
 
 def test_a_claim_states_its_own_models_and_both_means_apart() -> None:
@@ -159,7 +163,7 @@ def test_bars_are_in_order_of_the_table_or_of_their_length() -> None:
     for ordered, names in ((False, ["short", "long"]), (True, ["long", "short"])):
         (figure,) = Bars("what", ordered=ordered).draw(Results(rows)).values()
         axes = figure.axes[0]
-        assert [text.get_text() for text in axes.get_yticklabels()][::-1] == names
+        assert [text.get_text() for text in axes.get_yticklabels()] == names
         assert len(axes.patches) == 4 and axes.get_xlabel() == "PSNR [dB]"
 
 
