@@ -1,10 +1,7 @@
-"""Arrays that several rooms exchange, and files of them: NPY, NPZ and MATLAB files in, HDF5 and MATLAB files out.
+"""Arrays that several rooms exchange, and their NPY, NPZ, HDF5 and MATLAB files.
 
-NumPy maps an NPY file into memory, where a file that is cut short meanwhile ends the process, and allocates as much
-as the header of one in an NPZ claims. Here a header's claims are held against the file first, and numbers are copied.
-
-HDF5's own writer cannot close a file on a disk that is full: it says so many times on stderr, and once more when the
-program ends, or ends it. Here it writes through Python, which keeps the error until the file is closed.
+A header's claims are compared with the file before memory is allocated, and files are never mapped, because a mapped
+file that is cut short ends the process. HDF5 is written through Python, because its own writer fails on a full disk.
 """
 
 from __future__ import annotations
@@ -33,24 +30,19 @@ if TYPE_CHECKING:
     import h5py
 
 FloatArray = npt.NDArray[np.float64]
-"""Real numbers in double precision."""
 SeparableTerm = tuple[FloatArray, FloatArray]
-"""Left (m, n) and right (m', n') of one of the products that an operator from scene pixels to a sensor is a sum of."""
+"""Left (m, n) and right (m', n') factor of one product of an operator from scene pixels to a sensor."""
 Labels = npt.NDArray[np.int64]
-"""Index of the class or row that each item belongs to."""
 
 
 def sum_of_squares(values: FloatArray) -> float:
-    """Sum of the squares of ``values`` (any shape), without an array of them, and in one order, unlike BLAS."""
+    """Return the sum of squares in a fixed order of additions, unlike BLAS."""
     flat = np.ravel(values, order="K")  # as they lie in memory: transposed ones are not copied
     return float(np.einsum("i,i->", flat, flat))
 
 
 def mean_of_neighbours(values: FloatArray) -> FloatArray:
-    """Return the mean over the 3 x 3 neighbours of each of the ``values`` (rows, columns), edges repeated.
-
-    scipy.ndimage has the same, and takes 50 ms to import.
-    """
+    """Return the mean over 3 x 3 neighbours, edges repeated (importing scipy takes 50 ms)."""
     for _ in ("rows", "columns"):
         wide = np.pad(values, ((1, 1), (0, 0)), mode="edge")
         values = ((wide[:-2] + wide[1:-1] + wide[2:]) / 3).T
@@ -58,7 +50,7 @@ def mean_of_neighbours(values: FloatArray) -> FloatArray:
 
 
 class ByValue:
-    """A dataclass (with ``eq=False``) that compares and hashes by its values, arrays by their bytes."""
+    """Mixin for dataclasses (with ``eq=False``) that compare by their values, arrays by their bytes."""
 
     def _values(self) -> tuple[object, ...]:
         values = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
@@ -71,7 +63,6 @@ class ByValue:
         return hash(self._values())
 
     def _hold(self, **arrays: npt.NDArray[np.generic]) -> None:
-        """Set fields of a frozen dataclass to arrays that nobody can write to."""
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
@@ -80,19 +71,15 @@ class ByValue:
 # -------- NumPy's files
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-"""Readers by version; later versions are of names of fields alone, which no array of numbers has."""
+"""Later versions only add field names in UTF-8, which arrays of numbers do not have."""
 _PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""What NumPy writes."""
 _MOST_ARRAYS = 10_000
-"""In an NPZ; a point of a study has some ten."""
 _AGAIN = 2
-"""Bytes of memory that a byte of an NPZ takes: as it is unpacked, and as an array."""
+"""Bytes of memory for each byte of an NPZ: the unpacked data and the array."""
 
 
 @dataclass(frozen=True)
 class Npy:
-    """The header of an NPY file: shape and type of its array, whether columns come first, and where it begins."""
-
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     fortran: bool
@@ -100,12 +87,7 @@ class Npy:
 
     @classmethod
     def of(cls, file: BinaryIO, size: int) -> Npy:
-        """Read the header at the beginning of ``file``, of ``size`` bytes.
-
-        ValueError where it is none, of Python objects, or claims other than the file has.
-
-        ValueError where it is none, of Python objects, or claims other than the file has.
-        """
+        """Read a header; ValueError if it is invalid, or claims Python objects or more than ``size`` bytes."""
         read = _HEADERS.get(np.lib.format.read_magic(file))
         if read is None:
             raise ValueError("it is no array of numbers")
@@ -122,14 +104,10 @@ class Npy:
 
     @property
     def bytes(self) -> int:
-        """Bytes of its numbers."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     def part(self, file: BinaryIO, index: int | None = None) -> npt.NDArray[Any]:
-        """Return the numbers in ``file``, or those of one ``index`` of the first axis.
-
-        ValueError where it ends before.
-        """
+        """Return all numbers, or those at ``index`` of the first axis; ValueError if the file ends before."""
         several = index is not None and not self.fortran
         shape = self.shape[1:] if several else self.shape
         count = math.prod(shape)
@@ -142,21 +120,9 @@ class Npy:
 
 
 def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of an NPZ ``file``.
+    """Return the arrays of an NPZ ``file``, called ``name`` in messages.
 
-    Parameters
-    ----------
-    file
-        open for reading.
-    name
-        of it, for messages.
-
-    Raises
-    ------
-    ValueError
-        for a file that is damaged, or holds anything but arrays of numbers and texts.
-    MitsimError
-        where unpacking it would take more memory than is free.
+    ValueError if it is damaged or holds other types than numbers and texts; MitsimError if memory is too small.
     """
     try:
         with zipfile.ZipFile(file) as packed:
@@ -176,20 +142,14 @@ def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
 # -------- HDF5 files
 
 PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
-"""Filters that every HDF5 library has, and a checksum for each chunk. Higher levels of gzip take thrice the time for
-noise that does not get smaller."""
+"""Filters that every HDF5 library has. Higher levels of gzip take thrice the time and do not shrink noise."""
 _MOST_CHUNK = 4 * MOST_PIXELS
-"""Bytes that are unpacked at once: of the largest frame."""
 _MOST_ITEMS, _DEEPEST = 100_000, 16
-"""Groups and datasets of a file, and levels of groups within groups. Looking at so many takes some ten seconds."""
 
 
 @contextmanager
 def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
-    """Open an HDF5 file that takes the place of ``path`` on leaving; after an error nothing of it is left.
-
-    MitsimError when it cannot be written, as on a full disk.
-    """
+    """Open an HDF5 file that replaces ``path`` on leaving, or is removed after an error; MitsimError on a full disk."""
     import h5py  # here: it takes 50 ms to import, and most work writes none
 
     with whole_file(path) as part, open(part, "w+b", buffering=0) as disk:
@@ -205,25 +165,17 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
 
 @contextmanager
 def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] | None = None) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading after all that it holds was checked; every HDF5 input is opened here.
+    """Check all content of an HDF5 file, then open it for reading; every HDF5 input is opened here.
 
-    HDF5 follows links to other files, unpacks data that claim to be a thousand times larger (a million times by two
-    filters), and reads data that were never stored as zeros of any size.
+    HDF5 follows links to other files, unpacks data that claim to be a million times larger, and reads data that were
+    never stored as zeros. MitsimError refuses such content, damaged files, and files that do not fit into memory.
 
     Parameters
     ----------
-    path
-        of the file.
     copies
-        bytes of memory that the caller takes for each byte of an h5py.Dataset; 0 for one that it checks itself.
+        Bytes of memory that the caller needs for each byte of an h5py.Dataset; 0 for a dataset that the caller checks.
     known
-        marks of files that were checked and have not changed since, which are not checked again; the file is added.
-
-    Raises
-    ------
-    MitsimError
-        for a file that is missing or damaged; for links, data in other files or not wholly stored, filters other than
-        gzip, too many or too deep groups, and where reading takes more memory than is free.
+        Identities of files already checked and unchanged since; the file is added.
     """
     import h5py
 
@@ -272,7 +224,6 @@ def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] 
 
 @contextmanager
 def hdf5_errors(path: Path) -> Iterator[None]:
-    """Raise h5py's errors on the file ``path`` as one line."""
     try:
         yield
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
@@ -280,7 +231,7 @@ def hdf5_errors(path: Path) -> Iterator[None]:
 
 
 class _FirstErrorFile:
-    """A file whose first error in writing is kept as ``error``; later data are dropped, as if they were written."""
+    """Binary file that keeps its first writing error as ``error`` and then drops all data."""
 
     def __init__(self, disk: FileIO) -> None:
         self._disk = disk
@@ -288,7 +239,6 @@ class _FirstErrorFile:
         self.tell, self.seek, self.read = disk.tell, disk.seek, disk.read  # by which h5py knows an open file
 
     def write(self, data: Any) -> int:
-        """Write ``data``; return its length."""
         view = memoryview(data).cast("B")
         length = len(view)
         try:
@@ -299,7 +249,6 @@ class _FirstErrorFile:
         return length
 
     def truncate(self, size: int) -> int:
-        """Make the file ``size`` bytes long; return that."""
         try:
             if self.error is None:
                 self._disk.truncate(size)
@@ -311,7 +260,7 @@ class _FirstErrorFile:
         """Nothing waits: it is not buffered here."""
 
     def readinto(self, buffer: Any) -> int:
-        """Fill a ``buffer``, with zeros where nothing was written; returns its length."""
+        """Fill a ``buffer``, with zeros where nothing was written."""
         view = memoryview(buffer).cast("B")
         found = self._disk.readinto(view) or 0
         view[found:] = bytes(len(view) - found)
@@ -321,34 +270,24 @@ class _FirstErrorFile:
 # -------- MATLAB files of version 5
 
 LARGEST_VARIABLE = (1 << 31) - 1
-"""Bytes of an array in a file of version 5."""
+"""Largest array in a MATLAB file of version 5 [bytes]."""
 _HEAD = 128
-"""Bytes before the first variable: a text, the version and the order of bytes."""
 _HDF5, _HDF5_MARK = 2, b"\x89HDF\r\n\x1a\n"
-"""Version of a file that is an HDF5 file behind its head."""
 _USER_BLOCK = 512
-"""Bytes that MATLAB puts before HDF5 in a file of version 7.3."""
 _MATRIX, _COMPRESSED = 14, 15
-"""Kinds of elements: an array, and one that is packed."""
 _COMPLEX = 0x08
-"""Bit of an array's flags: its numbers are complex."""
 _BYTES_OF = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
-"""Bytes of a number that SciPy reads, by class: letters, double, single, whole numbers of 8 to 64 bits."""
 _BEGINNING = 4096
-"""Bytes of a variable that its flags, shape and name lie in; a name has 63 letters at most."""
+"""Bytes of a variable in which its flags, shape and name lie; names have at most 63 letters."""
 _PADDING = 16
-"""Bytes after a variable's shape and name that are no numbers: a tag, and what fills up to 8."""
+"""Bytes for a tag and for padding to multiples of 8."""
 _MOST_VARIABLES = 10_000
-"""Of a file; a run in 16 colours has 200."""
 _COPIES = 3
-"""Arrays of a variable's size that are held at once: as stored, of its class, and as a run's."""
+"""Arrays of a variable's size held at once: as stored, in its class, and as used here."""
 
 
 def write_variables(path: Path, variables: Mapping[str, Any]) -> None:
-    """Write ``variables`` to a MATLAB file at ``path``, whole or not at all.
-
-    MitsimError for an array that is larger than such files hold.
-    """
+    """Write a MATLAB file, whole or not at all; MitsimError for arrays above 2 GiB."""
     from scipy.io import savemat
 
     for name, values in variables.items():
@@ -363,10 +302,7 @@ def write_variables(path: Path, variables: Mapping[str, Any]) -> None:
 
 
 def is_hdf5(path: Path) -> bool:
-    """Return True if the file ``path`` is HDF5, as MATLAB files of version 7.3 are behind their head.
-
-    MitsimError where it is no plain file.
-    """
+    """Return True if ``path`` is HDF5, as MATLAB files of version 7.3 are."""
     check_plain(path)
     with open(path, "rb") as file:
         head = file.read(_USER_BLOCK + len(_HDF5_MARK))
@@ -374,11 +310,9 @@ def is_hdf5(path: Path) -> bool:
 
 
 def read_variables(path: Path) -> dict[str, Any]:
-    """Return the arrays of real numbers and the texts of the MATLAB file ``path``, by name.
+    """Return the real arrays and texts of a MATLAB file of version 5; other classes are skipped.
 
-    Cells, structures and objects are not read, because files of `mitsim export` and FlatCam have none.
-
-    MitsimError for a file that is missing, damaged, of version 7.3 or 4, or that takes more memory than is free.
+    MitsimError for a file that is missing, damaged, of version 7.3 or 4, or does not fit into memory.
     """
     from scipy.io import loadmat
 
@@ -398,10 +332,10 @@ def read_variables(path: Path) -> dict[str, Any]:
 
 
 def _arrays_in(file: BinaryIO) -> dict[str, int]:
-    """Return the bytes that each array of real numbers and each text of an open MATLAB ``file`` takes, by name.
+    """Return the bytes that each real array and text of a MATLAB ``file`` needs.
 
-    SciPy's readers allocate as much as a file claims, and call themselves for each cell within a cell until the process
-    ends. Here no more than the beginning of each variable is unpacked, after "MAT-File Format" (MathWorks).
+    SciPy allocates whatever a file claims and recurses into nested cells until the process ends. Therefore only the
+    beginning of each variable is unpacked here, after "MAT-File Format" (MathWorks).
     """
     head = file.read(_HEAD)
     mark = head[_HEAD - 2 :]
@@ -450,13 +384,12 @@ def _arrays_in(file: BinaryIO) -> dict[str, int]:
 
 
 def _tag(data: bytes, place: int, order: str) -> tuple[int, int]:
-    """Return the bytes of an element's content at a ``place``, and where it begins."""
     kind, length = struct.unpack_from(f"{order}2I", data, place)
     return (kind >> 16, place + 4) if kind >> 16 else (length, place + 8)
 
 
 def _element(data: bytes, place: int, order: str) -> tuple[bytes, int]:
-    """Return the content of an element at a ``place``, and where the next one begins."""
+    """Return the content of an element, and the offset of the next one."""
     length, start = _tag(data, place, order)
     if start + length > len(data):
         raise ValueError(f"a name or shape in it takes {length} bytes")

@@ -1,4 +1,4 @@
-"""Configuration files: a TOML path in, a checked pydantic model out; where the shipped ones lie."""
+"""TOML files as checked pydantic models, models of options, and the shipped files."""
 
 from __future__ import annotations
 
@@ -25,22 +25,21 @@ else:
     import tomli as tomllib
 
 _MOST_BYTES = 1 << 16
-"""Ten times the longest file that is shipped."""
 _MOST_DOTS = 200
-"""The parser takes a tenth of a second for a name of that many parts."""
+"""The parser takes 0.1 s for a dotted name of that many parts."""
 DEFAULT_CAMERA = "imx249"
-"""Of a bench where none is named: the paper's."""
+"""The paper's camera."""
 _SERVES = "Serves: "
-"""Begin of the sentence of a file's first comment that says what the file is for."""
+"""Introduces the purpose of a shipped file in its first comment."""
 Model = TypeVar("Model", bound=BaseModel)
 LARGEST = 1e12
-"""Largest number of a device, and one over the smallest: far from any device, and products of a few stay finite."""
+"""Largest number of a device, and inverse of the smallest, so that products of a few stay finite."""
 Positive = Annotated[float, Field(ge=1 / LARGEST, le=LARGEST, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 
 
 class Configuration(BaseModel):
-    """A frozen model of finite numbers, of the very types that it states, without further fields."""
+    """Frozen model of finite numbers with exact types and no further fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
@@ -48,24 +47,16 @@ class Configuration(BaseModel):
 # ---- Mistakes in files -----------------------------------------------------------------------------------------------
 
 _MOST_MISTAKES = 20
-"""Mistakes that are listed: a screen of them."""
 Place = tuple[str | int, ...]
-"""Names, and numbers of list items, that lead to a part of nested data."""
+"""Keys and list indices that lead to a part of nested data."""
 Mistake = tuple[int, str]
-"""Line of a mistake, 0 if it is not known, and its message."""
+"""Line of a mistake (0: unknown), and its message."""
 
 
 class Table(dict[str, Any]):
-    """Names and values that a person wrote into a file, all of whose mistakes are reported together.
+    """Content of a file that a person wrote; all mistakes in it are reported together.
 
-    Parameters
-    ----------
-    values
-        Names and values.
-    text
-        Text of the TOML file; empty where lines are not known.
-    place
-        Names of the tables that this one is in.
+    ``text`` is the TOML source, if known, and ``place`` has the names of the enclosing tables.
     """
 
     def __init__(self, values: Mapping[str, Any], text: str = "", place: Place = ()) -> None:
@@ -73,14 +64,10 @@ class Table(dict[str, Any]):
         self.text, self.place = text, place
 
     def part(self, name: str) -> Table:
-        """Return the table ``name`` in this one."""
         return Table(self[name], self.text, (*self.place, name))
 
     def line(self, place: Place) -> int:
-        """Return the line on which the name or table at a ``place`` begins, or that which holds it; 0 if none does.
-
-        Lines are read one by one, so that a name inside a text of several lines counts.
-        """
+        """Return the line on which the entry at ``place``, or its nearest parent, begins; 0 if unknown."""
         wanted, table, counts, best = (*self.place, *place), Place(), dict[Place, int](), (0, 0)
         for number, line in enumerate(self.text.split("\n"), 1):
             if not (found := _NAMED.match(line)):
@@ -100,11 +87,9 @@ class Table(dict[str, Any]):
 
 
 _NAMED = re.compile(r"\s*(?:(\[\[?)([^\]]+)\]|([\w\"' .-]+?)\s*=)")
-"""Line that begins a table, or sets a name."""
 
 
 def mistakes(model: type[BaseModel], data: Table) -> list[Mistake]:
-    """Return the mistakes in ``data`` that is to be a ``model``; an empty list if there are none."""
     try:
         model.model_validate(data)
     except ValidationError as error:
@@ -113,10 +98,7 @@ def mistakes(model: type[BaseModel], data: Table) -> list[Mistake]:
 
 
 def refusal(model: type[BaseModel], error: ValidationError, where: str, data: object = None) -> MitsimError:
-    """Return pydantic's ``error`` on the ``data`` of a ``model`` as a message that begins with ``where``.
-
-    Of a :class:`Table` it lists all mistakes; of other data, which programs write, the first.
-    """
+    """Convert pydantic's ``error``: all mistakes of a :class:`Table`, the first one of data that programs write."""
     found = _mistakes_in(model, error, data)
     if isinstance(data, Table):
         return refuse_together(where, found)
@@ -125,7 +107,6 @@ def refusal(model: type[BaseModel], error: ValidationError, where: str, data: ob
 
 
 def refuse_together(where: str, found: Sequence[Mistake]) -> MitsimError:
-    """Return a refusal, which begins with ``where``, for all mistakes that were ``found``."""
     if len(found) == 1:
         ((line, text),) = found
         return MitsimError(f"{where}:{line}: {text}" if line else f"{where}: {text}")
@@ -136,7 +117,7 @@ def refuse_together(where: str, found: Sequence[Mistake]) -> MitsimError:
 
 
 def _mistakes_in(model: type[BaseModel], error: ValidationError, data: object) -> list[Mistake]:
-    """Return pydantic's errors as mistakes, misspelt names first and one for each place."""
+    """Convert pydantic's errors to mistakes, one for each place, misspelt names first."""
     above = data.place if isinstance(data, Table) else ()
     found, meant = dict[Place, Mistake](), set[Place]()
     errors = error.errors(include_url=False)
@@ -180,11 +161,9 @@ def _mistakes_in(model: type[BaseModel], error: ValidationError, data: object) -
 
 
 _PLAINER = {"a valid integer": "a whole number", "a valid string": "text", "a valid boolean": "true or false"}
-"""Kinds of values as pydantic calls them, and in plain words."""
 
 
 def rule_of(message: str) -> str:
-    """Return a rule of pydantic as a request."""
     rule = message.removeprefix("Value error, ")
     if "pattern '^[^/" in rule:
         return "give a name without folders"
@@ -197,7 +176,6 @@ def rule_of(message: str) -> str:
 
 
 def _model_at(model: type[BaseModel] | None, place: Place) -> type[BaseModel] | None:
-    """Return the model of the part at a ``place`` in a ``model``; None for another kind of part."""
     for name in place:
         if model is not None and isinstance(name, str) and name in model.model_fields:
             kinds = [model.model_fields[name].annotation]
@@ -211,11 +189,7 @@ def _model_at(model: type[BaseModel] | None, place: Place) -> type[BaseModel] | 
 
 
 def shipped_path(*parts: str) -> Path:
-    """Return the path of a file or folder that comes with mitsim.
-
-    For example ``shipped_path("calibration", "imx249.toml")``. A wheel carries them inside the package, a source tree
-    beside it.
-    """
+    """Return the path of a shipped file, inside the package of a wheel or beside it in a source tree."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "_shipped"
     path = (inside if inside.is_dir() else package.parent).joinpath(*parts)
@@ -225,7 +199,6 @@ def shipped_path(*parts: str) -> Path:
 
 
 def read_toml(path: Path | str) -> Table:
-    """Return the table in the TOML file ``path`` of at most 64 KiB."""
     try:
         text = read_text(path, _MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
         # The parser's time grows with the square of the parts of a dotted name.
@@ -239,7 +212,6 @@ def read_toml(path: Path | str) -> Table:
 
 
 def read_table(path: Path, what: str) -> Table:
-    """Return the table in a person's TOML or JSON file ``path``, which messages call ``what``."""
     if path.suffix.lower() != ".json":
         return read_toml(path)
     data = read_json(path)
@@ -249,30 +221,11 @@ def read_table(path: Path, what: str) -> Table:
 
 
 def load_model(path: Path | str, model: type[Model]) -> Model:
-    """Return the TOML file ``path`` as a ``model``; MitsimError if it breaks a rule."""
     return validate(model, read_toml(path), f"file {path}")
 
 
 def validate(model: type[Model], data: dict[str, Any], where: str, context: object = None) -> Model:
-    """Return a dictionary as a checked model.
-
-    Parameters
-    ----------
-    model
-        class of the result.
-    data
-        names and values, as read from a file.
-    where
-        beginning of the message.
-    context
-        passed on to the model's validators.
-
-    Raises
-    ------
-    MitsimError
-        for fields that break a rule: value, rule, and remedy. Of a :class:`Table` all of them, each on a line; of
-        other data, which programs write, the first.
-    """
+    """Return ``data`` as a checked ``model``; MitsimError, beginning with ``where``, if it breaks a rule."""
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:
@@ -280,28 +233,14 @@ def validate(model: type[Model], data: dict[str, Any], where: str, context: obje
 
 
 CAMERA, PROJECTOR, RECIPE, LIST = "full_well_e", "effective_wavelength_nm", "board_reflectance", "patterns"
-"""Fields by which a shipped file is known to be of a camera or a projector, a session's recipe, or a list of what is
-known of frames."""
+"""Required fields that identify shipped cameras, projectors, recipes and lists of known frames."""
 
 
 def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"], ending: str, field: str = "") -> Path:
-    """Return the path of a file: of a shipped one by its bare name, else ``name`` itself.
+    """Return a path, or that of a shipped file by its bare name; ``./name`` is always a path.
 
-    Parameters
-    ----------
-    name
-        a shipped file's name, or a path; a bare name that is shipped comes first, ``./name`` is always a path.
-    shelf
-        where shipped ones lie.
-    ending
-        end of the path: a file in the folder ``name``, or a suffix.
-    field
-        which all files have that a message may offer, as :func:`shipped_files` takes it.
-
-    Raises
-    ------
-    MitsimError
-        for a bare name that is neither shipped nor the name of a file here.
+    ``ending`` is a file inside the folder ``name``, or a suffix. MitsimError for a bare name that is neither shipped
+    nor a file here; it offers shipped files that have the ``field``.
     """
     inside = not ending.startswith(".")
     text, path = str(name), Path(name)
@@ -321,15 +260,7 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"]
 
 
 def shipped_files(shelf: Literal["scenes", "calibration", "sessions"], ending: str, field: str = "") -> dict[str, Path]:
-    """Paths of shipped files by their names.
-
-    Parameters
-    ----------
-    shelf, ending
-        as :func:`locate` takes them.
-    field
-        which each of the files has, where they are TOML: cameras, projectors and lists lie on one shelf.
-    """
+    """Return paths of shipped files by name; of TOML files, those that have the ``field``."""
     if not ending.startswith("."):
         return {path.parent.name: path for path in sorted(shipped_path(shelf).glob(f"*/{ending}"))}
     files = sorted(shipped_path(shelf).glob(f"*{ending}"))
@@ -337,26 +268,21 @@ def shipped_files(shelf: Literal["scenes", "calibration", "sessions"], ending: s
 
 
 _OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)-->|((?:#[^\n]*\n)+)", re.DOTALL)
-"""Comment that opens a scene, or a TOML file."""
 
 
 def opening_words(path: Path) -> tuple[str, str]:
-    """Return the first sentence of the comment that opens a file, and the words after "Serves:" in that comment.
-
-    The file ``path`` is a scene or TOML.
-    """
+    """Return the first sentence of a file's opening comment, and the text after "Serves:" in it."""
     opening = _OPENING.match(path.read_text(encoding="utf-8"))
     if opening is None:
         return "", ""
     text = " ".join((opening[1] or re.sub("(?m)^#", "", opening[2] or "")).split())
-    # A full stop that ends a sentence stands before a capital; "0.90" and "e.g. a sheet" do not.
+    # A full stop that ends a sentence precedes a capital; "0.90" and "e.g. a sheet" do not.
     sentences = re.split(r"(?<=\.) (?=[A-Z])", text)
     serves = next((each for each in sentences if each.startswith(_SERVES)), "")
     return sentences[0], serves.removeprefix(_SERVES).removesuffix(".")
 
 
 def toml_value(value: object) -> str:
-    """Return text, a number, a truth, a list or a table as a TOML file has the ``value``, on one line."""
     import tomli_w
 
     # In a list with a number a table is inline. Line ends are those of lists, because texts have theirs escaped.
@@ -369,7 +295,6 @@ def toml_value(value: object) -> str:
 WHAT, QUALITY, DEVICES = "What", "Quality", "Scene and devices"
 OUTPUT, LIMITS = "Output", "Machine and limits"
 PANELS = WHAT, QUALITY, DEVICES, OUTPUT, LIMITS
-"""Headings of options in the help, in the order of a page."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -382,17 +307,17 @@ def option(default: Any, help: str, *names: str, kind: Any = None, **shown: Any)
     Parameters
     ----------
     default
-        Value of an option that is not given; ``...`` if it must be given.
+        Default value; ``...`` for a required option.
     help
         Sentence of the help.
     names
         Spellings on the command line, if they differ from the field's name.
     kind
-        Type of the word on the command line, if it differs from the field's; False for an option of Python alone.
+        Type on the command line, if it differs from the field's; False for an option of Python alone.
     shown
-        Further arguments of :class:`typer.Option`, such as ``metavar`` and ``show_default``; ``panel``, a heading;
-        ``complete``, which lists words; ``read``, which makes the value of the word; and limits of a number: ``ge``,
-        ``gt``, ``le`` and ``lt``, or ``min`` and ``max`` where the help states them.
+        Arguments of :class:`typer.Option`; ``panel``, a heading; ``complete``, which lists words; ``read``, which
+        converts
+        the word; and limits ``ge``, ``gt``, ``le``, ``lt``, or ``min`` and ``max`` if the help states them.
     """
     limits: Any = {name: shown.pop(name) for name in ("ge", "gt", "le", "lt") if name in shown}
     limits |= {name: shown[own] for name, own in (("ge", "min"), ("le", "max")) if own in shown}
@@ -401,16 +326,15 @@ def option(default: Any, help: str, *names: str, kind: Any = None, **shown: Any)
 
 
 class _Refused(ValueError):
-    """A refusal of ours, which pydantic collects with its own."""
+    """MitsimError wrapped as a ValueError, so that pydantic collects it."""
 
     def of(self, name: str) -> ArgumentError:
-        """Return the refusal as one of the option ``name``."""
         (error,) = self.args
         return error if isinstance(error, ArgumentError) else ArgumentError(name, re.sub(f"^{name}:? ", "", str(error)))
 
 
 def validated_by(check: Callable[[Any], Any]) -> AfterValidator:
-    """Return a validator of a field by a ``check``, which raises MitsimError, and returns the value or nothing."""
+    """Return a field validator from ``check``, which raises MitsimError and returns a new value or None."""
 
     def validate(value: Any) -> Any:
         try:
@@ -429,16 +353,14 @@ def _can_be_path(value: Path | str) -> Path | str:
 
 
 FilePath = Annotated[Path | str, AfterValidator(_can_be_path)]
-"""Path of a file or folder, or the name of a shipped file."""
 
 
 def shipped_names(field: str) -> list[str]:
-    """Return the names of shipped files that have a ``field``, which a shell offers."""
     return [*shipped_files("calibration", ".toml", field)]
 
 
 class Options(BaseModel):
-    """Options that go together. A value that an option cannot have is refused by ArgumentError, which names it."""
+    """Options that belong together; an invalid value raises ArgumentError, which names the option."""
 
     model_config = ConfigDict(
         frozen=True, strict=True, extra="forbid", arbitrary_types_allowed=True, defer_build=True, validate_default=False
@@ -458,7 +380,6 @@ class Options(BaseModel):
 
     @classmethod
     def _refusals(cls, error: ValidationError) -> list[ArgumentError]:
-        """Return the refusal of each option that pydantic found wrong; misspelt names come first."""
         found: dict[str, ArgumentError] = {}
         errors = error.errors(include_url=False)
         for one in sorted(errors, key=lambda one: one["type"] != "extra_forbidden"):
@@ -480,39 +401,29 @@ class Options(BaseModel):
 
     @property
     def given(self) -> dict[str, Any]:
-        """The options that were given, by name."""
+        """Return the options that were given explicitly."""
         return {name: getattr(self, name) for name in type(self).model_fields if name in self.model_fields_set}
 
     def part(self, model: type[M]) -> M:
-        """Return the options that were given of those that another ``model`` has, as that model."""
+        """Return the given options that another ``model`` shares."""
         return model(**{name: value for name, value in self.given.items() if name in model.model_fields})
 
     def without(self, *names: str) -> dict[str, Any]:
-        """Return the options that were given, but for those of some ``names``."""
         return {name: value for name, value in self.given.items() if name not in names}
 
     def refuse(self, names: Iterable[str], where: str) -> None:
-        """Refuse options that are given and have no effect: a user would believe that they are obeyed.
-
-        Parameters
-        ----------
-        names
-            Options without effect.
-        where
-            When they have none, for the message.
-        """
+        """Refuse given options that have no effect under the condition ``where``."""
         refuse_unused(self.model_fields_set, names, where)
 
 
 def refuse_unused(given: Iterable[str], names: Iterable[str], where: str) -> None:
-    """Refuse the first of the ``names`` that is ``given`` and has no effect ``where`` the message says."""
+    """Raise ArgumentError for the first given option that has no effect under the condition ``where``."""
     for name in names:
         if name in given:
             raise ArgumentError(name, f"has no effect {where}; leave it out")
 
 
 def limits_of(field: FieldInfo) -> str:
-    """Return the range of a number that a ``field`` states, in words; empty without one."""
     names, marks, kinds = ("ge", "gt", "le", "lt"), [*field.metadata], [field.annotation]
     for kind in kinds:  # grows, because a number may be optional, or one of several
         kinds += get_args(kind)
@@ -526,16 +437,9 @@ def limits_of(field: FieldInfo) -> str:
 
 
 def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Give a function that ends in ``**options`` the fields of models as keyword arguments in its signature.
+    """Add the fields of ``models``, except those listed in ``without``, as keywords of a function with ``**options``.
 
-    Its other arguments are checked as :func:`mitsim.core.errors.check_arguments` does.
-
-    Parameters
-    ----------
-    models
-        Models of the function's ``**options``.
-    without
-        Fields that the function does not take by keyword, with spaces between.
+    Other arguments are checked as in :func:`mitsim.core.errors.check_arguments`.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -564,6 +468,5 @@ def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]
 
 
 def unknown_option(name: str, function: str, known: Sequence[str]) -> ArgumentError:
-    """Return the refusal of an option that a ``function`` does not have, with those that are ``known``."""
     of = f"option of {function}" if function else "such option"
     return ArgumentError(name, f"is no {of}; {near_name(name, known)}use {', '.join(known)}")

@@ -1,4 +1,4 @@
-"""The machine: a variant's name in, Mitsuba ready to use out; and the checks behind `mitsim doctor`."""
+"""Selection of Mitsuba's variant and of LLVM, and the checks of `mitsim doctor`."""
 
 from __future__ import annotations
 
@@ -27,21 +27,19 @@ from mitsim.core.worker import held_back, workers
 from mitsim.version import __version__
 
 DEFAULT_VARIANT = "llvm_ad_mono"
-"""One panchromatic reflectance, as the factored estimator has it; the others cost time and change nothing else."""
+"""The other variants cost time and do not change monochrome frames."""
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral")
-"""Variants mitsim is tested with, and with cuda_ for llvm_ where there is a GPU (tests/physics/test_cuda.py);
-`load_variant` takes any that the installed Mitsuba has."""
+"""Tested variants, also with cuda_ for llvm_ on a GPU (tests/physics/test_cuda.py)."""
 
 _CHILD_SECONDS = 120
-"""Longest time for a check; chosen so: all of them take some ten, on a busy machine several times that."""
+"""All checks together take about 10 s, on a busy machine several times that."""
 _WARM_SECONDS = 1800
-"""The same for a capture that warms the cache; chosen so: the longest takes 20 on two idle cores."""
+"""The longest capture that warms the cache takes 20 s on two idle cores."""
 _WARM_ACCURACY = "3e-3"
-"""Three times the default, in half the time: plans then have the effects of the default still on."""
+"""Three times the default, because plans still include the default's effects and take half the time."""
 _FEWEST_THREADS = 2
-"""With a pool of one thread, Mitsuba 3.9.1 waits for ever when it reads an OpenEXR file."""
+"""Mitsuba 3.9.1 with a pool of one thread waits for ever when it reads an OpenEXR file."""
 _CACHE = "DRJIT_CACHE_DIR"
-"""Environment variable that names the folder of Dr.Jit's compiled kernels; without it, ~/.drjit."""
 _DRIVERS, _DRIVER_FOLDERS = ("libcuda.so", "libcuda.so.1"), ("x86_64-linux-gnu", "aarch64-linux-gnu", "wsl/lib")
 """Names and folders in which Dr.Jit 1.4 looks for the driver."""
 
@@ -68,8 +66,6 @@ figure.savefig(io.BytesIO(), format="png")
 
 @dataclass(frozen=True)
 class Check:
-    """One finding of the doctor: ``ok`` or not, a detail, and the one command that mends it."""
-
     name: str
     ok: bool
     detail: str
@@ -77,11 +73,10 @@ class Check:
 
 
 def load_variant(name: str) -> ModuleType:
-    """Return Mitsuba with the variant ``name`` set, after choosing an LLVM that works for the llvm_ variants.
+    """Return Mitsuba with the variant ``name`` set, after choosing a working LLVM.
 
-    Setting a variant is Mitsuba's own process-wide state; nothing in mitsim does so except by this call.
-    Raises MitsimError for an unknown variant, a Mitsuba that cannot be imported, a missing LLVM, or a missing GPU.
-    Control-C counts once Mitsuba is there.
+    Only this function changes Mitsuba's process-wide variant. MitsimError for an unknown variant, a Mitsuba that cannot
+    be imported, a missing LLVM, or a missing GPU. Control-C waits until Mitsuba is imported.
     """
     if name.startswith("llvm_"):
         select_llvm()
@@ -110,11 +105,10 @@ def load_variant(name: str) -> ModuleType:
 
 @contextmanager
 def keep_scenes() -> Iterator[None]:
-    """Have Python's collector wait while the context lasts, so that no scene goes while a kernel is put together.
+    """Pause Python's garbage collector, so that no scene is freed while a kernel is assembled.
 
-    A scene that nobody holds, but for a cycle, goes when the collector finds it: at any line. Dr.Jit (1.5.0) counts the
-    objects of all scenes where a call of one begins. If the count changes between two calls of a kernel, a function is
-    in it twice, and LLVM ends the process.
+    Dr.Jit 1.5.0 counts the objects of all scenes at each call. If the collector frees a cyclic scene between two calls
+    of a kernel, one function enters the kernel twice, and LLVM ends the process.
     """
     collecting = gc.isenabled()
     gc.disable()
@@ -127,7 +121,7 @@ def keep_scenes() -> Iterator[None]:
 
 @cache
 def compiled_arrays() -> tuple[ModuleType, ModuleType]:
-    """Dr.Jit's functions, and its arrays on this machine's processors: the same numbers whatever the variant is.
+    """Return Dr.Jit and its arrays on this machine's processors, the same under every variant.
 
     MitsimError for a missing LLVM, or a Dr.Jit that cannot be imported.
     """
@@ -142,7 +136,7 @@ def compiled_arrays() -> tuple[ModuleType, ModuleType]:
 
 
 def check_variant(variant: str) -> None:
-    """ArgumentError for a ``variant`` that light cannot be traced in; MitsimError as :func:`check_driver`."""
+    """Raise ArgumentError for a ``variant`` in which light cannot be traced, or MitsimError as :func:`check_driver`."""
     # CUDA has the same kinds; whether a driver has a GPU too shows when the variant is loaded.
     if variant.replace("cuda_", "llvm_", 1) not in VARIANTS:
         raise ArgumentError("variant", f"{variant!r}: use {', '.join(VARIANTS)}")
@@ -150,7 +144,7 @@ def check_variant(variant: str) -> None:
 
 
 def check_driver(variant: str) -> None:
-    """Raise MitsimError for a cuda_ ``variant`` without an NVIDIA driver that Dr.Jit, which is not imported, finds."""
+    """Raise MitsimError for a cuda_ ``variant`` without an NVIDIA driver; Dr.Jit is not imported."""
     if not variant.startswith("cuda_") or os.environ.get("DRJIT_LIBCUDA_PATH") or not sys.platform.startswith("linux"):
         return  # Dr.Jit knows
     for name in _DRIVERS:
@@ -167,17 +161,14 @@ def _without_gpu(variant: str) -> MitsimError:
 
 
 def has_gpu() -> bool:
-    """Return True if Dr.Jit finds a GPU for the cuda_ variants; never raise for the lack of one.
-
-    It imports Dr.Jit, which reads the path of its LLVM then: not to be asked before an LLVM is chosen.
-    """
+    """Return True if Dr.Jit finds a GPU; choose an LLVM first, because Dr.Jit reads its path when imported."""
     import drjit
 
     return bool(drjit.has_backend(drjit.JitBackend.CUDA))
 
 
 def doctor() -> list[Check]:
-    """Return all checks in order. Checks that can crash or hang run in child processes; all take some ten seconds."""
+    """Run all checks in about 10 s; checks that can crash or hang run in child processes."""
 
     def check_openexr() -> str:
         # Imported here: a broken OpenEXR must be a finding, not the end of the doctor.
@@ -225,22 +216,13 @@ def doctor() -> list[Check]:
 
 
 USUAL_SCENES = "cookie_bag", "gift_card", "metal_blade", "lamp_bench", "cards", "photograph"
-"""Shipped scenes whose captures compile the usual kernels, the longest first: glossy meshes over several surfaces,
-print under varnish, a mirror, lamps, several prints, and one."""
+"""Shipped scenes whose captures compile the usual kernels, slowest first."""
 
 
 def warm_up(variant: str = DEFAULT_VARIANT, scenes: Sequence[str] = USUAL_SCENES) -> Check:
-    """Compile the usual kernels into Dr.Jit's cache, where later runs find them.
+    """Compile the usual kernels into Dr.Jit's cache by capturing ``scenes``.
 
-    Each of the ``scenes`` is captured by a process of its own, one for each processor at a time: in one process Dr.Jit
-    compiles a kernel after the other, whatever the threads. 66 kernels, 37 processor seconds with all that they serve.
-
-    Parameters
-    ----------
-    variant
-        of Mitsuba.
-    scenes
-        shipped ones, or files.
+    Each scene has its own process, because Dr.Jit compiles the kernels of a process one after the other.
     """
 
     def capture(scene: str) -> float:
@@ -278,13 +260,10 @@ def _reinstall(package: str) -> str:
 # newer and a child process has compiled with it.
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
-"""Environment variable by which Dr.Jit finds the library."""
 OLDEST = 17
-"""First version that works: 14 is refused by Dr.Jit 1.5, 15 and 16 abort the process."""
+"""Dr.Jit 1.5 refuses version 14, and versions 15 and 16 abort the process."""
 _NEWEST = 30
-"""Names up to this version are looked for, the probe decides; chosen with years of releases to spare."""
 _PROBE_SECONDS = 60
-"""Longest time for a probe; chosen so: it takes about one, on a busy machine several."""
 
 # minimum and maximum are the operations LLVM 15 and 16 cannot select.
 _PROBE_PROGRAM = """
@@ -298,14 +277,11 @@ assert abs(float(total[0]) - 165.0) < 1e-3, total
 
 @dataclass(frozen=True)
 class Probe:
-    """The outcome of a child process: ``ok`` or not, and a detail."""
-
     ok: bool
     detail: str
 
 
 def install_command() -> str:
-    """Return the one command that installs a fitting LLVM on this machine."""
     if platform.system() == "Darwin":
         return "brew install llvm"
     sudo = "" if os.geteuid() == 0 else "sudo "
@@ -313,7 +289,6 @@ def install_command() -> str:
 
 
 def version(path: Path | str) -> int | None:
-    """Return LLVM's major version by the library's file name at ``path`` (links followed); None if it has none."""
     for name in (Path(path).name, Path(os.path.realpath(path)).name):
         match = re.search(r"libLLVM(?:-|\.so\.)(\d+)", name)
         if match:
@@ -322,7 +297,6 @@ def version(path: Path | str) -> int | None:
 
 
 def candidates() -> list[Path]:
-    """Existing LLVM libraries of version 17 or newer (or unknown), newest first, each file once."""
     by_file: dict[str, Path] = {}
     for path in _names():
         if path.exists() and (version(path) or OLDEST) >= OLDEST:
@@ -331,17 +305,7 @@ def candidates() -> list[Path]:
 
 
 def run_child(program: str, seconds: float, variables: Mapping[str, str] | None = None) -> Probe:
-    """Run a Python program in a child process, which may hang or die.
-
-    Parameters
-    ----------
-    program
-        source text.
-    seconds
-        longest time that it may take.
-    variables
-        environment variables beside this process's own.
-    """
+    """Run a source text in a child process, which may hang or die."""
     try:
         own, command = {**os.environ, **(variables or {})}, [sys.executable, "-c", program]
         done = subprocess.run(command, env=own, capture_output=True, text=True, errors="replace", timeout=seconds)
@@ -356,7 +320,6 @@ def run_child(program: str, seconds: float, variables: Mapping[str, str] | None 
 
 
 def probe(path: Path | str) -> Probe:
-    """Compile and run a small program with the library at ``path`` in a child process."""
     # A cache of its own: a kernel that a good LLVM left in the usual one would make any other look good.
     with tempfile.TemporaryDirectory() as home:
         variables = {VARIABLE: str(path), "PYTHONUSERBASE": site.getuserbase(), "HOME": home, _CACHE: home}
@@ -364,10 +327,7 @@ def probe(path: Path | str) -> Probe:
 
 
 def find_llvm() -> Path:
-    """Return the first library that works: the one DRJIT_LIBLLVM_PATH names, else the newest on this machine.
-
-    Raises MitsimError if the named one is too old or does not work, or if none is found.
-    """
+    """Return the library that DRJIT_LIBLLVM_PATH names, else the newest working one; MitsimError if none works."""
     tried = []
     named = os.environ.get(VARIABLE)
     for path in [Path(named)] if named else candidates():
@@ -386,10 +346,7 @@ def find_llvm() -> Path:
 
 
 def select_llvm() -> Path:
-    """Point Dr.Jit at a proven LLVM by setting DRJIT_LIBLLVM_PATH; to be called before drjit is imported.
-
-    Returns the library's path. Raises MitsimError as `find_llvm` does.
-    """
+    """Set DRJIT_LIBLLVM_PATH to a working LLVM; call this before drjit is imported. Raises as :func:`find_llvm`."""
     path = find_llvm()
     os.environ[VARIABLE] = str(path)
     return path
@@ -407,7 +364,7 @@ def _names() -> Iterator[Path]:
 
 
 def _cached_probe(path: Path) -> Probe:
-    """`probe`, remembering good results on disk: it costs about a second, and start-up should not."""
+    """Return `probe`'s result, cached on disk because a probe takes about a second."""
     import importlib.metadata  # here: it takes 20 ms to import, and no refusal needs it
 
     store = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsim" / "llvm.json"
@@ -434,7 +391,7 @@ def _cached_probe(path: Path) -> Probe:
 # -------- Versions of what computes
 
 DECIDING = ("mitsim", "mitsuba", "drjit", "numpy", "scipy")
-"""Packages of which another version may give other frames from the same seed."""
+"""Packages whose version may change frames for a given seed."""
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
 
 
@@ -452,10 +409,10 @@ def _versions() -> dict[str, str]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of mitsim, Python and the packages that decide the numbers, by name; imports none of them."""
+    """Return the versions of Python and of the :data:`DECIDING` packages without importing them."""
     return dict(_versions())
 
 
 def deciding_versions() -> dict[str, str]:
-    """Return those :func:`versions` that decide frames, which a manifest's configuration holds."""
+    """Return the versions that a manifest's configuration contains."""
     return {name: version for name, version in versions().items() if name in DECIDING}

@@ -1,7 +1,4 @@
-"""The exception for faults that a user can cause and mend, and the check of arguments of public functions.
-
-Arguments of another kind than their annotation says are refused by it in a line.
-"""
+"""Exceptions for faults that a user can repair, and type checks of public functions' arguments."""
 
 from __future__ import annotations
 
@@ -16,14 +13,13 @@ from numbers import Integral, Real
 from typing import ParamSpec, TypeVar
 
 _LONGEST = 1500
-"""Characters of a message: a screen of 80 x 20."""
 
 
 class MitsimError(Exception):
-    """A request that cannot be served; the command line prints it on one line and exits with status 2.
+    """Request that cannot be served; the command line prints it and exits with status 2.
 
     The ``message`` is one line: the fault, its place, the value received, the values allowed, and the remedy. Each of
-    several ``mistakes`` in one file has a line of its own under it. They are printable and not long, even if they quote
+    several ``mistakes`` in one file has its own line. All lines are printable and of limited length, even if they quote
     a hostile file.
     """
 
@@ -32,10 +28,10 @@ class MitsimError(Exception):
 
 
 class ArgumentError(MitsimError):
-    """A value that one argument cannot have; ``argument`` names it.
+    """Invalid value of one ``argument``.
 
-    The ``message`` begins with the argument, as Python spells it; the command line writes it as its option. Where
-    several arguments of a call are wrong, ``others`` has the refusals of the further ones.
+    The ``message`` begins with the argument's name in Python; the command line replaces it by the option. If several
+    arguments of a call are wrong, ``others`` has the further errors.
     """
 
     def __init__(self, argument: str, message: str) -> None:
@@ -44,38 +40,32 @@ class ArgumentError(MitsimError):
         self.others: tuple[ArgumentError, ...] = ()
 
     def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, str]]:
-        """Pickle the refusal by its own arguments, because a process that works for a study hands it back."""
         return ArgumentError, (self.argument, self._message)
 
 
 def printable(text: str) -> str:
-    """Return a ``text`` without characters that a terminal would obey.
-
-    Control characters and those that turn its direction become spaces; line ends stay.
-    """
+    """Return ``text`` with control characters and bidirectional marks replaced by spaces."""
     return "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
 
 
 def cut(text: str, length: int = 60) -> str:
-    """One printable line of ``text``, of at most ``length`` characters."""
     shown = printable(text[: length + 1]).replace("\n", " ")
     return shown if len(text) <= length else shown[: length - 3] + "..."
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the words of a library's ``error`` on one line; its name where it has none."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def near_name(text: str, known: Iterable[str]) -> str:
-    """Return "did you mean NAME? " for the ``known`` name that is nearest to ``text``; empty without one."""
+    """Return "did you mean NAME? " for the nearest ``known`` name, or an empty text."""
     near = difflib.get_close_matches(text, [*known], 1)
     return f"did you mean {near[0]}? " if near else ""
 
 
 # -------- Arguments of public functions
-# Annotations are read as they are written, so that no type of another room is imported for it: a class is known by its
-# name. What a value may be within its kind, such as a range, each function checks itself.
+# Annotations are read as text, and classes are matched by name, so that no other room is imported. Each function checks
+# ranges itself.
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -84,9 +74,9 @@ _ANY = "object", "Any"
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 100
 _LONGEST_PATH, _LONGEST_NAME = 4095, 255
-"""Bytes of a path, and of a name in it, that Linux takes."""
+"""Bytes of a path, and of a name in it, that Linux allows."""
 Kind = tuple[str, Callable[[object], bool]]
-"""What an annotation allows, in words and as a test."""
+"""Allowed values in words, and their test."""
 _KINDS: dict[str, Kind] = {
     "None": ("None", lambda value: value is None),
     "bool": ("True or False", lambda value: type(value).__name__ in ("bool", "bool_")),
@@ -104,9 +94,9 @@ _KINDS: dict[str, Kind] = {
 
 
 def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
-    """Make a public ``function`` refuse arguments of another kind than it is annotated with, by ArgumentError.
+    """Make ``function`` raise ArgumentError for arguments that do not fit its annotations.
 
-    Numbers of NumPy are passed on as Python's. Further keywords are checked by the function's own models.
+    NumPy scalars are converted to Python's. ``**options`` are checked by the function's models.
     """
     signature = inspect.signature(function)
     kinds = {name: _kinds(each.annotation, function) for name, each in signature.parameters.items()}
@@ -130,7 +120,7 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def plain_number(value: object) -> object:
-    """Return a number of NumPy, which is not imported, as Python's; else the ``value`` itself."""
+    """Convert a NumPy scalar to Python's without importing NumPy."""
     if type(value).__module__ != "numpy" or getattr(value, "shape", None) != ():
         return value
     kind = getattr(getattr(value, "dtype", None), "kind", "")
@@ -138,13 +128,13 @@ def plain_number(value: object) -> object:
 
 
 def checked_fields(made: C) -> C:
-    """Make a class refuse arguments when it is called as :func:`check_arguments` does."""
+    """Apply :func:`check_arguments` to a class's constructor."""
     made.__init__ = check_arguments(vars(made)["__init__"])  # type: ignore[misc]
     return made
 
 
 def _kinds(annotation: object, function: Callable[..., object]) -> list[Kind]:
-    """Return the kinds that an ``annotation`` such as ``float | Literal["auto"] | None`` allows; empty: any."""
+    """Return what an annotation such as ``float | Literal["auto"] | None`` allows; empty: anything."""
     if not isinstance(annotation, str) or annotation.startswith("Unpack"):
         return []
     found: list[Kind] = []
@@ -178,7 +168,6 @@ def _is_a(name: str, value: object) -> bool:
 
 
 def _is_number(value: object) -> bool:
-    """Return True if a ``value`` is a number that a float can be."""
     try:
         return not isinstance(value, bool) and isinstance(value, Real) and float(value) is not None
     except OverflowError:
@@ -186,21 +175,16 @@ def _is_number(value: object) -> bool:
 
 
 def _is_real_array(value: object) -> bool:
-    """Return True if a ``value`` is an array of bits, whole or real numbers as NumPy has them, which is not imported.
-
-    A masked array is none, because work would go on with the numbers under its mask.
-    """
+    """Return True if ``value`` is a real or boolean NumPy array without a mask; NumPy is not imported."""
     real = getattr(getattr(value, "dtype", None), "kind", "") in tuple("biuf")
     return real and not is_masked(value) and getattr(value, "ndim", 0) > 0
 
 
 def is_masked(value: object) -> bool:
-    """Return True if a ``value`` is a masked array of NumPy, which is not imported."""
     return _is_a("MaskedArray", value)
 
 
 def short_text(value: object, length: int = 60) -> str:
-    """Return a refused ``value`` on a short line; only its kind if it cannot be written."""
     try:
         return cut(str(os.fspath(value)) if isinstance(value, os.PathLike) else _SHORT.repr(value), length)
     except (TypeError, ValueError, RecursionError):
@@ -208,10 +192,7 @@ def short_text(value: object, length: int = 60) -> str:
 
 
 def is_path(value: object) -> bool:
-    """Return True if a ``value``, text or an object that has some, can be a path.
-
-    An empty one would be the working folder, and for a longer one the operating system has an error of its own.
-    """
+    """Return True if ``value`` can be a path: not empty (the working folder), and not longer than Linux allows."""
     try:
         text = os.fspath(value)  # type: ignore[call-overload]
         data = os.fsencode(text) if isinstance(text, str) else b""

@@ -1,13 +1,8 @@
-"""Frames on disk: named 2-D channels and metadata in, one OpenEXR file out, and back.
+"""Frames as OpenEXR files: named 2-D channels (float32 or uint32, lossless) and metadata.
 
-Channels are float32 (expected electrons, variances) or uint32 (digital numbers), stored losslessly. Every
-metadata entry is a header attribute `mitsim.<key>` holding JSON text: EXR's own numbers are 32-bit and would
-cut seeds and exposure times short.
-
-OpenEXR's own reader takes the header: it allocates nothing by its claims, and damaged ones raise. Three things
-are left to check here. It compares the names of channels with each other, which takes 18 s for a list of 100 000, so it
-is given the beginning of the file alone. It passes over an attribute that claims 2 GB, for which the older reader in
-Mitsuba allocates them. And reading the pixels allocates as much as a header claims, 4 GiB for a file of 300 bytes.
+Metadata are header attributes `mitsim.<key>` of JSON text, because EXR's 32-bit numbers cut seeds and exposure times.
+OpenEXR's reader is given only the beginning of a file, because it compares all channel names with each other; sizes
+that the file cannot hold are refused, because the reader would allocate them.
 """
 
 from __future__ import annotations
@@ -41,23 +36,9 @@ _PREFIX = "mitsim."
 
 
 def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> str:
-    """Write a frame, all or nothing: the file appears under its name only when complete. Returns its :func:`checksum`.
+    """Write a frame, whole or not at all, and return its :func:`checksum`.
 
-    Parameters
-    ----------
-    path
-        of the file.
-    channels
-        (rows, columns) each, of one shape, float32 or uint32; nothing is converted silently.
-    metadata
-        texts and numbers.
-
-    Raises
-    ------
-    TypeError, ValueError
-        for channels or metadata that cannot be stored as they are.
-    MitsimError
-        when the file cannot be written.
+    TypeError or ValueError for channels or metadata that cannot be stored exactly; MitsimError if writing fails.
     """
     if not channels:
         raise ValueError("write_frame: no channels given; a frame needs at least one")
@@ -88,10 +69,9 @@ def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> str
 
 
 def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
-    """Return channels (2-D, float32 or uint32; half floats become float32) and metadata of the frame ``path``.
+    """Return channels (float32 or uint32; half floats become float32) and metadata of a frame.
 
-    Files of other programs are read too; their metadata is then empty. MitsimError for a file that is
-    missing, is not OpenEXR, or is damaged.
+    Metadata of other programs' files are empty. MitsimError for a file that is missing, damaged or not OpenEXR.
     """
     path = Path(path)
     check_plain(path, "frame")
@@ -121,7 +101,7 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
 
 
 def checksum(path: Path | str) -> str:
-    """Return the SHA-256 of the file ``path`` as 64 hexadecimal digits. MitsimError when it cannot be read."""
+    """Return a file's SHA-256; MitsimError if it cannot be read."""
     digest = hashlib.sha256()
     check_plain(path)
     try:
@@ -134,21 +114,9 @@ def checksum(path: Path | str) -> str:
 
 
 def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -> None:
-    """Check that a file is the one whose checksum was noted; files without one are taken as they are.
+    """Compare a file with its recorded SHA-256 in ``checksums``; a file without one passes.
 
-    Parameters
-    ----------
-    folder, name
-        of the file.
-    checksums
-        SHA-256 by name.
-    remedy
-        advice where they differ.
-
-    Raises
-    ------
-    MitsimError
-        when they differ, or the name leads out of the folder by a link.
+    MitsimError, with the ``remedy``, if they differ, or if a link leads out of the folder.
     """
     if not resolve(folder / name).is_relative_to(resolve(folder)):
         raise MitsimError(f"{folder / name}: leads out of its folder; copy the file there")
@@ -158,15 +126,7 @@ def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -
 
 
 def verify_files(folder: Path, stated: object, remedy: str) -> None:
-    """Check that all files of a ``folder`` whose checksums were noted are there, and those that were written.
-
-    Parameters
-    ----------
-    folder, remedy
-        as for :func:`verify`.
-    stated
-        SHA-256 by name, as a file in the folder holds them; anything else states none.
-    """
+    """Check that all files in ``folder`` with recorded checksums exist and are unchanged."""
     for name, value in stated.items() if isinstance(stated, dict) else ():
         if not is_path(name):
             raise MitsimError(f"{folder}: notes a checksum of {cut(name)!r}, which names no file; {remedy}")
@@ -174,22 +134,7 @@ def verify_files(folder: Path, stated: object, remedy: str) -> None:
 
 
 def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
-    """Return one channel of a frame in double precision.
-
-    Parameters
-    ----------
-    channels
-        of the frame, (rows, columns) each.
-    name
-        of the one that is needed.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        when it is not there, or holds a value that is not finite.
-    """
+    """Return channel ``name`` in double precision; MitsimError if it is missing or not finite."""
     if name not in channels:
         raise MitsimError(f"{path}: channels are {', '.join(channels)}; {name} is needed")
     values = channels[name].astype(np.float64)
@@ -203,27 +148,23 @@ def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
 # -------- An OpenEXR file's path in
 
 MAGIC = b"\x76\x2f\x31\x01"
-"""First bytes of every OpenEXR file."""
 _ATTRIBUTE = re.compile(rb"[^\0]{1,255}\0[^\0]{1,255}\0(.{4})", re.DOTALL)
-"""Name, type and length of an attribute, after the document "OpenEXR File Layout" (openexr.com)."""
+"""Name, type and length of an attribute, after "OpenEXR File Layout" (openexr.com)."""
 _CHANNEL = re.compile(rb"[^\0]{1,255}\0([\0-\2])\0{3}.{12}", re.DOTALL)
 """Name and type of a channel in the attribute `channels`."""
 _HEADER_BYTES = 1 << 18
-"""Far more than the header of a frame; a list of channels that fits takes 0.15 s."""
+"""Far more than a frame's header; a list of channels that fits takes 0.15 s."""
 _LARGEST_RATIO = 1100
-"""Deflate cannot shrink more than 1032 times; a small file of any compression may claim ``_SMALL`` bytes."""
+"""Deflate shrinks at most 1032 times; files that claim less than ``_SMALL`` bytes are not checked."""
 _SMALL = 1 << 24
-"""16 MiB, so that an even image of 2048 x 2048 pixels is read whatever compresses it."""
+"""Lets a uniform image of 2048 x 2048 pixels pass under every compression."""
 _MOST_BYTES = 4 << 30
 """Four float32 channels of the largest sensor."""
 _MOST_CHANNELS = 64
-"""More than any renderer writes into one part."""
 
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """Size in pixels, number of channels and their types (uint, half, float) of a plain scan-line image."""
-
     width: int
     height: int
     channels: int
@@ -231,15 +172,10 @@ class ExrHeader:
 
 
 def read_header(path: Path) -> ExrHeader:
-    """Return the header of the file at ``path``, checked against the file's own size.
+    """Return the header of a file, checked against the file's size.
 
-    Raises
-    ------
-    ValueError
-        when the file is no OpenEXR image of one part and of scan lines, holds other pixels than those that are to be
-        shown, or claims more than it can hold. (Mitsuba crashes on data windows that begin below zero.)
-    OSError
-        when it cannot be read.
+    ValueError if it is no single-part scan-line image, or claims more than the file can hold, or if the data window is
+    not the display window (Mitsuba crashes on negative ones); OSError if it cannot be read.
     """
     size = os.stat(path).st_size
     with open(path, "rb") as file:

@@ -1,4 +1,4 @@
-"""Places to write to: checked before any work, held against other processes, and filled with whole files only."""
+"""Output places that are checked before work, locked against other processes, and filled with whole files only."""
 
 from __future__ import annotations
 
@@ -19,24 +19,23 @@ from typing import Any, Literal
 from mitsim.core.errors import MitsimError, cut
 
 LOCK = ".mitsim.lock"
-"""Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock. That
-of a file stands beside it, the file's name before this."""
+"""The writing process holds a lock on it; a killed process leaves the file but not the lock. A file's lock is a hidden
+file beside it."""
 _NAME_BYTES = 120
-"""Of a file's name that hidden files beside it begin with, so that none of theirs passes the 255 of a file system."""
+"""Keeps names of hidden files below the limit of 255 bytes."""
 _KINDS = {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_HEAD = 1 << 20
-"""An unfinished manifest is a few kB; what is larger is not looked into."""
 FRAMES, PARTS = "frame_*.exr", "*.part.npz"
-"""What an unfinished capture and an unfinished calibration have finished, as their folders name it."""
+"""Files that an unfinished capture or calibration has completed."""
 PAIRS, SHARDS = "pairs.json", "pairs_*.h5"
-"""Manifest of a store of pairs, and what an unfinished one has finished."""
+"""Manifest of a store of pairs, and files that an unfinished store has completed."""
 
 
 @contextmanager
 def whole_file(path: Path | str) -> Iterator[Path]:
-    """Yield a name beside ``path`` to write to, which takes its place on leaving, and is removed after an error.
+    """Yield a temporary name that replaces ``path`` on leaving and is removed after an error.
 
-    MitsimError when the file cannot be written, or is no plain file; a link stays, and its file is replaced.
+    MitsimError if the file cannot be written or is no plain file. A link's target is replaced.
     """
     path = Path(path)
     _check_name(path)
@@ -58,14 +57,13 @@ def whole_file(path: Path | str) -> Iterator[Path]:
 
 
 def write_bytes(path: Path | str, data: bytes) -> str:
-    """Write ``data`` to ``path``, all or nothing; return their SHA-256. MitsimError when they cannot be written."""
+    """Write ``data``, whole or not at all, and return the SHA-256; MitsimError if that fails."""
     with whole_file(path) as part:
         part.write_bytes(data)
     return hashlib.sha256(data).hexdigest()
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write ``text`` to ``path`` in UTF-8, all or nothing. MitsimError when it cannot be written."""
     try:
         data = text.encode()
     except UnicodeEncodeError as error:
@@ -74,11 +72,9 @@ def write_text(path: Path | str, text: str) -> None:
 
 
 PAGE, PICTURES = "report.html", "pictures"
-"""What shows a folder to people, and the folder of the pictures in it."""
 
 
 def remove_page(folder: Path) -> None:
-    """Remove the page of a ``folder`` and its pictures, because the content that it shows is about to change."""
     (folder / PAGE).unlink(missing_ok=True)
     for picture in (folder / PICTURES).glob("*.png"):
         picture.unlink()
@@ -87,34 +83,21 @@ def remove_page(folder: Path) -> None:
 
 
 _PART = ".*.part"
-"""What files are called while they are written; a killed process leaves them behind."""
 _UNFINISHED = ".mitsim.part"
-"""Mark of a folder whose files appear together, until they are all there."""
+"""Marks a folder whose files must appear together until all are there."""
 
 
 def sweep(folder: Path) -> None:
-    """Remove half-written files of killed processes from a ``folder`` that this one holds, and from its pictures."""
+    """Remove half-written files of killed processes from a ``folder`` that this process has locked."""
     for part in (*folder.glob(_PART), *(folder / PICTURES).glob(_PART)):
         part.unlink(missing_ok=True)
 
 
 def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> Path:
-    """Make sure, before any work, that output can be written; nothing is deleted.
+    """Check, before any work, that output can be written, and create a missing folder; nothing is deleted.
 
-    Parameters
-    ----------
-    path
-        the place; a folder is created if its parent exists.
-    overwrite
-        whether it may be a folder that holds files already, or an existing file.
-    kind
-        ``folder`` or ``file``.
-
-    Raises
-    ------
-    MitsimError
-        when the parent is missing, or the place is not writable, is of the other kind, holds something and
-        ``overwrite`` is off, or has a name that is not UTF-8, which OpenEXR cannot open.
+    MitsimError if the parent is missing, or the place is not writable, is of the other kind, holds something without
+    ``overwrite``, or has a name that is not UTF-8, which OpenEXR cannot open.
     """
     path = Path(path)
     _check_name(path)
@@ -150,7 +133,6 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
 
 
 def _check_name(path: Path) -> None:
-    """MitsimError for a name that OpenEXR and HDF5 cannot open."""
     try:
         os.fspath(path.absolute()).encode()
     except UnicodeEncodeError:
@@ -158,18 +140,7 @@ def _check_name(path: Path) -> None:
 
 
 def check_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> None:
-    """Refuse a place that :func:`prepare_output` would refuse, before slow imports; nothing is left behind.
-
-    Parameters
-    ----------
-    path, overwrite, kind
-        as there.
-
-    Raises
-    ------
-    MitsimError
-        as there.
-    """
+    """Refuse the same as :func:`prepare_output`, before slow imports, and leave nothing behind."""
     new = not os.path.lexists(path)
     try:
         prepare_output(path, overwrite, kind)
@@ -181,11 +152,9 @@ def check_output(path: Path | str, overwrite: bool = False, kind: Literal["folde
 
 @contextmanager
 def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """Hold the folder ``path`` for the time of a work, in which no other process may claim it.
+    """Lock an output folder, and remove a new one if the work fails before writing.
 
-    ``overwrite`` allows one that holds files. If the work fails before writing, a new folder is removed.
-
-    MitsimError as for :func:`prepare_output`, and when another process holds the folder.
+    MitsimError as for :func:`prepare_output`, and if another process has locked the folder.
     """
     new = not Path(path).exists()
     folder = prepare_output(path, overwrite)
@@ -203,12 +172,7 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """Hold the file ``path`` for the time of a work, in which no other process may claim it.
-
-    ``overwrite`` allows one that exists.
-
-    MitsimError as for :func:`prepare_output`, and when another process holds the file.
-    """
+    """Lock an output file; MitsimError as for :func:`output_folder`."""
     path = prepare_output(path, overwrite, "file")
     target = resolve(path)
     with _lock(path, _beside(target, LOCK)):
@@ -219,20 +183,7 @@ def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
 
 
 def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
-    """Refuse to replace a file that a work reads.
-
-    Parameters
-    ----------
-    path
-        its output.
-    inputs
-        files that it reads, and folders of which it reads files.
-
-    Raises
-    ------
-    MitsimError
-        when the output is one of the files, by whatever name, or a file in one of the folders.
-    """
+    """Raise MitsimError if the output ``path`` is one of ``inputs``, or a file in an input folder."""
     place = resolve(path)
     for each in map(Path, inputs):
         same = place == resolve(each) or (place.exists() and each.exists() and place.samefile(each))
@@ -242,11 +193,9 @@ def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
 
 @contextmanager
 def whole_folder(path: Path | str) -> Iterator[Path]:
-    """Hold the new or empty folder ``path`` for files that appear together.
+    """Lock a new or empty folder whose files appear together or, after an error, not at all.
 
-    After an error none of them is left, and the next process removes those of a killed one.
-
-    MitsimError as for :func:`output_folder`.
+    The next process removes files of a killed one. MitsimError as for :func:`output_folder`.
     """
     if (Path(path) / _UNFINISHED).is_file():
         with _lock(Path(path), Path(path) / LOCK):
@@ -268,13 +217,12 @@ def _empty(folder: Path) -> None:
 
 
 def _beside(path: Path, ending: str) -> Path:
-    """Return a hidden name in the folder of ``path`` that begins as its own."""
     name = path.name.encode()[:_NAME_BYTES].decode(errors="ignore")
     return path.with_name(f".{name}{ending}")
 
 
 def _check_plain(path: Path) -> None:
-    """MitsimError where ``path`` leads to a device, a named pipe or a socket, which a file would replace."""
+    """Raise MitsimError if ``path`` is a device, pipe or socket, which a file would replace."""
     try:
         mode = path.stat().st_mode
     except OSError:
@@ -286,7 +234,6 @@ def _check_plain(path: Path) -> None:
 
 @contextmanager
 def _lock(path: Path, name: Path) -> Iterator[None]:
-    """Hold the lock of the output ``path``, whose file has this ``name``; MitsimError where another process does."""
     from filelock import FileLock, Timeout  # here: it takes 20 ms to import, and no refusal needs it
 
     lock = FileLock(name)
@@ -302,7 +249,7 @@ def _lock(path: Path, name: Path) -> Iterator[None]:
 
 
 def _unfinished_work(folder: Path) -> str:
-    """Return the number of files that a killed work finished, and how to go on; nothing when there are none."""
+    """Return the number of files that a killed work finished and how to resume it, or an empty text."""
     try:
         name = PAIRS if (folder / PAIRS).is_file() else "manifest.json"
         manifest = json.loads(read_text(folder / name, _LONGEST_HEAD))
@@ -319,15 +266,11 @@ def _unfinished_work(folder: Path) -> str:
 # -------- JSON files
 
 MOST_BYTES = 32 << 20
-"""A little more than the largest manifest that a capture writes: 65536 shots of 4096 x 256 patterns make 29 MB."""
+"""A little more than the largest manifest of a capture: 65536 shots of 4096 x 256 patterns make 29 MB."""
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` as JSON can hold it.
-
-    Arrays become lists, paths text, pydantic models dictionaries, NaN and infinities null (JSON has no such numbers).
-    TypeError for anything else.
-    """
+    """Convert to JSON types; NaN and infinities become null, TypeError for unknown types."""
     if hasattr(value, "model_dump"):
         value = value.model_dump()
     if hasattr(value, "tolist"):  # arrays and numbers of numpy, which plain data can do without
@@ -346,17 +289,15 @@ def plain(value: Any) -> Any:
 
 
 def json_text(obj: Any) -> str:
-    """``obj`` (see :func:`plain`) as indented JSON."""
     return json.dumps(plain(obj), indent=1, allow_nan=False) + "\n"
 
 
 def write_json(path: Path | str, obj: Any) -> None:
-    """Write ``obj`` to ``path`` as :func:`json_text`, all or nothing. MitsimError when the file cannot be written."""
     write_text(path, json_text(obj))
 
 
 def parse_json(text: str) -> Any:
-    """Return the object in a JSON ``text``. ValueError when it is none, has a key twice, or is nested too deep."""
+    """Parse JSON; ValueError if it is invalid, repeats a key, or is nested too deep."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         unique: dict[str, Any] = {}
@@ -373,16 +314,11 @@ def parse_json(text: str) -> Any:
 
 
 BYTE_ORDER_MARK = "\ufeff"
-"""Which editors of Windows begin a file with."""
+"""Editors of Windows begin files with it."""
 
 
 def read_json(path: Path | str) -> Any:
-    """Return the object in the JSON file ``path`` of at most 32 MiB.
-
-    MitsimError when it cannot be read, is not JSON, or has a key twice.
-
-    MitsimError when it cannot be read, is not JSON, or has a key twice.
-    """
+    """Return the object in a JSON file of at most 32 MiB; MitsimError if it is unreadable, invalid or repeats a key."""
     try:
         return parse_json(read_text(path, MOST_BYTES).removeprefix(BYTE_ORDER_MARK))
     except ValueError as error:
@@ -393,27 +329,19 @@ def read_json(path: Path | str) -> Any:
 
 _silence = threading.RLock()
 MOST_SIDE = 16384
-"""Pixels a side of the largest picture that is read: of the largest sensor and environment map that are simulated."""
+"""Pixels a side of the largest sensor or environment map."""
 MOST_PIXELS = 1 << 26
-"""Of a frame or other picture, 8192 x 8192: sixteen times the largest sensors that coded masks are used with (2048 a
-side); an import of one predicts 1.7 GB and takes 2.5 s of processor time. Of a larger sensor a region or binned frames
-are read."""
+"""Pixels of a frame, 8192 x 8192: sixteen times the largest sensors used with coded masks. An import of one frame takes
+1.7 GB and 2.5 s; of a larger sensor, a region or binned frames are read."""
 FRAME_LIMITS = f"at most {MOST_SIDE} pixels a side and {MOST_PIXELS} in all"
-"""For messages."""
 
 
 def fits_a_frame(shape: Sequence[int]) -> bool:
-    """Return True if a picture of this ``shape`` (rows, columns) is no larger than a frame may be."""
     return max(shape, default=0) <= MOST_SIDE and math.prod(shape) <= MOST_PIXELS
 
 
 def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
-    """Return the status of the plain file ``path``, called ``what`` in errors.
-
-    MitsimError when it cannot be looked at, or is a folder, pipe or device, from which reading may never end.
-
-    MitsimError when it cannot be looked at, or is a folder, pipe or device, from which reading may never end.
-    """
+    """Return the status of a plain file; MitsimError if it is missing, or a folder, pipe or device."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -426,20 +354,15 @@ def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
 
 
 def resolve(path: Path | str) -> Path:
-    """Return the place that ``path`` leads to, links followed as far as they lead.
-
-    ``Path.resolve`` raises RuntimeError for a link that leads to itself, before Python 3.13.
-    """
+    """Follow links; a link to itself does not raise, unlike ``Path.resolve`` before Python 3.13."""
     return Path(os.path.realpath(path))
 
 
 @contextmanager
 def stderr_silenced() -> Iterator[None]:
-    """Drop lines that native code writes to stderr about a damaged file, past Python, because it raises too.
+    """Suppress lines that native code writes to stderr about a damaged file, because Python raises an error, too.
 
-    One thread at a time, so that two do not restore each other's stream.
-
-    One thread at a time, so that two do not restore each other's stream.
+    Only one thread at a time may do so, or two would restore each other's stream.
     """
     with _silence:
         stderr = os.dup(2)
@@ -453,12 +376,7 @@ def stderr_silenced() -> Iterator[None]:
 
 
 def read_text(path: Path | str, most: int) -> str:
-    """Return the UTF-8 text of the plain file ``path``.
-
-    MitsimError as ``check_plain``, and for over ``most`` bytes; ValueError when it is no UTF-8.
-
-    MitsimError as ``check_plain``, and for over ``most`` bytes; ValueError when it is no UTF-8.
-    """
+    """Return a plain file's text; MitsimError for over ``most`` bytes, ValueError if it is not UTF-8."""
     size = check_plain(path).st_size
     if size > most:
         raise MitsimError(f"file {path}: has {size} bytes; at most {most} are allowed")

@@ -1,10 +1,4 @@
-"""A list's or command line's words on pictures in: which are read, how, and how they become frames; file names out.
-
-Files of a folder are in the order of their numbers.
-
-None is opened here, and numpy is not imported, so that a mistake is reported at once. `mitsim.core.images` reads
-numbers, `mitsim.core.prepare` makes frames of them.
-"""
+"""Options for reading pictures, and lists of picture files, without importing numpy."""
 
 from __future__ import annotations
 
@@ -24,33 +18,31 @@ if TYPE_CHECKING:
     import numpy as np
 
 FORMATS = (".png", ".tif", ".tiff", ".npy", ".exr", ".dng")
-"""Endings of files that say themselves what they hold."""
+"""Formats whose header describes the content."""
 JPEG = (".jpg", ".jpeg")
-"""Endings of pictures that no frames are read from."""
+"""Pictures that are not read as frames."""
 PRINTS = (*FORMATS[:-1], *JPEG)
-"""Of files that pictures to put on a sheet are taken of: all but a camera's raw files."""
+"""Formats of pictures for prints: all but raw files of cameras."""
 BARE = (".raw", ".bin", ".dat")
-"""Endings of files without a header."""
+"""Formats without a header."""
 _Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
 _Place = Annotated[int, Field(ge=0, lt=MOST_SIDE)]
 PLANES = ("r", "gb", "gr", "b")
-"""Planes of a mosaic of colour filters, as FlatCam names them: gb is the green one in the rows of blue pixels."""
+"""FlatCam's names: gb is the green plane in the rows of blue pixels."""
 ALL = "all"
-"""In a plane's place: every one."""
 WAVELENGTHS_NM = 600.0, 540.0, 460.0
-"""Of red, green and blue planes, where nobody says others [nm]: middles of what usual filters pass, as those of
-calibration/ov5647.toml."""
+"""Default wavelengths of red, green and blue planes [nm], as in calibration/ov5647.toml."""
 _Wavelength = Annotated[float, Field(ge=1, le=1e6)]
 BGGR = "BGGR"
-"""The mosaic of cameras that do not state theirs: FlatCam's."""
+"""Default mosaic, FlatCam's."""
 CORRECTIONS = "dark", "flat", "flat_dark"
 """Fields of a preparation that are paths of frames."""
 TO_FILE = "file"
 """The orientation that a file states."""
 _LARGEST_TURN = 45.0
-"""Degrees: what is turned by more is turned by an orientation first, or no corner of it stays."""
+"""Degrees; beyond, no corner of the picture would remain."""
 _LARGEST_FACTOR = 1 << 24
-"""Of whole numbers that single precision tells apart: no camera's numbers lie farther from each other."""
+"""Whole numbers that single precision resolves."""
 
 
 class Raw(Configuration):
@@ -59,21 +51,13 @@ class Raw(Configuration):
     shape: tuple[_Side, _Side] = Field(strict=False)
     """Rows and columns."""
     bits: int = Field(ge=1, le=32)
-    """Of a number; up to 8 take a byte, up to 16 two, up to 32 four."""
+    """Bits of a number; up to 8 take a byte, up to 16 two, up to 32 four."""
     byte_order: Literal["little", "big"] = "little"
-    """Which byte of a number comes first."""
+    """Order of the bytes of a number."""
 
     @classmethod
     def of(cls, shape: str, bits: int | None, byte_order: str) -> Raw:
-        """Make one of words of the command line; MitsimError for words that are none.
-
-        Parameters
-        ----------
-        shape
-            ROWSxCOLUMNS.
-        bits, byte_order
-            as the class has them.
-        """
+        """Return a Raw from words of the command line; MitsimError for invalid ones."""
         sides = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", shape)
         if not sides or not all(0 < int(side) <= MOST_SIDE for side in sides.groups()):
             raise ArgumentError("shape", f"{shape!r}: give ROWSxCOLUMNS, 1 to {MOST_SIDE} each")
@@ -85,7 +69,6 @@ class Raw(Configuration):
 
     @property
     def kind(self) -> np.dtype[Any]:
-        """The type of a number."""
         import numpy as np  # here: most who state it read no numbers
 
         width = 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4
@@ -100,13 +83,13 @@ class Crop(Configuration):
     column: _Place = 0
     """First column."""
     rows: _Side | None = None
-    """How many; none: all that follow."""
+    """Number of rows; none: all that follow."""
     columns: _Side | None = None
-    """How many; none: all that follow."""
+    """Number of columns; none: all that follow."""
 
     @classmethod
     def of(cls, text: str) -> Crop:
-        """Make one of the ``text`` ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS of a command line; MitsimError for another."""
+        """Return a Crop from ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS; MitsimError for another ``text``."""
         numbers = re.fullmatch(r"([0-9]{1,5}),([0-9]{1,5})(?:,([0-9]{1,5}),([0-9]{1,5}))?", text)
         if not numbers:
             raise ArgumentError("crop", f"{text!r}: give ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS [pixels]")
@@ -118,28 +101,29 @@ class Preparation(Configuration):
     """Steps that make a frame of a file's numbers, in the order of these fields."""
 
     divide_by: int | None = Field(default=None, ge=1, le=_LARGEST_FACTOR)
-    """Factor that all numbers have; none: found, where a camera's numbers were shifted to the high bits."""
+    """Common factor of all numbers; none: determined, if a camera's numbers were shifted to the high bits."""
     dark: str | None = None
-    """Frame without any light, or a folder of such, whose mean is taken off; a path from the list's folder."""
+    """Frame without any light, or a folder of such frames, whose mean is subtracted; a path from the list's folder."""
     flat: str | None = None
-    """Frame, or a folder of such, of even light and no mask: its mean, over its own mean, divides frames."""
+    """Frame of uniform light without mask, or a folder of such frames; frames are divided by its mean, normalised to 1.
+    """
     flat_dark: str | None = None
-    """Frames without light of the flat's exposure; none: those of `dark`, or the black level."""
+    """Frames without light at the flat's exposure; none: those of `dark`, or the black level."""
     mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
     """Colour filters of the first 2 x 2 pixels, row by row; none: the camera file's, else BGGR."""
     channel: Literal["r", "gb", "gr", "b", "all"] | None = None
-    """Plane of the mosaic that is taken, or all of them; none: the picture is no mosaic."""
+    """Plane of the mosaic, or `all`; none: the picture is no mosaic."""
     wavelengths_nm: Annotated[tuple[_Wavelength, ...], Field(strict=False, min_length=3, max_length=3)] = WAVELENGTHS_NM
-    """What red, green and blue planes count as in a colour image [nm]."""
+    """Wavelengths of red, green and blue planes in a colour image [nm]."""
     orientation: Literal["file", 1, 2, 3, 4, 5, 6, 7, 8] | None = None
-    """How to turn the picture or plane: an orientation of Exif and TIFF, or as the file says; none: as it is stored,
-    and a file that is to be shown turned is refused."""
+    """Rotation of the picture or plane: an orientation of Exif and TIFF, or `file` for the stated one; none: not
+    rotated, and a file that states a rotation is refused."""
     turn_deg: float = Field(default=0.0, ge=-_LARGEST_TURN, le=_LARGEST_TURN)
-    """Angle that it is turned by after that, counter-clockwise [degrees], by bilinear interpolation."""
+    """Angle of a further counter-clockwise rotation [degrees], by bilinear interpolation."""
     turn_about: Literal["centre", "corner"] = "centre"
-    """What stays in place: the middle of the picture, or the centre of its first pixel."""
+    """Fixed point of that rotation: the middle of the picture, or the centre of its first pixel."""
     crop: Crop | None = None
-    """The part that is taken in the end; none: all, or as much as a calibration has, from the middle of a plane."""
+    """Final crop; none: the whole picture, or for a calibrated plane the middle part of the calibration's size."""
 
     @model_validator(mode="after")
     def _is_whole(self) -> Preparation:
@@ -153,7 +137,7 @@ class Preparation(Configuration):
 
 
 def planes_of(mosaic: str) -> dict[str, tuple[int, int]]:
-    """First row and column of each of the :data:`PLANES` of a ``mosaic`` such as RGGB."""
+    """Return the first row and column of each of the :data:`PLANES`."""
     places = {(index // 2, index % 2): colour.lower() for index, colour in enumerate(mosaic)}
     names = {
         colour if colour != "g" else colour + places[row, 1 - column]: (row, column)
@@ -163,7 +147,6 @@ def planes_of(mosaic: str) -> dict[str, tuple[int, int]]:
 
 
 def check_channel(name: str) -> str:
-    """Return the ``name`` if a plane is called so, or all are; ArgumentError otherwise."""
     if name not in (*PLANES, ALL):
         raise ArgumentError("channel", f"{name!r}: use {', '.join(PLANES)} or {ALL}")
     return name
@@ -171,24 +154,18 @@ def check_channel(name: str) -> str:
 
 @dataclass(frozen=True)
 class Wanted:
-    """The kind of pictures, and the files that are read.
+    """Kind of pictures to read.
 
     Attributes
     ----------
-    what
-        that they are of, for messages.
-    most
-        pixels a side.
     bits
-        of a number in PNG and TIFF files. Frames have none of 2 and 4, which Pillow spreads over 0 to 255.
-    colour
-        whether red, green and blue of 8 bits are read too.
+        Allowed bits of PNG and TIFF; frames exclude 2 and 4, which Pillow scales to 0 to 255.
     raw
-        how files without a header are read; None: such files are refused.
+        Layout of files without a header; None: such files are refused.
     orientation
-        of pictures that are to be shown turned: None: they are refused; `file`: turned so; a number: read as stored.
+        Treatment of pictures with an orientation. None: refused; `file`: turned as stated; a number: read as stored.
     mosaic
-        colour filters that the frames are behind; None: nobody says. A file that states others is refused.
+        Colour filters of the frames, or None; a file that states others is refused.
     """
 
     what: str = "frame"
@@ -201,33 +178,17 @@ class Wanted:
 
     @classmethod
     def of(cls, raw: Raw | None, how: Preparation) -> Wanted:
-        """Frames without a header as ``raw`` says, to be prepared as ``how`` does."""
         return cls(raw=raw, orientation=how.orientation, mosaic=how.mosaic)
 
     def refusal(self, path: Path, reason: str) -> MitsimError:
-        """Return a line with the ``reason`` why the file ``path`` is not read."""
         return MitsimError(f"{self.what} {path}: {reason}")
 
 
 FRAME = Wanted()
-"""Frames of a camera, in files with a header."""
 
 
 def image_files(source: Path, wanted: Wanted = FRAME) -> tuple[Path, ...]:
-    """Pictures in a folder, in the order of the numbers in their names: shot 10 comes after shot 9.
-
-    Parameters
-    ----------
-    source
-        the folder; or a file, which is then all.
-    wanted
-        files without a header count where they can be read.
-
-    Raises
-    ------
-    MitsimError
-        where there is none.
-    """
+    """Return the pictures in a folder, sorted by the numbers in their names; MitsimError if there are none."""
     if not source.is_dir():
         check_plain(source, wanted.what)
         return (source,)

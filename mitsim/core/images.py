@@ -1,10 +1,7 @@
-"""Pictures of other programs in, their numbers out; and numbers in, pictures for people out.
+"""Numbers of pictures (PNG, TIFF, NPY, OpenEXR, DNG and bare numbers), and PNG and HTML for people.
 
-PNG, TIFF, NPY, OpenEXR, DNG and bare numbers are read. People get PNG bytes and the text that shows them in a notebook.
-
-Nothing is scaled, inverted or made grey, and turned only where that is asked for: a file whose numbers its reader would
-change is refused. A header's claims
-are bounded before pixels are read, and files are copied, not mapped: one that is cut short meanwhile is refused.
+Nothing is scaled, inverted or converted to grey, and a picture is turned only on request; a file whose numbers the
+library would change is refused. Files are copied, not mapped, because a mapped file that is cut short ends the process.
 """
 
 from __future__ import annotations
@@ -36,98 +33,63 @@ if TYPE_CHECKING:
 # -------- Pictures of other programs
 
 Numbers = npt.NDArray[Any]
-"""(rows, columns) numbers of a picture: whole, or real; where colours are wanted, (rows, columns, 3 or 4)."""
+"""(rows, columns) whole or real numbers of a picture, or (rows, columns, 3 or 4) in colour."""
 _PNG_BITS = {"1": 1, "L;2": 2, "L;4": 4, "L": 8, "I;16B": 16}
-"""Of a grey number in a PNG, by Pillow's name of how it is stored."""
+"""Bits of a grey PNG by Pillow's mode."""
 _COLOURS_A_PIXEL = 3, 4
-"""Numbers of a pixel in colour, without and with transparency: pages of so few columns are none of a camera."""
 _COLOURS = "RGB", "RGBA"
-"""The same of numbers of 8 bits of red, green and blue."""
 _BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLES = 258, 259, 262, 339
-"""Tags of TIFF 6.0: BitsPerSample, Compression, PhotometricInterpretation, SampleFormat."""
+"""TIFF 6.0: BitsPerSample, Compression, PhotometricInterpretation, SampleFormat."""
 _BIG = 43
-"""Version of a TIFF whose places have 8 bytes, and numbers of entries too (BigTIFF)."""
+"""Version number of BigTIFF."""
 _BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
-"""Of TIFF and BigTIFF."""
+"""Magic numbers of TIFF and BigTIFF."""
 _DNG_VERSION = 50706
-"""Tag that every DNG has in its first page (Digital Negative Specification 1.4)."""
+"""Tag in the first page of every DNG (Digital Negative Specification 1.4)."""
 _PLAIN = 1
-"""Compression of a TIFF that has none."""
 _LOSSY = (6, 7)
-"""Compressions of TIFF by JPEG (TIFF 6.0; its technical note 2)."""
+"""JPEG compressions of TIFF (TIFF 6.0, technical note 2)."""
 _PAGE_KIND, _ORIENTATION, _TILES, _PARTS = 254, 274, (322, 323), 330
-"""Tags of TIFF 6.0: NewSubfileType, Orientation, TileWidth and TileLength; SubIFDs of TIFF/EP, where raw files keep
-the picture itself."""
+"""NewSubfileType, Orientation, TileWidth and TileLength, and SubIFDs of TIFF/EP, where raw files keep the picture."""
 _NO_PAGE = 0b101
-"""Bits of NewSubfileType: a reduced picture of another page, a mask of one."""
+"""Bits of NewSubfileType: reduced picture, transparency mask."""
 _TILE_MARGIN = 1024
-"""Pixels by which a tile may exceed a picture, chosen beyond usual tiles (64 to 512): readers allocate whole ones."""
+"""Readers allocate whole tiles, so a tile may not exceed its picture by more pixels; usual tiles have 64 to 512."""
 _UPRIGHT = 1
-"""Orientation of a picture whose row 0 is at the top and column 0 at the left, as stored."""
 _TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (-1, True), 6: (-1, False), 7: (1, True)}
 _TURNS[8] = (1, False)
-"""Quarters of a turn counter-clockwise, and whether left and right change places after it, by orientation (TIFF 6.0,
-tag 274)."""
+"""Counter-clockwise quarter turns, and whether left and right are swapped afterwards (TIFF 6.0, tag 274)."""
 _MOST_PAGES = 1 << 16
-"""Of a file: as many as shots of a run."""
 _MOST_ENTRIES = 512
-"""Of a page that are looked through for its orientation; chosen: ten times what cameras write."""
 _WIDTHS = {1: 1, 3: 2, 4: 4}
-"""Bytes of whole numbers in TIFF, by type."""
 _PIXEL_BYTES = 24
-"""Of memory for a pixel while a page is read and checked; measured at most 21, of a PNG of 16 bits."""
+"""Memory of a pixel while a page is read and checked; measured: at most 21, for a PNG of 16 bits."""
 _BLACK_IS_ZERO, _RGB = 1, 2
-"""PhotometricInterpretation of files that are read; 0 stores black as the largest number."""
+"""PhotometricInterpretation; 0 (refused) stores black as the largest number."""
 _FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}
-"""Orientations by LibRaw's names of them."""
+"""TIFF orientations by LibRaw's flip."""
 _UNSIGNED = 1
-"""SampleFormat of whole numbers from 0, which is also meant where the tag is missing."""
+"""Also the default without the tag."""
 _CHANNEL = "DN"
-"""Channel of an OpenEXR file of several that is read."""
 
 
 _Reader = Iterator[Any]
-"""Yields what a header says - pages, size of the first, bytes of memory that a pixel takes while it is read -, and then
-the numbers of each page."""
+"""Yields the header's pages, size and memory per pixel, then the numbers of each page."""
 
 
 def image_pages(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, tuple[int, int]]:
-    """Return the number of pages of a picture, and rows and columns of the first, from its header.
-
-    Parameters
-    ----------
-    path, wanted
-        as for :func:`read_images`, whose errors it raises.
-    """
+    """Return pages, and rows and columns of the first page, from the header."""
     with _one_line_refusals(Path(path), wanted):
         (pages, size, _), _ = _read_header(Path(path), wanted)
         return pages, size
 
 
 def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
-    """Return rows and columns of a picture, from its header; of several pages, of the first.
-
-    Parameters
-    ----------
-    path, wanted
-        as for :func:`read_images`, whose errors it raises.
-    """
     return image_pages(path, wanted)[1]
 
 
 def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
-    """Return the numbers of a picture of one page.
-
-    Parameters
-    ----------
-    path, wanted
-        as for :func:`read_images`.
-
-    Raises
-    ------
-    MitsimError
-        as there, and for several pages.
-    """
+    """Return the numbers of a picture of one page; raises as :func:`read_images`, and for several pages."""
     pages, _ = image_pages(path, wanted)
     if pages != 1:
         raise wanted.refusal(Path(path), f"has {pages} pages; give each {wanted.what} a file of its own")
@@ -135,23 +97,11 @@ def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
 
 
 def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
-    """Yield the numbers of every page of a picture as they are stored: no gamma, no scale.
+    """Yield the numbers of every page as they are stored: no gamma, no scale.
 
-    PNG, TIFF (of one page or more), NPY of whole or real numbers (rows x columns, or pages before them), OpenEXR with a
-    channel `DN` or one channel, and bare numbers.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    wanted
-        kind of picture, and files that are read.
-
-    Raises
-    ------
-    MitsimError
-        for a file that is missing, damaged, animated, to be shown turned, of another kind or size, in colours that are
-        not wanted, with numbers that its reader would change, that are not finite, or that memory does not hold.
+    OpenEXR files need a channel `DN` or a single channel; NPY files may have an axis of pages first. MitsimError for a
+    file that is missing, damaged, animated, or not of the kind, size, colours or orientation ``wanted``; and for
+    numbers that the library would change, that are not finite, or that do not fit into memory.
     """
     path = Path(path)
     with _one_line_refusals(path, wanted):
@@ -166,15 +116,11 @@ def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
 
 
 def own_end(values: Numbers) -> float | None:
-    """Return the largest number that a file of such ``values`` can hold: 255 or 65535.
-
-    None where cameras seldom reach it.
-    """
+    """Return 255 or 65535 by the type of ``values``; None for types that cameras seldom fill."""
     return float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" and values.dtype.itemsize < 4 else None
 
 
 def _read_header(path: Path, wanted: Wanted) -> tuple[tuple[int, tuple[int, int], float], Iterator[Numbers]]:
-    """Return pages, size and memory of a pixel by the header of a file, and an iterator over its pages."""
     check_plain(path, wanted.what)
     ending = path.suffix.lower()
     if ending not in _READERS:
@@ -220,10 +166,7 @@ def _png(path: Path, wanted: Wanted) -> _Reader:
 
 
 def _upright(path: Path, values: Numbers, stated: Any, wanted: Wanted) -> Numbers:
-    """Return the numbers of a picture as they are ``wanted`` of a file that states its orientation.
-
-    MitsimError where nobody says whether the stored or the shown picture is meant.
-    """
+    """Turn a picture as ``wanted``; MitsimError if it states an orientation and no choice was made."""
     if wanted.orientation is None and stated != _UPRIGHT:
         raise wanted.refusal(
             path,
@@ -238,7 +181,7 @@ def _upright(path: Path, values: Numbers, stated: Any, wanted: Wanted) -> Number
 
 
 def orient(values: Numbers, orientation: int) -> Numbers:
-    """Return ``values`` (rows, columns) as they are to be shown by an ``orientation`` of TIFF 6.0 and Exif, 1 to 8."""
+    """Turn ``values`` by an ``orientation`` of TIFF 6.0 and Exif, 1 to 8."""
     turns, mirrored = _TURNS[orientation]
     turned = np.rot90(values, turns)
     return turned[:, ::-1] if mirrored else turned
@@ -274,13 +217,10 @@ def _tiff(path: Path, wanted: Wanted) -> _Reader:
 
 
 def _pages_of(path: Path) -> tuple[int, dict[int, tuple[int, int, bytes]]]:
-    """Return the number of pages of a TIFF, and the orientation of each page that is not upright.
+    """Return the number of pages of a TIFF, and value, offset and replacement of each orientation that is not upright.
 
-    There may be one page more than :data:`_MOST_PAGES`. An orientation is its value, its place in the file, and the
-    bytes of an upright one.
-
-    Pillow takes a millisecond for each page, and turns a picture as it loads it: of files that are packed and of others
-    in different ways, which change with its version. It is given upright ones.
+    Pillow is given a copy in which all pages are upright, because it turns some pictures as it loads them, depending on
+    compression and version.
     """
     found: dict[int, tuple[int, int, bytes]] = {}
     with open(path, "rb") as file:
@@ -306,7 +246,6 @@ def _pages_of(path: Path) -> tuple[int, dict[int, tuple[int, int, bytes]]]:
 
 
 def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
-    """Return True if a page of a TIFF ``picture`` has numbers without sign; MitsimError for one that is not wanted."""
     tags: Any = picture.tag_v2  # type: ignore[attr-defined]
     bits, photometric, samples = tags.get(_BITS, (1,)), tags.get(_PHOTOMETRIC), tags.get(_SAMPLES, (_UNSIGNED,))
     grey = photometric == _BLACK_IS_ZERO and len(bits) == 1 and bits[0] in wanted.bits
@@ -404,7 +343,6 @@ _READERS: dict[str, Callable[[Path, Wanted], _Reader]] = {
     **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr, _dng), strict=True)),
     **dict.fromkeys(BARE, _bare),
 }
-"""What looks into a file, by the end of its name in small letters."""
 
 
 def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
@@ -419,16 +357,9 @@ def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
 def _open_picture(
     path: Path, kind: str, whole: bool = False, places: Mapping[int, tuple[int, int, bytes]] | None = None
 ) -> Iterator[Image]:
-    """Open a picture file of that ``kind``, its pixels not yet read.
+    """Open a picture file without reading its pixels.
 
-    Parameters
-    ----------
-    path, kind
-        of the file.
-    whole
-        from a copy in memory, as the library for packed TIFF would map the file, or read all of it for each page.
-    places
-        orientations in it that are made upright, in a copy too.
+    ``whole`` opens a copy in memory, because libtiff maps the file or reads all of it for each page.
     """
     from PIL import Image, UnidentifiedImageError  # most work reads no picture
 
@@ -458,7 +389,7 @@ def _open_picture(
 
 
 class _Copied:
-    """A file that Pillow can read, but not map: it has no name and no descriptor."""
+    """File without name and descriptor, which Pillow can read but not map."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.read, self.seek, self.tell = file.read, file.seek, file.tell
@@ -466,7 +397,6 @@ class _Copied:
 
 @contextmanager
 def _one_line_refusals(path: Path, wanted: Wanted) -> Iterator[None]:
-    """Raise whatever readers raise as one line that names the file."""
     try:
         yield
     except MitsimError:
@@ -483,49 +413,34 @@ def _one_line_refusals(path: Path, wanted: Wanted) -> Iterator[None]:
 # -------- Pictures for people
 
 _LARGEST_INLINE = 128
-"""Pixels a side that a notebook shows: the pictures of one object then stay below 100 kB."""
+"""Largest side of pictures in a notebook, which keeps them below 100 kB for each object."""
 _SHORT_CELL = 20
-"""A table's cells of fewer letters are not broken into lines: names and numbers."""
+"""Table cells of fewer letters are not broken into lines."""
 _SHOWN_HEIGHT = 144
-"""Height of a notebook's pictures [screen pixels]: four stand side by side."""
+"""Height in a notebook [screen pixels]; four fit side by side."""
 
 
 def png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
-    """Encode reflectances, or linear sRGB, as a PNG that is shown as :func:`lightness`.
-
-    Parameters
-    ----------
-    values
-        (rows, columns), or (rows, columns, 3) in colour.
-    largest, smallest
-        as for :func:`grey_png`.
-    """
+    """Encode reflectances, or linear sRGB, as :func:`grey_png` after :func:`lightness`."""
     return grey_png(lightness(values), largest, smallest)
 
 
 def lightness(reflectance: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """``reflectance`` cut to 0..1 and encoded for a screen by the sRGB curve (IEC 61966-2-1)."""
+    """Clip to 0..1 and encode by the sRGB curve (IEC 61966-2-1)."""
     linear = np.clip(np.asarray(reflectance, dtype=np.float64), 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def linear_light(shade: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return the reflectance 0..1 that :func:`lightness` encodes as a ``shade``."""
+    """Invert :func:`lightness`."""
     encoded = np.clip(np.asarray(shade, dtype=np.float64), 0, 1)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
-    """Encode ``values`` as they are as a PNG.
+    """Encode (rows, columns) or (rows, columns, 3) values as a PNG, 0 black and 1 white.
 
-    Parameters
-    ----------
-    values
-        (rows, columns), or (rows, columns, 3) in colour, 0 black, 1 white.
-    largest
-        pixels a side beyond which every picture pixel is the mean of 2 x 2 (3 x 3, ...).
-    smallest
-        pixels a side that there are at least: each value then takes a square of them.
+    Pictures above ``largest`` pixels a side are reduced by means over blocks; below ``smallest``, values are repeated.
     """
     # Imported here: most work shows nothing.
     from PIL import Image
@@ -542,53 +457,29 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
 
 
 def from_above(module: str, name: str) -> Callable[..., Any]:
-    """Return a function that draws or labels results of rooms below its own, for methods by which they offer it.
-
-    These are the only calls up the house; who never draws imports nothing for it.
-
-    Parameters
-    ----------
-    module, name
-        of the function, in mitsim.
-    """
+    """Return a function of a higher room that draws or labels results for a method; imported at its first call."""
     found: Callable[..., Any] = getattr(import_module(f"mitsim.{module}"), name)
     return found
 
 
 def data_uri(picture: bytes, kind: str = "png") -> str:
-    """Return a ``picture``, a PNG or of another ``kind``, as the address that holds it.
-
-    A page with it refers to nothing outside itself.
-    """
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
 
 
 def span(values: npt.ArrayLike, unit: str) -> str:
-    """Return the range of ``values`` with their ``unit``, for the caption of a picture of them."""
     ends = np.min(values), np.max(values)
     low, high = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in ends)
     return f"{low} to {high} {unit}"
 
 
 def normalise(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Numbers ``values`` with their range brought to 0..1; 0 where all are equal."""
     shown = np.asarray(values, dtype=np.float64)
     low, high = float(shown.min()), float(shown.max())
     return (shown - low) / (high - low) if high > low else np.zeros_like(shown)
 
 
 def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]) -> str:
-    """HTML of an object in a notebook.
-
-    Parameters
-    ----------
-    title
-        above all.
-    pictures
-        reflectances, or numbers scaled to 0..1, or linear sRGB (rows, columns, 3), by caption.
-    facts
-        lines below them.
-    """
+    """Return an object's HTML for a notebook; ``pictures`` are values in 0..1 or linear sRGB by caption."""
     sources = {caption: data_uri(png(values, _LARGEST_INLINE)) for caption, values in pictures.items()}
     figures = "".join(
         '<figure style="display:inline-block;vertical-align:top;margin:4px 12px 4px 0">'
@@ -602,19 +493,7 @@ def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]
 def table(
     title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], facts: Iterable[str] = (), numbers: int = 0
 ) -> str:
-    """HTML of a table in a notebook.
-
-    Parameters
-    ----------
-    title, headings
-        above the table, and above its columns.
-    rows
-        of cells.
-    facts
-        lines below it.
-    numbers
-        how many of the last columns hold numbers.
-    """
+    """Return a table's HTML for a notebook; the last ``numbers`` columns are aligned as numbers."""
 
     def line(cells: Sequence[str], tag: str) -> str:
         sides = ["left"] * (len(cells) - numbers) + ["right"] * numbers

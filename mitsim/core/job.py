@@ -1,7 +1,4 @@
-"""Companions of long work: a clock, progress, limits, and the memory and disk that this machine has left.
-
-Work that would take more than that is refused.
-"""
+"""Clock, progress, and limits on time, memory and disk of long work."""
 
 from __future__ import annotations
 
@@ -27,22 +24,21 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 Progress = Callable[[str, float], None]
-"""Called with a stage's name and its finished part, 0 to 1."""
+"""Called with a stage's name and its finished fraction, 0 to 1."""
 
 
 def silent(stage: str, fraction: float) -> None:
-    """Ignore the progress of ``stage``, its finished ``fraction``: the :data:`Progress` of who wants none."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
 class CompiledKernels:
-    """Kernels that were in no cache: their ``number``, and the wall ``seconds`` that it took to compile them."""
+    """Kernels that were not in a cache, and the wall ``seconds`` of compiling them."""
 
     number: int = 0
     seconds: float = 0.0
 
     def since(self, earlier: CompiledKernels) -> CompiledKernels:
-        """Return those that were compiled after ``earlier``."""
         return CompiledKernels(self.number - earlier.number, self.seconds - earlier.seconds)
 
 
@@ -50,10 +46,9 @@ _compiled, _counting = CompiledKernels(), threading.Lock()
 
 
 def compiled_kernels() -> CompiledKernels:
-    """All kernels that this process has compiled. Waits for those that were launched, and takes Dr.Jit's history.
+    """Return all kernels compiled by this process, and clear Dr.Jit's history.
 
-    Dr.Jit keeps a copy of each launched kernel's text, some 0.2 MB, until it is asked: who launches many asks now and
-    then, where there is nothing to wait for.
+    Dr.Jit keeps 0.2 MB of text for each launched kernel until its history is read, so call this now and then.
     """
     global _compiled
     drjit = sys.modules.get("drjit")
@@ -69,33 +64,33 @@ def compiled_kernels() -> CompiledKernels:
 
 
 class Watch:
-    """A receiver of progress, such as the rows on a terminal. This one ignores it all."""
+    """Receiver of progress that ignores it."""
 
     def begin(self, stage: str) -> None:
         """Note that the ``stage`` goes on from here."""
 
     def end(self, stage: str, seconds: float) -> None:
-        """Note that the ``stage`` is over, or waits for its next turn; ``seconds`` all in all so far."""
+        """Note that ``stage`` is over or pauses; ``seconds`` in total so far."""
 
     def predict(self, seconds: Mapping[str, float]) -> None:
-        """Note the ``seconds`` that stages to come are predicted to take, by name."""
+        """Note the predicted ``seconds`` of coming stages."""
 
     def report(self, stage: str, fraction: float) -> None:
-        """Note the finished ``fraction``, 0 to 1, of a ``stage``, or of a loop over several: a :data:`Progress`."""
+        """Note the finished ``fraction`` of a ``stage``, or of a loop over several: a :data:`Progress`."""
 
 
 @checked_fields
 class Clock:
-    """Seconds by stage, in the order of first use.
+    """Wall seconds by stage, in order of first use.
 
     Parameters
     ----------
     start
-        seconds that the program has run already, which count as a stage of that name.
+        Seconds that the program has already run, counted as a stage "start".
     watch
-        receiver of progress.
+        Receiver of progress.
     prefix
-        before their names, there.
+        Text before the stages' names in reports to ``watch``.
     """
 
     def __init__(self, start: float = 0.0, watch: Watch | None = None, prefix: str = "") -> None:
@@ -107,7 +102,7 @@ class Clock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time spent inside the context to ``name``."""
+        """Add the time spent inside the context to stage ``name``."""
         started = time.perf_counter()
         self._watch.begin(self._prefix + name)
         try:
@@ -117,16 +112,16 @@ class Clock:
 
     @check_arguments
     def predict(self, stages: Mapping[str, float]) -> None:
-        """Report the predicted seconds of ``stages``; those that have begun are left out."""
+        """Report predicted seconds of the ``stages`` that have not begun."""
         self._watch.predict({self._prefix + name: own for name, own in stages.items() if name not in self._stages})
 
     def apart(self, prefix: str) -> Clock:
-        """Return a clock for a part of the work, watched by the same with ``prefix`` before its stages' names."""
+        """Return a clock for a part of the work, with the same watch and ``prefix`` before its stages' names."""
         return Clock(0.0, self._watch, self._prefix + prefix)
 
     @check_arguments
     def add(self, stages: Mapping[str, float], prefix: str = "") -> None:
-        """Take over the ``stages`` [s] of another clock, except its total, ``prefix`` before their names."""
+        """Add the ``stages`` [s] of another clock, except its total, with ``prefix`` before their names."""
         try:
             sum(stages.values())
         except TypeError:
@@ -136,13 +131,13 @@ class Clock:
                 self._add(prefix + name, seconds)
 
     def seconds(self) -> dict[str, float]:
-        """Stages and ``total`` since the clock was made [s]."""
+        """Return seconds by stage, and ``total`` since the clock was made [s]."""
         return {**self._stages, "total": time.perf_counter() - self._started}
 
     def kernels(self) -> dict[str, float]:
-        """Return the ``number`` of kernels compiled since the clock was made, and the ``seconds`` that it took.
+        """Return ``number`` and ``seconds`` of the kernels compiled since the clock was made.
 
-        Later runs find them in Dr.Jit's cache, and are the faster by so much.
+        Later runs save this time because the kernels are then in Dr.Jit's cache.
         """
         return asdict(compiled_kernels().since(self._compiled))
 
@@ -151,13 +146,13 @@ class Clock:
         self._watch.end(self._prefix + name, self._stages[name])
 
 
-# ---- What work may take ----
+# ---- Limits and costs of work ----
 
 
 @checked_fields
 @dataclass(frozen=True)
 class Limits:
-    """Limits of one command: wall seconds, and bytes of memory (None: nine tenths of what is free)."""
+    """Limits of one command: wall seconds, and bytes of memory (None: nine tenths of the free memory)."""
 
     seconds: float = 86400.0
     memory_bytes: float | None = None
@@ -171,29 +166,14 @@ class Limits:
 
 @dataclass(frozen=True)
 class Cost:
-    """Estimated cost of a work: wall seconds, bytes of memory beyond those in use now, bytes of disk."""
+    """Estimated wall seconds, bytes of additional memory, and bytes of disk."""
 
     seconds: float = 0.0
     memory_bytes: float = 0.0
     disk_bytes: float = 0.0
 
     def check(self, what: str, limits: Limits, output: Path | None = None) -> None:
-        """Refuse work that takes too much.
-
-        Parameters
-        ----------
-        what
-            the work, for the message.
-        limits
-            on time and memory.
-        output
-            where it writes, if it does.
-
-        Raises
-        ------
-        MitsimError
-            when the work takes more than its limits, or than the disk of ``output`` has free.
-        """
+        """Raise MitsimError if the work ``what`` exceeds its limits or the free space on the disk of ``output``."""
         if not self.seconds <= limits.seconds:
             raise MitsimError(
                 f"{what}: would take about {self.seconds:.3g} s; allowed are {limits.seconds:.3g} s; "
@@ -219,18 +199,18 @@ class Cost:
 @checked_fields
 @dataclass(frozen=True)
 class Job:
-    """How one piece of long work is watched and bounded; of no influence on its results.
+    """Clock, progress and limits of one piece of work, which do not influence its results.
 
     Attributes
     ----------
     clock
-        takes the seconds of each stage.
+        Takes the seconds of each stage.
     progress
-        function that gets each stage and its finished part.
+        Function that receives each stage and its finished fraction.
     limits
-        beyond which the work is refused before it begins.
+        The work is refused before it begins if it would exceed them.
     command
-        command line that asks for it, which manifests keep; None: Python does.
+        Command line, which manifests record; None: called from Python.
     """
 
     clock: Clock = field(default_factory=Clock)
@@ -239,27 +219,14 @@ class Job:
     command: str | None = None
 
     def apart(self, prefix: str) -> Job:
-        """Return a job for a part of the work whose seconds are its own, ``prefix`` before its stages' names."""
+        """Return a job for a part of the work, with its own clock and ``prefix`` before its stages' names."""
         return replace(
             self, clock=self.clock.apart(prefix), progress=lambda stage, part: self.progress(prefix + stage, part)
         )
 
     @contextmanager
     def planning(self, what: str, least: Cost | None = None) -> Iterator[None]:
-        """Enter the stage "plan", which is refused once the work has taken all seconds that its limits allow.
-
-        Parameters
-        ----------
-        what
-            the work, for the message.
-        least
-            least cost that is known before a plan; None: not known.
-
-        Raises
-        ------
-        MitsimError
-            where that is more than the limits allow, and when the seconds are over before the plan is made.
-        """
+        """Enter the stage "plan"; MitsimError if planning, or the ``least`` cost known before, exceeds the limits."""
         if least is not None:
             least.check(what, self.limits)
         try:
@@ -272,22 +239,20 @@ class Job:
             ) from None
 
 
-# ---- A time at which work ends wherever it is ----
+# ---- Interruption of work after a given time ----
 #
-# Work that is made of many steps of unknown length - looks at a scene, a search for light in small mirrors, a drawing's
-# shadow - would need a check in each of them. An alarm (SIGALRM) interrupts whatever the main thread does; what takes
-# long in native code is interrupted after its call.
+# An alarm (SIGALRM) interrupts the main thread, or native code after its call, so that the many steps of unknown length
+# need no checks of their own.
 
 _AGAIN_S = 1.0
-"""After which the alarm comes again: an exception that fell into a callback of native code is dropped there."""
+"""The alarm repeats, because an exception inside a callback of native code is dropped."""
 
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Interrupt the block by :class:`mitsim.core.worker.OutOfTime` once so many wall ``seconds`` are over.
+    """Raise :class:`mitsim.core.worker.OutOfTime` in the block after so many wall ``seconds``.
 
-    Where there are no alarms (Windows, other threads than the main one), or somebody else has set one, the block runs
-    to its own end.
+    Without alarms (Windows, other threads than the main one), or if another alarm is set, the block runs to its end.
     """
     if seconds <= 0:
         raise OutOfTime
@@ -314,20 +279,19 @@ def within(seconds: float) -> Iterator[None]:
                 signal.signal(signal.SIGALRM, before)
 
 
-# ---- What this machine has left, and what this process has taken ----
+# ---- Free memory and disk, and memory in use ----
 
 _CGROUPS = (
     (Path("/sys/fs/cgroup"), "memory.max", "memory.current", "inactive_file"),
     (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 )
-"""Where control groups of version 2 and 1 say what a container may take, what it takes, and how much of that is cache
-of files, which the kernel gives back when it is needed."""
+"""Limit, use and reclaimable file cache of containers, in control groups of version 2 and 1."""
 _USABLE = 0.9
-"""Part of the free memory that work may take: the rest is for what estimates and other programs add."""
+"""Fraction of the free memory that work may use; the rest covers errors of estimates and other programs."""
 
 
 def free_memory() -> float:
-    """Bytes that this process can still take: the machine's, its control group's, or its own limit's, the least."""
+    """Return the bytes that the limits of machine, control group and process still allow."""
     import psutil  # here: it takes 10 ms to import, and no refusal needs it
 
     left = [float(psutil.virtual_memory().available)]
@@ -347,7 +311,7 @@ def free_memory() -> float:
 
 
 def memory_from_here() -> float:
-    """Return the bytes of memory that this process holds, and count the peak from here where the system lets it."""
+    """Return the bytes of memory in use, and reset the peak where the system allows it."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")  # proc(5): the peak becomes what is held now
     import psutil
@@ -356,7 +320,7 @@ def memory_from_here() -> float:
 
 
 def memory_since(held: float) -> float:
-    """Return the bytes of memory taken at most beyond those ``held`` at :func:`memory_from_here`."""
+    """Return the peak of memory beyond ``held`` since :func:`memory_from_here` [bytes]."""
     try:
         # Not getrusage, where there is this: its peak is inherited from the process that started this one.
         lines = Path("/proc/self/status").read_text().splitlines()
@@ -369,9 +333,8 @@ def memory_since(held: float) -> float:
 
 
 def running_seconds() -> float:
-    """Return the seconds since this process began, which its start took when work begins."""
     try:
-        # proc(5): in ticks since boot. psutil adds the time of boot to it, which Linux tells in whole seconds.
+        # proc(5): in ticks since boot. psutil adds the time of boot, which Linux rounds to seconds.
         began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
         return max(time.clock_gettime(time.CLOCK_BOOTTIME) - began, 0.0)
     except (OSError, AttributeError):  # not Linux
@@ -381,48 +344,43 @@ def running_seconds() -> float:
 
 
 def free_disk(path: Path) -> float:
-    """Bytes left on the disk where ``path`` is, or will be."""
     existing = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
     return float(shutil.disk_usage(existing).free)
 
 
 def size_text(count: float) -> str:
-    """Return a ``count`` of bytes for people."""
     return f"{count / 2**30:.3g} GiB" if count >= 1000 * 2**20 else f"{count / 2**20:.3g} MiB"
 
 
 # -------- Progress on a terminal, in a notebook or in a log
 
 SECONDS_A_LINE = 60.0
-"""Least time between two lines of progress in a log [s]: a run of an hour leaves a page of them, a short one none."""
+"""Least time between two lines of progress in a log [s]."""
 _SHORTEST_S = 0.05
-"""Stages below this get no row: they would say 0.0 s."""
+"""Shorter stages get no row, because they would show 0.0 s."""
 _REFRESHES = 5
-"""Times a second that rows are written: 2.7 ms of a processor each, eight of them, 1.3 % of one."""
+"""Updates per second; eight rows take 1.3 % of a processor."""
 _BAR = 24
-"""Characters of a bar: with a stage's name and two times it fits into a terminal of 80."""
 
 
 @check_arguments
 @contextmanager
 def progress(limits: Limits | None = None, hidden: bool = False, start: float = 0.0) -> Iterator[Job]:
-    """Make a job that shows how far it is while the context lasts.
-
-    It shows rows on a terminal and in a notebook, else a line a minute on standard error.
+    """Yield a job that shows its progress: rows on a terminal and in a notebook, else a line a minute on stderr.
 
     Parameters
     ----------
     limits
-        on the work; None: a day, and nine tenths of the memory that is free.
+        Limits on the work; None: a day, and nine tenths of the free memory.
     hidden
-        whether nothing is shown.
+        True to show nothing.
     start
-        seconds that the program has run already, which count as a stage of that name.
+        Seconds that the program has already run, counted as a stage "start".
 
     Raises
     ------
     MitsimError
-        for arguments of another kind.
+        for arguments of another type.
 
     Examples
     --------
@@ -446,13 +404,10 @@ def progress(limits: Limits | None = None, hidden: bool = False, start: float = 
 
 
 class _Log(Watch):
-    """Progress as lines of a log on stderr, the first after :data:`SECONDS_A_LINE`."""
-
     def __init__(self) -> None:
         self._written = time.monotonic()
 
     def report(self, stage: str, fraction: float) -> None:
-        """Write ``stage`` and its finished ``fraction`` if the last line is old enough."""
         if time.monotonic() - self._written >= SECONDS_A_LINE:
             self._written = time.monotonic()
             sys.stderr.write(f"mitsim: {printable(stage)} ({fraction:.0%})\n")
@@ -461,12 +416,6 @@ class _Log(Watch):
 
 @dataclass
 class _Row:
-    """One stage on a terminal.
-
-    It has its name or last report, the seconds of earlier turns, the begin of the present turn, the seconds and the
-    part that its rate counts from, and its seconds at its end by its rate or by the plan.
-    """
-
     words: str
     spent: float = 0.0
     begun: float | None = None
@@ -474,19 +423,17 @@ class _Row:
     ends: float | None = None
 
     def seconds(self, now: float) -> float:
-        """Return the seconds of all turns until ``now``."""
         return self.spent + (0.0 if self.begun is None else now - self.begun)
 
     def rest(self, now: float) -> float:
-        """Return the seconds that are left; 0 where they are unknown, as once it takes longer than predicted."""
+        """Return the remaining seconds; 0 if unknown."""
         return 0.0 if self.ends is None else max(self.ends - self.seconds(now), 0.0)
 
 
 class _Rows(Watch):
-    """Progress as rows of a terminal: a stage's bar, its seconds, and those that are left by its own rate or the plan.
+    """Progress as rows of a terminal: bar, elapsed seconds, and remaining seconds by rate or plan.
 
-    A loop over several stages, such as frames that are formed, exposed and written in turns, reports under a name of
-    its own, of which no stage runs. It has a row too, and its rate says how long all goes on.
+    A loop over several stages that take turns reports under its own name; its row shows the remaining time of the loop.
     """
 
     def __init__(self, start: float) -> None:
@@ -495,7 +442,6 @@ class _Rows(Watch):
         self._started = time.monotonic() - start
 
     def begin(self, stage: str) -> None:
-        """Begin a turn of ``stage``."""
         row = self._rows.setdefault(stage, _Row(stage))
         if row is self._loop:
             self._loop = None
@@ -503,19 +449,16 @@ class _Rows(Watch):
         self._show_again()
 
     def end(self, stage: str, seconds: float) -> None:
-        """End a turn of ``stage`` after ``seconds`` in all turns."""
         row = self._rows.setdefault(stage, _Row(stage))
         row.spent, row.begun = seconds, None
         self._show_again()
 
     def predict(self, seconds: Mapping[str, float]) -> None:
-        """Add rows of stages to come, with the ``seconds`` that they are predicted to take."""
         for stage, own in seconds.items():
             row = self._rows.setdefault(stage, _Row(stage))
             row.ends = row.spent + own
 
     def report(self, stage: str, fraction: float) -> None:
-        """Show that a ``fraction`` of a stage or of a loop is finished; the rest takes as long as that did."""
         name, now = stage.partition(":")[0], time.monotonic()
         row = self._rows.setdefault(name, _Row(name))
         row.words = stage.partition(",")[0]
@@ -565,15 +508,10 @@ class _Rows(Watch):
             self._loop.spent, self._loop.begun, self._loop = self._loop.seconds(now), None, None
 
     def _show_again(self) -> None:
-        """Do nothing, because a terminal's rows are written again by rich."""
+        """Do nothing, because rich refreshes a terminal's rows itself."""
 
 
 class _Cell(_Rows):
-    """The same rows below a cell of a notebook.
-
-    They are written anew at most :data:`_REFRESHES` times a second; the last ones stay.
-    """
-
     _handle: Any = None
     _written = 0.0
 
@@ -582,7 +520,6 @@ class _Cell(_Rows):
             self.show()
 
     def show(self) -> None:
-        """Write the rows as they are now."""
         self._written = time.monotonic()
         from IPython.display import HTML, display
         from rich.console import Console
@@ -598,7 +535,6 @@ class _Cell(_Rows):
 
 
 def _text(seconds: float) -> str:
-    """Return seconds as a clock shows them."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(int(seconds), 60)

@@ -1,7 +1,4 @@
-"""Content of manifest.json of RUN and CAL folders: plain data in, a checked and frozen model out, and back.
-
-Writers and readers use these models, so each field is declared once; docs/formats.md shows them as tables.
-"""
+"""Models of manifest.json and colour.json, whose fields docs/formats.md shows as tables."""
 
 from __future__ import annotations
 
@@ -28,15 +25,14 @@ if TYPE_CHECKING:  # and where it computes: numpy takes 0.1 s to import, and a r
 
 MANIFEST = "manifest.json"
 SIDES = ("left", "right")
-"""The two factors of a calibration, as their files in a CAL folder are called."""
 FORMAT = 1
-"""Number of the format that is written here and the newest that is read."""
+"""Version of the format that is written, and the newest that is read."""
 MOST_PIXELS = 4096
-"""Scene pixels a side, and pattern columns: eight times the projector's, and the manifest stays within its limit."""
+"""Scene pixels a side, and pattern columns; larger manifests would exceed their limit."""
 MOST_SHOTS = 1 << 16
-"""Shots of one capture: 256 patterns a side, twice the side of any family of 128 pixels."""
+"""256 patterns a side."""
 _MOST_BINNED = 64**2
-"""Pixels that a camera file may bin: black level and dark current of a binned pixel add up to that many times one's."""
+"""Pixels that a camera file may bin; a binned pixel's black level and dark current are sums over them."""
 _UNVERSIONED = "0.3.0"
 
 # Bounds far from any camera, within which products of these numbers stay finite.
@@ -45,17 +41,17 @@ Row = Annotated[tuple[Weight, ...], Field(strict=False, max_length=MOST_PIXELS),
 Rows = Annotated[tuple[Row, ...], Field(strict=False, max_length=MOST_PIXELS), FailFast()]
 BinnedSum = Annotated[float, Field(ge=0, le=LARGEST * _MOST_BINNED, allow_inf_nan=False)]
 Coordinate = Annotated[float, Field(ge=-1e7, le=1e7, allow_inf_nan=False)]
-"""Within 10 km, and tan-angles of any lens."""
+"""Within 10 km [mm]."""
 FARTHEST = 1e10
-"""The largest `scene_distance` [mm]."""
+"""Largest `scene_distance` [mm]."""
 Distance = Annotated[float, Field(gt=0, le=FARTHEST, allow_inf_nan=False)]
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
 Plain = Annotated[dict[str, Any], pydantic.BeforeValidator(plain)]
-"""A part that others than the solver read, as JSON holds it."""
+"""Part that the solver does not read, as JSON."""
 
 
 def _texts(checksums: dict[str, Any]) -> dict[str, str]:
-    """One complaint, where pydantic would list each of a million."""
+    """Raise one error, because pydantic would list each of a million entries."""
     wrong = next((name for name, value in checksums.items() if not isinstance(value, str)), None)
     if wrong is not None:
         raise ValueError(f"that of {cut(wrong)!r} is no text; give the SHA-256 of that file, or leave it out")
@@ -73,7 +69,7 @@ class _Part(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _of_0_3_0(cls, data: Any, info: pydantic.ValidationInfo) -> Any:
-        """Drop unknown fields where no format was stated, as in version 0.3.0, because they are others'."""
+        """Drop unknown fields of version 0.3.0, which stated no format, because other programs added some."""
         if info.context == _UNVERSIONED and isinstance(data, dict):
             return {name: value for name, value in data.items() if name in cls.model_fields}
         return data
@@ -104,11 +100,9 @@ class Digital(_Part):
 
     @property
     def noise_is_stated(self) -> bool:
-        """True if all of a frame's noise is known, and not only that of its light."""
         return self.read_noise_e is not None
 
     def rate(self, dn: npt.NDArray[Any]) -> FloatArray:
-        """Photoelectrons a second of digital numbers ``dn``."""
         rate: FloatArray = dn.astype("float64")
         rate -= self.black_level_dn
         rate /= self.gain_dn_per_e
@@ -119,14 +113,8 @@ class Digital(_Part):
     def variance(self, light: FloatArray | float, shots: int = 1) -> FloatArray:
         """Return the noise variance [(electrons / s)^2] of a sum or difference of shots, after EMVA 1288.
 
-        It counts shot noise of light and dark current, read noise and rounding; parts that are not stated count as 0.
-
-        Parameters
-        ----------
-        light
-            sum of the :meth:`rate` of these shots, any shape; measured light keeps the variance's mean unbiased.
-        shots
-            their number.
+        It includes shot noise of light and dark current, read noise and rounding; quantities that are not stated count
+        as 0. ``light`` is the sum of the shots' :meth:`rate`, any shape; with measured light the variance is unbiased.
         """
         import numpy as np
 
@@ -165,9 +153,9 @@ class Patterns(_Part):
 
     @classmethod
     def of(cls, family: Any, files: Sequence[str]) -> Patterns:
-        """Return the patterns of a :class:`mitsim.devices.patterns.PatternFamily`, its shots in ``files`` by index.
+        """Return the patterns of a :class:`mitsim.devices.patterns.PatternFamily` whose shots are in ``files``.
 
-        MitsimError when there are more pixels or shots than a reader takes.
+        MitsimError for more pixels or shots than a reader accepts.
         """
         shots = [
             {"file": file, "row": shot.row, "column": shot.column, "sign": shot.sign}
@@ -179,7 +167,7 @@ class Patterns(_Part):
 
     @property
     def matrices(self) -> tuple[FloatArray, FloatArray]:
-        """P_L (n, K) and P_R (n', K')."""
+        """Return P_L (n, K) and P_R (n', K')."""
         import numpy as np
 
         return np.array(self.P_L, dtype=np.float64), np.array(self.P_R, dtype=np.float64)
@@ -227,20 +215,20 @@ class Patterns(_Part):
 
 class _Head(_Part):
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
-    """Version of this format; without it unknown fields are ignored, as by version 0.3.0."""
+    """Version of this format; without a version, unknown fields are ignored, as in version 0.3.0."""
     status: Literal["incomplete", "complete"] = "complete"
-    """Whether all files are written."""
+    """`complete` if all files are written."""
     configuration: Plain = {}
-    """All that decides the frames: options, files, devices, versions."""
+    """Everything that determines the frames: options, files, devices, versions."""
     warnings: Texts = ()
-    """Why the folder is flagged; an image made of it is flagged too."""
+    """Reasons why the folder is flagged; an image from it is flagged too."""
     versions: dict[str, str] = {}
-    """Of mitsim, Python and packages."""
+    """Versions of mitsim, Python and packages."""
     command: str | None = None
-    """Command line that finished it; none: Python, or not stated."""
+    """Command line that finished the folder; none: Python, or not stated."""
     opened: Plain | None = None
-    """Files of `camera` and `projector` as they were named (none: the usual ones), and `allow_outside_files`; by these
-    `mitsim run --from` repeats it. None: not stated."""
+    """Arguments for `mitsim run --from`: names of the files of `camera` and `projector` (none: the default ones), and
+    `allow_outside_files`; none: not stated."""
 
 
 class AmbientFile(_Part):
@@ -249,11 +237,11 @@ class AmbientFile(_Part):
     file: FileName
     """Name of the frame in the run's folder, without a path."""
     shots: int = Field(ge=1, le=MOST_SHOTS)
-    """Shots that it is the mean of, each exposed as the frames."""
+    """Number of averaged shots, each with the exposure of the frames."""
     part: float | None = None
-    """Ambient light in all light of the frames."""
+    """Ambient light as a fraction of all light in the frames."""
     noise: float | None = None
-    """Noise of the frames less the ambient frame, over the projector's light; closed form."""
+    """Noise of the frames without ambient light, relative to the projector's light; closed form."""
 
 
 ClosingKind = Literal["first", "uniform"]
@@ -268,58 +256,57 @@ class ClosingFile(_Part):
     file: FileName
     """Name of the frame in the run's folder, without a path."""
     exposure_s: Positive
-    """Exposure of this frame [s]; shorter than the run's where a uniform frame would saturate."""
+    """Exposure of this frame [s]; shorter than the run's if a uniform frame would saturate."""
 
 
 class RunHead(_Head):
-    """The manifest of an unfinished run, with which that of a finished one begins."""
+    """Manifest of an unfinished run, and beginning of a finished run's manifest."""
 
     kind: Literal["capture"] = "capture"
-    """What the folder is."""
+    """Kind of the folder."""
     configuration_sha256: str = ""
-    """Hash of `configuration`; a run is resumed by the same alone."""
+    """Hash of `configuration`; only the same configuration can resume the run."""
 
     @classmethod
     def of(cls, configuration: Mapping[str, Any]) -> RunHead:
-        """Return the head of an unfinished run of that ``configuration``."""
         digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
         return cls(status="incomplete", configuration=dict(configuration), configuration_sha256=digest)
 
 
 class RunManifest(RunHead):
-    """A capture: how its frames are read, and which patterns were projected."""
+    """Manifest of a capture: how its frames are read, and the projected patterns."""
 
     camera: Plain
-    """Identity that a calibration must share; anything, as long as both are equal."""
+    """Identity that a calibration must share; any value."""
     digital: Digital
-    """How digital numbers become electrons a second."""
+    """Conversion of digital numbers to electrons a second."""
     patterns: Patterns
-    """What was projected, and in which file it is seen."""
+    """Projected patterns, and the files of their shots."""
     ambient_frame: AmbientFile | None = None
-    """The frame of ambient light alone; none: nothing is taken off the frames."""
+    """Frame of the ambient light; none: nothing is subtracted from the frames."""
     closing_frame: ClosingFile | None = None
-    """The closing frame; none: none was taken. It is no measurement."""
+    """Closing frame; none: none was taken. It is no measurement."""
     order: str | None = None
     """Order in which the imported frames were taken (`mitsim import --order`); none: that of `captures`."""
     checksums: Checksums = {}
-    """SHA-256 by file name, where known."""
+    """SHA-256 by file name, if known."""
     plan: Plain | None = None
-    """The effect plan, see Plan."""
+    """Effect plan, see Plan."""
     mc_error: NonNegative | None = None
     """Relative Monte Carlo error of the expected frames."""
     total_error: float | None = None
-    """Relative error of the expected frames, all in all: the plan's systematic error and that."""
+    """Relative error of the expected frames: the plan's systematic error and the Monte Carlo error."""
     total_error_bound: float | None = None
-    """What it is below, at 95 %."""
+    """Upper bound of the total error at 95 %."""
     total_error_of_projector: float | None = None
-    """That bound relative to the projector's light alone: more, where lamps are on."""
+    """The same bound relative to the projector's light alone, which is larger if lamps are on."""
     mc_to_sensor_noise: float | None = None
-    """Largest ratio of that to a frame's sensor noise."""
+    """Largest ratio of Monte Carlo error to a frame's sensor noise."""
     sensor_noise: float | None = None
     """Relative noise of the sensor over all frames, closed form."""
     heaviest_group: float | None = None
-    """Largest part of the Monte Carlo variance in one of the groups of the light; above 0.72 a few heavy paths make
-    it."""
+    """Largest fraction of the Monte Carlo variance in one group of the light; above 0.72, a few heavy paths cause it.
+    """
     truth_error: NonNegative | None = None
     """Standard error of truth.exr, rms over the image; 1 is the board's reflectance."""
     light_error: NonNegative | None = None
@@ -327,17 +314,16 @@ class RunManifest(RunHead):
     paths: int | None = None
     """Connections and paths traced."""
     lost_light: float | None = None
-    """Part of the light that came from beyond the plan's directions; it is in no frame."""
+    """Fraction of the light that came from beyond the plan's directions; it is missing in the frames."""
     seconds: dict[str, float] = {}
-    """By stage; `imports`: of modules that no earlier work needed."""
+    """Seconds by stage; `imports`: of modules that no earlier work needed."""
     kernels: dict[str, int | float] = {}
-    """`number` of kernels that no cache held, and `seconds`, of those above, that it took to compile them."""
+    """`number` of kernels that were not in a cache, and `seconds` of compiling them, which are included above."""
     predicted_memory_bytes: float | None = None
-    """Memory that this was predicted to take at most, beyond what the program held before."""
+    """Predicted peak of memory, beyond the memory that the program used before."""
 
     @property
     def others(self) -> dict[str, str]:
-        """Files of frames that are no captures: `ambient` and `closing`, where the run has them."""
         frames = {"ambient": self.ambient_frame, "closing": self.closing_frame}
         return {name: frame.file for name, frame in frames.items() if frame}
 
@@ -355,45 +341,45 @@ class RunManifest(RunHead):
 
 
 class FactorNoise(_Part):
-    """How far a calibration's factors are from those of the camera."""
+    """Deviation of a calibration's factors from the camera's true factors."""
 
     left: NonNegative
-    """Standard deviation of each number of the left factor, as its noise makes it."""
+    """Standard deviation of each number of the left factor from noise."""
     right: NonNegative
-    """The same of the right factor."""
+    """Standard deviation of each number of the right factor from noise."""
     unexplained: NonNegative
-    """Part of the responses that no separable camera explains, rms."""
+    """Fraction of the responses that no separable camera explains, rms."""
 
 
 Edges = Annotated[tuple[Coordinate, ...], Field(strict=False, min_length=2, max_length=2)]
-"""Of the first and of the last projector pixel."""
+"""Edges of the first and of the last projector pixel."""
 
 
 class Parallax(_Part):
-    """How a calibration's factors move with depth.
+    """Motion of a calibration's factors with depth.
 
-    The projector's window, seen from the middle of the frames on a plane at distance z, has its edges at tan-angles
+    On a plane at distance z, seen from the middle of the frames, the projector's window has its edges at tan-angles
     window + parallax (1/z - 1/depth), in index coordinates.
     """
 
     depth_mm: Distance
-    """Sensor to the board [mm]."""
+    """Distance from sensor to board [mm]."""
     row_tan: Edges
     """First and last edge of the window's rows on the board."""
     column_tan: Edges
-    """The same of its columns."""
+    """First and last edge of the window's columns on the board."""
     row_mm: Edges
-    """Parallax of these edges; the baseline, where the projector faces as the camera."""
+    """Parallax of the edges of rows; the baseline, if the projector faces in the direction of the camera."""
     column_mm: Edges
-    """The same of columns."""
+    """Parallax of the edges of columns."""
     pixel_pitch_mm: Distance
-    """Between columns of (binned) sensor pixels, and between rows."""
+    """Distance between columns of (binned) sensor pixels, and between rows."""
     row_pitch_mm: Distance | None = None
-    """Between rows, where pixels are not square."""
+    """Distance between rows, if pixels are not square."""
     mask_distance_mm: Distance
-    """Sensor to the mask."""
+    """Distance from sensor to mask."""
     stop_tan: Distance | None = None
-    """Tangent at which a square field stop ends, along both axes; none: not known."""
+    """Tangent at which a square field stop ends, along both axes; none: unknown."""
 
     @model_validator(mode="after")
     def _a_window_behind_a_mask(self) -> Parallax:
@@ -405,61 +391,60 @@ class Parallax(_Part):
         return self
 
     def pitch_mm(self, axis: int) -> float:
-        """Distance between rows (``axis`` 0) or columns (1) of sensor pixels."""
         return self.pixel_pitch_mm if axis or self.row_pitch_mm is None else self.row_pitch_mm
 
 
 class FittedNumber(_Part):
-    """A number of a modelled camera."""
+    """Parameter of a modelled camera."""
 
     value: float
-    """In its unit."""
+    """Value in its unit."""
     standard_error: NonNegative | None = None
-    """As its fit tells it; none: it was held."""
+    """Standard error from the fit; none: the number was held fixed."""
     unit: str
-    """Of both."""
+    """Unit of value and standard error."""
 
 
 class ModelledFactors(_Part):
-    """The fit of modelled factors."""
+    """Fit of modelled factors."""
 
     model: Literal["geometric", "wave"]
-    """Of the mask's shadow."""
+    """Model of the mask's shadow."""
     frames: int = Field(ge=1, le=MOST_SHOTS)
-    """That it was fitted to."""
+    """Number of frames in the fit."""
     chi_square: NonNegative
-    """A datum, of what the fit uses of the frames; 1 for a right model."""
+    """Chi-square per datum of the fit; 1 for a correct model."""
     parameters: dict[str, FittedNumber]
-    """By name: where mask and projector are, and the gain."""
+    """Fitted numbers by name: positions of mask and projector, and the gain."""
 
 
 class CalibrationManifest(_Head):
-    """A calibration: of which camera, and how its factors are used."""
+    """Manifest of a calibration: its camera, and how its factors are used."""
 
     kind: Literal["calibration"] = "calibration"
-    """What the folder is."""
+    """Kind of the folder."""
     camera: Plain
     """Identity that a run must share."""
     centre: bool = False
-    """Frames and factors lose row and column means (FlatCam masks)."""
+    """True if row and column means are removed from frames and factors (FlatCam masks)."""
     board_reflectance: float | None = Field(default=None, gt=0, le=1)
     """Reflectance of the board that counts as 1 in the image; none: unknown."""
     digital: Digital | None = None
-    """Of the session's frames."""
+    """Conversion of the session's digital numbers to electrons a second."""
     checksums: Checksums = {}
-    """SHA-256 by file name, where known."""
+    """SHA-256 by file name, if known."""
     noise: FactorNoise | None = None
-    """How exact the factors are; none: not stated."""
+    """Noise of the factors; none: not stated."""
     parallax: Parallax | None = None
-    """How the factors move with depth; none: not known, and no `--focus`."""
+    """Motion of the factors with depth; none: unknown, and no `--focus`."""
     modelled: ModelledFactors | None = None
-    """The model that was fitted; none: the factors are measured."""
+    """Fitted model; none: the factors are measured."""
     result: Plain = {}
-    """The session in numbers, as `calibrate --json` gives them."""
+    """Results of the session, as in `calibrate --json`."""
     estimate: str | None = None
-    """The estimator's own words."""
+    """Text of the estimator."""
     verdict: str | None = None
-    """The estimator's verdict, one of `mitsim.reconstruct.solution.Verdict`."""
+    """Verdict of the estimator, one of `mitsim.reconstruct.solution.Verdict`."""
 
 
 # ---- Reading and writing ----
@@ -468,10 +453,7 @@ Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
 
 
 def read_manifest(folder: Path, model: type[Manifest]) -> Manifest:
-    """Return the manifest of a finished run or calibration in ``folder``, by its ``model``.
-
-    MitsimError when there is none, or it is of another kind, unfinished, or breaks a rule of its format.
-    """
+    """Return the manifest of a finished work; MitsimError if it is missing, of another kind, unfinished, or invalid."""
     if not folder.is_dir():
         command = "capture" if model is RunManifest else "calibrate"
         raise MitsimError(f"{folder}: no such folder; give the output of `mitsim {command}`")
@@ -479,22 +461,7 @@ def read_manifest(folder: Path, model: type[Manifest]) -> Manifest:
 
 
 def checked_manifest(data: Any, model: type[Manifest], place: Path) -> Manifest:
-    """Return the manifest of a finished run or calibration.
-
-    Parameters
-    ----------
-    data
-        as JSON holds it.
-    model
-        of the manifest that it is to be.
-    place
-        where it was found, for messages.
-
-    Raises
-    ------
-    MitsimError
-        when it is of another kind, unfinished, or breaks a rule of its format.
-    """
+    """Return ``data`` as a finished work's manifest; MitsimError if it is of another kind, unfinished, or invalid."""
     kind = model.model_fields["kind"].default
     if not isinstance(data, dict) or data.get("kind") != kind:
         raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
@@ -504,12 +471,11 @@ def checked_manifest(data: Any, model: type[Manifest], place: Path) -> Manifest:
 
 
 def _kind(data: Any) -> str:
-    """Return the kind of folder that the ``data`` of a manifest or colour.json states."""
     return str(data.get("kind") if isinstance(data, dict) else type(data).__name__)
 
 
 def resumable(folder: Path, kind: str) -> dict[str, Any]:
-    """Return the manifest of work of a ``kind`` in ``folder``, finished or not; MitsimError when it holds none."""
+    """Return the manifest of finished or unfinished work; MitsimError if there is none."""
     data = read_json(folder / MANIFEST)
     if not isinstance(data, dict) or data.get("kind") != kind:
         raise MitsimError(f"resume=True: {folder}/{MANIFEST} is not that of a {kind}; use another folder")
@@ -517,13 +483,11 @@ def resumable(folder: Path, kind: str) -> dict[str, Any]:
 
 
 def read_head(folder: Path) -> RunHead:
-    """Return the head of the run in ``folder``, finished or not; MitsimError when it holds none."""
     data = resumable(folder, "capture")
     return validate(RunHead, data, f"{folder}/{MANIFEST}", _UNVERSIONED)
 
 
 def write_manifest(folder: Path, manifest: RunHead | CalibrationManifest) -> None:
-    """Write ``manifest`` to ``folder``, all or nothing. MitsimError when it cannot be written."""
     # Version 0.10.0 refuses keys that it does not know.
     left_out = {key for key in ("closing_frame", "order") if getattr(manifest, key, None) is None}
     write_json(folder / MANIFEST, manifest.model_dump(exclude=left_out))
@@ -541,11 +505,11 @@ _COMMANDS = {
 }
 """Commands that make a folder of each kind."""
 MONO, LINES, BANDS = "mono", "lines", "bands"
-"""Ways to simulate a projector's light: wavelengths not separated, each line, or ``bands:K`` of lines."""
+"""Ways to simulate a projector's light: one effective wavelength, each line, or ``bands:K`` of lines."""
 MOST_LINES = 4
-"""Lines at which light is traced together: wavelengths that a path carries in Mitsuba's spectral variants."""
+"""Lines traced together: wavelengths of a path in Mitsuba's spectral variants."""
 JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
-"""Ways from frames behind colour filters to images of lines (:mod:`mitsim.report.reconstruct_run`), the best first."""
+"""Ways from frames behind colour filters to images of lines, best first."""
 _Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -558,18 +522,17 @@ def bands_of(name: str) -> int:
 
 
 def spectral_of(variant: str) -> str:
-    """Return the spectral variant of the same backend as ``variant``."""
     return f"{variant.rpartition('_')[0]}_spectral"
 
 
 def check_undecided(variant: str) -> None:
-    """Raise ArgumentError for a spectral ``variant``, with which colours cannot be compared with mono light."""
+    """Raise ArgumentError for a spectral ``variant``, in which colours cannot be compared with mono light."""
     if variant.endswith("_spectral"):
         raise ArgumentError("variant", f"{variant}: open the bench with a mono variant; colours are looked at too")
 
 
 class Line(BaseModel):
-    """One spectral line and the folder that holds it."""
+    """Spectral line and the folder that holds it."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
@@ -578,7 +541,7 @@ class Line(BaseModel):
     wavelength_nm: float = Field(ge=1, le=1e6, allow_inf_nan=False)
     """Wavelength of the line."""
     radiant_share: float | None = Field(default=None, ge=0, le=1, allow_inf_nan=False)
-    """Part of the projector's power; none: not known."""
+    """Fraction of the projector's power; none: unknown."""
 
     @field_validator("name")
     @classmethod
@@ -589,12 +552,12 @@ class Line(BaseModel):
 
 
 class ColourManifest(BaseModel):
-    """Content of colour.json: the kind of folder, and its lines."""
+    """Content of colour.json: kind of the folder, and its lines."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
     kind: Literal["colour-run", "colour-calibration", "colour-image", "mosaic-run"]
-    """What the folder is."""
+    """Kind of the folder."""
     channels: Annotated[tuple[Line, ...], Field(strict=False, min_length=1, max_length=256)]
     """Spectral lines, each in a folder of its name."""
 
@@ -609,24 +572,22 @@ class ColourManifest(BaseModel):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the lines."""
         return tuple(line.name for line in self.channels)
 
     @property
     def wavelengths_nm(self) -> tuple[float, ...]:
-        """Wavelengths of the lines."""
         return tuple(line.wavelength_nm for line in self.channels)
 
 
 class MosaicManifest(ColourManifest):
-    """Content of the colour.json of a run behind colour filters."""
+    """Content of colour.json for a run behind colour filters."""
 
     mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"]
     """Filters of 2 x 2 pixels, row by row from the frame's first pixel."""
     weights: Annotated[
         tuple[Annotated[tuple[_Share, ...], Field(strict=False)], ...], Field(strict=False, min_length=4, max_length=4)
     ]
-    """Of each of these four pixels, electrons per photon of each line."""
+    """Electrons per photon of each line, for each of these four pixels."""
 
     @model_validator(mode="after")
     def _a_weight_for_each_line(self) -> MosaicManifest:
@@ -638,55 +599,42 @@ class MosaicManifest(ColourManifest):
 
 
 def lines_of_planes(kind: str, wavelengths_nm: tuple[float, ...]) -> ColourManifest:
-    """Return the planes of a mosaic as lines of a folder of a ``kind``, with wavelengths of red, green and blue."""
     lengths = dict(zip("rgb", wavelengths_nm, strict=True))
     lines = [{"name": name, "wavelength_nm": lengths[name[0]]} for name in PLANES]
     return validate(ColourManifest, {"kind": kind, "channels": lines}, "planes")
 
 
 def is_coloured(folder: Path | str) -> bool:
-    """Return True if ``folder`` has a colour.json."""
     return (Path(folder) / COLOUR).is_file()
 
 
 class Coloured:
-    """A folder or its content with ``colours``, its lines and filters; None where wavelengths are not separated."""
+    """Mixin for a folder or its content with ``colours``, None if wavelengths are not separated."""
 
     colours: ColourManifest | None
 
     @property
     def filters(self) -> MosaicManifest | None:
-        """The colour filters that the frames were seen through."""
+        """Return the colour filters in front of the sensor, if any."""
         return self.colours if isinstance(self.colours, MosaicManifest) else None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the lines; one empty name where wavelengths are not separated."""
+        """Return the names of the lines; one empty name if wavelengths are not separated."""
         return self.colours.names if self.colours else ("",)
 
 
 @dataclass(frozen=True)
 class SpectralFolder(Coloured):
-    """A run, calibration or image, and its spectral lines.
-
-    Attributes
-    ----------
-    folder
-        The folder.
-    colours
-        Content of its colour.json; None where the folder does not separate wavelengths.
-    """
-
     folder: Path
     colours: ColourManifest | None
 
     @property
     def parts(self) -> dict[str, Path]:
-        """Folders of frames or factors by line; behind filters, and without lines, the folder itself by ""."""
+        """Return the folder of each line; the folder itself, by "", behind filters and without lines."""
         return {"": self.folder} if self.filters else {name: self.folder / name for name in self.names}
 
     def check_calibration(self, calibration: Path) -> SpectralFolder:
-        """Return the ``calibration`` of this run; MitsimError where it has other lines than the run."""
         if self.colours is not None:
             check_lines(self.colours, str(self.folder), calibration)
         elif is_coloured(calibration):
@@ -697,10 +645,7 @@ class SpectralFolder(Coloured):
 
 
 def open_lines(folder: Path | str, *kinds: str) -> SpectralFolder:
-    """Return a folder of one of the ``kinds`` (:data:`KINDS`) with its spectral lines, if it separates wavelengths.
-
-    MitsimError for a colour.json of another kind, or one that breaks a rule.
-    """
+    """Return a folder with its spectral lines; MitsimError if colour.json is invalid or not in ``kinds``."""
     if not is_coloured(folder):
         return SpectralFolder(Path(folder), None)
     data = read_json(Path(folder) / COLOUR)
@@ -709,17 +654,13 @@ def open_lines(folder: Path | str, *kinds: str) -> SpectralFolder:
 
 
 def read_colours(folder: Path | str, kind: str) -> ColourManifest:
-    """Return the lines of a coloured ``folder`` of a ``kind``, one of :data:`KINDS`.
-
-    MitsimError for a folder without colour.json, of another kind, or whose colour.json breaks a rule.
-    """
+    """Return the lines of a folder; MitsimError if colour.json is missing, of another ``kind``, or invalid."""
     if not is_coloured(folder):
         raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
     return checked_colours(read_json(Path(folder) / COLOUR), kind, Path(folder))
 
 
 def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
-    """Raise MitsimError where a ``calibration`` folder does not have the ``lines`` of a ``run``."""
     calibrated = read_colours(calibration, CALIBRATION)
     ours, theirs = (dict(zip(each.names, each.wavelengths_nm, strict=True)) for each in (lines, calibrated))
     if ours != theirs:
@@ -730,7 +671,6 @@ def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
 
 
 def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
-    """Validate the ``data`` of a colour.json, found at a ``place``, which has to be of a ``kind`` of :data:`KINDS`."""
     if _kind(data) != kind:
         raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
     return validate(MosaicManifest if kind == MOSAIC else ColourManifest, data, f"{place}/{COLOUR}")
@@ -742,7 +682,7 @@ def installed_ways() -> tuple[str, ...]:
 
 
 def check_way(way: str) -> str:
-    """Return the ``way``, one of :data:`WAYS`; ArgumentError for another, and for one that is not installed."""
+    """Return ``way``; ArgumentError if it is none of :data:`WAYS` or not installed."""
     installed = installed_ways()
     if way not in WAYS:
         raise ArgumentError("mosaic", f"{way!r}: use {', '.join(WAYS[:-1])} or {WAYS[-1]}")
@@ -756,5 +696,4 @@ def check_way(way: str) -> str:
 
 
 def write_colours(folder: Path, colours: ColourManifest, **more: Any) -> None:
-    """Write colour.json, all or nothing, with the folder's kind and lines and ``more`` entries."""
     write_json(folder / COLOUR, {**colours.model_dump(), **more})

@@ -1,8 +1,7 @@
-"""Work on all processors: a function and items in, results in order out; BLAS kept to one thread meanwhile.
+"""Threads over items, with BLAS restricted to one thread.
 
-Frames are many and small, so threads of ours over frames beat threads of BLAS inside a product: those wait for each
-other at every product, and on a busy machine that costs ten times the work. Results do not depend on the number of
-threads, because each product is computed by one.
+For many small frames they beat BLAS's own threads, which wait for each other at every product. Results do not depend on
+the number of threads.
 """
 
 from __future__ import annotations
@@ -26,18 +25,17 @@ Result = TypeVar("Result")
 _counting = threading.Lock()
 _inside_blas = 0
 _before = dict[str, tuple[Any, int]]()
-"""Libraries of BLAS that are kept to one thread, by path, each with the number that it had."""
+"""Libraries of BLAS that are restricted, by path, and their earlier numbers of threads."""
 
 _BRING_BLAS = "scipy.linalg", "scipy.special"
-"""Modules that load SciPy's own library of BLAS; whatever else of SciPy does imports one of them."""
+"""Every part of SciPy that uses BLAS imports one of these modules, which load SciPy's own BLAS."""
 
 
 @contextmanager
 def single_threaded_blas() -> Iterator[None]:
-    """Keep BLAS to one thread inside the context.
+    """Restrict BLAS to one thread inside the context.
 
-    The number of threads is the process's, and contexts of several threads overlap by chance. So earlier numbers are
-    put back when the last context is left: at the first one's end BLAS had its threads again while another worked.
+    Contexts of several threads may overlap, therefore the last one that ends restores the earlier numbers of threads.
     """
     global _inside_blas
     with _counting:
@@ -56,7 +54,6 @@ def single_threaded_blas() -> Iterator[None]:
 
 
 def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:
-    """Let each of some libraries of BLAS have so many threads."""
     for library, number in numbers:
         # Since 3.8 threadpoolctl heeds one thread's wishes at a time, and ignores those of others in silence.
         forget = getattr(library, "clear_controlling_thread", lambda **_: None)
@@ -67,10 +64,7 @@ def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:
 
 @cache
 def _libraries(*_: bool) -> tuple[Any, ...]:
-    """Libraries of BLAS in this process, which has imported these of :data:`_BRING_BLAS`.
-
-    Looking for them takes a millisecond, so it is done once, and again after such an import.
-    """
+    """Return the libraries of BLAS, cached until one of :data:`_BRING_BLAS` is imported: a search takes 1 ms."""
     # Imported here: threadpoolctl sets an environment variable when it is imported, and importing mitsim sets none.
     from threadpoolctl import ThreadpoolController
 
@@ -78,10 +72,10 @@ def _libraries(*_: bool) -> tuple[Any, ...]:
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Return ``function`` of each of the ``items``, in order, one thread a processor; its time should be numpy's.
+    """Apply a numpy-bound ``function`` to ``items``, one thread a processor; results are in order.
 
-    The threads are kept. One item, and items of an item, are worked on where they are asked for. After an error, or
-    Control-C, items that nobody has begun are left out, and those that somebody has are finished.
+    Nested calls and single items run in the calling thread. After an error or Control-C, items that have not begun are
+    skipped, and running ones are finished.
     """
     todo = list(items)
     with single_threaded_blas():
@@ -101,7 +95,7 @@ _inside = threading.local()
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """So many threads, kept for the next call: starting some takes as long as forming a small frame."""
+    """Return a pool that is reused, because starting threads takes as long as forming a small frame."""
     # Each thread is known as one of ours: were it to wait for others, all might wait.
     return ThreadPoolExecutor(threads, initializer=setattr, initargs=(_inside, "thread", True))
 
@@ -110,15 +104,13 @@ os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not live on 
 
 
 class Behind(Generic[Item]):
-    """Work on items in threads while the next ones are made; a context, which is left when all of it is done.
+    """Context that works on items in threads while the caller makes the next ones; it ends when all are done.
 
-    Two lots of items are held: the one that is worked on, and the one that is made meanwhile. Errors are raised
-    where the work is waited for. When the context is left by an error or Control-C, items that nobody has begun are
-    left out, and those that somebody has are finished.
+    Errors are raised by the next wait. After an error or Control-C, items that have not begun are skipped, and running
+    ones are finished.
     """
 
     def __init__(self, function: Callable[[Item], Any]) -> None:
-        """Make a context that does ``function`` to each item."""
         self._function, self._pool = function, ThreadPoolExecutor(workers())
         self._begun: list[Future[Any]] = []
 
@@ -131,12 +123,11 @@ class Behind(Generic[Item]):
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def give(self, items: Iterable[Item]) -> None:
-        """Wait for the items that were given before, and begin these ``items``."""
+        """Wait for the earlier items, and begin these ``items``."""
         self.wait()
         self._begun = [self._pool.submit(self._function, item) for item in items]
 
     def wait(self) -> None:
-        """Wait for all items; the first error of theirs is raised."""
         for future in self._begun:
             future.result()
         self._begun = []

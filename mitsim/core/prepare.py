@@ -1,9 +1,6 @@
-"""A file's numbers in, a frame out.
+"""Frames from the numbers of files: common factor, dark signal, response, plane of a mosaic, orientation and crop.
 
-The frame has no common factor, dark signal or uneven response, and is one plane of a mosaic, turned and cropped.
-
-Saturated pixels of a file stay so: they, and those that turning makes of them, have the end of the scale that
-:attr:`Preparer.digital` states.
+Saturated pixels, and pixels interpolated from them, get the saturation level that :attr:`Preparer.digital` states.
 """
 
 from __future__ import annotations
@@ -23,35 +20,29 @@ from mitsim.core.images import Numbers, orient, own_end, read_image, read_images
 from mitsim.core.manifests import Digital
 
 LEAST_RESPONSE = 0.1
-"""Of a pixel to even light, over the mean one, below which it is not corrected: it is defective or dark, and what
-divides it would multiply its noise by ten."""
+"""Pixels with a smaller response, relative to the mean, are not corrected, because that would multiply their noise by
+ten."""
 _MOST_DIFFERENT = 16
-"""Numbers that differ, that are counted: no factor that so many have is a chance."""
 _NO_CHANCE = 1 << 15
-"""Once in so many times k whole numbers share some factor of this over k - 1 (its root): 16 even ones, 5 multiples of
-16."""
+"""By chance, k of at most 16 different numbers share a factor f once in f^(k - 1) times."""
 _EDGE = 1e-9
-"""Pixels beyond the last one that rounding of a sine and cosine leaves."""
+"""Pixels by which rounding of sine and cosine may exceed the picture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Preparer:
-    """Makes frames of files' numbers.
+    """Steps that make frames of files' numbers.
 
     Attributes
     ----------
-    how
-        steps that are done.
-    digital
-        how digital numbers of the frames become electrons a second.
     end
-        of the files' numbers, from which they are saturated; None: not known.
+        Saturation of the files' numbers, or None.
     dark
-        (rows, columns) mean number without light; None: that which ``digital`` states.
+        (rows, columns) mean number without light; None: as ``digital`` states.
     response
-        (rows, columns) of each pixel over the mean one's; None: all are alike.
+        (rows, columns) relative to the mean pixel; None: uniform.
     unlit
-        pixels whose response is below :data:`LEAST_RESPONSE`, and is not corrected.
+        Number of pixels with a response below :data:`LEAST_RESPONSE`, which are not corrected.
     """
 
     how: Preparation
@@ -65,25 +56,9 @@ class Preparer:
     def of(
         cls, how: Preparation, digital: Digital, wanted: Wanted, base: Path = Path(), end: float | None = None
     ) -> Preparer:
-        """Make one with the dark and flat frames of ``how``.
+        """Return a preparer with the dark and flat frames of ``how``, whose paths begin at ``base``.
 
-        Parameters
-        ----------
-        how
-            steps that are done, to one plane.
-        digital
-            how numbers become electrons a second, before any is corrected.
-        wanted
-            how files are read.
-        base
-            folder that paths begin in.
-        end
-            of the numbers; None: as ``digital`` says.
-
-        Raises
-        ------
-        MitsimError
-            for dark or flat frames that cannot be read, are of several sizes, or without light.
+        MitsimError for dark or flat frames that cannot be read, differ in size, or have no light.
         """
         end = digital.saturation_dn if end is None else end
         plain, response, unlit = cls(how, digital, end), None, 0
@@ -109,27 +84,23 @@ class Preparer:
 
     @property
     def level(self) -> float:
-        """Digital number without light that is stated: corrected frames have it, too."""
+        """Return the stated digital number without light, which corrected frames have, too."""
         stated = self.digital
         return stated.black_level_dn + stated.dark_current_e_per_s * stated.exposure_s * stated.gain_dn_per_e
 
     @property
     def counts(self) -> bool:
-        """True if frames hold the numbers of the files, and none between."""
+        """Return True if frames hold the files' whole numbers."""
         return self.dark is None and self.response is None and not self.how.turn_deg
 
     def plane(self, values: Numbers) -> Numbers:
-        """Return the part of ``values`` (rows, columns) that is of the channel."""
         if self.how.channel is None:
             return values
         row, column = planes_of(self.how.mosaic or BGGR)[self.how.channel]
         return values[row::2, column::2]
 
     def mean(self, source: Path, wanted: Wanted) -> FloatArray:
-        """Return the mean of all frames in ``source``, a file or folder, as they are stored but for the common factor.
-
-        They are read as ``wanted``. MitsimError where one cannot be read, or is of another size.
-        """
+        """Return the mean of all frames in ``source``, divided by the common factor but otherwise as stored."""
         total, count = np.zeros(()), 0
         for path in image_files(source, wanted):
             for values in read_images(path, wanted):
@@ -139,24 +110,11 @@ class Preparer:
         return np.asarray(total / count, dtype=np.float64)
 
     def frame(self, path: Path, values: Numbers, mean: bool = False) -> Numbers:
-        """Return the frame of a file's ``values`` (rows, columns).
+        """Return the frame of a file's ``values``, in single precision if corrected or turned.
 
-        It is of their type, or of single precision where they are corrected or turned.
-
-        Parameters
-        ----------
-        path
-            of the file, for messages.
-        values
-            as they are stored.
-        mean
-            whether they are a mean of frames, which need not be multiples of the factor.
-
-        Raises
-        ------
-        MitsimError
-            for values that the factor does not divide, of another size than dark and flat frames, or smaller than the
-            part that is to be taken; and where turning would need pixels beyond the picture.
+        ``mean`` marks means of frames, which need not be multiples of the factor. MitsimError for values that the
+        factor does not divide, another size than the dark and flat frames', and a crop or turn that needs pixels beyond
+        the picture.
         """
         factor = self.how.divide_by or 1
         if mean:
@@ -182,7 +140,6 @@ class Preparer:
         return light.astype(np.float32)
 
     def _place(self, path: Path, values: Numbers) -> Numbers:
-        """Return the plane of ``values``, oriented, turned and cropped."""
         values = self.plane(values)
         values = orient(values, self.how.orientation) if isinstance(self.how.orientation, int) else values
         first, end, crop = (0, 0), values.shape, self.how.crop
@@ -221,15 +178,7 @@ class Preparer:
 
 @dataclass
 class CommonFactor:
-    """The common factor of all numbers of some files.
-
-    Attributes
-    ----------
-    factor
-        largest whole number that divides all; 0 of zeros alone.
-    high
-        largest number.
-    """
+    """Largest whole number that divides all numbers of some files (0 for zeros alone), and the highest number."""
 
     factor: int = 0
     high: float = 0.0
@@ -237,7 +186,6 @@ class CommonFactor:
     _different: set[float] = field(default_factory=set)
 
     def add(self, values: Numbers) -> None:
-        """Count a frame's ``values`` (rows, columns)."""
         self.high, self._bits = max(self.high, float(values.max())), 8 * values.dtype.itemsize
         if len(self._different) < _MOST_DIFFERENT:
             self._different.update(np.unique(values)[:_MOST_DIFFERENT].tolist())
@@ -249,26 +197,12 @@ class CommonFactor:
             self.factor = int(np.gcd.reduce(np.append(row.astype(np.int64), self.factor)))
 
     def shift(self, end: float | None) -> int:
-        """Return the factor of numbers in the high bits of these files, where these are multiples of it; else 1.
-
-        The camera counts to ``end``.
-        """
+        """Return the power of two by which the numbers of a camera that counts to ``end`` were shifted, or 1."""
         shift = 1 if end is None else 1 << max(self._bits - int(end).bit_length(), 0)
         return shift if self.factor % shift == 0 else 1
 
     def choose(self, end: float | None) -> tuple[int, int]:
-        """Return the factor to divide by, and the one to divide by if the numbers were shifted or scaled all the same.
-
-        Parameters
-        ----------
-        end
-            largest number that the camera counts to; None: not known.
-
-        Returns
-        -------
-        int, int
-            factor of numbers beyond the camera's range, else 1; factor that is doubtful, else 1.
-        """
+        """Return the factor to divide by, and a doubtful factor that the user may divide by; 1 for none."""
         chance = self.factor ** (len(self._different) - 1) < _NO_CHANCE
         shift = self.shift(end)
         likely = shift if shift > 1 else self.factor
@@ -284,29 +218,14 @@ def _size(values: npt.NDArray[np.generic]) -> str:
 # -------- Pictures to be printed
 
 _MOST_SIDE = 4096
-"""Texels a side of a print: 0.03 mm of a sheet of 128 mm, a thirtieth of a projector pixel; four fill the texels that a
-scene may have (:data:`mitsim.scene.headers.MOST_TEXELS`)."""
+"""Four prints of that many texels a side fill a scene's limit (:data:`mitsim.scene.headers.MOST_TEXELS`)."""
 
 
 def read_reflectance(path: Path) -> FloatArray:
-    """Return the reflectances of a picture's pixels: its numbers as they are stored, without a gamma curve.
+    """Return a picture's reflectances, (rows, columns) in 0 to 1, without a gamma curve.
 
-    Whole numbers of 8 or 16 bits are divided by 255 or 65 535; real ones, and whole ones of more bits, are reflectances
-    as they are. Of colours the mean is taken. A JPEG is turned as it is to be shown.
-
-    Parameters
-    ----------
-    path
-        of a PNG, TIFF, NPY, OpenEXR or JPEG file.
-
-    Returns
-    -------
-    (rows, columns), 0 to 1.
-
-    Raises
-    ------
-    MitsimError
-        for a file that cannot be read, one with transparent pixels, and numbers that are no reflectances.
+    Whole numbers of 8 or 16 bits are divided by 255 or 65 535; other numbers are reflectances as they are. Colours are
+    averaged. MitsimError for a file that cannot be read, transparent pixels, and numbers outside 0 to 1.
     """
     suffix = path.suffix.lower()
     if suffix not in PRINTS:
@@ -335,17 +254,7 @@ def read_reflectance(path: Path) -> FloatArray:
 
 
 def fit_square(reflectance: FloatArray) -> FloatArray:
-    """Return a picture in the middle of a square: as high to wide as it is, black beside or above and below it.
-
-    Parameters
-    ----------
-    reflectance
-        (rows, columns), 0 to 1; of over 4096 pixels a side equal blocks of pixels become their mean first.
-
-    Returns
-    -------
-    (k, k), 0 to 1, k the larger of its sides.
-    """
+    """Centre a picture in a black square; above 4096 pixels a side, means over equal blocks reduce it first."""
     block = -(-max(reflectance.shape) // _MOST_SIDE)
     if block > 1:
         for axis, size in enumerate(reflectance.shape):

@@ -1,4 +1,4 @@
-"""Captures in memory and on disk: shots of a pattern family in, one object out that reads the same from either."""
+"""Captures in memory and on disk, behind one interface."""
 
 from __future__ import annotations
 
@@ -29,15 +29,13 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 _SHOWN = 3
-"""Frames that a notebook shows: with the truth they fill a line."""
 _EVERY = 8
-"""Rows and columns that tell frames apart: 4096 numbers with noise of 512 x 512, 64 of the smallest sensors."""
+"""Stride of rows and columns that distinguish frames: 4096 noisy numbers of 512 x 512 pixels."""
 _CLIPPED, _UNLIKELY, _LEVELS = 10, 20.0, 16
-"""Readings at a frame's largest number from which it may be clipped; -log of the probability, 2e-9, of as many by
-chance; and the most numbers below it that are compared: chosen, as many as are needed for 10 to be no chance."""
+"""Clipping needs 10 readings at a frame's largest number, with -log of the chance probability above 20 (2e-9), compared
+with at most 16 numbers below."""
 _SAMPLE = 1024
-"""Numbers of a frame that are looked at first for a factor of all of them: by chance that many are even once in
-2^1024."""
+"""Numbers that are tested first for a common factor; by chance all are even once in 2^1024."""
 
 
 class Capture:
@@ -46,9 +44,9 @@ class Capture:
     Attributes
     ----------
     manifest
-        patterns that were projected, and how the frames are read.
+        Projected patterns, and how the frames are read.
     folder
-        where the files lie; None for a capture in memory. Frames are then read when they are first asked for.
+        Folder of the files; None for a capture in memory. Frames are read when they are first requested.
     """
 
     def __init__(
@@ -57,77 +55,66 @@ class Capture:
         folder: Path | None = None,
         memory: Mapping[str, tuple[Channels, Metadata]] | None = None,
     ) -> None:
-        """Make a capture of the channels and metadata of its files, by ``manifest``.
-
-        Parameters
-        ----------
-        manifest
-            of the finished capture.
-        folder
-            that holds the files.
-        memory
-            channels and metadata by file name, instead of a folder; read as they are asked for.
-        """
+        """Make a capture from a folder, or from channels and metadata by file name in ``memory``."""
         self.manifest, self.folder = manifest, folder
         self._memory = memory or {}
 
     @classmethod
     @check_arguments
     def from_recorder(cls, recorder: Recorder, manifest: RunManifest) -> Capture:
-        """Return the capture whose shots a ``recorder`` has, finished by its ``manifest``."""
         return cls(recorder.finish(manifest), recorder.folder, dict(sorted(recorder.files.items())))
 
     @property
     def name(self) -> str:
-        """The folder, or the name of a capture in memory for messages."""
+        """Return the folder, or the name of a capture in memory for messages."""
         return str(self.folder) if self.folder else "the capture"
 
     @cached_property
     def dn(self) -> Channel:
-        """(shots, rows, columns) digital numbers, uint32; float32 of a sensor without an ADC."""
+        """Return (shots, rows, columns) digital numbers, uint32; float32 for a sensor without an ADC."""
         return self._stack("DN")
 
     @cached_property
     def electrons(self) -> Channel | None:
-        """(shots, rows, columns) expected photoelectrons; None for a real camera, whose expectation nobody knows."""
+        """Return (shots, rows, columns) expected photoelectrons; None for a real camera."""
         first = self.manifest.patterns.captures[0].file
         return self._stack("electrons") if "electrons" in self.read(first)[0] else None
 
     @cached_property
     def truth(self) -> FloatArray | None:
-        """(n, n) apparent reflectance, relative to the board of :attr:`truth_board`; None for a real camera."""
+        """Return the (n, n) apparent reflectance relative to :attr:`truth_board`; None for a real camera."""
         return self._channel(TRUTH, "reflectance") if self._has_truth else None
 
     @cached_property
     def truth_standard_error(self) -> FloatArray | None:
-        """(n, n) standard error of :attr:`truth`, from sampling; None where nobody stated it, as in 0.4.0."""
+        """Return the (n, n) sampling error of :attr:`truth`; None if unknown, as in version 0.4.0."""
         known = self.truth is not None and "standard_error" in self.read(TRUTH)[0]
         return self._channel(TRUTH, "standard_error") if known else None
 
     @property
     def truth_board(self) -> float | None:
-        """Reflectance of the board that counts as 1 in :attr:`truth`, where that is known."""
+        """Return the reflectance of the board that counts as 1 in :attr:`truth`, if known."""
         board = None if self.truth is None else self.read(TRUTH)[1].get("board_reflectance")
         return None if board is None else float(board)
 
     @property
     def exposure_s(self) -> float:
-        """Exposure of every frame [s]."""
+        """Return the exposure of every frame [s]."""
         return self.manifest.digital.exposure_s
 
     @property
     def plan(self) -> dict[str, Any] | None:
-        """The effect plan, as the manifest holds it; None for a real camera."""
+        """Return the effect plan in the manifest; None for a real camera."""
         return self.manifest.plan
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the capture is flagged."""
+        """Return the reasons why the capture is flagged."""
         return self.manifest.warnings
 
     @cached_property
     def ambient(self) -> Ambient | None:
-        """Light that is taken off every frame but those of signed pairs; None where no ambient frame was taken."""
+        """Return the light that is subtracted from every frame except signed pairs; None without an ambient frame."""
         if self.manifest.ambient_frame is None:
             return None
         block, digital = self.manifest.ambient_frame, self.manifest.digital
@@ -136,7 +123,7 @@ class Capture:
 
     @cached_property
     def closing(self) -> ClosingFrame | None:
-        """The closing frame; None where none was taken. MitsimError for one that is missing or damaged."""
+        """Return the closing frame, or None if none was taken; MitsimError if it is missing or damaged."""
         block = self.manifest.closing_frame
         if block is None:
             return None
@@ -150,19 +137,19 @@ class Capture:
 
     @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
-        """P_L (n, K) and P_R (n', K')."""
+        """Return P_L (n, K) and P_R (n', K')."""
         return self.manifest.patterns.matrices
 
     def measurements(self, shape: tuple[int, int] | None = None) -> Iterator[tuple[FloatArray, int, int]]:
-        """Yield (frame, i, j) of every pattern; see :meth:`measured`, which also takes ``shape``."""
+        """Yield (frame, i, j) of every pattern, see :meth:`pattern_measurements`."""
         for each in self.pattern_measurements(shape):
             yield each.frame, each.row, each.column
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """Yield the measurement of every pattern, read one at a time.
 
-        The halves of a signed one come as their difference, others without the ambient frame, if one was taken.
-        MitsimError for a frame that is missing, damaged, not finite or of another ``shape`` than is asked for.
+        Signed patterns give the difference of their halves; other frames lose the ambient frame, if one was taken.
+        MitsimError for a frame that is missing, damaged, not finite, or not of the required ``shape``.
         """
         digital = self.manifest.digital
         waiting: dict[tuple[int, int], Measurement] = {}
@@ -179,7 +166,7 @@ class Capture:
             factor, top, end = _common_factor(dn), float(dn.max()), digital.saturation_dn
             full = int(np.count_nonzero(dn >= end)) if end is not None and top >= end else 0
             clipped = 0 if full else _clipped_readings(dn, top, digital, factor)
-            # Frames that are one and the same have one digest; those of one number have none.
+            # Identical frames share a digest; constant frames have none.
             some = np.ascontiguousarray(dn[::_EVERY, ::_EVERY])
             digest = 0 if (some == some.flat[0]).all() else 1 + zlib.crc32(some.tobytes())
             half = Measurement(own, *index, light, 1, full, factor, (digest,), (clipped,))
@@ -189,7 +176,6 @@ class Capture:
             yield waiting.pop(index) + half if shot.sign else half
 
     def _projector_part(self, light: FloatArray) -> FloatArray:
-        """Return the projector's part of a shot's ``light``."""
         if self.ambient is None:
             return light
         ambient = self.ambient.rate
@@ -202,19 +188,12 @@ class Capture:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the capture's files.
-
-        They are its shots', and those of ambient frame, closing frame and truth, if it has them.
-        """
         names = [*(shot.file for shot in self.manifest.patterns.captures), *self.manifest.others.values()]
         return (*names, TRUTH) if self._has_truth else tuple(names)
 
     @check_arguments
     def read(self, name: str) -> tuple[Channels, Metadata]:
-        """Return channels and metadata of one of the :attr:`files`, by its ``name``.
-
-        MitsimError for one that is missing or damaged.
-        """
+        """Return channels and metadata of one of the :attr:`files`; MitsimError if it is missing or damaged."""
         if name not in self._memory if self.folder is None else Path(name).name != name or "\0" in name:
             raise ArgumentError("name", f"{cut(repr(name))}: is no file of this capture; see files")
         if self.folder is None:
@@ -224,12 +203,12 @@ class Capture:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 that captures of the same frames share.
+        """Return a SHA-256 that captures of the same frames share.
 
-        mitsim's share it in memory and on disk, a real camera's in the same place.
+        Simulated captures share it in memory and on disk, captures of a real camera only in the same folder.
         """
         manifest = self.manifest
-        # What is not stated is left out: folders of 0.4.0 keep their fingerprints.
+        # Fields that are not stated are left out, so that folders of 0.4.0 keep their fingerprints.
         digest = hashlib.sha256(manifest.digital.model_dump_json(exclude_defaults=True).encode())
         digest.update(manifest.patterns.model_dump_json().encode() + manifest.configuration_sha256.encode())
         files = [shot.file for shot in manifest.patterns.captures]
@@ -246,7 +225,7 @@ class Capture:
         return digest.hexdigest()
 
     def summary(self) -> dict[str, Any]:
-        """Return the facts that the command line reports; None where they are unknown, as of a real camera."""
+        """Return the facts that the command line reports; unknown ones are None."""
         manifest = self.manifest
         planned = "accuracy", "asked_seconds", "predicted_seconds", "predicted_range", "colour"
         known = (
@@ -269,9 +248,9 @@ class Capture:
 
     @check_arguments
     def save(self, folder: Path | str) -> Path:
-        """Write the RUN folder that `mitsim capture` writes, to a new or empty ``folder``; returns it.
+        """Write the RUN folder of `mitsim capture` to a new or empty ``folder`` and return it.
 
-        MitsimError when it holds something, or cannot be written.
+        MitsimError if the folder holds something, or cannot be written.
         """
         with claim_run(Path(folder), self.manifest, resume=False) as run:
             if self.folder is not None:
@@ -290,28 +269,28 @@ class Capture:
 
     @check_arguments
     def plot(self, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None) -> Axes:
-        """Draw a frame, or the truth, with a colour bar; returns the axes.
+        """Draw a frame, or the truth, with a colour bar, and return the axes.
 
         Parameters
         ----------
         shot
-            number of the frame, from 0; of no meaning for the truth.
+            Number of the frame, from 0; ignored for the truth.
         quantity
-            ``dn``, digital numbers; ``electrons``, expected ones; ``truth``, apparent reflectance.
+            ``dn``, digital numbers; ``electrons``, expected photoelectrons; ``truth``, apparent reflectance.
         ax
-            matplotlib's axes to draw on; None: those of a new figure.
+            Matplotlib axes; None: a new figure's.
 
         Raises
         ------
         MitsimError
-            for a shot that there is not, and a quantity that is not known of a real camera.
+            for a shot that does not exist, or a quantity that a real camera does not have.
         """
         return from_above("report.plots", "draw_shot")(self, shot, quantity, ax)
 
     def to_xarray(self) -> Dataset:
-        """Return frames, expected electrons and truth where known, as an ``xarray.Dataset`` with coordinates.
+        """Return frames, expected electrons and truth, if known, as an ``xarray.Dataset`` with coordinates.
 
-        MitsimError where xarray, an extra, is not installed.
+        MitsimError if xarray, an extra, is not installed.
         """
         return from_above("exchange.labelled", "label_capture")(self)
 
@@ -356,12 +335,12 @@ class Capture:
 
 @check_arguments
 def load_run(folder: Path | str) -> Capture:
-    """Return the capture in the RUN folder ``folder``. MitsimError when it is not a complete one."""
+    """Return the capture in a RUN folder; MitsimError if it is not complete."""
     return Capture(manifests.read_manifest(Path(folder), RunManifest), Path(folder))
 
 
 def _common_factor(dn: FloatArray) -> int:
-    """Return the largest whole number that divides all numbers ``dn``; 1 where they are not whole."""
+    """Return the largest whole number that divides all numbers ``dn``; 1 if they are not whole."""
     for part in (dn.ravel()[:_SAMPLE], dn.ravel()):  # nearly always the first few tell
         if not np.array_equal(part, np.rint(part)):
             return 1
@@ -372,16 +351,9 @@ def _common_factor(dn: FloatArray) -> int:
 
 
 def _clipped_readings(dn: FloatArray, top: float, digital: Digital, factor: int) -> int:
-    """Return the number of readings at the largest number, ``top``, where noise does not leave so many; else 0.
+    """Return the number of readings at the largest number, ``top``, if noise makes so many unlikely; else 0.
 
-    Of light that ends in noise alone, no number at its end is more frequent than those just below it.
-
-    Parameters
-    ----------
-    dn, factor
-        numbers of a frame, and the largest whole number that divides them.
-    digital
-        of their sensor.
+    Without clipping, a frame's largest number is not more frequent than the numbers just below it.
     """
     count = int(np.count_nonzero(dn == top))
     if not _CLIPPED <= count < dn.size:
@@ -403,22 +375,19 @@ def _size(shape: tuple[int, ...]) -> str:
     return "x".join(map(str, shape))
 
 
-# -------- Shots of one pattern in, what was measured under it out
+# -------- Measurements from the shots of one pattern
 
 
 @dataclass(frozen=True, eq=False)
 class Ambient:
-    """Light that a camera sees with the projector off, as it is taken off every frame of a run.
+    """Ambient light, which is subtracted from the frames of a run.
 
     Attributes
     ----------
     rate
         (rows, columns) mean over the shots [electrons/s].
     variance
-        (rows, columns) of that mean [(electrons/s)^2], by the noise that the manifest states. It is one
-        draw, the same in all frames.
-    shots
-        that were averaged.
+        (rows, columns) noise variance of that mean [(electrons/s)^2]; the noise itself is the same in all frames.
     """
 
     rate: FloatArray
@@ -428,20 +397,18 @@ class Ambient:
 
 @dataclass(frozen=True, eq=False)
 class ClosingFrame:
-    """A frame that was taken after all others to check that lamp, camera and scene stayed the same.
+    """Frame that was taken after all others to check that lamp, camera and scene stayed the same.
 
     Attributes
     ----------
-    kind
-        ``first``: the first shot again, in signed patterns the first half of the first pair; ``uniform``: all projector
-        pixels at full power.
     light
-        (rows, columns) [electrons/s] less black level and dark current, and less the ambient frame where measurements
-        lose it; shots of signed patterns do not, because their difference loses ambient light.
+        (rows, columns) [electrons/s] without black level and dark current, and without ambient light unless the
+        patterns
+        are signed.
     variance
-        (rows, columns) of its own noise [(electrons/s)^2], as the manifest states the sensor's noise.
+        (rows, columns) noise variance [(electrons/s)^2].
     saturated
-        readings at the full well or the ADC's end.
+        Readings at the full well or the ADC's end.
     """
 
     kind: ClosingKind
@@ -452,28 +419,23 @@ class ClosingFrame:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """The measurement under one pattern.
+    """Measurement under one pattern (i, j), which is ``row``, ``column``.
 
     Attributes
     ----------
     frame
-        (rows, columns) [electrons/s], of a signed pattern the difference of its halves; of others without ambient
-        light.
-    row, column
-        indices (i, j) of the pattern.
+        (rows, columns) [electrons/s]: difference of the halves of a signed pattern, otherwise without ambient light.
     light
-        (rows, columns) [electrons/s] sum of its shots as they were read, which have shot noise.
-    shots
-        their number.
+        (rows, columns) [electrons/s] sum of the shots as read, which determines shot noise.
     saturated
-        readings of them at the full well or the ADC's end.
+        Readings at the full well or the ADC's end.
     factor
-        largest whole number that divides all of their digital numbers; 1 where they are not whole.
+        Largest whole number that divides all digital numbers; 1 if they are not whole.
     digests
-        of each shot, which no two that were read apart share; 0 where all of its numbers are equal.
+        Hash of each shot, different for independent readings; 0 for a constant frame.
     clipped
-        of each shot, readings at its largest number, below the end of their range, where noise leaves fewer; 0 where
-        it leaves as many.
+        For each shot, readings at its largest number, below the end of the range, if noise makes so many unlikely; else
+        0.
     """
 
     frame: FloatArray
@@ -487,14 +449,14 @@ class Measurement:
     clipped: tuple[int, ...] = ()
 
     def __add__(self, other: Measurement) -> Measurement:
-        """Both halves of a signed pattern as one measurement."""
+        """Combine both halves of a signed pattern."""
         summed = ("frame", "light", "shots", "saturated", "digests", "clipped")
         sums = {name: getattr(self, name) + getattr(other, name) for name in summed}
         return replace(self, **sums, factor=math.gcd(self.factor, other.factor))
 
     @property
     def power(self) -> float:
-        """Sum of the squares of its shots [(electrons/s)^2]."""
+        """Return the sum of squares of the shots [(electrons/s)^2]."""
         # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
         halves = (self.light,) if self.shots == 1 else (self.frame, self.light)
         return float(sum(np.vdot(values, values) for values in halves)) / len(halves)
@@ -506,17 +468,7 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False)
 class LineTruth:
-    """A perfect image of a line.
-
-    Attributes
-    ----------
-    reflectance
-        (n, n), relative to the board.
-    standard_error
-        (n, n) of it, from sampling.
-    board
-        reflectance of the board that counts as 1.
-    """
+    """Perfect image (n, n) of a spectral line, relative to the ``board`` of that reflectance."""
 
     reflectance: FloatArray
     standard_error: FloatArray
@@ -530,11 +482,11 @@ class MosaicCapture:
     Attributes
     ----------
     shots
-        the frames. Their own truth is the lines' by the light that all pixels together see of each.
+        Frames; their own truth is the mean of the lines, weighted by the light that all pixels together receive.
     manifest
-        lines, filters, and the light that each passes.
+        Lines, filters, and the light that each filter passes.
     truths
-        of each line by its name; none of a real camera.
+        Perfect image of each line by name; none for a real camera.
     """
 
     shots: Capture
@@ -543,16 +495,16 @@ class MosaicCapture:
 
     @property
     def weights(self) -> FloatArray:
-        """(4, lines) electrons per photon of each of 2 x 2 pixels, row by row."""
+        """Return (4, lines) electrons per photon of each of 2 x 2 pixels, row by row."""
         return np.array(self.manifest.weights, dtype=np.float64)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the capture is flagged."""
+        """Return the reasons why the capture is flagged."""
         return self.shots.warnings
 
     def truth(self, board: float | None = None) -> FloatArray | None:
-        """(n, n, lines) of all lines, relative to a ``board`` of that reflectance; None without truths."""
+        """Return the (n, n, lines) truth relative to a ``board`` of that reflectance, or None."""
         if not self.truths:
             return None
         each = (self.truths[name] for name in self.manifest.names)
@@ -560,15 +512,14 @@ class MosaicCapture:
 
     @check_arguments
     def save(self, folder: Path | str) -> Path:
-        """Write the folder that `mitsim capture --colour mosaic` writes, to a new or empty ``folder``; return it.
+        """Write the folder of `mitsim capture --colour mosaic` to a new or empty ``folder`` and return it.
 
-        MitsimError when it holds something, or cannot be written.
+        MitsimError if the folder holds something, or cannot be written.
         """
         self.write_lines(path := self.shots.save(folder))
         return path
 
     def write_lines(self, folder: Path) -> None:
-        """Write the lines' truths and colour.json beside the frames in ``folder``, colour.json last."""
         for name, truth in self.truths.items():
             with output_folder(folder / name, overwrite=True) as place:
                 channels = {"reflectance": truth.reflectance, "standard_error": truth.standard_error}
@@ -589,7 +540,7 @@ class MosaicCapture:
 
 @check_arguments
 def load_mosaic(folder: Path | str) -> MosaicCapture:
-    """Return the run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
+    """Return the run behind colour filters in ``folder``; MitsimError if it is not complete."""
     folder = Path(folder)
     manifest = cast("MosaicManifest", manifests.read_colours(folder, manifests.MOSAIC))
     truths = {}
@@ -608,20 +559,11 @@ TRUTH, AMBIENT, CLOSING = "truth.exr", "ambient.exr", "closing.exr"
 
 
 def frame_name(index: int) -> str:
-    """File name of shot number ``index`` in its run folder."""
     return f"frame_{index:05d}.exr"
 
 
 class Recorder:
-    """Keeps the files of a run, from any thread: in memory, or, as :class:`RunFolder`, on disk.
-
-    Attributes
-    ----------
-    folder
-        where the files lie; None in memory.
-    files
-        channels and metadata by file name, in memory alone.
-    """
+    """Keeper of a run's files, from any thread: here in memory, in :class:`RunFolder` on disk."""
 
     folder: Path | None = None
 
@@ -629,69 +571,49 @@ class Recorder:
         self.files: dict[str, tuple[Channels, Metadata]] = {}
 
     def begin(self) -> None:
-        """Begin to write: all input has been checked."""
+        """Begin to write after all input was checked."""
 
     def keeps(self, index: int) -> bool:
-        """Return True if shot number ``index`` is there already, which then counts as written; never in memory."""
+        """Return True if shot ``index`` exists already, and count it as written."""
         return False
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        """Write a file of the run by its ``name``, whole or not at all.
-
-        It has ``channels``, (rows, columns) each, and ``metadata``.
-        """
         self.files[name] = channels, metadata
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        """Write the shot number ``index``: its ``channels``, (rows, columns) each, and ``metadata``."""
         self.write(frame_name(index), channels, metadata)
 
     def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
-        """Write the truth.
-
-        Parameters
-        ----------
-        reflectance, board
-            (n, n), relative to a board of that reflectance.
-        standard_error
-            (n, n) of it, where known.
-        """
         known = {"reflectance": reflectance, "standard_error": standard_error}
         channels = {name: values.astype(np.float32) for name, values in known.items() if values is not None}
         self.write(TRUTH, channels, {"board_reflectance": board})
 
     def finish(self, manifest: RunManifest) -> RunManifest:
-        """Return the ``manifest`` of the finished run, with checksums where there are files."""
+        """Return the ``manifest`` of the finished run, with checksums if there are files."""
         return manifest
 
 
 class RunFolder(Recorder):
-    """Keeps a run in a folder, whole, resumable and checked; made by :func:`claim_run`.
+    """Keeper of a run in a folder, whole, resumable and checked; made by :func:`claim_run`.
 
-    A frame is kept on resume when it is the one that a finished run's checksum names, or, in an interrupted run, when
-    it is readable, carries this run's digest, and its pixels have the checksum that was noted with it.
+    On resume a frame is kept if its checksum is in a finished run's manifest or, in an interrupted run, if it has this
+    run's digest, and its pixels have the checksum in its metadata.
     """
 
     folder: Path
 
     def __init__(self, folder: Path, head: RunHead, known: Mapping[str, str]) -> None:
-        """Make a run of the configuration in ``head``, in its ``folder``.
-
-        Checksums of an earlier, finished run by file name are ``known``.
-        """
         super().__init__()
         self.folder, self.head = folder, head
         self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
 
     def begin(self) -> None:
-        """Mark the folder as an unfinished run of this configuration."""
         remove_page(self.folder)
         configuration, digest = self.head.configuration, self.head.configuration_sha256
         head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
         manifests.write_manifest(self.folder, head)
 
     def keeps(self, index: int) -> bool:
-        """Return True if shot number ``index`` is there already; it then counts as written."""
         name = frame_name(index)
         path = self.folder / name
         if not path.is_file():
@@ -710,15 +632,12 @@ class RunFolder(Recorder):
         return same
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        """Write a file of the run, whole or not at all, as :meth:`Recorder.write`."""
         self._note(name, write_frame(self.folder / name, channels, metadata))
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        """Write one shot as :meth:`Recorder.write_frame`, with its identity."""
         super().write_frame(index, channels, {**self._identity(index, channels), **metadata})
 
     def finish(self, manifest: RunManifest) -> RunManifest:
-        """Write the ``manifest`` of the finished run, with checksums; return it."""
         checksums = dict(sorted(self._checksums.items()))
         manifest = manifest.model_copy(update={"status": "complete", "checksums": checksums})
         manifests.write_manifest(self.folder, manifest)
@@ -729,10 +648,7 @@ class RunFolder(Recorder):
             self._checksums[name] = value
 
     def _identity(self, index: int, channels: Channels) -> Metadata:
-        """Return the metadata that distinguish a frame from one of another run or place, and from a damaged one.
-
-        In an interrupted run no manifest holds checksums of files yet.
-        """
+        """Return the metadata that identify a frame of an interrupted run, whose manifest has no checksums yet."""
         digest = hashlib.sha256()
         for name, values in sorted(channels.items()):
             digest.update(name.encode())
@@ -742,21 +658,10 @@ class RunFolder(Recorder):
 
 @contextmanager
 def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
-    """Claim a folder for a run, checked before any work; if that fails before writing, a new folder is removed.
+    """Claim a folder for a run; a new folder is removed if the run fails before writing.
 
-    Parameters
-    ----------
-    path
-        of the folder.
-    head
-        the configuration of the run.
-    resume
-        whether the folder may hold an unfinished or finished run of the same configuration.
-
-    Raises
-    ------
-    MitsimError
-        for a place that cannot be written, that holds something else, or, with ``resume``, another configuration.
+    ``resume`` allows an earlier run of the same configuration. MitsimError for a place that cannot be written, or that
+    holds something else.
     """
     known: Mapping[str, str] = {}
     again = resume and (path / MANIFEST).is_file()

@@ -1,7 +1,6 @@
-"""Independent random streams: one root seed and a name in, a generator out.
+"""Independent random streams by root seed and name.
 
-A stream depends on the root and its own name only, never on how many others were asked for or in which order,
-so frame 17's shot noise is the same whether frames 0 to 16 were drawn or not.
+A stream depends only on the root and its own name, so frame 17's shot noise does not depend on frames 0 to 16.
 """
 
 from __future__ import annotations
@@ -15,31 +14,24 @@ if TYPE_CHECKING:  # and where streams are made: checking a seed does not need i
     import numpy as np
 
 _LARGEST_ROOT = 2**64
-"""What a frame's metadata and other programs hold as an unsigned integer."""
+"""Seeds are unsigned 64-bit integers in a frame's metadata and in other programs."""
 
 
 def check_root(root: int) -> int:
-    """Return the seed ``root`` of all streams; MitsimError when it is out of range."""
     if not 0 <= root < _LARGEST_ROOT:
         raise MitsimError(f"seed: got {root}; allowed are whole numbers from 0 to 2^64 - 1")
     return root
 
 
 def stream(root: int, *names: str | int) -> np.random.Generator:
-    """Return a generator of its own for ``names`` under the seed ``root`` (0 <= root < 2^64).
-
-    For example ``stream(seed, "shot", frame)``. MitsimError for a root out of range.
-    """
+    """Return the generator of a name, for example ``stream(seed, "shot", frame)``; MitsimError for an invalid root."""
     import numpy as np
 
     return np.random.Generator(np.random.PCG64(_sequence(root, "stream", names)))
 
 
 def integer(root: int, *names: str | int) -> int:
-    """Return a child seed in [0, 2^32) for ``names`` under the seed ``root``, for libraries that want an integer.
-
-    It is unrelated to the :func:`stream` of that name. MitsimError for a root out of range.
-    """
+    """Return a seed in [0, 2^32) for libraries that need an integer, unrelated to the :func:`stream` of that name."""
     import numpy as np
 
     return int(_sequence(root, "integer", names).generate_state(1, np.uint32)[0])

@@ -1,8 +1,8 @@
-"""A process of its own for long work: whatever becomes of it, somebody is left to say so.
+"""Worker process for long work, and a parent that reports the worker's end.
 
-Native code (Dr.Jit, LLVM, OpenEXR) can end a process without an exception, and the kernel kills one that takes too
-much memory. So the program splits in two before anything heavy is imported: the worker goes on, and the parent waits,
-passes signals on and turns the worker's end into an exit status and, where it died, one clear line.
+Native code (Dr.Jit, LLVM, OpenEXR) can end a process without an exception, and the kernel kills a process that takes
+too much memory. Therefore the program forks before heavy imports: the parent passes signals on, and converts the
+worker's end to an exit status and, if it died, one line.
 """
 
 from __future__ import annotations
@@ -23,37 +23,30 @@ from typing import NoReturn
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status after Control-C, as in a shell."""
 RESUME = "finished work is kept, go on with --resume"
-"""Advice to whom a capture or a calibration was cut short."""
 _STOPS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name))
 _CRASHES = ("SIGABRT", "SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGTRAP")
 _SPACE_BYTES = 0.7e9
-"""Address space in which a command comes to its own check of memory; measured: below, LLVM ends the process."""
+"""Address space that a command needs to reach its own check of memory (measured); below, LLVM ends the process."""
 _SPACE_BYTES_PER_PROCESSOR = 85e6
-"""What each processor adds, buffers and stacks of two OpenBLAS; measured."""
+"""Buffers and stacks of two OpenBLAS for each processor (measured)."""
 _AGAIN_S = 0.01
-"""After which an interrupt that was lost comes again, and again: the callback that dropped it is over by then, and
-one that comes just before Python waits for something would not wake it."""
+"""A lost interrupt repeats at this interval, because a callback may drop it, or Python may begin to wait just after it.
+"""
 _LONGEST_FAULT = 300
-"""Characters of an uncaught error's message: some have whole files in them."""
 _LONGEST_ADVICE = 256
-"""Bytes; chosen so that any sentence fits."""
 
 
 def workers() -> int:
-    """Processors that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 _WHOLE = "\r\x1b[J\x1b[?25h"
-"""What a terminal is left with when the worker could not: a free line, and a cursor that is seen."""
+"""Clears the line and shows the cursor of a terminal after the worker died."""
 
 
 class OutOfTime(BaseException):
-    """Raised in work whose time is over (:mod:`mitsim.core.job`).
-
-    It is no Exception, so that nothing in the work takes it for a failure that it may go on from.
-    """
+    """Raised in work whose time is over; no Exception, so that the work does not handle it as a failure."""
 
 
 _stopped_by: int | None = None
@@ -62,13 +55,11 @@ _status: int | None = None
 
 
 def enter_worker() -> None:
-    """Return in a child process; the parent never returns, but exits with the child's status.
+    """Fork, and return in the child; the parent exits with the child's status, or 128 + the signal that ended it.
 
-    A worker that a signal ended gives 128 + its number, as in a shell. SIGINT, SIGTERM, SIGHUP and SIGQUIT to the
-    parent reach the worker, where they raise KeyboardInterrupt (see :func:`end_stopped`); a second one kills it. When
-    the parent is killed, so is the worker. An address space too small to start in ends the program with status 2. To
-    be called once, before threads are started: RuntimeError when Dr.Jit is there already, whose threads a fork leaves
-    behind. Without ``os.fork`` the process stays one.
+    Signals that stop the parent are passed to the worker, where they raise KeyboardInterrupt (see :func:`end_stopped`);
+    a second one kills it. The worker dies with the parent. Call it once, before threads start: RuntimeError if Dr.Jit
+    is loaded, because a fork loses its threads. Without ``os.fork`` there is no second process.
     """
     global _advice
     if not hasattr(os, "fork"):
@@ -125,11 +116,7 @@ def enter_worker() -> None:
 
 
 def end_with(status: object) -> None:
-    """Note the exit ``status`` of a worker that is about to end.
-
-    Once threads have ended, functions that are registered for the exit are done and output is written, it ends at once.
-    To take interpreter and native libraries apart takes 0.2 s.
-    """
+    """Register the exit ``status`` of a worker, which then skips taking down interpreter and libraries (0.2 s)."""
     global _status
     _status = status if isinstance(status, int) else None
 
@@ -146,18 +133,16 @@ def _leave() -> None:
 
 
 def advise(text: str) -> None:
-    """Note advice, a ``text`` without a full stop, for a command that is cut short; empty for none."""
     if _advice is not None:
         _advice[:] = text.encode()[:_LONGEST_ADVICE].ljust(_LONGEST_ADVICE, b"\0")
 
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Make signals that stop this process wait until the block ends.
+    """Delay signals that stop this process until the block ends.
 
-    Native code that is being imported turns their exceptions into errors of its own, or ends the process. Threads that
-    begin in it leave them to the main one for good; those that were there, as of a library for linear algebra, may
-    still take one, which is kept for the end.
+    Native code that is being imported turns their exceptions into its own errors or ends the process. Threads that
+    start in the block never receive the signals.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -181,11 +166,7 @@ def held_back() -> Iterator[None]:
 
 @contextmanager
 def pause_collector() -> Iterator[None]:
-    """Make Python's collector wait while modules are imported.
-
-    It would go through their objects again and again, for 0.06 to 0.1 s of a capture. In a worker it ignores all
-    earlier objects from there on.
-    """
+    """Pause Python's collector during imports, which saves 0.06 to 0.1 s of a capture."""
     collecting, known = gc.isenabled(), len(sys.modules)
     gc.disable()
     try:
@@ -199,27 +180,23 @@ def pause_collector() -> Iterator[None]:
 
 
 def has_rows() -> bool:
-    """Return True if standard error is a terminal on which rows of progress can be written again."""
     return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def is_stopped() -> bool:
-    """Return True if a signal asked this process to end."""
     return _stopped_by is not None
 
 
 def end_stopped() -> NoReturn:
-    """Report the signal that stopped this process, with advice, and exit with 128 + its number."""
     number = signal.Signals(_stopped_by or signal.SIGINT)
     _say(_with_advice(_ending(number)))
     sys.exit(128 + number)
 
 
 def end_uncaught(error: BaseException) -> NoReturn:
-    """Report in one line an ``error`` that nobody caught, with the file of its traceback, and exit with 2.
+    """Report an uncaught ``error`` in one line, and exit with 2, because 1 means a result.
 
-    1 would mean that there is a result. If an interrupt became that error on its way, as in a module that was being
-    imported, the interrupt is reported.
+    If an interrupt became that error, for example during an import, the interrupt is reported.
     """
     if is_stopped():
         end_stopped()
@@ -258,12 +235,10 @@ def _say(text: str) -> None:
 
 
 def say_note(text: str) -> None:
-    """Write the ``text`` of a Python warning to stderr, in a line, without the file and line of a program."""
     _say(f"note: {' '.join(text.split())}")
 
 
 def _signals_to_heed() -> list[int]:
-    """Signals that are not ignored already, as nohup and background jobs of a shell have it."""
     return [number for number in _STOPS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
@@ -276,14 +251,7 @@ def _stop(number: int, _: FrameType | None) -> None:
 
 
 def _insist_on_signals() -> None:
-    """Repeat a signal until its handler has run.
-
-    Python's own C handler only notes it and writes a byte; where that happens just before Python waits for something,
-    nothing ends the wait.
-
-    Python's own C handler only notes it and writes a byte; where that happens just before Python waits for something,
-    nothing ends the wait.
-    """
+    """Repeat a signal until its handler has run, because a signal just before a wait does not end it."""
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
@@ -304,11 +272,7 @@ def _again(_: int, __: FrameType | None) -> None:
 
 
 def _unraisable(lost: sys.UnraisableHookArgs) -> None:
-    """Repeat an interrupt that fell into a callback or a destructor, where Python drops it with a traceback.
-
-    Other errors of a stopped process are not reported, such as a second signal that came too late. Alarms of
-    :mod:`mitsim.core.job` come again of themselves.
-    """
+    """Repeat an interrupt that Python dropped in a callback or destructor; alarms repeat anyway."""
     if lost.exc_type is OutOfTime:
         return
     if not is_stopped():
@@ -318,7 +282,6 @@ def _unraisable(lost: sys.UnraisableHookArgs) -> None:
 
 
 def _watch(child: int) -> NoReturn:
-    """Wait for the worker, pass signals on, report its end, and exit."""
     asked: list[int] = []
     # Signals stay blocked and are waited for, the worker's end among them: a handler's call can be late by a wait.
     signal.signal(signal.SIGCHLD, lambda *_: None)  # some systems drop what is ignored, blocked or not
