@@ -50,7 +50,7 @@ NONUNIFORMITY, SPECKLE = "response nonuniformity", "speckle"
 """Names of noise sources beside those of :mod:`mitsim.calibrate.board_session`."""
 DIM_E = 5600
 """Electrons of the brightest pixel with which the idealised model has the paper's decibels of uniform light and of 49
-dots, mask at 2000 um: 22.8 and 34.8 (`benchmarks/noise_reading.py --distance 2`)."""
+dots, mask at 2000 um: 22.8 and 34.8."""
 DIM = f"a peak of {DIM_E} electrons"
 LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
 """Lambdas relative to the largest sigma^2, a quarter of a decade apart, for a search with the truth."""
