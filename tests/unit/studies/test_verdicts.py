@@ -22,6 +22,7 @@ from mitsim.studies.framework.claims import (
     within,
 )
 from mitsim.studies.framework.experiment import Results, find_experiment
+from mitsim.studies.light_studies import AS_BRIGHT, STRONG, WEAK
 from mitsim.studies.waterfall_study import EFFECTS
 
 Row = dict[str, Value]
@@ -134,9 +135,9 @@ def at_depths(value: float, auto: float = 0.0, mapped: float = 9.0, flagged: boo
 
 
 def lamps(hadamard_db: float, dots_range: float = 0.5) -> list[Row]:
-    """Under a lamp as bright as the projector, and under one a hundredth of it."""
+    """Under a lamp as bright as the projector, under one a hundredth of it, and under a strong one."""
     found: list[Row] = []
-    for lamp, ratio in (("1", 0.01), ("100", 1.0)):
+    for lamp, ratio in ((WEAK, 0.01), (AS_BRIGHT, 1.0), (STRONG, 100.0)):
         case = {"lamp": lamp, "ratio": ratio, "model": RENDERED, "range_low": 0.0}
         for name, gained, top in (("dots:8", 0.0, dots_range), ("hadamard:8", hadamard_db, 0.5), ("uniform", 0.0, 0.5)):
             shown = rows(20 + gained, patterns=name, absolute=False, jitter=name == "hadamard:8", **case)
