@@ -163,13 +163,7 @@ def reconstruct_psf_request(
         flags.append(f"{saturated} readings are at the full well or the ADC's end: expose for less.")
     return Reconstruction(
         **{**vars(solution), "status": replace(status, flags=(*status.flags, *flags))},
-        rank=None,
-        condition=None,
-        rank_sides=None,
-        condition_sides=None,
-        misfit=None,
         fit=fit,
-        uncertainties=None,
         seconds={stage: spent for stage, spent in clock.seconds().items() if stage != "total"},
         inputs=psf_inputs(shots, light, reduce, request),
     )

@@ -88,12 +88,12 @@ class Reconstruction(Solution):
         Fit to a point spread function; None for an image by factors.
     """
 
-    rank: int | None
-    condition: float | None
-    rank_sides: tuple[int, int] | None
-    condition_sides: tuple[float, float] | None
-    misfit: Misfit | None
-    uncertainties: Uncertainty | None
+    rank: int | None = None
+    condition: float | None = None
+    rank_sides: tuple[int, int] | None = None
+    condition_sides: tuple[float, float] | None = None
+    misfit: Misfit | None = None
+    uncertainties: Uncertainty | None = None
     seconds: dict[str, float]
     inputs: dict[str, Any]
     focus: Depth | DepthMap | None = None

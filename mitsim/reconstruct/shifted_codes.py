@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -98,9 +97,17 @@ class Shape:
     centre: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Side:
-    """Geometry of one side: ``sensor`` and ``scene`` pixels, ``scale``, ``terms``, and whether it is centred."""
+    """Geometry of one side: ``sensor`` and ``scene`` pixels, ``scale``, ``terms``, and whether it is centred.
+
+    Attributes
+    ----------
+    width, length
+        Length of the window of the code that one sensor pixel sees, and of the code.
+    weights
+        Polynomials b_k (terms, n) of mean square 1.
+    """
 
     sensor: int
     scene: int
@@ -108,23 +115,12 @@ class Side:
     terms: int
     centre: bool
 
-    @property
-    def width(self) -> int:
-        """Length of the window of the code that one sensor pixel sees."""
-        return int(np.floor(self.scale * (self.scene - 1))) + 3
-
-    @property
-    def length(self) -> int:
-        """Length of the code."""
-        return self.sensor + self.width - 1
-
-    @cached_property
-    def weights(self) -> FloatArray:
-        """Polynomials b_k (terms, n) of mean square 1."""
+    def __post_init__(self) -> None:
+        self.width = int(np.floor(self.scale * (self.scene - 1))) + 3
+        self.length = self.sensor + self.width - 1
         place = np.linspace(-1, 1, self.scene) if self.scene > 1 else np.zeros(1)
-        return np.stack(
-            [np.polynomial.legendre.Legendre.basis(k)(place) * np.sqrt(2 * k + 1) for k in range(self.terms)]
-        )
+        bases = ((np.polynomial.legendre.Legendre.basis(k), 2 * k + 1) for k in range(self.terms))
+        self.weights: FloatArray = np.stack([basis(place) * np.sqrt(size) for basis, size in bases])
 
     def hats(self, offset: float) -> FloatArray:
         """Return the linear interpolation (n, width) of each scene pixel in its window, at an ``offset``."""
