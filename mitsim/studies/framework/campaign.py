@@ -1,4 +1,4 @@
-"""Studies from name and scope to a folder with points, table, claims, figures and page; and studies of one bench.
+"""Studies from name and scope to a folder with points, table, claims, figures and page.
 
 Points of a study are measured in processes of their own, which keep their studio from batch to batch. A process that
 dies loses the point that it was measuring, and another process tries it again.

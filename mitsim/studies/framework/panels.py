@@ -13,7 +13,6 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import pairwise, product
 from pathlib import Path
 from string import Formatter
-from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -423,10 +422,6 @@ class Part:
         begins = re.compile(r"[+-]?\d|nothing$")
         return tuple(any(cells) and all(not cell or begins.match(cell) for cell in cells) for cells in columns)
 
-    def lines(self) -> list[str]:
-        """Return title, lead and table as text."""
-        return [f"{self.title}:", *wrap(self.lead, 100), *text_table(self.head, self.rows)]
-
 
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return the lines of a table of ``rows`` under their ``head``; none without rows."""
@@ -562,7 +557,7 @@ def build_findings(
     name: str, titles: tuple[str, str], where: str, parts: Sequence[Part], pictures: Mapping[str, tuple[str, int]],
     warnings: Sequence[str] = (),
 ) -> str:  # fmt: skip
-    """Return the page of a study of one bench as HTML.
+    """Return the page of findings that are no table of points as HTML.
 
     Parameters
     ----------
