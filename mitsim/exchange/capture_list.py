@@ -1,4 +1,4 @@
-"""A person's knowledge of a real camera's frames, in a list or on the command line; checked before any is opened."""
+"""Facts about a real camera's frames, from a list or the command line; checked before any frame is opened."""
 
 from __future__ import annotations
 
@@ -24,49 +24,50 @@ _OTHERS = {
     "full_well_e": "a camera's file; give it to --camera, and the list of a capture to --list",
     "signed_capture": "the list of a calibration's frames; `mitsim calibrate --frames` reads it, in their folder",
 }
-"""What other files are, by a field that each of them has."""
+"""Kinds of files that are no capture list, by a field that each of them has."""
 TURNED = "turn_deg"
-"""Of a calibration's configuration: angle by which its frames are turned, as `turn_deg` of a list."""
+"""Field of a calibration's configuration with the angle by which its frames are turned."""
 
 
 class CaptureList(Configuration):
-    """Facts of a real capture, and how its files become frames.
+    """Facts of a real capture, and preparation of its files.
 
-    Options of `mitsim import` take their place.
+    Options of `mitsim import` replace them.
     """
 
     camera: Identity | None = None
-    """Identity that a calibration must share: a name, or anything as a run's manifest has it; none: by --camera or
+    """Identity that a calibration must share: a name, or any value as in a run's manifest; none: by --camera or
     --calibration."""
     digital: Digital | None = None
-    """How digital numbers become electrons a second, as in a run's manifest; none: by --camera and --exposure."""
+    """Conversion of digital numbers to electrons a second, as in a run's manifest; none: by --camera and --exposure."""
     bits: int | None = Field(default=None, ge=1, le=32)
-    """Of a number of the camera, which counts whole ones; none: its numbers are real, or the camera file says it."""
+    """Bits of the camera's whole numbers; none: real numbers, or as in the camera file."""
     patterns: str | None = None
     """Name of the family, or patterns.json of `mitsim export --format png`, a path from the list's folder."""
     n: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
     """Scene pixels a side, without a calibration."""
     seed: int = Field(default=0, ge=0, lt=2**64)
-    """Of patterns of a `random` family."""
+    """Seed of patterns of a `random` family."""
     ambient: str | None = None
-    """Frame with the projector off, or a folder of such; a path from the list's folder."""
+    """Frame with the projector off, or a folder of such frames; a path from the list's folder."""
     ambient_shots: int | None = Field(default=None, ge=1)
-    """Shots that a single such frame is the mean of."""
+    """Number of shots averaged in a single ambient frame."""
     closing_frame: ClosingKind | None = None
-    """`first` or `uniform`: the last frame checks lamp, camera and scene, and shows the first shot again, or all pixels
-    of the projector lit; none: there is no such frame."""
+    """`first` or `uniform`: the last frame checks lamp, camera and scene, and shows the first shot again, or all
+    projector pixels lit; none: no such frame."""
     closing_exposure_s: Positive | None = None
     """Exposure of the closing frame [s]; none: that of all frames."""
     order: str | None = None
     """Order in which the shots were taken, such as `column-major`; none: row-major, of signed ones + before -."""
     raw: Raw | None = None
-    """How files without a header are read; none: there are none."""
+    """Layout of files without a header; none: there are no such files."""
     centre: bool | None = None
-    """Whether calibrations of these frames take row and column means off (FlatCam masks); none: they say it."""
+    """True if calibrations of these frames remove row and column means (FlatCam masks); none: as the calibration
+    states."""
     prepare: Preparation = Preparation()
-    """Table: what is done to the files' numbers before they are frames."""
+    """Table: preparation of the files' numbers."""
     source: str | None = None
-    """Where all this is known from."""
+    """Source of these facts."""
 
     @model_validator(mode="after")
     def _is_whole(self) -> CaptureList:
@@ -82,10 +83,7 @@ class CaptureList(Configuration):
 
 
 def load_capture_list(name: Path | str) -> CaptureList:
-    """Load the list of a ``name``, shipped, or in a TOML or JSON file; its paths begin where the command runs.
-
-    MitsimError when there is none, or it breaks a rule.
-    """
+    """Load a list by its shipped ``name``, or from a TOML or JSON file; MitsimError if it is missing or invalid."""
     path = configuration.locate(name, "calibration", ".toml", configuration.LIST)
     data = configuration.read_table(path, "list")
     for name_of_field, kind in _OTHERS.items():
@@ -98,27 +96,12 @@ def load_capture_list(name: Path | str) -> CaptureList:
 
 
 def _from_folder(holder: Configuration, folder: Path, *names: str) -> dict[str, str]:
-    """Return those of the fields ``names`` that hold a path, from ``folder`` on."""
     return {name: str(folder / path) for name in names if (path := getattr(holder, name)) is not None}
 
 
 @dataclass(frozen=True)
 class Electronics:
-    """A camera by its numbers.
-
-    Attributes
-    ----------
-    name
-        for messages.
-    identity
-        that a calibration must share.
-    digital
-        how its numbers become electrons a second.
-    largest
-        number that it counts to; None: its numbers are real.
-    stated
-        its part of a manifest's configuration.
-    """
+    """Identity and electronics of a camera; ``largest`` is None for real numbers."""
 
     name: str
     identity: dict[str, Any]
@@ -129,21 +112,10 @@ class Electronics:
 
 @dataclass(frozen=True)
 class RealCapture:
-    """A person's knowledge of a real capture.
+    """Facts about a real capture; None: as ``listed`` states.
 
-    Attributes
-    ----------
-    listed
-        content of a list, or options in the place of it.
-    camera
-        electronics: name of a shipped file, or a TOML file; None: as ``listed`` says.
-    exposure_s
-        of every frame [s]; None: as ``listed`` says.
-    calibration
-        CAL folder of the same camera, which states its identity and the projector's pixels; of all planes a coloured
-        one.
-    black_level_dn
-        digital number of a (binned) pixel without charge, where it is another than the camera's.
+    ``calibration`` is a CAL folder of the same camera, coloured for all planes, which states identity and projector
+    pixels.
     """
 
     listed: CaptureList
@@ -154,32 +126,27 @@ class RealCapture:
 
     @property
     def patterns(self) -> str:
-        """Name of the family, or file of `mitsim export --format png`. ArgumentError where nobody says it."""
+        """Return the name of the family, or the file of patterns; ArgumentError if none is stated."""
         if self.listed.patterns is None:
             raise ArgumentError("patterns", "is not given, and frames do not say it; give it")
         return self.listed.patterns
 
     @property
     def in_file(self) -> bool:
-        """True if the patterns are in a file."""
         return Path(self.patterns).suffix == ".json"
 
     @property
     def wanted(self) -> Wanted:
-        """Kind of its files, and how they are read."""
         return Wanted.of(self.listed.raw, self.listed.prepare)
 
     @property
     def colours(self) -> ColourManifest | None:
-        """All planes as lines of a coloured folder; None of a single plane, or a picture that is no mosaic."""
+        """Return all planes as lines of a coloured folder; None for a single plane, or a picture without mosaic."""
         prepare = self.listed.prepare
         return manifests.lines_of_planes(manifests.RUN, prepare.wavelengths_nm) if prepare.channel == ALL else None
 
     def electronics(self) -> tuple[Electronics, Preparation]:
-        """Return the camera, by its file or the list; and the preparation of its numbers, with its mosaic.
-
-        MitsimError where neither says it, or a value cannot be.
-        """
+        """Return camera and preparation with its mosaic; MitsimError if neither file nor list has them."""
         listed = self.listed
         prepare = listed.prepare
         if self.camera is not None:
@@ -204,7 +171,7 @@ class RealCapture:
         return Electronics(name, identity, digital, largest, stated), prepare
 
     def check(self, source: Path) -> None:
-        """Raise MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
+        """Raise MitsimError for invalid values, and a ``source`` without frames, before any frame is opened."""
         listed = self.listed
         check_root(listed.seed)
         if listed.closing_exposure_s is not None:
@@ -232,7 +199,6 @@ class RealCapture:
                 image_files(Path(place), self.wanted)
 
     def _check_calibration(self, folder: Path) -> None:
-        """Raise MitsimError for a calibration that is none, of other lines, or that keeps means that the list takes."""
         colours = self.colours
         if colours is not None:
             manifests.read_colours(folder, manifests.CALIBRATION)
@@ -252,7 +218,7 @@ class RealCapture:
                 )
 
 
-# ---- What is said of frames in the place of a list ----
+# ---- Options in place of a list ----
 
 _OF_BARE = ("shape", "bits", "byte_order")
 """Options of files without a header alone."""
@@ -261,7 +227,7 @@ _LISTS, _CAMERAS = (partial(configuration.shipped_names, field) for field in (co
 
 
 class FrameFacts(Options):
-    """Facts of a real camera's frames, in the place of a list's; None if not known."""
+    """Facts about a real camera's frames that replace a list's; None if unknown."""
 
     VERB = "import_frames"
 
@@ -306,10 +272,7 @@ class FrameFacts(Options):
     seed: int | None = _said("root of every random stream", panel=configuration.QUALITY)
 
     def of(self, source: Path) -> RealCapture:
-        """Return the facts of the frames at ``source``, checked before any is opened.
-
-        MitsimError as :meth:`RealCapture.check`, and for options without effect.
-        """
+        """Return the checked facts about ``source``; MitsimError as :meth:`RealCapture.check`, or unused options."""
         listed = CaptureList() if self.list is None else load_capture_list(self.list)
         bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
         if self.shape is None or not bare:
@@ -341,7 +304,6 @@ class FrameFacts(Options):
         return known
 
     def _preparation(self, listed: Preparation) -> Preparation:
-        """Return the preparation of a list, ``listed``, with the options in the place of it."""
         paths = {"dark": self.dark_frame, "flat": self.flat_frame, "flat_dark": self.flat_dark_frame}
         stated = {"channel": self.channel, "mosaic": self.mosaic, "divide_by": self.divide, "turn_deg": self.turn}
         given: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
@@ -360,8 +322,6 @@ class FrameFacts(Options):
 
 
 class FrameKeys(TypedDict, total=False):
-    """Keywords of :class:`FrameFacts`."""
-
     list: Path | str | None
     patterns: str | None
     camera: Path | str | None
@@ -390,5 +350,4 @@ class FrameKeys(TypedDict, total=False):
 
 
 def _text_of(parts: str | tuple[int, ...], sign: str) -> str:
-    """Numbers as a text has them, with a ``sign`` between."""
     return parts if isinstance(parts, str) else sign.join(map(str, parts))

@@ -1,8 +1,6 @@
-"""RUN and CAL folders in, a file or folder of a format that other programs read out; and back.
+"""Export of RUN and CAL folders to files of other programs, import of such files and of real frames, and pictures.
 
-A real camera's frames become folders, too, and patterns become pictures for a real projector.
-
-Each format is a row of :data:`FORMATS`. Its module is imported when it is used; a request is checked before.
+Each format is a row of :data:`FORMATS`; its module is imported when it is used, after the request was checked.
 """
 
 from __future__ import annotations
@@ -33,21 +31,19 @@ if TYPE_CHECKING:
 
 
 PNG = "png"
-"""The format that is a folder in place of a file. It alone holds no calibration and no run behind colour filters."""
+"""Only this format is a folder; it has no calibration and no run behind colour filters."""
 FORMATS = {
     "hdf5": "packed.write_hdf5",
     "mat": "matlab.write_matlab",
     "torch": "labelled.write_tensors",
     PNG: "png_files.write_pngs",
 }
-"""Modules of this room and functions that write a format, by the name that `--format` takes: from the place, the run
-(of one line, coloured or behind filters), and its ``calibration`` or a ``projector``'s name, to sentences on the parts
-of the run that the format does not hold, or on its use."""
+"""Functions that write each format: from place, run, and calibration or projector to notes on the use of the file, or
+on parts of the run that it does not hold."""
 READERS = {".h5": "packed.load_hdf5", ".hdf5": "packed.load_hdf5", ".mat": "matlab.load_mat"}
-"""Functions that open a file that `mitsim import` takes, by the end of its name: from the place and a channel to a
-context of :data:`mitsim.exchange.packed.Loaded`."""
+"""Functions that open files of `mitsim import`, by suffix: from place and channel to a context of
+:data:`mitsim.exchange.packed.Loaded`."""
 _CALLED = {"output": "run", "calibration_output": "calibration"}
-"""What the folder of an argument is, in messages."""
 
 
 def _function(name: str) -> Callable[..., Any]:
@@ -57,7 +53,7 @@ def _function(name: str) -> Callable[..., Any]:
 
 
 class Exported(Options):
-    """How a run is written."""
+    """Options of an export."""
 
     PANEL = configuration.OUTPUT
     VERB = "export"
@@ -78,8 +74,6 @@ class Exported(Options):
 
 
 class ExportKeys(TypedDict, total=False):
-    """Keywords of :class:`Exported`, beside the place and the calibration."""
-
     overwrite: bool
     projector: str | None
 
@@ -97,13 +91,13 @@ def export(
     Parameters
     ----------
     run
-        RUN folder, a coloured one, or one behind colour filters.
+        RUN folder, also a coloured one, or one behind colour filters.
     format
-        a key of :data:`FORMATS`.
+        Key of :data:`FORMATS`.
     output
-        file or folder to make.
+        File or folder to create.
     calibration
-        CAL folder that goes with it.
+        CAL folder to include.
 
     Returns
     -------
@@ -113,9 +107,9 @@ def export(
     Raises
     ------
     MitsimError
-        before anything is written, for an unknown format, a missing calibration, a place that holds something or is
-        called as one of another format, a folder that is none, or a calibration of other lines; and for a run that the
-        format cannot hold.
+        before anything is written, for an unknown format, a missing calibration or one of other lines, an ``output``
+        that
+        holds something or has another format's suffix, an invalid folder, and a run that the format cannot hold.
     """
     asked = Exported(format=format, output=output, calibration=calibration, **options)
     check_export(run, format, output, calibration, projector := asked.projector)
@@ -142,13 +136,7 @@ def check_export(
     calibration: Path | str | None = None,
     projector: str | None = None,
 ) -> None:
-    """Refuse all that :func:`export` refuses before it writes.
-
-    Parameters
-    ----------
-    run, format, output, calibration, projector
-        as there.
-    """
+    """Raise the errors that :func:`export` raises before it writes."""
     check_format(format, output, calibration, projector)
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
     lines = open_lines(folder, RUN, MOSAIC)
@@ -168,13 +156,7 @@ def check_export(
 def check_format(
     format: str, output: Path | str, calibration: Path | str | None = None, projector: str | None = None
 ) -> None:
-    """Refuse all that :func:`export` refuses before it looks into a folder.
-
-    Parameters
-    ----------
-    format, output, calibration, projector
-        as there.
-    """
+    """Raise the errors that :func:`export` raises before it opens a folder."""
     if format not in FORMATS:
         raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
     if projector is not None and format != PNG:
@@ -194,18 +176,18 @@ def import_file(
     calibration_output: Path | str | None = None,
     channel: str | None = None,
 ) -> dict[str, Any]:
-    """Write the folders that a file of `mitsim export` holds, each whole or not at all.
+    """Write the folders in a file of `mitsim export`, each whole or not at all.
 
     Parameters
     ----------
     source
-        the file.
+        File to read.
     output
-        RUN folder to make; None: only the calibration is wanted.
+        RUN folder to create; None: only the calibration is wanted.
     calibration_output
-        CAL folder to make; None: the file's calibration, if it has one, is not wanted.
+        CAL folder to create; None: the calibration is not wanted.
     channel
-        plane of a real FlatCam's calibration that is taken, or `all`.
+        Plane of a real FlatCam's calibration, or `all`.
 
     Returns
     -------
@@ -216,7 +198,7 @@ def import_file(
     Raises
     ------
     MitsimError
-        for a file that is none or is damaged, a part that it does not hold, or a place that holds something.
+        for an unknown or damaged file, a part that it does not hold, or a place that holds something.
     """
     source = Path(source)
     if output is None and calibration_output is None:
@@ -262,16 +244,16 @@ def _frames_of(run: Run) -> int:
 def import_frames(
     source: Path | str, output: Path | str, job: Job | None = None, **known: Unpack[FrameKeys]
 ) -> dict[str, Any]:
-    """Make a RUN folder of a real camera's frames, whole or not at all.
+    """Make a RUN folder from a real camera's frames, whole or not at all.
 
     Parameters
     ----------
     source
-        folder of frames, in the order of the numbers in their names; or one file.
+        Folder of frames, sorted by the numbers in their names; or one file.
     output
-        RUN folder to make.
+        RUN folder to create.
     job
-        whose command line the manifest keeps; None: Python asks.
+        Its command line is recorded in the manifest; None: called from Python.
 
     Returns
     -------
@@ -282,8 +264,9 @@ def import_frames(
     Raises
     ------
     MitsimError
-        for values that cannot be or have no effect, frames that are missing, too many, unlike each other or beyond the
-        camera's range, or a place that holds something.
+        for invalid or unused values, frames that are missing, too many, unlike each other or beyond the camera's range,
+        or
+        a place that holds something.
     """
     facts = FrameFacts(**known).of(Path(source))
     from mitsim.exchange.real import import_capture
@@ -292,11 +275,11 @@ def import_frames(
 
 
 STRIPES = "stripes"
-"""Pictures of a calibration session, in the place of a family of patterns."""
+"""Name of a calibration session's pictures, in place of a family of patterns."""
 
 
 class Pictures(Options):
-    """A projector that patterns are drawn for, its last picture, and the camera that stripes need."""
+    """Options of pictures: projector, last picture, and the camera that stripes need."""
 
     PANEL = configuration.DEVICES
     VERB = "pattern_pictures"
@@ -328,8 +311,6 @@ class Pictures(Options):
 
 
 class PictureKeys(TypedDict, total=False):
-    """Keywords of :class:`Pictures`."""
-
     projector: Path | str
     projector_pixels: int
     seed: int | None
@@ -346,21 +327,22 @@ def pattern_pictures(patterns: str, output: Path | str, **options: Unpack[Pictur
     Parameters
     ----------
     patterns
-        name of a family, or ``stripes``: those of a calibration.
+        Name of a family, or ``stripes`` for a calibration.
     output
-        folder to make.
+        Folder to create.
 
     Returns
     -------
     dict
-        `patterns`, `n`, `pictures`, `projector` (its rows and columns, and the grid's place), `output`, and `session`,
-        the list that goes with the frames of stripes.
+        `patterns`, `n`, `pictures`, `projector` (rows, columns, and the grid's place), `output`, and `session`, the
+        list
+        for the frames of stripes.
 
     Raises
     ------
     MitsimError
-        for patterns that there are not or that do not fit the projector, values that cannot be or have no effect, and
-        a place that holds something.
+        for unknown patterns, patterns that do not fit the projector, invalid or unused values, and a place that holds
+        something.
     """
     asked, folder = Pictures(**options), Path(output)
     seed, last, pixels = asked.seed or 0, asked.closing_frame, asked.projector_pixels

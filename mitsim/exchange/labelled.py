@@ -1,8 +1,6 @@
-"""Runs and factors in, a file of PyTorch's tensors out; captures, factors and images in, xarray Datasets out.
+"""Export of runs and factors to tensors of PyTorch, and of captures, factors and images to xarray (CF conventions).
 
-Datasets have axes, units and coordinates by the CF conventions.
-
-PyTorch and xarray are extras (`pip install mitsim[torch,xarray]`), imported when they are used.
+Both libraries are extras (`pip install mitsim[torch,xarray]`), imported when they are used.
 """
 
 from __future__ import annotations
@@ -31,29 +29,14 @@ if TYPE_CHECKING:
 # -------- Tensors
 
 _PATTERNS = ("P_L", "P_R")
-"""Tensors of the patterns' factors."""
 
 
 def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
-    """Write a run as a file of tensors that `torch.load` reads with `weights_only`, whole or not at all.
+    """Write a run as tensors that `torch.load` reads with `weights_only`, whole or not at all.
 
-    Of several lines the tensors have an axis of lines before the others. Behind colour filters `y` has none, and
-    `weights` (4, lines) is the light that each filter passes.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        that is exported; its lines were captured under the same patterns.
-    calibration
-        that goes with it, of the same lines.
-
-    Raises
-    ------
-    MitsimError
-        where PyTorch is not installed, a frame cannot be read, or lines differ in their patterns or in the shape of a
-        tensor.
+    Several lines add a first axis to the tensors. Behind colour filters `y` has no such axis, and `weights` (4, lines)
+    is the light that each filter passes. MitsimError if PyTorch is not installed, a frame cannot be read, or lines
+    differ in their patterns or shapes.
     """
     try:
         torch: Any = importlib.import_module("torch")
@@ -97,9 +80,9 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
 
 
 def measurements(shots: Capture) -> FloatArray:
-    """Return (K K', rows, columns) electrons a second of every pattern of ``shots``, row-major over (i, j).
+    """Return (K K', rows, columns) electrons a second of every pattern, row-major over (i, j).
 
-    They are differences of signed pairs, others less the ambient frame. MitsimError for a frame that cannot be read.
+    Signed pairs are subtracted, other frames lose the ambient frame. MitsimError for a frame that cannot be read.
     """
     columns = shots.patterns[1].shape[1]
     frames = {each.row * columns + each.column: each.frame for each in shots.pattern_measurements()}
@@ -109,14 +92,11 @@ def measurements(shots: Capture) -> FloatArray:
 # -------- Labelled arrays
 
 Labels = dict[str, tuple[Any, ...]]
-"""Dimensions, values and attributes by name, as xarray takes them."""
+"""Dimensions, values and attributes by name, as xarray requires."""
 
 
 def label_capture(shots: Capture) -> Dataset:
-    """Label frames (shot, row, column), expected electrons and the truth where they are known, of ``shots``.
-
-    MitsimError where xarray is not installed.
-    """
+    """Label frames (shot, row, column), and expected electrons and truth if known; MitsimError without xarray."""
     captures = shots.manifest.patterns.captures
     frame = ("shot", "row", "column")
     numbers: Labels = {"dn": (frame, shots.dn, _attributes("DN", "digital number"))}
@@ -143,10 +123,7 @@ def label_capture(shots: Capture) -> Dataset:
 
 
 def label_factors(factors: Factors) -> Dataset:
-    """Label both of a camera's ``factors``, with places on sensor and scene where the calibration states them.
-
-    MitsimError where xarray is not installed.
-    """
+    """Label a camera's ``factors``, with positions on sensor and scene if known; MitsimError without xarray."""
     numbers: Labels = {
         name: ((axis, f"scene_{axis}"), side, _attributes("electron0.5 s-0.5", f"factor of the {axis}s"))
         for name, axis, side in (("left", "row", factors.left), ("right", "column", factors.right))
@@ -157,19 +134,9 @@ def label_factors(factors: Factors) -> Dataset:
 
 
 def label_image(image: Reconstruction, factors: Factors | None = None) -> Dataset:
-    """Label an image, its uncertainty and depths where they are known.
+    """Label an image, and its uncertainty and depths if known; ``factors`` provide the positions of its pixels.
 
-    Parameters
-    ----------
-    image
-        that was recovered.
-    factors
-        that it was solved with, which state the places of its pixels; None: they are not said.
-
-    Raises
-    ------
-    MitsimError
-        where xarray is not installed, and for factors of another number of pixels.
+    MitsimError without xarray, and for factors of another number of pixels.
     """
     scene, places = ("scene_row", "scene_column"), Labels()
     if factors is not None:
@@ -205,7 +172,7 @@ def _dataset(title: str, numbers: Labels, places: Labels, facts: Mapping[str, An
 
 
 def _sensor_places(camera: Mapping[str, Any], shape: tuple[int, ...]) -> Labels:
-    """Return the middles of a frame's rows and columns on the sensor [mm], where a ``camera`` states its pixels."""
+    """Return the centres of a frame's rows and columns on the sensor [mm], if ``camera`` states its pixels."""
     known, found = camera.get("geometry"), Labels()
     for letter, axis, count in zip("yx", ("row", "column"), shape, strict=True):
         if isinstance(known, Mapping) and "pixel_pitch" in known:
@@ -221,7 +188,7 @@ def _sensor_places(camera: Mapping[str, Any], shape: tuple[int, ...]) -> Labels:
 
 
 def _scene_places(factors: Factors) -> Labels:
-    """Return the middles of scene pixels on the calibrated plane [mm], where a calibration states its parallax."""
+    """Return the centres of scene pixels on the calibrated plane [mm], if a calibration states its parallax."""
     parallax, found = factors.manifest.parallax, Labels()
     if parallax is None:
         return found

@@ -1,11 +1,9 @@
-"""A run and its calibration in one MATLAB file: folders in, the file out, and back.
+"""A run and its calibration in one MATLAB file, with the variables of the paper's public script.
 
-With the variables of the paper's public script `phi_left` (P o X) `phi_right`' = `data_coded` - `measBg` in digital
-numbers, for each pattern P = PL(:, i) PR(:, j)' (Zheng & Asif, arXiv 2111.12862, section III-B).
-
-Files that are written are of version 5, which SciPy, GNU Octave and every MATLAB read; version 7.3 is read, too. The
-calibration of a real FlatCam (Asif et al. 2017, arXiv 1509.00116) is read: a plane of its colour sensor, less the
-means of its rows and columns, is P1 X Q1^T.
+`phi_left` (P o X) `phi_right`' = `data_coded` - `measBg` in digital numbers, for each pattern P = PL(:, i) PR(:, j)'
+(Zheng & Asif, arXiv 2111.12862, section III-B). Written files are of version 5; version 7.3 is read, too. In the
+calibration of a real FlatCam (Asif et al. 2017, arXiv 1509.00116), a plane of the colour sensor without the means of
+its rows and columns is P1 X Q1^T.
 """
 
 from __future__ import annotations
@@ -45,15 +43,7 @@ ELECTRONS = "expected electrons of the frames"
 
 @dataclass(frozen=True, eq=False)
 class MatFile:
-    """Variables of a MATLAB file, or of one line in it, checked as they are asked for.
-
-    Attributes
-    ----------
-    path
-        of the file, for messages.
-    values
-        arrays and texts by name.
-    """
+    """Variables of a MATLAB file, or of one line in it, checked when they are read."""
 
     path: Path
     values: Mapping[str, Any]
@@ -62,7 +52,6 @@ class MatFile:
         return name in self.values
 
     def text(self, name: str) -> str:
-        """Return the text called ``name``; MitsimError where there is none."""
         value = np.asarray(self.values.get(name))
         if value.dtype.kind != "U" or value.size != 1:
             raise MitsimError(
@@ -72,9 +61,9 @@ class MatFile:
         return str(value.item())
 
     def array(self, name: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-        """Return the array called ``name`` in a ``shape``, of which MATLAB drops axes of length 1 at the end.
+        """Return an array in ``shape``, because MATLAB drops trailing axes of length 1.
 
-        MitsimError where it is missing, or not of so many real numbers.
+        MitsimError if it is missing, or does not have so many real numbers.
         """
         array = np.asarray(self.values.get(name))
         if array.dtype.kind not in "uif" or array.size != math.prod(shape):
@@ -83,7 +72,7 @@ class MatFile:
         return array.reshape(shape, order="F")
 
     def matrix(self, name: str) -> FloatArray:
-        """Return the matrix called ``name``, of any size; MitsimError where it is missing, or none of real numbers."""
+        """Return a matrix of any size; MitsimError if it is missing or not real."""
         matrix = np.asarray(self.values.get(name))
         if matrix.ndim != 2 or matrix.dtype.kind not in "uif":
             reported = "no matrix of numbers" if name in self else "missing"
@@ -91,12 +80,12 @@ class MatFile:
         return matrix.astype(np.float64)
 
     def image(self, name: str, scale: float = 1.0) -> Channel:
-        """Return the matrix called ``name``, over a ``scale``, as a channel: (rows, columns) float32."""
+        """Return a matrix, divided by ``scale``, as a float32 channel."""
         # Rounding in double precision is far below half of the last digit in single: the number is the one written.
         return as_channel((self.matrix(name) / scale).astype(np.float32), name, self.path)
 
     def by_line(self, names: Sequence[str]) -> dict[str, MatFile]:
-        """Return the variables of each of the lines ``names``, by their names without the ending."""
+        """Return the variables of each line, by their names without the ending."""
         return {
             name: MatFile(
                 self.path, {key.removesuffix(end): each for key, each in self.values.items() if key.endswith(end)}
@@ -106,15 +95,12 @@ class MatFile:
 
 
 _CLASSES = {"char", "single", "double", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
-"""MATLAB's names of arrays of numbers and texts."""
 
 
 def variables_in(path: Path) -> dict[str, Any]:
-    """Return the arrays of real numbers and the texts of the MATLAB file ``path``, of version 5 or 7.3, by name.
+    """Return the real arrays and the texts of a MATLAB file of version 5 or 7.3; other classes are skipped.
 
-    Cells, structures and sparse matrices are not read.
-
-    MitsimError for a file that is missing, damaged, of version 4, or that takes more memory than is free.
+    MitsimError for a file that is missing, damaged, of version 4, or does not fit into memory.
     """
     if not is_hdf5(path):
         return read_variables(path)
@@ -123,7 +109,7 @@ def variables_in(path: Path) -> dict[str, Any]:
     found = dict[str, Any]()
 
     def kind(dataset: h5py.Dataset) -> str:
-        """Return the class of an array of the file's own; "" of the content of structures and cells."""
+        """Return the class of an array at the file's root, or ""."""
         held = dataset.name.count("/") > 1 or dataset.dtype.kind not in "uif" or "MATLAB_empty" in dataset.attrs
         return "" if held else bytes(dataset.attrs.get("MATLAB_class", b"double")).decode("ascii")
 
@@ -139,25 +125,15 @@ def variables_in(path: Path) -> dict[str, Any]:
 
 
 COLOURED, FILTERED, _CALIBRATED = "colour_run", "mosaic_run", "colour_calibration"
-"""Variables that hold the colour.json of a coloured run, of one behind colour filters, and of a calibration."""
+"""Variables with the colour.json of a coloured run, of one behind filters, and of a calibration."""
 _LONGEST_LINE = 31
-"""Letters of a line's name: a variable of MATLAB has 63 at most, truth_board_reflectance_ half of them."""
+"""MATLAB's names have at most 63 letters; truth_board_reflectance_ takes half of them."""
 
 
 def endings(names: Sequence[str], path: Path) -> dict[str, str]:
-    """Return the endings of each line's variables by the line's name: of letters, digits and _, as MATLAB wants it.
+    """Return the endings of each line's variables, of letters, digits and _; "" for a run without lines.
 
-    Parameters
-    ----------
-    names
-        of the lines; "" of a run without lines.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        for a name that no variable can end in, or two that are the same to MATLAB.
+    MitsimError for a name that no variable can end in, or two that MATLAB does not distinguish.
     """
     ends = {name: name and "_" + re.sub(r"[^0-9A-Za-z_]", "_", name) for name in names}
     for name in filter(None, names):
@@ -170,34 +146,19 @@ def endings(names: Sequence[str], path: Path) -> dict[str, str]:
 
 
 def _dn_per_rate(digital: Digital) -> float:
-    """Return the digital numbers of a photoelectron a second, in frames that are read as ``digital`` says."""
     return digital.gain_dn_per_e * digital.exposure_s
 
 
-# -------- Folders in, the paper's variables out
+# -------- Writing the paper's variables
 
 
 def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
-    """Write a run with the paper's variables, whole or not at all; return sentences on the parts that are left out.
+    """Write a run with the paper's variables, whole or not at all; return notes on omitted parts.
 
-    Of several lines, the variables of each end in its name: `phi_left_638nm`. Behind colour filters the frames are
-    those of all lines, only the truths and factors of each line end in its name, and `weights` is (4, lines) of the
-    light that each filter passes.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        of whole shots, or of signed pairs; with lines called as `mitsim capture` calls them.
-    calibration
-        that goes with it, of the same lines; without one `phi_left` and `phi_right` are left out.
-
-    Raises
-    ------
-    MitsimError
-        for a run that mixes whole shots and pairs, or is larger than such a file may be, and for lines whose names
-        cannot end one of a variable.
+    With several lines, variables end in the line's name: `phi_left_638nm`. Behind colour filters only truths and
+    factors do, because the frames belong to all lines, and `weights` is (4, lines), the light that each filter passes.
+    MitsimError for a run that mixes whole shots and signed pairs, or is too large for such a file, and for lines whose
+    names cannot end a variable.
     """
     variables: dict[str, Any] = {}
 
@@ -234,7 +195,7 @@ def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple
 def _run_variables(run: Packed[RunManifest]) -> dict[str, Any]:
     """Return manifest, patterns, other frames, and the frames of a run by name.
 
-    `data_coded` and, of signed pairs, `data_negative` are (rows, columns, K, K'), `measBg` is (rows, columns).
+    `data_coded` and, for signed pairs, `data_negative` are (rows, columns, K, K'), `measBg` is (rows, columns).
     """
     manifest, digital = run.manifest, run.manifest.digital
     signs = {abs(shot.sign) for shot in manifest.patterns.captures}
@@ -262,24 +223,15 @@ def _run_variables(run: Packed[RunManifest]) -> dict[str, Any]:
     return {**variables, "data_coded": stacks[0], "measBg": background}
 
 
-# -------- A file in, folders out
+# -------- Reading
 
 
 @contextmanager
 def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
     """Read run and calibration in a MATLAB file of `mitsim export`.
 
-    Parameters
-    ----------
-    path
-        of the file.
-    channel
-        the file is the calibration of a real FlatCam, of which this plane is taken, or `all`.
-
-    Raises
-    ------
-    MitsimError
-        for a file that is none of these, or is damaged.
+    With a ``channel`` the file is the calibration of a real FlatCam, and this plane, or `all`, is read. MitsimError for
+    an unknown or damaged file.
     """
     if channel is not None:
         yield None, flatcam_calibration(path, channel), ()
@@ -316,7 +268,6 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
 
 
 def _run_in(own: MatFile) -> Packed[RunManifest]:
-    """Return the run of the variables ``own``."""
     text = own.text("run_manifest")
     manifest = unpack(text, RunManifest, own.path)
     ambient, closing = manifest.ambient_frame, manifest.closing_frame
@@ -356,7 +307,6 @@ def _run_in(own: MatFile) -> Packed[RunManifest]:
 
 
 def _truth_in(own: MatFile) -> tuple[Channels, Metadata]:
-    """Return channels (n, n') and metadata of the truth; MitsimError where it is no image."""
     channels = {"reflectance": own.image("truth")}
     if "truth_standard_error" in own:
         own.array("truth_standard_error", channels["reflectance"].shape)
@@ -368,10 +318,7 @@ def _truth_in(own: MatFile) -> tuple[Channels, Metadata]:
 
 
 def _calibration_in(own: MatFile, digital: Digital) -> Packed[CalibrationManifest]:
-    """Return the calibration of the variables ``own``, of a run whose frames are read as ``digital`` says.
-
-    Its unit is that of `phi_left` and `phi_right`.
-    """
+    """Return the calibration in the unit of `phi_left` and `phi_right`."""
     text = own.text("calibration_manifest")
     manifest = unpack(text, CalibrationManifest, own.path)
     metadata: Metadata = {"unit": "sqrt(e-/s)"}
@@ -386,25 +333,10 @@ def _calibration_in(own: MatFile, digital: Digital) -> Packed[CalibrationManifes
 
 
 def flatcam_calibration(path: Path, channel: str) -> Calibration:
-    """Return the factors of one plane of a real FlatCam, or of all, from its calibration file.
+    """Return the factors of one plane of a real FlatCam, or of `all`, from its calibration file with `P1*` and `Q1*`.
 
-    Parameters
-    ----------
-    path
-        of the file, with `P1*` and `Q1*`.
-    channel
-        one of :data:`mitsim.core.imagelist.PLANES`, or `all`.
-
-    Returns
-    -------
-    Content
-        a calibration for frames of that plane, of all planes a coloured one. Its manifests' configuration holds the
-        angle by which the frames are turned first.
-
-    Raises
-    ------
-    MitsimError
-        for a file without that plane, and for one whose rows and columns are exchanged.
+    The manifests' configuration holds the angle by which frames are turned first. MitsimError for a file without that
+    plane, or with rows and columns exchanged.
     """
     check_channel(channel)
     file = MatFile(path, {"angle": [[0.0]], **variables_in(path)})
@@ -412,7 +344,6 @@ def flatcam_calibration(path: Path, channel: str) -> Calibration:
     size = tuple(map(int, file.matrix("cSize").ravel())) if "cSize" in file else ()
 
     def part(plane: str) -> Packed[CalibrationManifest]:
-        """Return the calibration of one plane."""
         sides = {name: file.image(f"{stem}{plane}") for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
         pixels, scene = zip(*(side.shape for side in sides.values()), strict=True)
         if size != pixels and all(map(operator.lt, pixels, scene)):

@@ -1,8 +1,7 @@
-"""RUN and CAL folders in, one HDF5 file out, and back, bit for bit; manifests and files by name for other formats.
+"""RUN and CAL folders as :class:`Content`, independent of their storage, and one HDF5 file for both, bit for bit.
 
-The content of a folder is one :class:`Content`: of a mono folder it has one part, of a coloured one a part for each
-line. A run behind colour filters is one RUN folder of all lines, with a truth of each. docs/exchange.md describes the
-layout of HDF5 files.
+A mono folder has one part, a coloured one a part for each line. A run behind colour filters is one RUN folder with a
+truth for each line. docs/exchange.md describes the layout of HDF5 files.
 """
 
 from __future__ import annotations
@@ -31,27 +30,24 @@ if TYPE_CHECKING:
 
 Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
 FACTORS = tuple(f"{name}.exr" for name in manifests.SIDES)
-"""Names of a CAL folder's files: the left factor's and the right one's."""
 
 # -------- The content of a folder
 
 
 @dataclass(frozen=True, eq=False)
 class Packed(Generic[Manifest]):
-    """A folder's content, its files read when they are asked for.
+    """Content of a folder, whose files are read on request.
 
     Attributes
     ----------
-    manifest
-        of the folder.
     text
-        of its `manifest.json`, letter by letter; empty where only the model is known.
+        Exact text of `manifest.json`; empty if only the model is known.
     names
-        of its files.
+        File names.
     read
-        channels, (rows, columns) each, and metadata of a file, by its name.
+        Function from a file name to channels, (rows, columns) each, and metadata.
     place
-        folder or file that it was found in, for messages.
+        Folder or file of origin, for messages.
     """
 
     manifest: Manifest
@@ -63,8 +59,8 @@ class Packed(Generic[Manifest]):
     def fill(self, folder: Path) -> None:
         """Write all files into a ``folder`` that this process holds (:func:`mitsim.core.files.whole_folder`).
 
-        The manifest is written letter by letter, but for checksums of files whose bytes are others now: OpenEXR of
-        another version, or channels that the exchange left out.
+        The manifest keeps its text, except checksums of files whose bytes differ because of another OpenEXR or omitted
+        channels.
         """
         for name in dict.fromkeys(self.names):
             channels, metadata = self.read(name)
@@ -82,18 +78,18 @@ class Packed(Generic[Manifest]):
 
 @dataclass(frozen=True, eq=False)
 class Content(manifests.Coloured, Generic[Manifest]):
-    """All that a RUN or CAL folder holds.
+    """Content of a RUN or CAL folder.
 
     Attributes
     ----------
     parts
-        content of each line's folder, by the line's name; that of the folder itself by "".
+        Content of each line's folder by the line's name; of the folder itself by "".
     colours
-        lines, and filters where there are some; None of a folder without lines.
+        Lines, and filters if there are any; None without lines.
     text
-        of its `colour.json`, letter by letter.
+        Exact text of its `colour.json`.
     truths
-        of a run behind filters: channels and metadata of each line's `truth.exr`, by its name; none of a real camera.
+        Channels and metadata of each line's `truth.exr` behind filters; none for a real camera.
     """
 
     parts: Mapping[str, Packed[Manifest]]
@@ -102,7 +98,7 @@ class Content(manifests.Coloured, Generic[Manifest]):
     truths: Mapping[str, tuple[Channels, Metadata]] = field(default_factory=dict)
 
     def of_line(self, name: str) -> Packed[Manifest]:
-        """Return the folder that a line called ``name`` is in: its own, or that of all lines."""
+        """Return the folder of a line, which behind filters is the folder of all lines."""
         return self.parts.get(name) or self.parts[""]
 
     def fill(self, folder: Path) -> None:
@@ -120,17 +116,15 @@ class Content(manifests.Coloured, Generic[Manifest]):
 Run = Content[RunManifest]
 Calibration = Content[CalibrationManifest]
 Loaded = tuple[Run | None, Calibration | None, tuple[str, ...]]
-"""Run and calibration of an exchanged file, where it has them, and the parts of a run that it does not hold."""
+"""Run and calibration of an exchanged file, if present, and the parts of a run that it does not hold."""
 
 
 def pack_run(folder: Path) -> Packed[RunManifest]:
-    """Return the content of the RUN ``folder``. MitsimError when it is not a complete one."""
     shots = load_run(folder)
     return Packed(shots.manifest, read_text(folder / manifests.MANIFEST, MOST_BYTES), shots.files, shots.read, folder)
 
 
 def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
-    """Return the content of the CAL ``folder``. MitsimError when it is not a complete one."""
     manifest = manifests.read_manifest(folder, CalibrationManifest)
 
     def read(name: str) -> tuple[Channels, Metadata]:
@@ -144,10 +138,7 @@ def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
 
 
 def run_content(folder: Path) -> Run:
-    """Return the content of the RUN ``folder``, coloured, behind colour filters, or neither.
-
-    MitsimError when it, or a line's folder, is not a complete one.
-    """
+    """Return the content of a RUN folder, coloured, behind filters, or neither; MitsimError if it is not complete."""
     lines = manifests.open_lines(folder, manifests.RUN, manifests.MOSAIC)
     files = {name: folder / name / TRUTH for name in (lines.names if lines.filters else ())}
     truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
@@ -156,20 +147,17 @@ def run_content(folder: Path) -> Run:
 
 
 def calibration_content(folder: Path) -> Calibration:
-    """Return the content of the CAL ``folder``, coloured or not.
-
-    MitsimError when it, or a line's folder, is not a complete one.
-    """
+    """Return the content of a CAL folder, coloured or not; MitsimError if it is not complete."""
     lines = manifests.open_lines(folder, manifests.CALIBRATION)
     text = read_text(folder / manifests.COLOUR, MOST_BYTES) if lines.colours else ""
     return Content({name: pack_calibration(part) for name, part in lines.parts.items()}, lines.colours, text)
 
 
 def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Metadata]]:
-    """Yield every shot of a ``run`` with its channels, (rows, columns) each, and metadata, read one at a time.
+    """Yield every shot with its channels, (rows, columns) each, and metadata, read one at a time.
 
-    MitsimError for a shot without DN, or of another shape or other channels than the first: elsewhere one array holds
-    them all.
+    MitsimError for a shot without DN, or with other shape or channels than the first, because other formats use one
+    array.
     """
     first = ""
     for shot in run.manifest.patterns.captures:
@@ -191,10 +179,7 @@ def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Met
 
 
 def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
-    """Return the manifest, of a ``model``, in the ``text`` that an exchanged file at a ``place`` holds.
-
-    MitsimError when it is not JSON, breaks a rule of its format, or names frames that a folder cannot have.
-    """
+    """Return the manifest in ``text``; MitsimError if it is invalid, or names files that a folder cannot have."""
     try:
         if len(text) > MOST_BYTES:
             raise ValueError(f"it has {len(text)} letters; at most {MOST_BYTES} are allowed")
@@ -211,23 +196,10 @@ def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
 
 
 def unpack_colours(text: str, kind: str, place: Path, beside: Sequence[str] = ()) -> ColourManifest:
-    """Return the lines, and filters, that an exchanged file has.
+    """Return lines and filters from the ``text`` of a colour.json.
 
-    Parameters
-    ----------
-    text
-        of the colour.json that it holds.
-    kind
-        of folder that this is to be of, one of :data:`mitsim.core.manifests.KINDS`.
-    place
-        the file, for messages.
-    beside
-        names of files beside the lines' folders.
-
-    Raises
-    ------
-    MitsimError
-        when the text is not JSON, breaks a rule of its format, or names a folder that cannot be.
+    ``beside`` are names of files beside the lines' folders. MitsimError if the text is invalid, not of that ``kind``,
+    or names an impossible folder.
     """
     try:
         data = parse_json(text)
@@ -241,20 +213,7 @@ def unpack_colours(text: str, kind: str, place: Path, beside: Sequence[str] = ()
 
 
 def as_channel(values: object, name: str, place: Path) -> Channel:
-    """Return an array of an exchanged file as a channel of a frame.
-
-    Parameters
-    ----------
-    values
-        (rows, columns) float32 or uint32.
-    name, place
-        of the channel, and the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        for another type or shape.
-    """
+    """Return an array as a channel of a frame; MitsimError unless it is (rows, columns) float32 or uint32."""
     array = np.asarray(values)
     fits = array.ndim == 2 and array.size and files.fits_a_frame(array.shape)
     if array.dtype not in (np.float32, np.uint32) or not fits:
@@ -267,27 +226,15 @@ def as_channel(values: object, name: str, place: Path) -> Channel:
 # -------- HDF5 files: shots are chunks of their own, so that one is read without the others
 
 _LINES = "lines"
-"""Group that has a group of each line."""
+"""Group of the lines' groups."""
 LAYOUT = 1
-"""Number of the layout that is written here, and the newest that is read: attribute `mitsim_exchange` of the file."""
+"""Layout version that is written, and the newest that is read: attribute `mitsim_exchange` of the file."""
 
 
 def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> tuple[str, ...]:
-    """Write a run to one file, whole or not at all; nothing is left out.
+    """Write a run, and a calibration of the same lines, to one file, whole or not at all; nothing is omitted.
 
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        with shots of one shape, in each line.
-    calibration
-        that goes with it, of the same lines.
-
-    Raises
-    ------
-    MitsimError
-        for shots that differ in shape or channels, or a file that cannot be read or written.
+    MitsimError for shots of a line that differ in shape or channels, or a file that cannot be read or written.
     """
 
     def write_text(group: h5py.Group, name: str, text: str) -> None:
@@ -348,8 +295,7 @@ def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> 
 def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
     """Open the folders in the file ``path``, coloured or not, while the context lasts.
 
-    MitsimError for a file that is missing or damaged, is none of these, or leads to other files; and for a ``channel``,
-    because its frames have one.
+    MitsimError for a file that is missing, unknown or damaged, or leads to other files; and for a ``channel``.
     """
     path = Path(path)
     if channel is not None:
@@ -437,7 +383,6 @@ def _text_in(group: h5py.Group, name: str, path: Path) -> str:
 
 
 def _frame_in(place: h5py.Group, name: str, path: Path) -> tuple[Channels, Metadata]:
-    """Return channels and metadata of the frame ``name``. MitsimError where it takes more memory than is free."""
     group, channels = hdf5_item(place, name, path, "Group"), {}
     for key in group:
         if key != "metadata":
@@ -449,7 +394,7 @@ def _frame_in(place: h5py.Group, name: str, path: Path) -> tuple[Channels, Metad
 
 def _metadata_in(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Value]:
     """Return the metadata of a frame whose channels were read before."""
-    # What is beyond the end of a file that was cut short after it was opened is read as zeros.
+    # HDF5 reads zeros beyond the end of a file that was cut short after it was opened.
     if path.stat().st_size < texts.file.id.get_filesize():
         raise ValueError("it was cut short while it was read")
     text = texts[number] if texts.ndim == 1 else None
@@ -462,10 +407,7 @@ def _metadata_in(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Valu
 
 
 def hdf5_item(parent: h5py.Group, name: str, path: Path, kind: str = "Dataset") -> Any:
-    """Return the item ``name`` of a group of the file ``path``.
-
-    MitsimError where it is not of that ``kind``, or is an array that no frames fit.
-    """
+    """Return an item of a group; MitsimError if it is not of that ``kind``, or an array too large for frames."""
     item = parent.get(name)
     if type(item).__name__ != kind:
         what = "is missing" if item is None else f"is no {kind.lower()}"

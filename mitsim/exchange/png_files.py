@@ -1,4 +1,4 @@
-"""Patterns in; pictures at a projector's own resolution out, to show on a real one: of a family, or a calibration's."""
+"""Pictures of patterns, or of a calibration's stripes, in a projector's own resolution."""
 
 from __future__ import annotations
 
@@ -25,17 +25,15 @@ from mitsim.devices.session import UNIFORM, halves_in_order
 from mitsim.exchange.packed import Run, shots_of
 
 PATTERNS = "patterns.json"
-"""Which picture shows what, and where the grid lies in it."""
+"""Describes each picture, and the grid's place in it."""
 SESSION = "session.json"
-"""The list of a session's frames, as `mitsim calibrate --frames` reads it."""
+"""List of a session's frames, as `mitsim calibrate --frames` reads it."""
 SQUARE = 0.01
-"""How far a cell's width on the scene may be off its height, as a logarithm, to count as square: a hundredth, which
-nobody sees in an image."""
+"""Largest logarithm of a cell's width over its height that counts as square; not visible in an image."""
 _SECONDS_PER_PIXEL, _PIXEL_BYTES = 2e-8, 3
-"""Of drawing a picture: measured 6e-9 s of dots:7 in a raster of 720 x 1920, and some three times that for a slow
-disk. Bytes of cells, picture and file."""
+"""Measured: 6e-9 s for dots:7 in 720 x 1920 pixels, tripled for slow disks. Bytes of cells, picture and file."""
 _WHITE = 255
-"""Of a picture for the projector; black is 0, so that its gamma plays no part."""
+"""Only white and black (0) are shown, so that the projector's gamma has no effect."""
 
 
 # ---- A projector's raster ----
@@ -43,15 +41,7 @@ _WHITE = 255
 
 @dataclass(frozen=True)
 class Raster:
-    """A projector's own pixels.
-
-    Attributes
-    ----------
-    rows, columns
-        how many there are.
-    aspect
-        width of one on the scene, over its height.
-    """
+    """A projector's pixels; ``aspect`` is a pixel's width on the scene over its height."""
 
     rows: int
     columns: int
@@ -59,13 +49,13 @@ class Raster:
 
     @classmethod
     def of(cls, projector: str) -> Raster:
-        """Return that of the ``projector``, a name or TOML file. MitsimError where its rows and columns are unknown."""
+        """Return the raster of a projector's name or TOML file; MitsimError if rows and columns are unknown."""
         path = locate(projector, "calibration", ".toml", PROJECTOR)
         return cls.of_projector(load_model(path, ProjectorModel).model_dump())
 
     @classmethod
     def of_projector(cls, model: Mapping[str, Any]) -> Raster:
-        """Return that of a projector's ``model``, as a run's manifest has it; MitsimError as :meth:`of`."""
+        """Return the raster of a projector's ``model`` in a run's manifest; MitsimError as :meth:`of`."""
         if not model:
             raise ArgumentError("projector", "is not known of a run of imported frames; give its name or file")
         rows, columns = model.get("rows"), model.get("columns")
@@ -80,32 +70,11 @@ class Raster:
 def draw_family(
     folder: Path, name: str, n: int, projector: str, seed: int = 0, closing: ClosingKind | None = None
 ) -> dict[str, Any]:
-    """Draw every shot of a family of patterns to a new folder, whole or not at all.
+    """Draw every shot of a family to a new folder, `patterns/` and `patterns.json`, whole or not at all.
 
-    Parameters
-    ----------
-    folder
-        to make: `patterns/` and `patterns.json`.
-    name
-        of the family.
-    n
-        projector pixels a side that the patterns have.
-    projector
-        name or TOML file, of known rows and columns.
-    seed
-        of patterns of a `random` family.
-    closing
-        light of a last picture, for the closing frame; None: there is none.
-
-    Returns
-    -------
-    dict
-        `patterns`, `n`, `pictures`, `projector` (its rows and columns, and the grid's place), `output`.
-
-    Raises
-    ------
-    MitsimError
-        for a family that there is none of, or a projector of unknown or too few pixels.
+    ``closing`` adds a last picture for the closing frame. The result has `patterns`, `n`, `pictures`, `projector`
+    (rows, columns, and the grid's place) and `output`. MitsimError for an unknown family, or a projector of unknown or
+    too few pixels.
     """
     family = parse_patterns(name, n, seed)
     names = [frame_name(index) for index in range(len(family.shots))]
@@ -119,28 +88,10 @@ def draw_family(
 
 
 def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, Any]:
-    """Draw every shot of a calibration session to a new folder, whole or not at all.
+    """Draw every shot of a calibration session to a new folder, with `session.json`, the list of its frames.
 
-    The order is that in which `mitsim calibrate --frames` counts frames.
-
-    Parameters
-    ----------
-    folder
-        to make: `patterns/`, `patterns.json`, and the list that goes with the frames, `session.json`.
-    projector
-        name or TOML file, of known rows and columns.
-    listed
-        list of the frames that will be taken.
-
-    Returns
-    -------
-    dict
-        as of :func:`draw_family`.
-
-    Raises
-    ------
-    MitsimError
-        for a projector of unknown or too few pixels, and where no Hadamard matrix has so many rows.
+    The order is that of frames in `mitsim calibrate --frames`. Returns and raises as :func:`draw_family`; MitsimError
+    also if no Hadamard matrix has so many rows.
     """
     n, raster, signs = listed.n, Raster.of(projector), stripe_signs(listed.n)
     light, shots = [], []
@@ -158,23 +109,9 @@ def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, A
 
 
 def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> FrameList:
-    """Return the list of a calibration session's frames, in the order of their names.
+    """Return the list of a calibration session's frames in the order of their names; MitsimError for invalid values.
 
-    Parameters
-    ----------
-    camera
-        electronics: name of a shipped file, or a TOML file.
-    exposure_s
-        of every frame [s].
-    n
-        projector pixels a side.
-    signed_capture
-        `pair` or `uniform`: how a +-1 pattern is captured.
-
-    Raises
-    ------
-    MitsimError
-        for values that cannot be.
+    ``signed_capture`` is `pair` or `uniform`: how a +-1 pattern is captured.
     """
     sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     digital = digital_of(sensor, check_exposure(exposure_s)).model_dump(exclude_none=True)
@@ -186,42 +123,20 @@ def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> F
 
 
 def frame_name(index: int) -> str:
-    """Return the name of the frame of shot ``index`` among PNG files."""
     return f"frame_{index:05d}.png"
 
 
 def picture_name(index: int) -> str:
-    """Return the path of the picture of shot ``index`` in the folder that holds it."""
     return f"patterns/pattern_{index:05d}.png"
 
 
 def draw(
     folder: Path, light: Iterable[npt.NDArray[Any]], count: int, raster: Raster, sides: tuple[int, int], place: str
 ) -> dict[str, Any]:
-    """Write a picture for each shot to `patterns/` in a folder that this process holds, and a black and a white one.
+    """Write a picture for each of ``count`` shots, and a black and a white one, to `patterns/` in a folder.
 
-    Parameters
-    ----------
-    folder
-        that holds `patterns/`.
-    light, count
-        (n, n') of 0 and 1 for each shot, and their number.
-    raster
-        of the projector.
-    sides
-        n and n'.
-    place
-        of the grid, for messages.
-
-    Returns
-    -------
-    dict
-        `rows`, `columns` of the projector, and the grid's place as of :func:`grid_in`.
-
-    Raises
-    ------
-    MitsimError
-        where a cell would have no pixel, and where the pictures take more than a day, or than the memory that is free.
+    ``light`` yields (n, n') of 0 and 1. Returns `rows`, `columns`, and the grid's place as :func:`grid_in`. MitsimError
+    if a cell would have no pixel, or the pictures take more than a day or the free memory.
     """
     pixels = raster.rows * raster.columns
     cost = Cost(count * pixels * _SECONDS_PER_PIXEL, _PIXEL_BYTES * pixels)
@@ -242,30 +157,17 @@ def draw(
 
 
 def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any]:
-    """Return the place of the patterns' grid in a projector's raster: whole pixels a cell, in the middle.
+    """Return the place of the patterns' grid in a projector's raster: whole pixels a cell, centred.
 
-    On the scene a cell is square to :data:`SQUARE`, and of such cells as large as fits; where none is, it is the
-    squarest.
-
-    Parameters
-    ----------
-    raster
-        of the projector.
-    sides
-        rows and columns of the grid.
-    place
-        name of the grid's projector or run, for messages.
+    The largest cells that are square on the scene to :data:`SQUARE` are used, or else the squarest. MitsimError if a
+    cell would have no pixel.
 
     Returns
     -------
     dict
         `cell`, `cell_columns`: rows and columns of a cell [pixels]; `cell_shape`: its width on the scene over its
-        height; `first_row`, `first_column` of the first cell.
-
-    Raises
-    ------
-    MitsimError
-        where a cell would have no pixel.
+        height;
+        `first_row`, `first_column` of the first cell.
     """
     most = raster.rows // sides[0], raster.columns // sides[1]
     if min(most) < 1:
@@ -292,7 +194,7 @@ def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any
 
 
 def describe_cells(where: Mapping[str, Any]) -> str:
-    """Return a cell's size, and its shape on the scene, of the place ``where`` of a grid as of :func:`grid_in`."""
+    """Return size, and shape on the scene, of a cell of the grid (see :func:`grid_in`)."""
     rows, columns, shape = where["cell"], where["cell_columns"], where["cell_shape"]
     size = f"{rows} pixels a side" if rows == columns else f"{rows} x {columns} pixels"
     if abs(math.log(shape)) > SQUARE:
@@ -301,19 +203,9 @@ def describe_cells(where: Mapping[str, Any]) -> str:
 
 
 def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
-    """Yield the projector's light for each shot, (n, n') of 0 and 1, one at a time.
+    """Yield the projector's light for each shot, (n, n') of 0 and 1.
 
-    Parameters
-    ----------
-    patterns
-        and their shots.
-    place
-        of the run, for messages.
-
-    Raises
-    ------
-    MitsimError
-        for light between, which a projector's gamma changes.
+    MitsimError for values between, because a projector's gamma would change them.
     """
     left, right = patterns.matrices
     if not np.isin(np.concatenate([left.ravel(), right.ravel()]), (-1, 0, 1)).all():
@@ -329,7 +221,7 @@ def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
 
 
 def with_closing(pictures: Iterable[npt.NDArray[Any]], closing: ClosingKind | None) -> Iterator[npt.NDArray[Any]]:
-    """Yield the ``pictures`` of all shots, and for a ``closing`` frame the first one again or a uniform one."""
+    """Yield the ``pictures``, then the first one again or a uniform one for a ``closing`` frame."""
     first = None
     for picture in pictures:
         first = picture if first is None else first
@@ -338,21 +230,11 @@ def with_closing(pictures: Iterable[npt.NDArray[Any]], closing: ClosingKind | No
         yield first if closing == "first" else np.ones_like(first)
 
 
-# ---- What patterns.json says ----
+# ---- Content of patterns.json ----
 
 
 def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of `patterns.json` for a family.
-
-    Parameters
-    ----------
-    patterns
-        and their shots.
-    names
-        of the frames, one a shot.
-    where
-        the grid's place, as :func:`draw` gives it.
-    """
+    """Return the content of `patterns.json` for a family, with the grid's place ``where`` from :func:`draw`."""
     shots = [
         {"file": name, "pattern": picture_name(index), **shot.model_dump(include={"row", "column", "sign"})}
         for index, (name, shot) in enumerate(zip(names, patterns.captures, strict=True))
@@ -364,7 +246,6 @@ def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any])
 
 
 def write_png(path: Path, values: npt.NDArray[Any]) -> None:
-    """Write ``values`` (rows, columns) of 8 or 16 bits to ``path``. MitsimError where that is not possible."""
     from PIL import Image
 
     with whole_file(path) as part:
@@ -374,32 +255,15 @@ def write_png(path: Path, values: npt.NDArray[Any]) -> None:
 # ---- A run as PNG files ----
 
 _LARGEST = 2**16 - 1
-"""Of a PNG's numbers."""
 
 
 def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[str, ...]:
-    """Write the frames of a run, and its patterns as a projector shows them, to a new folder, whole or not at all.
+    """Write the frames of a run, and its patterns as pictures, to a new folder, whole or not at all.
 
-    Parameters
-    ----------
-    folder
-        to make: `frames/`, `patterns/`, `patterns.json`, and `ambient.npy` where an ambient frame was taken; of a
-        coloured run a folder of each line with these, and colour.json.
-    run
-        with digital numbers of up to 16 bits.
-    projector
-        name or TOML file; None: the run's own.
-
-    Returns
-    -------
-    tuple of str
-        how the frames are read again, and how large the patterns' cells are.
-
-    Raises
-    ------
-    MitsimError
-        for numbers that PNG cannot hold, patterns that are not of 0, 1 and -1, or a projector of unknown or too few
-        pixels.
+    The folder has `frames/`, `patterns/`, `patterns.json`, and `ambient.npy` for an ambient frame; for a coloured run,
+    a folder of each line with these, and colour.json. Returns notes on reading frames and on the size of cells.
+    MitsimError for digital numbers above 16 bits, patterns of other values than 0, 1 and -1, or a projector of unknown
+    or too few pixels.
     """
     rasters = {name: check_pictures(shots.manifest, projector, str(shots.place)) for name, shots in run.parts.items()}
     notes = [f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN"] if run.colours else []
@@ -440,22 +304,7 @@ def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[st
 
 
 def check_pictures(manifest: RunManifest, projector: str | None, place: str) -> Raster:
-    """Return the raster that a run's pictures are drawn for.
-
-    Parameters
-    ----------
-    manifest
-        of the run.
-    projector
-        name or TOML file; None: the run's own.
-    place
-        of the run, for messages.
-
-    Raises
-    ------
-    MitsimError
-        for a projector or patterns of which no pictures can be drawn.
-    """
+    """Return the raster of a run's pictures; MitsimError if its projector or patterns cannot be drawn."""
     known = manifest.configuration.get("projector_model")
     own = known if isinstance(known, dict) else {}
     raster, sides = Raster.of(projector) if projector else Raster.of_projector(own), manifest.patterns.matrices

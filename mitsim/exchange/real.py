@@ -1,9 +1,4 @@
-"""A real camera's frames and their facts in; a RUN folder that `mitsim reconstruct` takes out.
-
-All planes of a mosaic make a coloured one.
-
-Truth, scene, expected electrons and predicted error, which a real capture lacks, are left out.
-"""
+"""Import of a real camera's frames as a RUN folder; all planes of a mosaic make a coloured one."""
 
 from __future__ import annotations
 
@@ -34,38 +29,19 @@ from mitsim.exchange.capture_list import Electronics, RealCapture
 from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
 
 _SECONDS_PER_PIXEL = 1e-7
-"""Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""
+"""Every frame is read twice and written once: 30 s for 256 megapixels on a slow disk."""
 _MOST_STAMPED = 1e-3
-"""Of a picture's numbers, that are not light: of the public DiffuserCam capture two, chosen beyond a line of text."""
+"""Fraction of a picture's numbers that may be a stamp and not light; a line of text is below."""
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
-"""Parts of a run that are unknown of a real capture."""
+"""Parts of a run that are unknown for a real capture."""
 
 
 def import_capture(source: Path, output: Path, known: RealCapture, command: str | None = None) -> dict[str, Any]:
-    """Write the RUN folder of a real capture, of all planes a coloured one, whole or not at all.
+    """Write the RUN folder of a real capture, whole or not at all.
 
-    Parameters
-    ----------
-    source
-        folder of frames, in the order of the numbers in their names; or one file.
-    output
-        RUN folder to make.
-    known
-        facts of the capture.
-    command
-        command line that asks for it, which the manifests keep; None: Python does.
-
-    Returns
-    -------
-    dict
-        `frames`, `shape`, `output`, `calibration_output` (None), `holds`, `left_out`, `divided_by`, `planes`,
-        `notes`, `warnings`: the output of the command line.
-
-    Raises
-    ------
-    MitsimError
-        for values that cannot be, frames that are missing, too many, unlike each other or beyond the camera's range, or
-        a place that holds something.
+    Returns the output of the command line: `frames`, `shape`, `output`, `calibration_output` (None), `holds`,
+    `left_out`, `divided_by`, `planes`, `notes`, `warnings`. MitsimError for invalid values, frames that are missing,
+    too many, unlike each other or beyond the camera's range, or a place that holds something.
     """
     known.check(source)
     files = image_files(source, known.wanted)
@@ -153,9 +129,9 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
 
 
 def _range_check(path: Path, frame: Numbers, camera: Electronics) -> Callable[[int, bool], None]:
-    """Return a function that raises MitsimError if a frame's numbers, over a factor, are beyond the ``camera``.
+    """Return a function that raises MitsimError if a frame's numbers, divided by a factor, exceed the camera's range.
 
-    Those of a mean frame need not be whole.
+    The numbers of a mean frame need not be whole.
     """
     largest, low, high, kind = camera.largest, float(frame.min()), float(frame.max()), frame.dtype
     whole = kind.kind != "f" or np.array_equal(frame, np.rint(frame))
@@ -208,7 +184,7 @@ class _Plane:
                 raise ArgumentError(
                     "projector_pixels", f"{n}: the calibration has {scene[0]} x {scene[1]}; leave it out"
                 )
-        # Frames of a camera of another pitch would be taken for those of the calibration's camera.
+        # Otherwise frames of a camera with another pitch would count as frames of the calibration's camera.
         calibrated, own = (data.get("sensor", {}) for data in (self.identity, camera.stated))
         for axis in ("row", "pixel") if {"pixel_pitch_um", "binning"} <= calibrated.keys() & own.keys() else ():
             theirs, ours = (
@@ -231,18 +207,9 @@ class _Plane:
         first: Numbers,
         command: str | None,
     ) -> tuple[Packed[RunManifest], tuple[int, ...], int]:
-        """Return the run, the shape of its frames, and the number of pixels that are not corrected for want of light.
+        """Return the run, the shape of its frames, and the number of uncorrected pixels (too little response).
 
-        Parameters
-        ----------
-        how
-            preparation of its numbers.
-        source, files, places
-            of the frames, and file and page of each shot.
-        first
-            numbers of the first frame.
-        command
-            for the manifest.
+        ``places`` has file and page of each shot, ``first`` the numbers of the first frame.
         """
         known, camera, listed, captures = self.known, self.camera, self.known.listed, self.patterns.captures
         preparer = Preparer.of(how, camera.digital, known.wanted)
@@ -282,7 +249,7 @@ class _Plane:
         following = places[0][0], -1
 
         def read(name: str) -> tuple[Channels, Metadata]:
-            """Read and prepare a frame again; of one file, page after page is asked for."""
+            """Read and prepare a frame again; pages of one file are read in order."""
             nonlocal pages, following
             if ambient and name == AMBIENT:
                 return {"DN": ambient[0]}, {"shots": ambient[1], "exposure_s": camera.digital.exposure_s}
@@ -303,9 +270,9 @@ class _Plane:
         return Packed(manifest, "", names, read, source), shape, preparer.unlit
 
     def _part(self, path: Path, frame: Numbers, how: Preparation) -> Numbers:
-        """Return the part of a ``frame`` that the calibration is of.
+        """Return the calibrated part of a ``frame``: all of it, or the middle of a plane without a stated crop.
 
-        It is all of it, or the middle of a plane without a stated crop. MitsimError for another size.
+        MitsimError for another size.
         """
         if self.shape is not None and how.channel is not None and how.crop is None:
             row, column = ((side - wanted) // 2 for side, wanted in zip(frame.shape, self.shape, strict=True))
@@ -316,7 +283,6 @@ class _Plane:
         return frame
 
     def _ambient(self, source: Path, preparer: Preparer, shape: tuple[int, ...]) -> tuple[Channel, int]:
-        """Return the mean of all frames with the projector off, and their number."""
         total, count, stated = np.zeros(shape), 0, self.known.listed.ambient_shots
         for path in image_files(source, self.known.wanted):
             for frame in read_images(path, self.known.wanted):
@@ -331,7 +297,6 @@ class _Plane:
 
 
 def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
-    """Patterns of the shots, in their files, for a scene of so many projector pixels."""
     if known.in_file:
         data = read_json(known.patterns)
         if not isinstance(data, dict) or "shots" not in data:
@@ -359,7 +324,6 @@ def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
 def _configuration(
     known: RealCapture, camera: Electronics, how: Preparation, files: tuple[Path, ...]
 ) -> dict[str, Any]:
-    """Return all that decides the frames: whose files, and how they are read."""
     more = () if known.listed.ambient is None else image_files(Path(known.listed.ambient), known.wanted)
     corrected = {
         name: {path.name: checksum(path) for path in image_files(Path(place), known.wanted)}
