@@ -172,7 +172,7 @@ EXPOSURE = Study(
 
 # -------- Ambient light
 
-RADIANCES = WEAK, _, AS_BRIGHT, _, STRONG = ("1.17", "11.7", "117", "1170", "11700")
+RADIANCES = WEAK, _, AS_BRIGHT, *_ = ("1.17", "11.7", "117", "1170", "11700")
 """Radiance of the scene's lamp [W m^-2 sr^-1]; that of lamp_bench lights its sheet a hundredth as the projector does,
 to a hundred times."""
 _PERCENTILES = (1.0, 99.0)
@@ -219,7 +219,12 @@ AMBIENT = Study(
             paper="0.06 to 0.17 against 0 to 0.02",
         ),
         Gain(
-            "Hadamard patterns are better under a strong lamp", _BETTER, _OTHER, where={"lamp": STRONG}, paper="better"
+            "Hadamard patterns are better under lamps as bright as the projector or brighter",
+            _BETTER,
+            _OTHER,
+            where={"lamp": RADIANCES[2:]},
+            every="lamp",
+            paper="better",
         ),
         Gain(
             "Dots, half of the frames, are preferred under a weak lamp",
