@@ -172,7 +172,7 @@ EXPOSURE = Study(
 
 # -------- Ambient light
 
-RADIANCES = WEAK, _, AS_BRIGHT, *_ = ("1.17", "11.7", "117", "1170", "11700")
+RADIANCES = WEAK, _, AS_BRIGHT, BRIGHTER, STRONG = ("1.17", "11.7", "117", "1170", "11700")
 """Radiance of the scene's lamp [W m^-2 sr^-1]; that of lamp_bench lights its sheet a hundredth as the projector does,
 to a hundred times."""
 _PERCENTILES = (1.0, 99.0)
@@ -222,7 +222,7 @@ AMBIENT = Study(
             "Hadamard patterns are better under lamps as bright as the projector or brighter",
             _BETTER,
             _OTHER,
-            where={"lamp": RADIANCES[2:]},
+            where={"lamp": (AS_BRIGHT, BRIGHTER, STRONG)},
             every="lamp",
             paper="better",
         ),
