@@ -572,7 +572,7 @@ SIZES = {
     "scene": (8, 1739),
     "sensor": (5, 1191),
     "sessions": (4, 1019),
-    "studies": (25, 7011),
+    "studies": (25, 7016),
     "transport": (21, 4489),
     "verbs": (1, 340),
     "version": (1, 1),
