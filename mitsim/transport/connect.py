@@ -1,14 +1,12 @@
 """Connections from a lit surface point to the irradiance that it casts on the sensor, and to the projector's lens.
 
-The bare sensor is a receiver. A surface point P that receives the flux phi irradiates the sensor point with::
+A surface point P that receives the flux phi irradiates the bare sensor with::
 
     E = f(P) cos_s / cos_g  phi  cos_P cos_a / r^2  r(t)        [W m^-2]
 
 f is the BSDF, cos_s and cos_g the arriving light's cosines to the shading and the geometric normal at P, cos_P and
-cos_a those of the connection at P and at the sensor, and r(t) the pixel's angular response. Without a lens, every
-surface point that is not in the shadow of another sees the sensor. Light can therefore be followed from the projector's
-side, where every path counts for a known pixel. Behind flat glass r and cos_a are those of the point that the sensor
-seems to see (:mod:`mitsim.transport.transmission`).
+cos_a those of the connection at P and at the sensor, and r(t) the pixel's angular response. Light is followed from the
+projector's side because every path then counts for a known pixel.
 """
 
 from __future__ import annotations
@@ -34,18 +32,9 @@ from mitsim.transport.transmission import Passage, refracted_way
 
 @dataclass(frozen=True)
 class SensorPoints:
-    """Points of the sensor to which light is followed: its centre, several anchors, or random points as one anchor.
+    """Points of the sensor to which light is followed: anchors along each axis, or with ``spread`` random points.
 
-    Attributes
-    ----------
-    half_width
-        Of the sensor [mm].
-    anchors
-        Along an axis; one is the centre.
-    spread
-        Random points replace the one anchor: their light is the mean over the sensor.
-    distance
-        Distance at which paths that start there are aimed at the same cells [mm].
+    Paths from all points are aimed at the same cells at ``distance`` [mm].
     """
 
     half_width: float
@@ -71,7 +60,6 @@ class SensorPoints:
         return self.place(row, column, mi.Point2f(rng.next_float32(spread), rng.next_float32(spread)))
 
     def place(self, row: mi.UInt32, column: mi.UInt32, point: mi.Point2f) -> mi.Point3f:
-        """Return anchors, or points given in the unit square: one kernel serves centre, anchors, and random points."""
         # Of one number alone Dr.Jit would make another kernel.
         positions = mi.Float(np.append(self.positions, 0).astype(np.float32))
         anchor = mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
@@ -86,9 +74,7 @@ class SensorPoints:
 class Way:
     """Way from a surface point P to a point of the sensor.
 
-    Light leaves P in ``direction``, and the part ``passed`` arrives. ``geometric`` has all factors of the irradiance
-    but the BSDF and the arriving light's cosine [mm^-2]; ``row``, ``column`` and ``inverse_depth`` are those of
-    :class:`mitsim.transport.records.PathSamples`.
+    ``geometric`` has all factors of the irradiance but the BSDF and the arriving light's cosine [mm^-2].
     """
 
     open: mi.Bool
@@ -102,10 +88,7 @@ class Way:
 
 @dataclass
 class Reception:
-    """Irradiance for each unit of flux that comes by a ``way`` [mm^-2].
-
-    ``pdf`` is the density of sampling the turn at P from the sensor's side [1/sr].
-    """
+    """Irradiance for each unit of flux that comes by a ``way`` [mm^-2]; ``pdf`` is that of the reverse turn [1/sr]."""
 
     irradiance: mi.Spectrum
     pdf: mi.Float
@@ -139,7 +122,6 @@ class OpticalSetup:
     @cached_property
     @keep_scenes()
     def board(self) -> float:
-        """Irradiance by the light of a projector pixel from a white board at the aligned distance [W m^-2]."""
         pixel = dr.arange(mi.UInt32, self.projector.n**2)
         wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), self.projector.lines)
         flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
@@ -148,7 +130,6 @@ class OpticalSetup:
     def receive(
         self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, local: mi.Point3f, active: mi.Bool
     ) -> Reception:
-        """Connect surface points, lit from unit directions `toward`, to sensor points [mm]."""
         return self.received(si, toward, self.way(si, local, active))
 
     def way(self, si: mi.SurfaceInteraction3f, local: mi.Point3f, active: mi.Bool) -> Way:
@@ -192,8 +173,7 @@ class OpticalSetup:
 def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = None) -> tuple[mi.Color0f, mi.Spectrum]:
     """Return wavelengths of a path and their weights; none and 1 but in spectral variants.
 
-    Weighted light has a mean that is the mean over 360-830 nm, where a flat spectrum of 1 counts as 1; or the sum over
-    given lines, four at most, each with its share.
+    The mean of weighted light is the mean over 360-830 nm, or the sum over given lines, four at most.
     """
     wavelengths, weight = camera.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_float32(), True)
     if not mi.is_spectral:
@@ -220,7 +200,6 @@ class Landing:
 
 
 def landing(setup: OpticalSetup, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Landing:
-    """Return where light crosses the plane of the sensor from the front, whatever hides it."""
     inverse, passage = setup.camera.world_transform().inverse(), setup.passage
     ray, length = mi.Ray3f(si.p, direction, si.time, si.wavelengths), mi.Float(0)
 
@@ -254,8 +233,6 @@ def landing(setup: OpticalSetup, si: mi.SurfaceInteraction3f, direction: mi.Vect
 
 @dataclass
 class Connection:
-    """Connection from a scene point to the projector: weight is radiance / pdf, 0 is the pdf of a pinhole."""
-
     direction: mi.Vector3f
     target: mi.Point3f
     weight: mi.Spectrum
@@ -288,7 +265,6 @@ class ProjectorConnector:
     def connect(
         self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool, lens: mi.Point3f | None = None
     ) -> Connection:
-        """Connect surface points to the projector, without a test of visibility."""
         if self.projector.ideal:
             ds, weight = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
             return Connection(ds.d, ds.p, weight, mi.Float(0), self.projector.pixel_at(ds.uv), active & (ds.pdf > 0))
@@ -307,10 +283,7 @@ class ProjectorConnector:
     def hit(
         self, ray: mi.Ray3f, reach: mi.Float, rng: mi.PCG32, active: mi.Bool, since: mi.Float | float = 0.0
     ) -> LensHit:
-        """Return the rays of random directions that meet the finite lens before they meet the scene at `reach`.
-
-        `since` is the distance from the surface where the direction was drawn to the ray's start [mm].
-        """
+        """Return the random rays that meet the finite lens before they meet the scene at ``reach``."""
         inverse = self._to_world.inverse()
         origin, direction = inverse @ ray.o, inverse @ ray.d
         distance = -origin.z / direction.z
@@ -355,7 +328,6 @@ _LAMP_POINTS = 2**10
 
 @keep_scenes()
 def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
-    """Return True if a point of the sensor sees the lamp within the field stop."""
     edge = np.linspace(-1, 1, _SENSOR_POINTS) * camera.geometry.half_width
     x, y = (mi.Float(axis.ravel()) for axis in np.meshgrid(edge, edge))
     to_world, sensor = camera.world_transform(), dr.zeros(mi.SurfaceInteraction3f, _SENSOR_POINTS**2)

@@ -1,8 +1,7 @@
 """Direct light: every projector pixel's rays, followed to the first surface and on to each anchor of the sensor.
 
-A ray meets a surface at P, and P is connected to every anchor (:mod:`mitsim.transport.connect`), or to one random point
-of the sensor, even together with the places in the pixels. All anchors see the same points. Where surfaces let light
-pass (:mod:`mitsim.transport.transmission`), one of the points that the ray meets is drawn in proportion to its light.
+All anchors see the same surface points. Where surfaces let light pass (:mod:`mitsim.transport.transmission`), one of
+the points that the ray meets is drawn in proportion to its light.
 """
 
 from __future__ import annotations
@@ -30,16 +29,12 @@ accumulators hold 2^22 times bright light, 40 times that."""
 
 
 class DirectTracer(Tracer):
-    """Direct light of a projector at a number of anchors."""
-
     def __init__(self, setup: OpticalSetup, anchors: int, spread: bool = False, pixels: IntArray | None = None) -> None:
-        """Prepare the tracer of some `pixels` (m,); `spread` replaces anchors by random points."""
         super().__init__(setup, SensorPoints(setup.geometry.half_width, anchors, spread))
         self._pixels = np.arange(setup.projector.n**2) if pixels is None else pixels
 
     @property
     def board(self) -> float:
-        """Bright light, of sharp lobes too [W m^-2]."""
         return _LOBE * self.setup.board
 
     @property
@@ -117,8 +112,6 @@ class DirectTracer(Tracer):
 
 
 class FluxTracer:
-    """Direct light of each projector pixel at the sensor as a whole."""
-
     paths_per_launch = PATHS_PER_LAUNCH
 
     def __init__(self, setup: OpticalSetup, glossy: bool = False) -> None:
@@ -127,15 +120,7 @@ class FluxTracer:
 
     @keep_scenes()
     def sums(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
-        """Return the light (lines, groups, m) of m blocks of samples [W m^-2].
-
-        Parameters
-        ----------
-        pixels, first
-            (m,) projector pixel of each block, and the number of its first sample in the pixel's sequence.
-        samples
-            Samples of each block.
-        """
+        """Return the light (lines, groups, m) of m blocks of samples [W m^-2]."""
         blocks, at_once = groups * len(pixels), max(1, self.paths_per_launch // samples)
         lines, projectors = self._setup.projector.lines, self._setup.projector.per_wavelength
         total = np.zeros((len(lines.shares) if lines and lines.several else 1, blocks))
@@ -241,8 +226,6 @@ class _Axis:
 
 
 class AimedTracer(DirectTracer):
-    """Direct light of some projector pixels, aimed at anchors; pairs `far` of pixel and anchor are connected seldom."""
-
     def __init__(self, setup: OpticalSetup, anchors: int, pixels: IntArray) -> None:
         super().__init__(setup, anchors, pixels=pixels)
         self._aims = self._aim()

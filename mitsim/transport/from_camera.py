@@ -1,16 +1,13 @@
 """Light followed from the camera's side: of lamps, in mirrors, and over sharp turns before the sensor.
 
-A path starts at the sensor - its centre, a random point, or each of several anchors -, goes through a cell of
-directions, and connects to the lights at its vertices; a connection to the projector finds the projector pixel. Mask
-and sensor pixels are applied afterwards in closed form (:mod:`mitsim.optics`). For tan-angle t a path collects::
+A path starts at the sensor, goes through a cell of directions, and connects to the lights at its vertices. Mask and
+sensor pixels are applied afterwards in closed form (:mod:`mitsim.optics`). For tan-angle t a path collects::
 
     g(t) dt = L(t) (1 + |t|^2)^-2 r(t) dt          [W m^-2]        r: the pixel's angular response
 
-Most of the projector's light is followed from its own side (:mod:`mitsim.transport.direct`, `.indirect`). The camera's
-side finds the rest: light whose last surface before the sensor is a mirror, and the part of indirect light over sharp
-turns (:func:`mitsim.transport.integrator.camera_part`). Light is accumulated under the direction and depth of the first
-vertex that is no mirror; in plane mirrors, of its image, as the camera sees it. Russian roulette, which keeps the
-estimate unbiased, ends the paths.
+Of the projector's light the camera's side finds that whose last surface before the sensor is a mirror, and the part of
+indirect light over sharp turns (:func:`mitsim.transport.integrator.camera_part`). Light is accumulated under the
+direction and depth of the first vertex that is no mirror, or of its image in plane mirrors.
 """
 
 from __future__ import annotations
@@ -39,8 +36,6 @@ _MARGIN = 1e-4
 
 
 class FromCameraTracer(integrator.FollowingTracer):
-    """Light of a scene from the camera's side; `of_projector` includes the projector's light beside that of lamps."""
-
     of_projector: ClassVar[bool] = True
 
     def __init__(
@@ -75,14 +70,10 @@ class CameraState(integrator.PathState):
         Part of the light over the turn before the sensor that is found here.
     kept, turned
         Parts that the projector's side keeps over the turns since the last mirror, and the last.
-    in_mirror
-        True if a mirror made the turn before the sensor.
-    travelled, since
-        Length of the way, and of the way since the last turn [mm].
-    behind_glass
-        True if glass has bent the way since.
-    came_from, came_pdf, by_delta
-        Point of the last turn, its density [1/sr], and whether it was a mirror's.
+    in_mirror, behind_glass
+        True if a mirror made the turn before the sensor, and if glass has bent the way since.
+    came_pdf, by_delta
+        Density of the last turn [1/sr], and True if it was a mirror's.
     """
 
     inverse_depth: mi.Float = field(default_factory=lambda: mi.Float(0))
@@ -102,8 +93,6 @@ State = TypeVar("State", bound=CameraState)
 
 
 class CameraPaths(integrator.PathIntegrator[State]):
-    """Paths from the camera, which keep one connection of each kind of light."""
-
     IMPORTANCE = False
 
     def __init__(self, tracer: FromCameraTracer, state: type[State], flight: integrator.InFlight) -> None:
@@ -324,17 +313,7 @@ def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
 
 @dataclass(frozen=True, eq=False)
 class LampResponse:
-    """Response of the camera to lamps.
-
-    Attributes
-    ----------
-    bands
-        One for each wavelength of a path; of no width where fewer are needed.
-    units
-        Irradiance of each line of the projector for a count of 1 [W m^-2].
-    first
-        Number of the first band among all.
-    """
+    """Response of the camera to lamps, in one band for each wavelength of a path; ``units`` are irradiances [W m^-2]."""
 
     response: Response
     bands: Sequence[Band]
@@ -343,10 +322,7 @@ class LampResponse:
 
 
 class LampTracer(FromCameraTracer):
-    """Light of lamps alone, at its own wavelengths.
-
-    Band b has the pixel number n^2 + b, and an irradiance at the projector's line, or at each of its lines.
-    """
+    """Light of lamps alone, at its own wavelengths; band b has the pixel number n^2 + b."""
 
     of_projector = False
     by_line = True
@@ -358,7 +334,6 @@ class LampTracer(FromCameraTracer):
 
     @property
     def per_wavelength(self) -> Sequence[LampTracer]:
-        """Itself, or one tracer for each band where glass separates wavelengths."""
         if not self.projector.parted:
             return [self]
         return [self._of(band) for band, (first, last) in enumerate(self.counted.bands) if last > first]
@@ -415,8 +390,6 @@ class LampTracer(FromCameraTracer):
 
 
 class CombinedTracer:
-    """Sum of the light of several tracers, with the same samples of each."""
-
     def __init__(self, *tracers: integrator.Tracer) -> None:
         self.tracers = tracers
 

@@ -1,13 +1,11 @@
 """Indirect light from the projector's side: every pixel's rays, followed over any number of surfaces to the sensor.
 
-After the first surface a path is connected at each surface to the sensor: its centre, a random point, or each of
-several anchors, for which one path serves (:mod:`mitsim.transport.connect`). So every path that meets a second surface
-counts, and for its own pixel. Of the connections of a path to one anchor, one is drawn in proportion to its light, and
-carries the light of all.
+After the first surface a path is connected at each surface to the sensor. Of the connections of a path to one anchor,
+one is drawn in proportion to its light, and carries the light of all.
 
-Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side finds the light
+Connections rarely meet the lobe of a last surface that turns light sharply; there the camera's side finds the light
 (:func:`mitsim.transport.integrator.camera_part`). Light that only mirrors have turned before the last surface (a
-caustic) belongs to direct light. Russian roulette, which keeps the estimate unbiased, ends the paths.
+caustic) belongs to direct light.
 """
 
 from __future__ import annotations
@@ -32,12 +30,9 @@ _ROOMS = (4**2, 12**2)
 
 
 class IndirectTracer(integrator.FollowingTracer):
-    """Indirect light of a projector, and its caustics, at points of the sensor."""
-
     adaptive: AdaptiveSamples | None = None
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
-        """Return a tracer to one point of the sensor that repeats blocks of pixels by `repeats` (blocks^2,)."""
         return self._with_counts(by_pixel(repeats, self.projector.n))
 
     def _with_counts(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
@@ -75,20 +70,6 @@ class IndirectTracer(integrator.FollowingTracer):
 
 @dataclass
 class Emission:
-    """Paths where they leave the projector.
-
-    Attributes
-    ----------
-    pixel
-        Of the projector.
-    anchor
-        Row and column of the anchor to which each path is followed.
-    first_turn
-        Point of the unit square that draws the first turn.
-    weight
-        Of the light.
-    """
-
     pixel: mi.UInt32
     anchor: tuple[mi.UInt32, mi.UInt32]
     rng: mi.PCG32
@@ -97,8 +78,6 @@ class Emission:
 
 
 class ProjectorPaths(integrator.PathIntegrator[integrator.PathState]):
-    """Paths from the projector's pixels, which keep one connection of each kind of light for each anchor."""
-
     IMPORTANCE = True
 
     def __init__(self, tracer: IndirectTracer, emission: Emission) -> None:
@@ -201,7 +180,7 @@ class _OneConnection:
         return held
 
     def fetch(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
-        """Fetch some kinds with `also` in one kernel, because each would trace all paths again."""
+        """Fetch some kinds with ``also`` in one kernel, because each would trace all paths again."""
         dr.eval([held[kind] for kind in kinds], self._anchor if kinds else (), also)
         return [PathSamples.fetch(held[kind], integrator.KINDS[kind], self._anchor) for kind in kinds]
 
@@ -295,7 +274,7 @@ def block_moments(pixel: npt.NDArray[np.int64], light: FloatArray, pixels: int) 
 def adaptive_counts(moments: FloatArray) -> npt.NDArray[np.int64]:
     """Return the paths (blocks, blocks) of each block's pixels in a sample, of least variance times cost.
 
-    Moments are smoothed over neighbours first; blocks without light count a tenth of the mean.
+    Blocks without light count a tenth of the mean.
     """
     if not moments.any():
         return np.ones(moments.shape, dtype=np.int64)
@@ -312,14 +291,6 @@ def effect_of(repeats: npt.NDArray[np.int64], moments: FloatArray) -> tuple[floa
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveSamples:
-    """Block, or pixel, of each of a sample's units of paths.
-
-    Attributes
-    ----------
-    unit, turn, count
-        (units,) its number, the number of the path in the sample, and the number of such paths.
-    """
-
     unit: mi.UInt32
     turn: mi.UInt32
     count: mi.UInt32

@@ -1,8 +1,6 @@
-"""The path loop: from a scene, and where paths start and connect, to the light that they bring to the camera.
+"""The path loop, from a scene and the places where paths start and connect to the light that they bring to the camera.
 
-Paths from the projector (:mod:`~mitsim.transport.indirect`; with common vertices, :mod:`~mitsim.transport.path_reuse`)
-and from the camera (:mod:`~mitsim.transport.from_camera`) go through :class:`PathIntegrator`. Direct light draws no
-direction, and specular chains are traced on the host in double precision; they have loops of their own.
+Direct light draws no direction, and specular chains are traced on the host in double precision; both have own loops.
 """
 
 from __future__ import annotations
@@ -68,8 +66,6 @@ class InFlight:
 
 
 class Tracer(ABC):
-    """Tracer of a scene's light; prepared once, and each seed gives an independent estimate."""
-
     paths_per_launch: ClassVar[int] = PATHS_PER_LAUNCH
 
     def __init__(self, setup: OpticalSetup, points: SensorPoints | None = None) -> None:
@@ -87,7 +83,6 @@ class Tracer(ABC):
 
     @property
     def per_wavelength(self) -> Sequence[Self]:
-        """Itself, or one tracer for each wavelength where glass separates them."""
         projectors = self.projector.per_wavelength
         return [self] if len(projectors) == 1 else [self._lit_by(projector) for projector in projectors]
 
@@ -112,10 +107,7 @@ class Tracer(ABC):
 
     @keep_scenes()
     def replicates(self, seeds: Sequence[int], *samples: int, first: int = 0) -> list[list[PathSamples]]:
-        """Return the light of `samples` of each seed, from one kernel.
-
-        The numbers of samples increase.
-        """
+        """Return the light of increasing numbers of ``samples`` of each seed, from one kernel."""
         each, most = self.paths_per_sample, samples[-1]
         starts = [each * most * place for place in range(len(seeds))]
         ranges = np.array([(start, start + each * count) for count in samples for start in starts])
@@ -137,7 +129,7 @@ class Tracer(ABC):
     ) -> PathSamples:
         """Return the light of samples from ``first`` on, except for that in an accumulator.
 
-        The accumulator's unit is ``board``; the camera's side fills none. Raise MitsimError for NaN or infinite light.
+        The accumulator's unit is ``board``; the camera's side fills none. Raises MitsimError for NaN or infinite light.
         """
         parts = list[PathSamples]()
         for tracer in self.per_wavelength:
@@ -155,9 +147,8 @@ class Tracer(ABC):
 class Paths:
     """Light that is followed besides projector - surface - camera.
 
-    ``mirrors``: over delta reflections and transmissions, on the camera's side; ``interreflection``: any number of
-    bounces; ``emitters``: other lights of the scene, one class of ambient light, on the camera's side; ``steep``:
-    divide light that shading normals or hair make heavy between both sides (:func:`projector_part`).
+    ``mirrors``: over delta reflections and transmissions, on the camera's side; ``emitters``: other lights of the
+    scene; ``steep``: divide light that shading normals or hair make heavy between both sides (:func:`projector_part`).
     """
 
     mirrors: bool = False
@@ -169,8 +160,7 @@ class Paths:
 class FollowingTracer(Tracer):
     """Tracer of light over any number of surfaces, or of some orders.
 
-    The *order* of light is the number of surfaces that have turned it and are no mirrors: 1 for what a projector lights
-    and the sensor sees, 0 for a lamp in view.
+    The *order* of light is the number of surfaces that have turned it and are no mirrors; a lamp in view has 0.
     """
 
     orders: tuple[int, int] | None = None
@@ -196,17 +186,8 @@ class FollowingTracer(Tracer):
 class PathState:
     """Buffer of paths under way.
 
-    Attributes
-    ----------
-    sightings
-        Light kept of each path, by its kind in :data:`KINDS`.
-    throughput
-        Part of the light, or of the weight, that is left.
-    depth, scattered
-        Vertices that turned the path, with and without mirrors.
-    straight
-        True for paths that have only passed surfaces (:mod:`mitsim.transport.transmission`), which are direct light's
-        own.
+    ``depth`` and ``scattered`` count the vertices that turned the path, with and without mirrors. ``straight`` paths
+    have only passed surfaces and belong to direct light.
     """
 
     active: mi.Bool
@@ -232,8 +213,8 @@ class Turn:
 class PathIntegrator(ABC, Generic[State]):
     """Paths of one launch, followed from vertex to vertex: the first apart, all others in a loop of one kernel.
 
-    A subclass defines where paths start, what light they bring from a vertex, and whether they carry the projector's
-    light (``IMPORTANCE``) or the light that the camera sees.
+    A subclass defines where paths start and the light that they bring from a vertex. With ``IMPORTANCE`` they carry the
+    projector's light.
     """
 
     IMPORTANCE: ClassVar[bool]
@@ -339,7 +320,6 @@ class PathIntegrator(ABC, Generic[State]):
 
 
 def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
-    """Return True for the direction of a mirror, reflected or refracted."""
     mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
     return (sample.sampled_type & mirror) != 0
 
@@ -353,15 +333,13 @@ def shading_correction(
 
 
 def tilt(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
-    """Return the cosine of a direction to the shading normals over that to the geometric ones."""
     return dr.dot(si.sh_frame.n, direction) / dr.dot(si.n, direction)
 
 
 def part_over_turn(paths: PathState, si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
     """Return the part of the light over the next turn that is followed from the projector.
 
-    For a first turn only :func:`matt_part` counts, and after a mirror the part is one, because the camera's side finds
-    nothing there.
+    For a first turn it is :func:`matt_part`, after a mirror one, because the camera's side finds nothing there.
     """
     later = dr.select(paths.scattered > 0, projector_part(si, correction), matt_part(si))
     return dr.select(paths.depth == paths.scattered, later, 1)
@@ -370,8 +348,7 @@ def part_over_turn(paths: PathState, si: mi.SurfaceInteraction3f, correction: mi
 def projector_part(si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
     """Return the part of the light over a later turn that is followed from the projector.
 
-    A shading normal multiplies it by a correction, which the camera's side has not. Grazing light is met in proportion
-    to its cosine and multiplied by its inverse: the variance would be infinite.
+    A shading normal's correction may grow without bound for grazing light, so that the variance would be infinite.
     """
     return matt_part(si) * dr.select(dr.abs(correction) > _STEEP, _STEEP / dr.abs(correction), 1)
 
@@ -379,8 +356,7 @@ def projector_part(si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Floa
 def matt_part(si: mi.SurfaceInteraction3f) -> mi.Float:
     """Return 0 for hair, whose light is followed from the camera, and 1 elsewhere.
 
-    Mitsuba samples hair for a view. Forward, its values over the density have no bound: single paths had a third of the
-    light of a quarter million.
+    Mitsuba samples hair for a view. Forward, its values over the density have no bound, and single paths dominate.
     """
     return dr.select(holds_hair(si.bsdf().flags()), mi.Float(0), 1)
 
@@ -388,7 +364,7 @@ def matt_part(si: mi.SurfaceInteraction3f) -> mi.Float:
 def camera_part(pdf: mi.Float) -> mi.Float:
     """Return the part of the light over the last turn before the sensor that is followed from the camera.
 
-    `pdf` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to one.
+    Both sides know the density ``pdf`` [1/sr] of sampling the turn from the camera's side, so the parts add up to one.
     A connection to a lobe sharper than ``_SHARP`` keeps ``_SHARP / pdf`` of its light, so that it is bounded.
     """
     return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)

@@ -1,16 +1,13 @@
 """Undetected light: estimate of the light that tracers find seldom or never, and its source.
 
 Mirrors or curved glass may bring light both from the projector to a surface and from there to the camera (a print in a
-bottle). A path from the camera meets no pinhole, and none from the projector the sensor's centre; the same holds for
-the part of indirect light that is followed from the camera to a caustic. So rays of the projector are followed over
-mirrors to where they land, and those that land near the vertices of paths from the camera give the missing light: light
-per area, over small squares of a surface. Paths run into a lens of the projector by chance, but seldom if it is small.
+bottle). Paths from either side then miss the pinhole and the sensor's centre. So rays of the projector are followed
+over mirrors to where they land, and those that land near the vertices of paths from the camera give the missing light:
+light per area, over small squares of a surface.
 
 Other paths come over one mirror and one sharp lobe. A small lens in the pinhole's place casts the same light, and paths
-run into it. Connections may meet such a lobe by chance: of the projector's side from the lobe to the sensor, of the
-camera's side from the lobe, seen in a mirror, to the projector. With x the light of a path that runs into the lens and
-I that of the connection along the same way, E[x I] is a connection's second moment, so that a sample of connections
-sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits would.
+run into it. With x the light of such a path and I that of the connection along the same way, E[x I] is a connection's
+second moment. A sample of connections therefore sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits.
 
 Lobes that the projector lights itself, and the highlights of glossy balls, are searched from the surface.
 """
@@ -48,15 +45,10 @@ _LENS = 0.02
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Omitted light by shape, (k,) each.
+    """Omitted light by shape, (k,) each, as irradiance at the sensor's centre [W m^-2].
 
-    Attributes
-    ----------
-    mirrors, lens_hits
-        Irradiance at the sensor's centre that no connection finds, by the last mirror or glass before the camera
-        [W m^-2]; equal hits of the projector's own lens in a sample of paths.
-    lobes, hits
-        Irradiance over a mirror and one sharp lobe, by the shape with the lobe; equal hits in a sample of connections.
+    ``mirrors`` is by the last mirror or glass before the camera, ``lobes`` over a mirror and by the shape with a sharp
+    lobe; ``lens_hits`` and ``hits`` are equal hits in a sample of paths and of connections.
     """
 
     mirrors: FloatArray
@@ -79,7 +71,6 @@ class LeftOut:
 
 @keep_scenes()
 def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int) -> LeftOut:
-    """Estimate the light that is omitted, or may be, from `samples` paths of each cell."""
     far = setup.geometry.scene_distance
     lens = replace(setup.projector, aperture=_LENS * far, focus=far)
     tracer = _MissedTracer(replace(setup, projector=lens), grid, Paths(mirrors=True, interreflection=True))
@@ -136,8 +127,7 @@ class _Landed:
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum, mi.UInt32]:
         """Return the radiance that surfaces send on of the light in their cubes, one ray of each drawn for all.
 
-        Further results are the radiance of a lens of 1 mm^2 in the pinhole's place, where a turn meets it, and the
-        mirror.
+        Further results are the radiance of a lens of 1 mm^2 in the pinhole's place and the mirror.
         """
         code = _cube(si.p, self.side)
         first, end = (dr.gather(mi.UInt32, self.first, code + step, active) for step in (0, 1))
@@ -242,16 +232,9 @@ _ON_BALL = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Highlights:
-    """Light of glossy balls.
+    """Light of glossy balls on the sensor's centre without the mask, by spot.
 
-    Attributes
-    ----------
-    pixels
-        (k,) projector pixel of each spot.
-    irradiance
-        (k,) on the sensor's centre without the mask [W m^-2].
-    moments
-        (k,) second moment of the light of one ray of every projector pixel [W^2 m^-4].
+    ``moments`` are those of the light of one ray of every projector pixel [W^2 m^-4].
     """
 
     pixels: Labels
@@ -268,7 +251,6 @@ class Highlights:
 
 @keep_scenes()
 def highlights(setup: OpticalSetup) -> Highlights:
-    """Return the highlights of all glossy balls that the projector's pinhole and the sensor's centre both see."""
     scene, projector = setup.scene, setup.projector
     balls = [s for s in scene.shapes() if s.class_name() == "Sphere" and s.bsdf() is not None and _glossy(s.bsdf())]
     balls = balls[:: -(-len(balls) // _MOST_BALLS)] if balls else []
@@ -396,17 +378,15 @@ class SharpLight:
 
     Attributes
     ----------
-    irradiance, error
-        Mean over the sensor, and its Monte Carlo error [W m^-2].
+    irradiance, error, rest
+        Mean over the sensor, its Monte Carlo error, and all other direct light [W m^-2].
     hits
         Connections, one of every projector pixel, that would meet a lobe.
     by_pixel, moments
         (n^2,) irradiance of each projector pixel, and the second moment of its connection [W^2 m^-4].
     width
-        Radius of the lobes on the sensor [mm], sqrt(P / (pi q)) of all but the sharpest tenth of the light: with P the
-        part of a pixel's turns that are sharp, q / P is the density of a lobe by itself.
-    rest
-        All other direct light, mean over the sensor [W m^-2].
+        Radius of the lobes on the sensor [mm], sqrt(P / (pi q)) of all but the sharpest tenth of the light, with P the
+        part of a pixel's turns that are sharp, and q / P the density of a lobe by itself.
     """
 
     irradiance: float
@@ -426,8 +406,7 @@ class SharpLight:
 def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     """Estimate direct light over lobes too sharp for connections.
 
-    A shorter search with a wider sensor comes first. Light that few rays find comes from small parts of a few pixels,
-    as off curved surfaces: these pixels, those that connections find, and their neighbours get as many rays once more.
+    Pixels whose light few rays find, pixels that connections find, and their neighbours get as many rays once more.
     """
     n, paths_per_sample = setup.projector.n, setup.projector.n**2
     lobes = _Lobes(setup)

@@ -4,18 +4,16 @@ Light of projector pixel i comes to x1_i, is turned there toward x2_i, and goes 
 pixel k of the same block of ``SIDE`` x ``SIDE`` pixels found. The balance heuristic over the block's N directions, each
 drawn by its own BSDF, gives::
 
-    L_i = sum_k  f_i(x2_k) V(x1_i, x2_k) / sum_j p_j(x2_k)  x  (what x2_k hands on of light from x1_i)
+    L_i = sum_k  f_i(x2_k) V(x1_i, x2_k) / sum_j p_j(x2_k)  x  (light from x1_i that x2_k sends on)
 
 f_i is the light that x1_i sends per area at x2_k, p_j the density per area of x1_j, 0 where x1_j sends nothing. The
 estimate is unbiased (Veach and Guibas 1995; Bekaert, Sbert, Halton 2002, "Accelerating path tracing by re-using
 paths"), and bounded near edges where f_i grows. Shifting dots never light neighbours together, so that common points
-correlate their frames, but make none noisier.
+make no frame noisier.
 
-x2 sends light of each x1_i to the sensor by its BSDF, and, where diffuse, to further surfaces along the path of pixel
-k. That path leaves x2 on the side that x1_k lights, by the shading normal; it counts for those x1_i that light the same
-side, and in its density only such x1_j do. A glossy x2 is followed further for its own pixel alone. Lines share the
-weights, which are geometric. Mirrors at x1, wavelengths drawn for each path, and scenes with straight transmission are
-not shared.
+A diffuse x2 also sends light of each x1_i along the path of pixel k, which leaves x2 on the side that x1_k lights; only
+x1_i and x1_j that light the same side count. Mirrors at x1, wavelengths drawn for each path, and scenes with straight
+transmission are not shared.
 """
 
 from __future__ import annotations
@@ -53,8 +51,6 @@ _REFLECTANCE = re.compile(r"(brdf_\d\.)?reflectance\.")
 
 
 class PathReuseTracer(IndirectTracer):
-    """Light of :class:`IndirectTracer`, to one point of the sensor or random ones."""
-
     paths_per_launch = _PATHS_PER_LAUNCH
 
     @property
@@ -81,7 +77,6 @@ class PathReuseTracer(IndirectTracer):
 
     @property
     def all_diffuse(self) -> bool:
-        """True if all surfaces are diffuse, and none of their light is divided."""
         return len(self.diffuse) == len(self.setup.scene.shapes()) and not self.paths.steep
 
     def _emission(self, flight: InFlight) -> Emission:
@@ -110,8 +105,6 @@ def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
 
 
 class ReusedPaths(ProjectorPaths):
-    """Paths of whole blocks of pixels, each with the second points of its block."""
-
     tracer: PathReuseTracer
 
     def __init__(self, tracer: PathReuseTracer, emission: Emission) -> None:
@@ -229,10 +222,10 @@ class ReusedPaths(ProjectorPaths):
         return projector_part(si, correction) if self.rules.steep else 1
 
     def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
-        """Return what each pixel sends to each second point of its block, and the points' densities.
+        """Return the light from each pixel to each second point of its block, and the points' densities.
 
-        The first (lanes * members,) is negative to the point's other side; the densities (lanes,) are that of all, and
-        that of pixels that light the own side.
+        The light (lanes * members,) is negative to the point's other side; the second density counts pixels on its own
+        side.
         """
         width = dr.width(self.lit)
         density = dr.zeros(mi.Float, width * MEMBERS)
@@ -358,8 +351,8 @@ class ReusedPaths(ProjectorPaths):
 class DiffuseReusedPaths(ReusedPaths):
     """Paths where all surfaces are diffuse, so that turns depend on two cosines and no material.
 
-    A diffuse surface of shading normal s and geometric normal n turns light from w by rho / pi |s w| / |n w|, whatever
-    it goes on to, on the side of s w.
+    A diffuse surface of shading normal s and geometric normal n turns light from w by rho / pi |s w| / |n w| on the
+    side of s w.
     """
 
     sends = 1

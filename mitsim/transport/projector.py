@@ -1,12 +1,8 @@
-"""The projector as tracers see it: from a pixel of its window to the ray through it, its area, and its flux.
+"""The projector for tracers: from a pixel of its window to the ray through it, its area, and its flux.
 
 A stock ``projector`` emitter does not state its field of view, so that its map is fitted to the uv of many points. It
-casts pi x scale x texture on the plane at unit distance. A ray of a pixel that is cut into N rays carries
-``phi = pi scale texture a / N``, a being the pixel's area on that plane: the same through every point of a lens. Every
-pixel has its own rays, so that light is never attributed to a pixel by chance.
-
-One map (:class:`CanvasMap`, and :class:`ProjectorOptics` for the window) serves the renderer's float32
-(:class:`ProjectorRays`) and the host's float64 (:class:`PinholeRays`).
+casts pi x scale x texture on the plane at unit distance. A ray of a pixel that is cut into N rays carries ``phi = pi
+scale texture a / N``, a being the pixel's area on that plane: the same through every point of a lens.
 """
 
 from __future__ import annotations
@@ -37,9 +33,8 @@ class ProjectorOptics:
     """The emitter and its window: n x n pixels from (first_row, first_column) of a (rows, columns) canvas.
 
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
-    standard deviation of a pixel's spot [pixels]. ``lines`` are traced in spectral variants (None: drawn wavelengths),
-    and ``parted`` if glass separates them. ``share`` of a pixel's light leaves by the pixel; the lens scatters the rest
-    with a standard deviation of ``glare_spread`` pixels.
+    standard deviation of a pixel's spot [pixels]. ``lines`` None means drawn wavelengths. ``share`` of a pixel's light
+    leaves by the pixel; the lens scatters the rest with a standard deviation of ``glare_spread`` pixels.
     """
 
     emitter: mi.Emitter
@@ -57,13 +52,12 @@ class ProjectorOptics:
 
     @property
     def scattered(self) -> ProjectorOptics:
-        """Light that the lens scatters, as a projector with wide spots."""
         spread = math.hypot(self.blur, self.glare_spread)
         return replace(self, share=1 - self.share, blur=spread, glare_spread=0.0)
 
     @property
     def per_wavelength(self) -> tuple[ProjectorOptics, ...]:
-        """Itself, or one projector for each separated line; raise MitsimError if wavelengths are drawn."""
+        """Return itself, or one projector for each separated line; raise MitsimError if wavelengths are drawn."""
         if not (self.parted and mi.is_spectral):
             return (self,)
         if self.lines is None:
@@ -103,10 +97,9 @@ class ProjectorOptics:
         return mi.UInt32(row * n + column)
 
     def pixel_size(self) -> tuple[float, float]:
-        """Size (x, y) of a pixel on the plane at unit distance [mm], by the emitter's own float32.
+        """Return the size (x, y) of a pixel on the plane at unit distance [mm], by the emitter's own float32.
 
-        :class:`CanvasMap` is 1e-4 more exact, but frames of a blurred spot stay bit-equal from version to version only
-        so.
+        :class:`CanvasMap` is 1e-4 more exact, but frames of a blurred spot would not stay bit-equal.
         """
         probe = dr.zeros(mi.SurfaceInteraction3f, 2)
         probe.p = self.emitter.world_transform() @ mi.Point3f([0.0, _PROBE_STEP], [0.0, _PROBE_STEP], [1.0, 1.0])
@@ -144,7 +137,6 @@ class CanvasMap:
         return cls(turn, origin, fits[0], fits[1])
 
     def tangents(self, u: Numbers, v: Numbers, number: Callable[[float], Numbers] = float) -> tuple[Numbers, Numbers]:
-        """Return local tan-angles (x, y) of canvas points; `number` converts the map's numbers to theirs."""
         x, y = ([number(float(value)) for value in axis] for axis in (self.x, self.y))
         return x[0] * u + x[1], y[0] * v + y[1]
 
@@ -153,8 +145,6 @@ class CanvasMap:
 
 
 class ProjectorRays:
-    """Rays of a projector with its lens and its blur; numbers are opaque, so that one kernel serves all projectors."""
-
     def __init__(self, projector: ProjectorOptics) -> None:
         self.projector, self._map = projector, projector.canvas_map
 
@@ -175,7 +165,6 @@ class ProjectorRays:
         return mi.Ray3f(self._origin + self._turn @ lens, dr.normalize(self._turn @ image), 0.0, wavelengths)
 
     def flux(self, pixel: mi.UInt32, wavelengths: mi.Color0f) -> mi.Spectrum:
-        """Return the flux of each pixel: irradiance at unit distance times area there [W m^-2 mm^2]."""
         n = dr.opaque(mi.UInt32, self.projector.n)
         centre = self._image(mi.Float(pixel // n) + 0.5, mi.Float(pixel % n) + 0.5)
         at = dr.zeros(mi.SurfaceInteraction3f)
@@ -216,7 +205,6 @@ def line_wavelengths(lines: Lines) -> tuple[mi.Color0f, FloatArray]:
 
 
 def wavelength_sets(lines: Lines | None = None) -> list[mi.Color0f | None]:
-    """Return the wavelengths [nm] of spectra: the lines, or evenly over the range; none but in spectral variants."""
     if not mi.is_spectral:
         return [None]
     if lines is not None:
@@ -230,14 +218,7 @@ def wavelength_sets(lines: Lines | None = None) -> list[mi.Color0f | None]:
 class PinholeRays:
     """Rays of a projector without lens and blur, in float64.
 
-    Attributes
-    ----------
-    origin
-        (3,) pinhole in world coordinates [mm].
-    area
-        Area of one pixel on the plane at unit distance [mm^2 at 1 mm].
-    power
-        (n * n, channels) irradiance there of each pixel, by colour channel or wavelength [W m^-2].
+    ``area`` is that of a pixel at unit distance [mm^2], ``power`` (n * n, channels) its irradiance there [W m^-2].
     """
 
     def __init__(self, projector: ProjectorOptics, wavelengths: Sequence[mi.Color0f | None]) -> None:
@@ -255,7 +236,6 @@ class PinholeRays:
         return np.asarray(world / np.linalg.norm(world, axis=1, keepdims=True))
 
     def points(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return window points (row, column) (k, 2) and depths [mm] of places (k, 3)."""
         local = np.linalg.solve(self._map.turn, (places - self.origin).T)
         depth, canvas = local[2], self._projector.canvas
         with np.errstate(divide="ignore", invalid="ignore"):

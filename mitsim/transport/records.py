@@ -1,8 +1,7 @@
 """Light per cell from path samples: a sparse matrix light[row, layer x (anchor, cell) x (anchor, cell)].
 
-A row is a projector pixel, or a class of pixels that a pattern family always lights together. The last rows are ambient
-light, one or one for each band. A path's light is accumulated in the cell of its direction, over which it counts as
-even, and split between the two layers (in 1/z) that enclose its depth.
+A row is a projector pixel, or a class of pixels that a pattern family always lights together; the last rows are ambient
+light. A path's light is split between the two layers (in 1/z) that enclose its depth.
 """
 
 from __future__ import annotations
@@ -38,8 +37,6 @@ _COUNTED = 4
 
 @dataclass
 class Sightings:
-    """Light of connections as in :class:`PathSamples`; ``lines`` is ``value`` by line."""
-
     value: mi.Float
     pixel: mi.UInt32
     row: mi.Float
@@ -49,7 +46,6 @@ class Sightings:
 
     @classmethod
     def of(cls, light: mi.UnpolarizedSpectrum, by_line: bool, pixel: mi.UInt32, *place: mi.Float) -> Sightings:
-        """Return light [W m^-2] by the weights of :func:`mitsim.transport.connect.sample_wavelengths`."""
         row, column, inverse_depth = place
         lines = light / len(light) if by_line else None
         return cls(panchromatic(light), pixel, row, column, inverse_depth, lines)
@@ -91,8 +87,6 @@ class PathSamples:
     ----------
     pixel
         (m,) projector pixel 0..n^2-1 (row-major), or n^2 plus the band for ambient light.
-    anchor_row, anchor_column
-        (m,) anchor that the path started from.
     row, column
         (m,) tan-angle seen from the sensor's centre, index coordinates.
     inverse_depth
@@ -134,7 +128,6 @@ class PathSamples:
 
     @classmethod
     def fetch(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> PathSamples:
-        """Fetch lit connections of one kind from the renderer; raise MitsimError for NaN or infinite light."""
         # Together: one by one, each would trace all paths again.
         dr.eval(seen, anchors)
         light = np.array(seen.value)
@@ -187,17 +180,10 @@ _ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name not in
 
 @dataclass(frozen=True)
 class Bundle:
-    """Accumulation of light in cells, anchors and layers.
+    """Accumulation of light in cells, anchors and layers, whose ``depths`` [mm] are far to near.
 
-    Attributes
-    ----------
-    depths
-        Of the layers, far to near [mm].
-    between
-        Split light between the two nearest cell centres along each axis, because light over a sharp lobe comes from a
-        small part of a cell.
-    lamps
-        Rows of ambient light.
+    ``between`` splits light between the two nearest cell centres along each axis, because light over a sharp lobe comes
+    from a small part of a cell.
     """
 
     grid: CellGrid
@@ -241,7 +227,6 @@ class Bundle:
         return light
 
     def entries(self, path_samples: PathSamples, samples: int = 1) -> tuple[IntArray, FloatArray, IntArray]:
-        """Return place, light and projector pixel (e,) of all accumulated light, unsorted and not summed."""
         inside = self._inside(path_samples)
         if not inside.all():
             path_samples = path_samples.where(inside)
@@ -278,7 +263,6 @@ class Bundle:
         return sparse.coo_array(copied, shape=(light.shape[0], self.size)).tocsr()
 
     def average(self, light: sparse.csr_array, weights: FloatArray) -> sparse.csr_array:
-        """Return light as one anchor's: the mean with ``weights`` (anchors,) along rows and columns."""
         entries = light.tocoo()
         height, width = self.cells
         line, place = np.divmod(entries.col.astype(np.int64), self.anchors * width)
@@ -318,8 +302,6 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class CellAxis:
-    """Equal cells along one axis: ``count`` cells of tan-angle ``size`` from ``start`` on (index coordinates)."""
-
     start: float
     size: float
     count: int
@@ -355,8 +337,8 @@ def aligned_grid(
 ) -> CellGrid:
     """Return cells that divide the projector's pixels, and more of them to cover the field stop.
 
-    Light that a plane at the aligned distance reflects then never shares a cell with a neighbouring pixel. Margins are
-    multiples of ``subdivision`` cells, so that grids of different subdivisions nest.
+    Light that a plane at the aligned distance reflects then never shares a cell with a neighbouring pixel. Grids of
+    different subdivisions nest.
     """
 
     def axis(window: tuple[float, float]) -> CellAxis:
@@ -388,16 +370,6 @@ them."""
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """Sums that hold light of any line, and their places in a matrix.
-
-    Attributes
-    ----------
-    numbers
-        Numbers of the sums, increasing.
-    rows, size, lamps
-        Rows of the projector's light, places, and rows of lamps after them.
-    """
-
     numbers: npt.NDArray[np.uint32]
     rows: int
     size: int
@@ -426,23 +398,10 @@ class Lit:
 
 
 class DeviceAccumulator:
-    """Sums of light by row and place.
+    """Sums of light by row and place; ``one`` is the irradiance of about a bright path [W m^-2].
 
-    Parameters
-    ----------
-    labels
-        (n^2,) row of each projector pixel.
-    one
-        Irradiance of about a bright path [W m^-2].
-
-    Attributes
-    ----------
-    sums
-        ((places * rows + 1) * lines,) on the device, in units. A place's rows lie side by side, because neighbouring
-        pixels have different rows and light one place at a time; so do the lines, because a path has light of every
-        line.
-    traced
-        Number of traces that have added light.
+    ``sums`` ((places * rows + 1) * lines,) are in units. A place's rows lie side by side, because neighbouring pixels
+    have different rows and light one place at a time.
     """
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float, lines: int = 1) -> None:
@@ -476,7 +435,7 @@ class DeviceAccumulator:
         return lines * entries < MOST_PLACES and entries < _PAYS * parts * paths
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
-        """Return the one place that accumulates light; numbers `chosen` in [0, 1) choose its layer."""
+        """Return the one place that accumulates light; numbers ``chosen`` in [0, 1) choose its layer."""
         layer = mi.UInt32(0)
         for part in self._parts_beyond(seen):
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
@@ -558,7 +517,7 @@ class DeviceSums:
     def light(self, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
         """Return light (rows + lamps, places) per sample, all light received, and the light outside [W m^-2].
 
-        Raise MitsimError for light that is NaN, infinite, or four million times a bright path's.
+        Raises MitsimError for light that is NaN, infinite, or four million times a bright path's.
         """
         lit, units, accumulator = self.lit, self.units, self.accumulator
         if len(lit.numbers) and lit.numbers[-1] == accumulator._rows * accumulator._width and units[-1]:

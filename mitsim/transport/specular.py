@@ -1,11 +1,10 @@
-"""Specular chains: beams of rays that reach the sensor from a pinhole projector over perfect mirrors alone, or nothing.
+"""Specular chains: beams that reach the sensor from a pinhole projector over perfect mirrors alone, or directly.
 
-A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it; nor a projector in
-view. Such light is traced from the projector (:mod:`mitsim.transport.specular_rays`) through a grid of points of each
-pixel. Four neighbours that met the same surfaces in the same way (the same *chain*) bound a beam. Beams near the sensor
-are divided until the map from the window to the sensor is bilinear over each. :mod:`mitsim.optics.mirror_frames` turns
-beams into frames. Flux: the projector's irradiance on the plane at unit distance is pi x scale x texture, so that a
-beam has that times its area on this plane.
+A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it. Such light is traced
+from the projector (:mod:`mitsim.transport.specular_rays`) through a grid of points of each pixel. Four neighbours that
+met the same surfaces in the same way (the same *chain*) bound a beam. Beams near the sensor are divided until the map
+from the window to the sensor is bilinear over each. The flux of a beam is its area on the plane at unit distance times
+the projector's irradiance there, pi x scale x texture.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ _ARRAYS = ("pixel", "flux", "sensor", "tangent", "throughput")
 def trace_specular_chains(
     scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = _MIRRORS
 ) -> Beams:
-    """Return the beams from the projector's pinhole to the sensor over perfect mirrors or lenses alone, or nothing.
+    """Return the beams from the projector's pinhole to the sensor over perfect mirrors or lenses alone, or directly.
 
     A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 along an axis) is not
     found.
@@ -95,7 +94,7 @@ def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> 
 def turned_by_mirrors(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics) -> Rays:
     """Return the rays that mirrors have turned, before each surface, for a grid over the window.
 
-    Instead of a spectrum they have their flux [W m^-2 mm^2], and what leaves 1 mm^2 at unit distance.
+    Instead of a spectrum they have their flux [W m^-2 mm^2], and that of 1 mm^2 at unit distance.
     """
     parts = list[Rays]()
     for each in projector.per_wavelength:
@@ -236,9 +235,9 @@ def _refine(
 
 
 def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
-    """Return the width (q,) of long squares' light [mm], and the unit direction (q, 2) of least motion.
+    """Return the width (q,) of long squares' light [mm], infinite if compact, and the unit direction of least motion.
 
-    A wire spreads light across itself a thousand times more than along. The width is inf for compact light.
+    A wire spreads light across itself a thousand times more than along.
     """
     corners = nodes.sensor[:, ::2, ::2]
     # What the sensor's place moves by over the square, for a step down and a step across.
@@ -270,8 +269,7 @@ def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
 def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> tuple[Beams, IntArray]:
     """Convert undivided squares to beams without extent, one at each node (q, 3, 3) that meets the sensor.
 
-    A node represents its part of the square's flux (q,): for squares of an edge that is right in the mean. The numbers
-    of the beams' squares are returned beside.
+    A node represents its part of the square's flux (q,), which is right in the mean for squares of an edge.
     """
     seen = nodes.valid & (np.abs(nodes.sensor) < geometry.half_width).all(axis=-1)
     seen &= (np.abs(nodes.tangent) <= geometry.tan_half_fov).all(axis=-1)
@@ -301,8 +299,7 @@ def _spread(nodes: _Nodes, before: FloatArray) -> FloatArray:
 def _near(nodes: _Nodes, spread: FloatArray, geometry: CameraGeometry) -> Mask:
     """Return (q,) True for squares that may light the sensor within the field stop.
 
-    A whole square bulges by its curvature; one that a rim cuts may be as large as the `spread` (q, 2) of its parent.
-    Directions are compared by sines, which stay finite.
+    A whole square bulges by its curvature; one that a rim cuts may be as large as the ``spread`` (q, 2) of its parent.
     """
     sine = geometry.tan_half_fov / np.hypot(1, geometry.tan_half_fov)
     whole = nodes.valid.all(axis=(1, 2))
@@ -371,7 +368,7 @@ def first_squares(
 ) -> Iterator[tuple[int, IntArray, IntArray]]:
     """Return squares that tile the window, small where small mirrors are seen: size, first rows and first columns.
 
-    `coarse` is the least number of coarsest squares along the window; `more` boxes are refined besides.
+    ``coarse`` is the least number of coarsest squares along the window; ``more`` boxes are refined too.
     """
     size = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(coarse / n)))))
     line = np.arange(0, n * _UNIT, size)

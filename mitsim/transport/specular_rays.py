@@ -2,8 +2,7 @@
 
 Mitsuba's float32 is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error in a masked frame. So each
 hit is computed again in float64: the ray meets the tangent plane of the surface, and is reflected or refracted there.
-The error that is left is the surface's own place and normal in float32: nothing for a mirror that faces the axis; round
-ones and smooth meshes are met in float64 too.
+Round surfaces and smooth meshes are met in float64 too.
 """
 
 from __future__ import annotations
@@ -48,14 +47,8 @@ def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
 class Crossings:
     """Rays that crossed the sensor plane from the front; one ray may arrive several times.
 
-    Attributes
-    ----------
-    chain
-        (k,) number of the sequence of surfaces that turned the ray, by reflection or transmission.
-    sensor, tangent
-        (k, 2) place [mm] and tan-angles there, (row, column) in index coordinates.
-    throughput
-        (k,) part of the light left.
+    ``sensor`` and ``tangent`` (k, 2) are place [mm] and tan-angles (row, column); ``chain`` (k,) numbers the sequence
+    of surfaces.
     """
 
     ray: IntArray
@@ -69,14 +62,8 @@ class Crossings:
 class Rays:
     """Rays under way, (k, .) each.
 
-    Attributes
-    ----------
-    mirror
-        Number, in Dr.Jit's registry, of the last surface that turned the ray and is no pane; 0 for none.
-    start
-        Place a little beyond the surface, clear of it.
-    spectrum
-        Part of the light left by colour.
+    ``mirror`` is the registry number of the last surface that turned the ray and is no pane, 0 for none; ``start`` is
+    clear of the surface.
     """
 
     index: IntArray
@@ -98,8 +85,8 @@ def join(parts: Sequence[Some]) -> Some:
 class SpecularRays:
     """Rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
 
-    At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends:
-    that light is found from the camera.
+    A ray goes both ways where a surface reflects and transmits, and ends where it scatters, because the camera finds
+    that light.
     """
 
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int) -> None:
@@ -117,7 +104,7 @@ class SpecularRays:
         self._camera_turn, self.camera_place = turn_and_origin(camera.world_transform())
 
     def follow(self, points: FloatArray, turned: list[Rays] | None = None) -> Crossings:
-        """Send rays through window points (k, 2) [pixels]; `turned` receives those that mirrors turned."""
+        """Send rays through window points (k, 2) [pixels]; ``turned`` receives those that mirrors turned."""
         count = len(points)
         origin = np.broadcast_to(self.rays.origin, (count, 3))
         rays = Rays(
@@ -228,8 +215,7 @@ class SpecularRays:
 def _lobes(materials: Iterable[mi.BSDF]) -> dict[tuple[int, int], list[int]]:
     """Return the registry numbers of materials with a delta part, by its kind and component.
 
-    A BSDF gives the part of the light for one component, so that nothing is left to chance. Straight light is one part
-    of any material.
+    A BSDF gives the part of the light for one component, so that nothing is left to chance.
     """
     found: dict[tuple[int, int], list[int]] = {}
     straight = int(mi.BSDFFlags.Null)
@@ -388,9 +374,8 @@ Boxes = tuple[FloatArray, FloatArray, FloatArray]
 def grazing(tracer: SpecularRays, half_width: float, unit: int) -> tuple[list[Boxes], float]:
     """Return where balls of glass send light to the sensor from near their rim, and the flux too near to trace.
 
-    Light that is reflected inside a ball leaves more steeply the closer to the rim it entered: two thirds of the
-    returned light may come from the last thirtieth. Rays across the middle of each ball, in its plane with projector
-    and sensor, show where; by symmetry the rest lies on an arc.
+    Light that is reflected inside a ball leaves more steeply the closer to the rim it entered. Rays across the middle
+    of each ball, in its plane with projector and sensor, show where; by symmetry the rest lies on an arc.
     """
     glass = int(mi.BSDFFlags.DeltaTransmission)
     balls = [s for s in tracer.mirrors if s.class_name() == "Sphere" and s.bsdf().flags() & glass]

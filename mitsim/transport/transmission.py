@@ -1,10 +1,8 @@
 """Light that passes surfaces: the way between two points of a scene, and the part of the light it keeps.
 
-The hole of a cut-out (``mask``), a thin pane (``thindielectric``), a filter: their *null lobe* lets a part of the light
-go straight on as if nothing were there. Flat glass bends it, but to one way between two points only. No random
-direction distinguishes such light from that of free space, so it is what it would be without the surface, weaker:
-direct light stays direct, and a light is searched behind a hole as before it. Scenes without such surfaces keep a plain
-test of visibility.
+The *null lobe* of a cut-out (``mask``), a thin pane (``thindielectric``) or a filter lets a part of the light go
+straight on. Flat glass bends it, but to one way between two points only. Such light is therefore treated as without the
+surface, but weaker: direct light stays direct.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ def lets_through(material: mi.BSDF) -> bool:
 
 
 def transmits(scene: mi.Scene) -> bool:
-    """Return True if a surface lets light through; an instance hides its materials, and may."""
+    """Return True if a surface lets light through, or is an instance, which hides its materials."""
     materials = [shape.bsdf() for shape in scene.shapes()]
     return any(bsdf is not None and lets_through(bsdf) for bsdf in materials) or _has_instances(scene)
 
@@ -49,8 +47,6 @@ def _has_instances(scene: mi.Scene) -> bool:
 
 @dataclass
 class Arrival:
-    """Light that comes to points of surfaces in a ``direction``, for the samples in flight that count."""
-
     si: mi.SurfaceInteraction3f
     direction: mi.Vector3f
     light: mi.Spectrum
@@ -76,17 +72,7 @@ class Passed:
 
 
 class Passage:
-    """Transmission of light in a scene; prepared once.
-
-    Attributes
-    ----------
-    panes
-        Shapes of flat glass.
-    open
-        True if light may pass a surface straight.
-    transmits
-        True if a surface transmits light in any way, so that something may stand close behind it.
-    """
+    """Transmission of light in a scene: ``open`` if light may pass a surface straight, ``transmits`` if in any way."""
 
     def __init__(self, scene: mi.Scene) -> None:
         self.scene, self.panes = scene, flat_panes(scene)
@@ -99,7 +85,7 @@ class Passage:
         self._round = int(mi.ShapeType.Cylinder) in kinds
 
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
-        """Return whether surface points and targets see each other, and the part of the light that arrives."""
+        """Return True where surface points and targets see each other, and the part of the light that arrives."""
         if not self.open:
             return ~self.scene.ray_test(self.leaving_to(si, target), active), mi.Spectrum(1)
         ray = self.leaving_to(si, target)
@@ -119,10 +105,7 @@ class Passage:
         return dr.max(part) > 0, part
 
     def along(self, ray: mi.Ray3f, light: mi.Spectrum, state: State, visit: Callable[[Arrival, State], State]) -> State:
-        """Return the state after ``visit`` of every surface on the way of each ray, up to the first opaque one.
-
-        Neighbouring rays are taken for coherent, which are found faster.
-        """
+        """Return the state after ``visit`` of every surface on the way of each ray, up to the first opaque one."""
         if not self.open:
             si = self.scene.ray_intersect(ray, mi.RayFlags.All, True)
             return visit(Arrival(si, ray.d, light, si.is_valid()), state)
@@ -143,8 +126,7 @@ class Passage:
     def next_surface(self, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.SurfaceInteraction3f:
         """Return the next surface on a ray, never behind its start, so that the ray advances.
 
-        On triangles as long and thin as those of a wire, single precision may put the point 0.01 mm behind the ray's
-        start; then it is the ray's own.
+        On the thin triangles of a wire, single precision may put the point 0.01 mm behind the ray's start.
         """
         si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent, active)
         si.p = dr.select(dr.dot(si.p - ray.o, ray.d) > 0, si.p, ray(si.t))
@@ -235,7 +217,6 @@ _FLAT = 1e-4
 
 
 def flat_panes(scene: mi.Scene) -> list[mi.ShapePtr]:
-    """Return the shapes of smooth flat glass: rectangles, disks, sheets and boxes."""
     return [
         mi.ShapePtr(shape)
         for shape in scene.shapes()
@@ -265,22 +246,6 @@ def _is_flat(shape: mi.Shape) -> bool:
 
 @dataclass
 class RefractedWay:
-    """Way of light from points of surfaces to their targets.
-
-    Attributes
-    ----------
-    apparent
-        Where the target sees the surface.
-    length
-        Of the way [mm].
-    part
-        Part of the light that arrives.
-    eta
-        Refractive index at the target over that at the surface.
-    open
-        True if there is a way.
-    """
-
     direction: mi.Vector3f
     apparent: mi.Point3f
     length: mi.Float
@@ -325,7 +290,6 @@ class _Aim:
 
 
 def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> RefractedWay:
-    """Return the way from points to targets through the panes between them; straight without panes."""
     search = _Search(passage, si, target, dr.normalize(target - si.p))
     nothing = mi.Float(0)
     start = _Aim(
@@ -421,7 +385,7 @@ _MOST = 16
 
 @dataclass(frozen=True)
 class Contact:
-    """Shape that lets light through, its distance to what stands too close, and the least allowed [mm]."""
+    """Shape that lets light through, its distance to the nearest surface, and the least allowed [mm]."""
 
     shape: int
     gap: float
@@ -436,7 +400,7 @@ class Contact:
 
 
 def contacts(scene: mi.Scene) -> tuple[Contact | None, Contact | None]:
-    """Return why the factored estimator and the reference must not be given a scene; None where they may."""
+    """Return a contact that the factored estimator cannot render, and one for the reference; None if there is none."""
     shapes = [shape for shape in scene.shapes() if shape.bsdf() is not None]
     clear = [shape for shape in shapes if lets_through(shape.bsdf())]
     found: list[Contact | None] = [None, None]

@@ -1,4 +1,4 @@
-"""Mitsuba plugins of mitsim, one a file; a call makes all of them known to the variant in use."""
+"""Mitsuba plugins of mitsim, one a file."""
 
 from __future__ import annotations
 
@@ -7,13 +7,7 @@ _REGISTERED: set[str] = set()
 
 
 def register() -> None:
-    """Register every plugin for the current variant; calling it again does nothing.
-
-    Raises
-    ------
-    MitsimError
-        when no variant is selected.
-    """
+    """Register every plugin for the current variant; raise MitsimError if none is selected."""
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError

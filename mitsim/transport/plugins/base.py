@@ -1,7 +1,6 @@
 """Common parts of plugins and tracers: the base of BSDFs, coordinates, arrays on the host, and random numbers.
 
-Index coordinates grow as rows and columns of images do: row = -y, column = -x in Mitsuba's camera frame, as lengths or
-as tan-angles.
+Index coordinates grow as rows and columns of images do: row = -y, column = -x in Mitsuba's camera frame.
 """
 
 from __future__ import annotations
@@ -23,10 +22,7 @@ def numbers(text: str) -> list[float]:
 
 
 def bsdf_class() -> type:
-    """Return the base of our BSDFs for the variant in use.
-
-    Without ``eval_pdf`` of its own a BSDF is a delta, which no given direction meets.
-    """
+    """Return the base of our BSDFs; one without ``eval_pdf`` of its own is a delta, which no given direction meets."""
 
     class ModelBSDF(mi.BSDF):  # type: ignore[misc]
         name: str
@@ -65,10 +61,10 @@ def channels(spectrum: mi.UnpolarizedSpectrum, count: int) -> FloatArray:
 
 
 def device_vectors(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Copy vectors (k, 3) to the device, in single precision.
+    """Copy vectors (k, 3) to the device, gathered from one array.
 
-    They are gathered from one array, because Dr.Jit compiles kernels that read arrays in place anew for each alignment,
-    which differs for nearly every k (50 ms each).
+    Dr.Jit compiles kernels that read arrays in place anew for each alignment, which differs for nearly every k (50 ms
+    each).
     """
     flat = mi.Float(np.ascontiguousarray(vectors, dtype=np.float32).ravel())
     first = 3 * dr.arange(mi.UInt32, len(vectors))
@@ -125,12 +121,10 @@ def streams(seed: int | mi.UInt32, stream: mi.UInt32, sample: mi.UInt32) -> tupl
 
 
 def seed_of(seed: int | mi.UInt32) -> mi.UInt32:
-    """One ``seed``, the same kernel for any, or one for each lane."""
     return dr.opaque(mi.UInt32, seed) if isinstance(seed, int) else seed
 
 
 def sobol_point(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:
-    """Return a point of a Sobol sequence in the unit square, scrambled by numbers drawn from ``rng``."""
     first = _scramble(dr.brev(index), rng.next_uint32())
     second = _scramble(_second_dimension(index), rng.next_uint32())
     return mi.Point2f(_unit(first), _unit(second))
@@ -139,7 +133,7 @@ def sobol_point(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:
 def shuffle(index: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
     """Permute the numbers of samples so that each aligned block of 2^m is again one.
 
-    :func:`stratified` points of them are as even as those of ``index`` and independent of these, so two pairs of
+    Their :func:`stratified` points are as even as those of ``index`` and independent of them, so two pairs of
     dimensions pad to four (Burley 2020, "Practical hash-based Owen scrambling", section 4).
     """
     return _scramble(index, rng.next_uint32())
@@ -170,7 +164,6 @@ def _unit(bits: mi.UInt32) -> mi.Float:
 
 
 def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
-    """Return the mean of radiance over channels, or over wavelengths with the weights of a path."""
     # dr.mean would write the number of lanes into the kernel: another kernel for each number of paths.
     return dr.sum(radiance) / len(radiance)
 

@@ -1,10 +1,8 @@
 """Pattern of light that a refractive diffuser before a bare sensor makes of a distant point.
 
-A sheet of glass (polycarbonate, as DiffuserCam's) has a random, smooth relief towards the sensor. Parallel rays meet
-the flat face, then the relief, are refracted by Mitsuba's smooth dielectric, and are counted on the sensor. For small
-slopes a ray at x lands at x + d (n - 1) grad h(x), with h the thickness, so that the irradiance is 1 / |det(1 + d (n -
-1) Hess h)|, summed over all x that land there: the caustics of a diffuser. The sensor at z = 0 looks along +z, row 0 is
-at +y, column 0 at +x.
+A sheet of glass has a random, smooth relief towards the sensor. For small slopes a ray at x lands at x + d (n - 1) grad
+h(x), with h the thickness, so that the irradiance is 1 / |det(1 + d (n - 1) Hess h)|, summed over all x that land
+there: the caustics of a diffuser.
 """
 
 from __future__ import annotations
@@ -28,8 +26,6 @@ _VERTICES = 12
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """A face over a square on the axis: height (g, g) of the glass towards the sensor [mm], and slopes."""
-
     side_mm: float
     height_mm: FloatArray
     slope_x: FloatArray
@@ -39,7 +35,7 @@ class Relief:
 def random_relief(side_mm: float, correlation_mm: float, slope: float, seed: int) -> Relief:
     """Draw a normal random surface with the autocorrelation exp(-r^2 / (2 correlation^2)) and an rms slope.
 
-    Raise MitsimError for lengths that do not fit, or a slope that is no small positive number.
+    Raises MitsimError for lengths that do not fit, or a slope that is no small positive number.
     """
     if not (0 < correlation_mm < side_mm / 4 and 0 < slope <= 0.5):
         raise MitsimError(
@@ -66,7 +62,7 @@ class Diffuser:
     """Sheet of an index at a distance [mm] before a sensor.
 
     By default the caustics fill as much of 300 x 400 pixels of 23.4 um as the public point spread function of
-    DiffuserCam, in cells about as wide.
+    DiffuserCam.
     """
 
     relief: Relief = field(default_factory=lambda: random_relief(6.0, 0.35, 0.05, 0))
@@ -120,8 +116,7 @@ def point_spread(
 ) -> FloatArray:
     """Return the irradiance (rows, columns) of a distant point behind a diffuser, over that before it.
 
-    Only light that meets the relief is traced. `tilt` has tangents along x and y of the light's direction; `rays` is
-    the number along an axis, one at random in each cell.
+    ``tilt`` has tangents of the light's direction; ``rays`` is the number along an axis, one at random in each cell.
     """
     scene, side = diffuser.scene(), diffuser.relief.side_mm
     rows, columns = shape

@@ -1,4 +1,4 @@
-"""Dispersive glass: a Mitsuba BSDF, from a direction and a wavelength to what a smooth face reflects and refracts.
+"""Dispersive glass: a Mitsuba BSDF, a smooth face that reflects and refracts by wavelength.
 
 Plugin ``mitsim_glass``
 -----------------------
@@ -8,7 +8,7 @@ Mitsuba's ``dielectric`` with an index of refraction that follows the wavelength
     n   = n_d + (n_d - 1) / V_d (lambda^-2 - lambda_d^-2) / (lambda_F^-2 - lambda_C^-2)                   A. Cauchy 1836
 
 with n_d at 587.56 nm and Abbe's number V_d = (n_d - 1) / (n_F - n_C) of Fraunhofer's lines F, 486.13, and C, 656.27 nm,
-as data sheets state them. Fresnel's formulas for unpolarised light divide what is reflected from what is refracted.
+as data sheets state them. Fresnel's formulas for unpolarised light give the reflected and the refracted part.
 Indices are those relative to air, as catalogues measure them.
 
 ===============  ====  ===========  ===================================================================================
@@ -18,7 +18,7 @@ parameter        unit  default      meaning
 ``sellmeier``    um^2  -            in place of ``glass``: B_1, C_1, B_2, C_2, ..., up to four pairs
 ``index``        -     -            in place of both: n_d, 1 to 5
 ``abbe``         -     -            V_d, 5 to 200; belongs to ``index``
-``wavelength``   nm    projector's  whose index mono and RGB variants take, 360 to 830
+``wavelength``   nm    projector's  whose index mono and RGB variants use, 360 to 830
 ===============  ====  ===========  ===================================================================================
 
 Mono variants have one wavelength: the projector's effective one, which a bench sets (:func:`tune`), or the one given.
@@ -111,7 +111,6 @@ class GlassModel(BaseModel):
         return model
 
     def index_squared(self, wavelength: Length) -> Length:
-        """Return the square of the index at a wavelength [nm], a number or Dr.Jit's."""
         square = (wavelength * 1e-3) ** 2
         if self.index is not None and self.abbe is not None:
             slope = (self.index - 1) / (self.abbe * (_LINE_F**-2 - _LINE_C**-2))
@@ -133,7 +132,6 @@ def _model(props: mi.Properties) -> GlassModel:
 
 
 def is_glass(material: mi.BSDF) -> bool:
-    """Return True for this plugin; Mitsuba has one name for all Python classes."""
     return isinstance(getattr(material, "model", None), GlassModel)
 
 

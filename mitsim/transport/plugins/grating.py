@@ -7,8 +7,8 @@ from the surface, | marks the tangential part of a unit vector (its direction co
 
     w_o| = -w_i| + m (lambda / pitch) g               g: unit vector across the grooves
 
-An order is no delta here but a lobe of direction cosines (a real disc is neither flat nor regular), with q what the
-grating equation leaves::
+An order is no delta here but a lobe of direction cosines (a real disc is neither flat nor regular), with q the
+remainder of the grating equation::
 
     f(w_i, w_o) = reflectance (diffuse / pi + sum over m of  eta_m D(q_m)),  q_m = w_i| + w_o| - m (lambda / pitch) g
     D(q) = exp(-(q . g)^2 / 2 sigma^2 - (q x g)^2 / 2 sigma_groove^2) / (2 pi sigma sigma_groove)

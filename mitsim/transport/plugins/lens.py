@@ -59,8 +59,8 @@ PLUGIN = "mitsim_projector"
 def aperture_scene_parts(projector: mi.Emitter, radius: float, focus: float) -> dict[str, Any]:
     """Return scene parts that replace a stock projector: its aperture as a disk that shines alike.
 
-    The bitmap is taken to be nearest and clamped. Raise MitsimError for a radius or focus [mm] that is not above 0, or
-    a projector without a bitmap or with a scaled ``to_world``.
+    Raises MitsimError for a radius or focus [mm] that is not above 0, or a projector without a bitmap or with a scaled
+    ``to_world``. The bitmap is taken to be nearest and clamped.
     """
     for name, value in (("radius", radius), ("focus", focus)):
         if not (math.isfinite(value) and value > 0):
@@ -103,8 +103,6 @@ def _number(props: mi.Properties, name: str, low: float, high: float) -> float:
 
 
 def plugin_class() -> type:
-    """Return the plugin for the variant in use."""
-
     class ApertureProjector(mi.Emitter):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)

@@ -97,8 +97,6 @@ def _check_rigid(transform: mi.AffineTransform4f) -> None:
 
 
 def plugin_class() -> type:
-    """Return the plugin for the variant in use."""
-
     class Lensless(mi.Sensor):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
@@ -112,7 +110,6 @@ def plugin_class() -> type:
             self.wear(_geometry(props, self.film()))
 
         def wear(self, geometry: CameraGeometry) -> None:
-            """Set the camera of a geometry, with the mask of a camera file."""
             self.geometry = geometry
             mask = geometry.build_mask()
             self._openings, self._feature = Openings(mask), mask.feature_mm
@@ -268,8 +265,6 @@ def plugin_class() -> type:
 
 
 class OpenAxis:
-    """Open rows of a grid, or its columns; coordinates count features from the first one's edge."""
-
     def __init__(self, bits: BoolArray) -> None:
         self._size = len(bits)
         # Once more at the end, and a place that is not there after the last one: nothing is open beyond the mask.
@@ -317,12 +312,9 @@ class Openings:
         self._grids = [(OpenAxis(rows), OpenAxis(columns)) for rows, columns in mask.openings]
 
     def draw(self, corner: mi.Point2f, width: float, number: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Draw an open place of a square window, each as likely as any other.
+        """Draw an open place of a square window uniformly; return its row and column, and the open part of the window.
 
-        Returns
-        -------
-        row and column from the window's first corner, in features, and the part of the window that is open: where it is
-        0 the place is undefined.
+        The place is undefined where the part is 0.
         """
         grids = [
             (rows.open_within(corner.x, width), columns.open_within(corner.y, width)) for rows, columns in self._grids

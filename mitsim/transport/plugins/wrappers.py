@@ -3,7 +3,7 @@
 Plugins ``mitsim_blendbsdf``, ``mitsim_mask``, ``mitsim_twosided``
 ------------------------------------------------------------------
 Mitsuba's ``blendbsdf`` weighs a mirror's direction by the density of the other material there as well, as if both were
-densities: half a mirror over half a matt surface keeps 0.8 of what it reflects. Its ``mask`` samples nothing when only
+densities: half a mirror over half a matt surface keeps 0.8 of the light. Its ``mask`` samples nothing when only
 the lobes of its material are asked for, and a ``twosided`` of two materials all lobes of the second in place of one.
 All three choose one of two materials: by weight, by opacity (the other is ``null``), or by side. Here a single
 direction (delta or null) has the chance of its choice as its ``pdf``, and a context with a component gives the part of
@@ -38,8 +38,6 @@ _ANY = 2**32 - 1
 
 
 def plugin_classes() -> dict[str, type]:
-    """Return the plugins for the variant in use, by name."""
-
     class Wrapper(bsdf_class()):  # type: ignore[misc]
         parts: list[mi.BSDF]
 
