@@ -189,7 +189,7 @@ def capture(
 ) -> Captured:
     """Render and expose every shot of a pattern family; see :meth:`mitsim.api.bench.Bench.capture`.
 
-    Nothing is written before all input has been checked. ``lights`` has each line's light by pixel or for this family.
+    Nothing is written before all input has been checked.
     """
     task = task or Task()
     job, spent = task.job, task.job.clock.seconds()

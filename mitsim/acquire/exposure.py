@@ -184,11 +184,6 @@ def ambient_shots(family: PatternFamily) -> int:
 
 @dataclass(frozen=True, eq=False)
 class AmbientFrame:
-    """Mean of several shots with the projector off.
-
-    ``electrons`` (rows, columns) are expected in each shot, without dark current.
-    """
-
     shots: int
     electrons: FloatArray
     digital: FloatArray
@@ -218,10 +213,7 @@ def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames)
 
 @dataclass(frozen=True)
 class Totals:
-    """Brightest pixel [W m^-2], relative Monte Carlo error and largest negative light over all expected frames.
-
-    ``heaviest`` is the largest part of the Monte Carlo variance from one group.
-    """
+    """Brightest pixel [W m^-2], relative Monte Carlo error and largest negative light over all expected frames."""
 
     peak: float
     mc_error: float
@@ -302,7 +294,6 @@ class Shooting:
         return math.sqrt((noise + own) / signal) if signal else math.inf
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
-        """Expose and record ``expected`` frames in chunks; a chunk is written while the next one is formed."""
         chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
         job.progress("frames", 0.0)
         with Behind(self._record) as writing:
@@ -381,9 +372,8 @@ def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float =
 def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
     """Return a ``bench`` whose mask has moved by a ``drift``, for light that was traced before.
 
-    Raises MitsimError for a mask that turns, tilts or shakes before mirrors or is drawn on a raster, for a thick mask
-    that
-    tilts, and for one that tilts too far or moves into the sensor or the scene.
+    Raises MitsimError for a mask that turns, tilts or shakes before mirrors or on a raster, for a thick one that tilts,
+    and for one that tilts too far or moves into the sensor or the scene.
     """
     row, column, axis = drift.mask_mm
     camera, kinds = bench.geometry, " and ".join(kind for kind in drift.kinds if kind in _OF_TERMS)
@@ -429,7 +419,6 @@ def drift_projector(bench: Apparatus, drift: Drift) -> Apparatus:
 
 
 def warmer(sensor: SensorModel, kelvin: float) -> SensorModel:
-    """Return a ``sensor`` that is ``kelvin`` warmer, or the same if its file states no temperature."""
     if sensor.dark_current_temperature_c is None or sensor.dark_doubling_c is None or not kelvin:
         return sensor
     now = sensor.dark_current_temperature_c if sensor.temperature_c is None else sensor.temperature_c
@@ -438,10 +427,7 @@ def warmer(sensor: SensorModel, kelvin: float) -> SensorModel:
 
 @dataclass(frozen=True)
 class DriftedExposer(Exposer):
-    """A camera that has drifted: frames are exposed in its true state and interpreted in its known one.
-
-    ``family`` has patterns in the order of the shots; ``ambient`` is lamps' light [W m^-2] in the ambient frame.
-    """
+    """A camera that has drifted: frames are exposed in its true state and interpreted in its known one."""
 
     drift: Drift = field(default_factory=Drift)
     family: PatternFamily | None = None

@@ -172,8 +172,7 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
     """Return the image (rows, columns) in an OpenEXR or NPY file, and the assumptions about it.
 
     Without ``channel``, the only channel is read, or Y, or the luminance of R, G and B. Raises MitsimError for a file
-    that
-    is missing, damaged or of another kind, or a missing channel.
+    that is missing, damaged or of another kind, or a missing channel.
     """
     path = Path(path)
     check_image(path)

@@ -49,11 +49,6 @@ _RAYS, _ALIKE = 4, 0.9
 
 @dataclass(frozen=True)
 class SpectralBench:
-    """A bench by the lines of its projector.
-
-    ``whole`` has all lines; ``manifest`` names them, and is None for mono light.
-    """
-
     whole: Apparatus
     manifest: manifests.ColourManifest | None = None
 
@@ -96,7 +91,6 @@ class SpectralBench:
         return (self.whole,) if self.whole.filters else self.benches
 
     def read(self, lights: Sequence[SampledLight]) -> Sequence[SampledLight]:
-        """Return the light of each of :attr:`readings` from ``lights`` of the lines."""
         if self.whole.filters is None or self.manifest is None:
             return lights
         return [MosaicLight.of(self.whole, lights, self.manifest.wavelengths_nm)]
@@ -313,9 +307,8 @@ def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
 class MosaicFrames(ExpectedFrames):
     """Frames of every shot behind the filters.
 
-    Lines share their paths, so that their errors are correlated: the error of the sum is at most the sum of the errors.
-    The
-    same holds for lamps' light unless it is ``independent``: no other light is on its paths.
+    Lines share their paths, so that the error of the sum is at most the sum of the errors; ``independent`` lamps' light
+    has no other light on its paths.
     """
 
     def __init__(
@@ -448,11 +441,6 @@ _ONCE, _TRACED = ("start", "plan"), ("transport", "truth")
 
 @dataclass(frozen=True)
 class Coloured(Generic[Opened]):
-    """The choice, ready for a capture: ``bench`` is in its variant and has its bands.
-
-    The plan lists the alternatives (:attr:`Plan.colour`); its accuracy is reduced by the colours' error.
-    """
-
     plan: Plan
     bench: Opened
 

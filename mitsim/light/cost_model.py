@@ -82,12 +82,6 @@ gift_card 0.3)."""
 
 @dataclass(frozen=True)
 class UnitCosts:
-    """Seconds of single things.
-
-    ``passes`` are by path or connection, ``product`` by multiplication in forming a frame; ``entry`` is one of a
-    wave-optical shadow, ``accumulated`` one of light.
-    """
-
     passes: Mapping[str, float]
     frame: float
     product: float
@@ -243,7 +237,6 @@ def checking_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Nu
 
 
 def tells_all(classes: int, shots: int, pixels: float) -> bool:
-    """Return True if checks see all shots, by the frames of their classes; ``pixels`` are a side of the sensor."""
     return classes <= MOST_CHECKED and mixes(classes, shots, pixels)
 
 

@@ -73,15 +73,10 @@ class FrameCheck:
 class SampledLight:
     """Sampled light of one scene, in independent groups.
 
-    Attributes
-    ----------
-    labels
-        (n^2,) row of each projector pixel: its class, or the pixel itself if any family is to be formed.
-    flux, flux_error
-        (n^2,) irradiance of each pixel's direct light without the mask, mean over the sensor, and its standard error.
-    restated
-        Factor of the Monte Carlo error over that from the groups' differences. Sampling stops where these happen to be
-        small; therefore a larger error that an earlier check predicted is used.
+    ``labels`` (n^2,) is the row of each projector pixel: its class, or the pixel itself if any family is to be formed.
+    ``flux`` (n^2,) is the mean irradiance over the sensor of each pixel's direct light without the mask. ``restated``
+    multiplies the Monte Carlo error from the groups' differences, because sampling stops where these happen to be
+    small.
     """
 
     groups: tuple[LightEstimate, ...]
@@ -169,11 +164,9 @@ class SampledLight:
 
     @check_arguments
     def speckle(self, family: PatternFamily | None = None) -> float:
-        """Return the contrast of speckle in frames of a family (None for a white picture); 0 if speckle is off."""
         return self.bench.speckle(family) if self.simulation.physics.speckle else 0.0
 
     def merge(self) -> SampledLight:
-        """Return the light as one group, whose frames form faster but have no variance."""
         return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
 
     @cached_property
@@ -320,7 +313,6 @@ def _checks(
     enough: float,
     predicted: Mapping[int, float],
 ) -> dict[int, _Check]:
-    """Check the noisiest line first, and the others once its bound meets ``enough``."""
     noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
     checks = {}
     for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
@@ -472,7 +464,6 @@ def first_samples(simulation: Simulation) -> dict[str, int]:
 def next_samples(
     simulation: Simulation, done: Mapping[str, int], variances: Mapping[str, float], excess: float
 ) -> dict[str, int]:
-    """Return the samples of a group after the next round, which is to reduce the error by the ratio ``excess``."""
     work = {
         name: PASSES[name].unit_cost
         * each.tracer.paths_per_sample
@@ -519,7 +510,6 @@ class SampledPass:
 
 
 def cheapest_samples(lights: Sequence[SampledPass], allowed: float) -> dict[str, int]:
-    """Return the samples of least work whose joint variance is ``allowed``, or all that a round may take."""
     stepped = [light for light in lights if light.name in EVEN]
     others = [light for light in lights if light.name not in EVEN]
     best, least = {light.name: light.steps[-1] for light in stepped}, math.inf

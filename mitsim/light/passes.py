@@ -73,8 +73,8 @@ class GridRow:
 class Grids:
     """Grids of a bench with settings.
 
-    ``one_line`` uses the mean wavelength alone for diffraction, in a third of the time. ``places`` are rows and columns
-    whose frames are formed. ``judging_cells`` a side of a projector pixel judge the coarse cells of a run in the pilot.
+    ``one_line`` uses the mean wavelength alone for diffraction, in a third of the time. ``judging_cells`` a side of a
+    projector pixel judge the coarse cells of a run in the pilot.
     """
 
     def __init__(
@@ -122,7 +122,6 @@ class Grids:
 
     @property
     def reach(self) -> float:
-        """Return the largest tan-angle from the sensor's centre that the sensor's edge sees at the light's depth."""
         return self.physics.geometry.reach(self.settings.depth)
 
     def cells(self, subdivision: int = 1, width: int = 1, reach: float | None = None) -> CellGrid:
@@ -198,8 +197,8 @@ MEAN_GRIDS = ("fine", "indirect")
 class LightEstimate:
     """Light by grid, (classes + 1, places) each [W m^-2]; the last row, or one for each band, is ambient light.
 
-    ``received`` is the mean of all light over the sensor without its mask, ``outside`` the part beyond all cells, which
-    is in no frame [W m^-2]. ``flux`` (n^2,) is each projector pixel's direct part, if measured.
+    ``received`` is the mean over the sensor without its mask, ``outside`` the part beyond all cells, which is in no
+    frame.
     """
 
     light: Mapping[str, sparse.csr_array]
@@ -284,7 +283,6 @@ class Tracers(Grids):
 
     @cached_property
     def anchored_occluded(self) -> DirectTracer | None:
-        """Return the tracer of direct light of occluded pixels to anchors of their own."""
         settings = self.settings
         others = np.setdiff1d(np.arange(self.bench.n**2), settings.with_own_anchors)
         return self._direct(settings.occluded_anchors, others) if settings.with_own_anchors else None
@@ -393,8 +391,6 @@ class Pass:
         Name of the random stream, which never changes, so that the same seed gives the same frames.
     unit_cost
         Time of a path, or of a connection to one anchor [s].
-    grid, indirect_grid
-        Grid of its light, and of its light over several surfaces if another.
     anchors
         Setting that counts its anchors. The pass then accumulates the residual over their mean.
     effects

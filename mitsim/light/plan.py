@@ -327,7 +327,6 @@ def _digest(own: Any) -> str:
 
 
 def _difference(one: Any, other: Any, place: str = "") -> tuple[str, Any, Any] | None:
-    """Return where JSON data first differs, with both values there; None for equal data."""
     if isinstance(one, dict) and isinstance(other, dict):
         each = (_difference(one.get(name), other.get(name), f"{name} ") for name in dict.fromkeys([*one, *other]))
         return next(filter(None, each), None)

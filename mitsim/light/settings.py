@@ -63,8 +63,7 @@ class SharpPixels:
 class Settings:
     """Effects that are simulated, and the numbers of anchors, layers, cells and samples.
 
-    Anchors are points along an axis of the sensor to which light is followed; ``occluded`` pixels have anchors of their
-    own.
+    Anchors are points along an axis of the sensor to which light is followed; ``occluded`` pixels have their own.
 
     Attributes
     ----------
@@ -75,8 +74,7 @@ class Settings:
     subdivision
         Cells along a projector pixel.
     samples
-        Predicted samples of each group by pass, for each projector pixel, or for each cell of light followed from the
-        camera. One is traced if the number is below 1 or missing.
+        Predicted samples of each group by pass, for each projector pixel, or for each cell of light from the camera.
     coarse_layers
         True if indirect light, and direct light beyond its mean over the anchors, has all layers and finer cells.
     shared
@@ -85,8 +83,8 @@ class Settings:
         (blocks^2,) paths of each block of pixels in a sample of indirect light; empty for one path of each pixel.
     reach
         Largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received, or None.
-    raster, raster_cells
-        True if frames are correlations with a mask's shadow on a raster, by FFT; its cells along a pixel, or 0.
+    raster
+        True if frames are correlations with a mask's shadow on a raster, by FFT.
     """
 
     depth: Positive
@@ -146,8 +144,8 @@ picture of light) to 2.9 (a mask turned by 0.3 degrees)."""
 class Noise:
     """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate.
 
-    ``spread`` is the relative variance of its square among estimates, 0 if many paths cause it; ``heavy`` is the number
-    of equal paths that would cause it as unevenly, infinite if not counted.
+    ``spread`` is the relative variance of its square, ``heavy`` the number of equal paths that would cause it as
+    unevenly.
     """
 
     error: float
@@ -158,10 +156,7 @@ class Noise:
 
     @classmethod
     def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
-        """Measure the noise of one of several replicates ``seen`` (replicates, ...), relative to the norm ``light``.
-
-        ``paths`` has the light of each path of all replicates, of which few may be heavy.
-        """
+        """Measure the noise of one of several replicates ``seen`` (replicates, ...), relative to the norm ``light``."""
         energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
         mean = float(energies.mean())
         spread = float(energies.var(ddof=1)) / mean**2 if mean else 0.0
@@ -180,8 +175,6 @@ class Noise:
 
 @dataclass(frozen=True)
 class SampleCost:
-    """Cost of one kind of light: noise relative to all light, paths in a sample, and seconds a path (0: not timed)."""
-
     noise: Noise
     paths: int
     seconds: float = 0.0
@@ -196,7 +189,6 @@ class SampleCost:
 
     @property
     def variance(self) -> float:
-        """Return the relative variance of one sample, if the error falls with the square root of their number."""
         return self.noise.samples * self.noise.error**2
 
 
@@ -257,24 +249,10 @@ class ErrorCovariance:
 class Forming:
     """Quantities that determine the cost of forming frames, besides settings.
 
-    Pairs are without diffraction and with it; pixels and cells are along an axis.
-
-    Attributes
-    ----------
-    lit
-        Part of the rows of cells that have light in a frame.
-    product
-        Seconds of a multiplication in a large product of matrices; 0 if not timed.
-    correlated
-        True if frames are always correlations with a shadow on a raster, and never sums of separable terms.
-    phases
-        Fewest raster cells of a pixel.
-    largest_terms
-        Terms of a shadow that must be drawn on a raster; infinite if too many, or if it need not be drawn.
-    drawing
-        Seconds of drawing a shadow on the coarsest raster, for each layer.
-    parted
-        True if glass sends each line its own way, so that lines share no paths.
+    Pairs are without diffraction and with it; pixels and cells are along an axis. ``lit`` is the part of the rows of
+    cells that have light in a frame, ``product`` the time of a multiplication in a large product [s], ``drawing`` that
+    of a shadow's layer. With ``correlated``, frames are never sums of separable terms; with ``parted``, lines share no
+    paths.
     """
 
     pixels: float
@@ -296,8 +274,6 @@ class Forming:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A mask's shadow on a raster: ``error`` of the frames with the first number of ``cells``, or None."""
-
     error: Estimate | None = None
     needed: bool = False
     cells: tuple[int, ...] = (4,)
@@ -317,9 +293,7 @@ class PilotResult:
     ----------
     changes
         Changes of the frames by omitting each effect, by each number of anchors, layers and cells that was tried, and
-        by one coarse cell a pixel, or one layer, for light in coarse cells.
-    sample_costs
-        Cost of each pass by name; that of light at anchors counts paths to one of them.
+        by one coarse cell a pixel, or one layer.
     spread
         Cost of direct light to random points of the sensor instead of its centre.
     apart
@@ -328,8 +302,6 @@ class PilotResult:
         Parts of the direct light in lobes that sampling would miss, and of all light that no tracer finds.
     unresolved_specular
         Part of all light that comes over mirrors alone and whose place on the sensor is unknown.
-    mirror
-        Number, among the scene's shapes, of the one that most of the light left out comes over.
     hits
         Rays that bring all direct light if each projector pixel sends one, if these are few; else infinite.
     """
@@ -357,7 +329,6 @@ class PilotResult:
         return replace(self, sample_costs={**self.sample_costs, **found})
 
     def forms(self, waves: bool) -> tuple[int, ...]:
-        """Return the raster cells along a pixel that frames may be formed with, 0 for a sum of terms."""
         drawn = self.raster[waves]
         if drawn.error is None:
             return (drawn.cells[0] if drawn.needed else 0,)
@@ -375,7 +346,6 @@ class PilotResult:
 
     @cached_property
     def ladders(self) -> dict[str, dict[int, Estimate]]:
-        """Return the error of each number of anchors, layers and cells that was tried, fewest first."""
         found: dict[str, dict[int, Estimate]] = {name: {} for name in COUNTED}
         for part in sorted(part for part in self.changes.parts if part.name in COUNTED):
             found[part.name][part.count] = self.error(part)

@@ -68,7 +68,6 @@ class Simulation(Tracers):
     # ---- Accumulation
 
     def accumulator(self, name: str, labels: Labels, lines: int) -> DeviceAccumulator | None:
-        """Return the accumulator of the lines' light on the device; None if the pass has none, or no room."""
         each, bundle = self.passes[name], self.grids[PASSES[name].grids[-1]].bundle
         if not each.row.device:
             return None
@@ -139,7 +138,6 @@ class Simulation(Tracers):
     def with_optics(
         self, groups: Sequence[LightEstimate], first: int
     ) -> tuple[list[AccumulatedLight], list[AccumulatedLight]]:
-        """Return light of the projector and ambient light, whose first row is ``first``, with their optics."""
         lights = [
             AccumulatedLight(self.grids[row.name].optics, tuple(_rows(group[row.name], 0, first) for group in groups))
             for row in GRIDS.values()
@@ -183,8 +181,7 @@ def expected_of(
 ) -> ExpectedFrames:
     """Return expected frames of light in several parts, for simulations of the same devices.
 
-    Leakage is that of the first simulation, specular chains are those of the last; ``rows`` (groups' rows,) has the
-    class of each row of the estimates. ``leaking`` is True if every shot lights all black pixels.
+    Leakage is that of the first simulation, specular chains are those of the last.
     """
     light = emission(parts[0][0].physics, lighting, leaking)
     formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]

@@ -32,8 +32,6 @@ _DOUBLINGS, _AT_ONCE = 8, 4
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Apparent reflectance of every projector pixel, (n, n), and its direct light from the board [W m^-2]."""
-
     reflectance: FloatArray
     standard_error: FloatArray
     board_flux: FloatArray
@@ -99,8 +97,8 @@ class _Flux:
     def refine(self, unit: FloatArray, target: FloatArray, likely: FloatArray) -> None:
         """Trace more where that reduces the error most, until every line meets its target or needs too many rays.
 
-        Errors are in units ``unit`` (lines, n^2). ``likely`` (n^2,) has variances from other knowledge, because a pixel
-        whose samples happen to agree would get no more of them.
+        ``likely`` (n^2,) has variances from other knowledge, because a pixel whose samples happen to agree would get no
+        more.
         """
         # An edge goes on in the next pixel, where all samples so far may have missed it.
         likely = likely + mean_of_neighbours(likely.reshape(self._shape)).ravel()
@@ -129,7 +127,6 @@ class _Flux:
 
 
 def _allot(likely: FloatArray, samples: IntArray, first: int, part: float, most: int) -> IntArray:
-    """Return the samples (n^2,) that leave a part of the variance, doubled where a sample reduces it most."""
     doublings = np.arange(_DOUBLINGS)
     left = (likely * (samples / first) ** -_RATE)[:, None] * 2.0 ** (-_RATE * doublings)
     gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings

@@ -142,7 +142,6 @@ def _table_of(pilot_result: PilotResult, settings: Settings, switches: Mapping[s
 
 
 def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, Approximation]:
-    """Return the work that an exact pilot result could save, and the part with the largest uncertainty."""
     careful, hopeful = (candidates.choice(accuracy, sure) for sure in (SURE, 0.0))
     unsure = _table_of(candidates.pilot_result, hopeful.settings, candidates.switches).unsure
     worst = max(sorted(unsure), key=lambda part: unsure[part], default=Approximation("cells", 1))
@@ -242,7 +241,6 @@ class _Table:
         return changes.squared_errors(np.stack(weights, axis=1))
 
     def _weight(self, part: Approximation) -> FloatArray:
-        """Return the (m,) fraction of a part's change that each row leaves."""
         light, _, what = part.name.rpartition(" ")
         # Errors of even cells are of second order in their size.
         numbers, finer_cells = self.numbers, np.square(1 / self.numbers.coarse[0])

@@ -385,7 +385,6 @@ def _most(rough: FloatArray, rest: float) -> Labels:
 
 
 def _roughness(simulation: Simulation, pixels: Labels, samples: int, seed: int) -> tuple[FloatArray, float]:
-    """Return each pixel's squared light that is not smooth over the sensor, and the square of all light."""
     light = DirectTracer(simulation.setup, _ANCHORS, pixels=pixels).sums(seed, samples) / samples
     # Orthonormal polynomials at Chebyshev's nodes, by degree: the discrete cosine transform.
     angle = (np.arange(_ANCHORS) + 0.5) * np.pi / _ANCHORS

@@ -80,8 +80,6 @@ _FARTHEST = 1e-4
 
 @dataclass(frozen=True)
 class Sample:
-    """Shots, pixels and numbers of samples of a replicate; ``times`` multiplies those of the shortest."""
-
     lighting: Lighting
     places: Places
     times: int = 1
@@ -288,8 +286,6 @@ def noise(seen: FloatArray) -> float:
 
 
 class DirectRuns:
-    """Direct light in many samples a cell, accumulated in different cells and layers; ``first`` is by replicate."""
-
     def __init__(self, bench: Apparatus, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self._known: Known = {}

@@ -133,7 +133,6 @@ class AnchorRuns:
         return {self._pass.name: SampleCost.relative(beyond, light, self._samples, self._lanes)}
 
     def _in_cells(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
-        """Form frames of the light at a few anchors beyond their mean; 0 ``cells`` are those of a run."""
         known = self._frames(self.few) if cells == 1 and not layers else None
         return self._beyond(self._simulation(self.few, cells, layers), self._few, known)
 
@@ -285,8 +284,6 @@ class Bounced(NamedTuple):
 
 
 class EffectRuns:
-    """Frames with all effects and without each; light is traced once and reused where possible."""
-
     def __init__(
         self,
         bench: Apparatus,
@@ -359,7 +356,6 @@ class EffectRuns:
 
     @cached_property
     def _looks(self) -> tuple[Bounced, Bounced]:
-        """Return first and closer replicates; closer ones if noise hides the change by one cell a pixel."""
         first, tracer = Bounced.of(self.followed["indirect"], self.sample.followed), self.simulation.indirect
         if tracer is None or self._is_faint or not any(light.value.size for light in first.indirect):
             return first, first

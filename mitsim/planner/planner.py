@@ -254,7 +254,6 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
 
 
 def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:
-    """Return seconds of a sample of a pass in a run, and of its paths alone."""
     each, at_once = simulation.passes[name], simulation.paths_at_once
     planned, paths_per_sample = each.whole, each.tracer.paths_per_sample
     every = GROUPS * planned
@@ -579,7 +578,6 @@ def known_losses(loaded: LoadedScene, effects: Mapping[str, bool]) -> Iterator[s
 
 
 def unseen_lamps(loaded: LoadedScene, paths: float, estimator: str) -> Iterator[str]:
-    """Describe lamps that shine on the sensor directly and that ``paths`` of an ``estimator`` rarely meet."""
     for lamp, tag in loaded.small_lamps:
         if shines_in(loaded.scene, loaded.camera, lamp):
             rule = (

@@ -344,7 +344,6 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
 
 @keep_scenes()
 def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
-    """Return the part of the field stop, in tan-angles, in which the sensor's centre could see a shining shape."""
     _, rng = streams(0, dr.arange(mi.UInt32, _LAMP_POINTS), mi.UInt32(0))
     to_world, place = (
         camera.world_transform(),

@@ -1,7 +1,7 @@
 """Direct light: every projector pixel's rays, followed to the first surface and on to each anchor of the sensor.
 
-All anchors see the same surface points. Where surfaces let light pass (:mod:`mitsim.transport.transmission`), one of
-the points that the ray meets is drawn in proportion to its light.
+Where surfaces let light pass (:mod:`mitsim.transport.transmission`), one of the points that the ray meets is drawn in
+proportion to its light.
 """
 
 from __future__ import annotations

@@ -62,18 +62,9 @@ class FromCameraTracer(integrator.FollowingTracer):
 class CameraState(integrator.PathState):
     """Paths from the camera under way.
 
-    Attributes
-    ----------
-    inverse_depth
-        1/z of the point at which their light is seen [1/mm].
-    part
-        Part of the light over the turn before the sensor that is found here.
-    kept, turned
-        Parts that the projector's side keeps over the turns since the last mirror, and the last.
-    in_mirror, behind_glass
-        True if a mirror made the turn before the sensor, and if glass has bent the way since.
-    came_pdf, by_delta
-        Density of the last turn [1/sr], and True if it was a mirror's.
+    ``inverse_depth`` is 1/z of the point at which their light is seen [1/mm]. ``part`` of the light over the turn
+    before the sensor is found here; ``kept`` and ``turned`` are the projector's parts over the turns since the last
+    mirror, and the last. ``since`` is the length of the way since the last turn [mm], ``came_pdf`` its density [1/sr].
     """
 
     inverse_depth: mi.Float = field(default_factory=lambda: mi.Float(0))
@@ -313,7 +304,7 @@ def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
 
 @dataclass(frozen=True, eq=False)
 class LampResponse:
-    """Response of the camera to lamps, in one band for each wavelength of a path; ``units`` are irradiances [W m^-2]."""
+    """Response of the camera to lamps, in one band for each wavelength of a path; ``units`` are in W m^-2."""
 
     response: Response
     bands: Sequence[Band]
@@ -322,7 +313,7 @@ class LampResponse:
 
 
 class LampTracer(FromCameraTracer):
-    """Light of lamps alone, at its own wavelengths; band b has the pixel number n^2 + b."""
+    """Light of lamps at its own wavelengths; band b has the pixel number n^2 + b."""
 
     of_projector = False
     by_line = True

@@ -180,7 +180,6 @@ class _OneConnection:
         return held
 
     def fetch(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
-        """Fetch some kinds with ``also`` in one kernel, because each would trace all paths again."""
         dr.eval([held[kind] for kind in kinds], self._anchor if kinds else (), also)
         return [PathSamples.fetch(held[kind], integrator.KINDS[kind], self._anchor) for kind in kinds]
 

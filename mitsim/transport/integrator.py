@@ -107,7 +107,6 @@ class Tracer(ABC):
 
     @keep_scenes()
     def replicates(self, seeds: Sequence[int], *samples: int, first: int = 0) -> list[list[PathSamples]]:
-        """Return the light of increasing numbers of ``samples`` of each seed, from one kernel."""
         each, most = self.paths_per_sample, samples[-1]
         starts = [each * most * place for place in range(len(seeds))]
         ranges = np.array([(start, start + each * count) for count in samples for start in starts])
@@ -147,8 +146,7 @@ class Tracer(ABC):
 class Paths:
     """Light that is followed besides projector - surface - camera.
 
-    ``mirrors``: over delta reflections and transmissions, on the camera's side; ``emitters``: other lights of the
-    scene; ``steep``: divide light that shading normals or hair make heavy between both sides (:func:`projector_part`).
+    ``steep`` divides light that shading normals or hair make heavy between both sides (:func:`projector_part`).
     """
 
     mirrors: bool = False
@@ -213,8 +211,7 @@ class Turn:
 class PathIntegrator(ABC, Generic[State]):
     """Paths of one launch, followed from vertex to vertex: the first apart, all others in a loop of one kernel.
 
-    A subclass defines where paths start and the light that they bring from a vertex. With ``IMPORTANCE`` they carry the
-    projector's light.
+    A subclass defines where paths start and the light that they bring from a vertex.
     """
 
     IMPORTANCE: ClassVar[bool]

@@ -45,10 +45,9 @@ _LENS = 0.02
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Omitted light by shape, (k,) each, as irradiance at the sensor's centre [W m^-2].
+    """Omitted light by shape, (k,) each, as irradiance at the sensor's centre [W m^-2] with its equal hits in a sample.
 
-    ``mirrors`` is by the last mirror or glass before the camera, ``lobes`` over a mirror and by the shape with a sharp
-    lobe; ``lens_hits`` and ``hits`` are equal hits in a sample of paths and of connections.
+    ``mirrors`` is by the last mirror or glass before the camera, ``lobes`` by the shape with a sharp lobe.
     """
 
     mirrors: FloatArray
@@ -61,10 +60,7 @@ class LeftOut:
         return cls(*np.zeros((4, 0)))
 
     def unseen(self, fewest: float, of_lens: float) -> tuple[float, int | None]:
-        """Return the irradiance that is not measured, and the shape of its largest part.
-
-        Measured light has at least ``fewest`` hits of a lobe, or ``of_lens`` hits of the projector's own lens.
-        """
+        """Return the irradiance that is not measured, and the shape of its largest part."""
         light = np.where(self.lens_hits < of_lens, self.mirrors, 0) + np.where(self.hits < fewest, self.lobes, 0)
         return float(light.sum()), int(np.argmax(light)) if light.any() else None
 
@@ -127,7 +123,7 @@ class _Landed:
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum, mi.UInt32]:
         """Return the radiance that surfaces send on of the light in their cubes, one ray of each drawn for all.
 
-        Further results are the radiance of a lens of 1 mm^2 in the pinhole's place and the mirror.
+        The radiance of a lens of 1 mm^2 in the pinhole's place, and the mirror, follow.
         """
         code = _cube(si.p, self.side)
         first, end = (dr.gather(mi.UInt32, self.first, code + step, active) for step in (0, 1))
@@ -385,8 +381,8 @@ class SharpLight:
     by_pixel, moments
         (n^2,) irradiance of each projector pixel, and the second moment of its connection [W^2 m^-4].
     width
-        Radius of the lobes on the sensor [mm], sqrt(P / (pi q)) of all but the sharpest tenth of the light, with P the
-        part of a pixel's turns that are sharp, and q / P the density of a lobe by itself.
+        Radius of the lobes on the sensor [mm], sqrt(P / (pi q)), with P the part of a pixel's turns that are sharp, and
+        q / P the density of a lobe by itself.
     """
 
     irradiance: float

@@ -224,8 +224,7 @@ class ReusedPaths(ProjectorPaths):
     def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
         """Return the light from each pixel to each second point of its block, and the points' densities.
 
-        The light (lanes * members,) is negative to the point's other side; the second density counts pixels on its own
-        side.
+        The light (lanes * members,) is negative to the point's other side.
         """
         width = dr.width(self.lit)
         density = dr.zeros(mi.Float, width * MEMBERS)
@@ -351,8 +350,8 @@ class ReusedPaths(ProjectorPaths):
 class DiffuseReusedPaths(ReusedPaths):
     """Paths where all surfaces are diffuse, so that turns depend on two cosines and no material.
 
-    A diffuse surface of shading normal s and geometric normal n turns light from w by rho / pi |s w| / |n w| on the
-    side of s w.
+    A surface of shading normal s and geometric normal n turns light from w by rho / pi |s w| / |n w| on the side of s
+    w.
     """
 
     sends = 1

@@ -33,8 +33,8 @@ class ProjectorOptics:
     """The emitter and its window: n x n pixels from (first_row, first_column) of a (rows, columns) canvas.
 
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
-    standard deviation of a pixel's spot [pixels]. ``lines`` None means drawn wavelengths. ``share`` of a pixel's light
-    leaves by the pixel; the lens scatters the rest with a standard deviation of ``glare_spread`` pixels.
+    standard deviation of a pixel's spot [pixels]. The lens scatters all but ``share`` of the light with a standard
+    deviation of ``glare_spread`` pixels.
     """
 
     emitter: mi.Emitter
@@ -57,7 +57,6 @@ class ProjectorOptics:
 
     @property
     def per_wavelength(self) -> tuple[ProjectorOptics, ...]:
-        """Return itself, or one projector for each separated line; raise MitsimError if wavelengths are drawn."""
         if not (self.parted and mi.is_spectral):
             return (self,)
         if self.lines is None:

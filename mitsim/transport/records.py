@@ -81,22 +81,11 @@ def check_finite(light: npt.NDArray[Any]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class PathSamples:
-    """Light that paths brought to the camera, one entry a connection.
+    """Light that paths brought to the camera, one entry (m,) a connection.
 
-    Attributes
-    ----------
-    pixel
-        (m,) projector pixel 0..n^2-1 (row-major), or n^2 plus the band for ambient light.
-    row, column
-        (m,) tan-angle seen from the sensor's centre, index coordinates.
-    inverse_depth
-        (m,) 1/z of the point where the light is seen [1/mm].
-    value
-        (m,) irradiance [W m^-2].
-    lines
-        (4, m) ``value`` by line, then zeros, in single precision; or None.
-    lane
-        (m,) increasing number of the connection in its launch; None unless just fetched.
+    ``pixel`` is n^2 plus the band for ambient light. ``row`` and ``column`` are tan-angles from the sensor's centre,
+    ``inverse_depth`` is 1/z of the point where the light is seen [1/mm], ``value`` its irradiance [W m^-2]. ``lines``
+    (4, m) is ``value`` by line, then zeros, in single precision.
     """
 
     pixel: IntArray
@@ -182,8 +171,8 @@ _ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name not in
 class Bundle:
     """Accumulation of light in cells, anchors and layers, whose ``depths`` [mm] are far to near.
 
-    ``between`` splits light between the two nearest cell centres along each axis, because light over a sharp lobe comes
-    from a small part of a cell.
+    ``between`` splits light between the two nearest cell centres, because sharp lobes send it from a small part of a
+    cell.
     """
 
     grid: CellGrid
@@ -429,13 +418,11 @@ class DeviceAccumulator:
 
     @staticmethod
     def holds(bundle: Bundle, labels: Labels, lines: int = 1, paths: float = math.inf) -> bool:
-        """Return True if an accumulator has room, and takes less time than the host."""
         entries = (int(labels.max()) + 1) * DeviceAccumulator._places(bundle)
         parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)
         return lines * entries < MOST_PLACES and entries < _PAYS * parts * paths
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
-        """Return the one place that accumulates light; numbers ``chosen`` in [0, 1) choose its layer."""
         layer = mi.UInt32(0)
         for part in self._parts_beyond(seen):
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))

@@ -63,8 +63,7 @@ def trace_specular_chains(
 ) -> Beams:
     """Return the beams from the projector's pinhole to the sensor over perfect mirrors or lenses alone, or directly.
 
-    A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 along an axis) is not
-    found.
+    A mirror that no ray of the coarse grid meets is not found.
     """
     if max_depth < 1:
         raise MitsimError(f"max_depth of specular chains is {max_depth}; give at least 1")
@@ -235,10 +234,7 @@ def _refine(
 
 
 def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
-    """Return the width (q,) of long squares' light [mm], infinite if compact, and the unit direction of least motion.
-
-    A wire spreads light across itself a thousand times more than along.
-    """
+    """Return the width (q,) of long squares' light [mm], infinite if compact, and the direction of least motion."""
     corners = nodes.sensor[:, ::2, ::2]
     # What the sensor's place moves by over the square, for a step down and a step across.
     down, across = ((c[:, 1] - c[:, 0]).mean(axis=1) for c in (corners, corners.transpose(0, 2, 1, 3)))
@@ -267,10 +263,7 @@ def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
 
 
 def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> tuple[Beams, IntArray]:
-    """Convert undivided squares to beams without extent, one at each node (q, 3, 3) that meets the sensor.
-
-    A node represents its part of the square's flux (q,), which is right in the mean for squares of an edge.
-    """
+    """Convert undivided squares to beams without extent, one at each node (q, 3, 3) that meets the sensor."""
     seen = nodes.valid & (np.abs(nodes.sensor) < geometry.half_width).all(axis=-1)
     seen &= (np.abs(nodes.tangent) <= geometry.tan_half_fov).all(axis=-1)
     light = _SHARES * nodes.throughput * flux[:, None, None]
@@ -366,10 +359,7 @@ class _Spots:
 def first_squares(
     mirrors: Sequence[mi.Shape], rays: PinholeRays, n: int, coarse: int, more: Sequence[Boxes] = ()
 ) -> Iterator[tuple[int, IntArray, IntArray]]:
-    """Return squares that tile the window, small where small mirrors are seen: size, first rows and first columns.
-
-    ``coarse`` is the least number of coarsest squares along the window; ``more`` boxes are refined too.
-    """
+    """Return squares that tile the window, small where small mirrors are seen: size, first rows and first columns."""
     size = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(coarse / n)))))
     line = np.arange(0, n * _UNIT, size)
     row, column = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))

@@ -45,10 +45,9 @@ def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Rays that crossed the sensor plane from the front; one ray may arrive several times.
+    """Rays that crossed the sensor plane from the front: (k, 2) place [mm] and tan-angles (row, column).
 
-    ``sensor`` and ``tangent`` (k, 2) are place [mm] and tan-angles (row, column); ``chain`` (k,) numbers the sequence
-    of surfaces.
+    One ray may arrive several times.
     """
 
     ray: IntArray
@@ -60,11 +59,7 @@ class Crossings:
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays under way, (k, .) each.
-
-    ``mirror`` is the registry number of the last surface that turned the ray and is no pane, 0 for none; ``start`` is
-    clear of the surface.
-    """
+    """Rays under way, (k, .) each; ``mirror`` numbers the last surface that turned the ray, 0 for none."""
 
     index: IntArray
     mirror: IntArray
@@ -104,7 +99,6 @@ class SpecularRays:
         self._camera_turn, self.camera_place = turn_and_origin(camera.world_transform())
 
     def follow(self, points: FloatArray, turned: list[Rays] | None = None) -> Crossings:
-        """Send rays through window points (k, 2) [pixels]; ``turned`` receives those that mirrors turned."""
         count = len(points)
         origin = np.broadcast_to(self.rays.origin, (count, 3))
         rays = Rays(
@@ -213,10 +207,7 @@ class SpecularRays:
 
 
 def _lobes(materials: Iterable[mi.BSDF]) -> dict[tuple[int, int], list[int]]:
-    """Return the registry numbers of materials with a delta part, by its kind and component.
-
-    A BSDF gives the part of the light for one component, so that nothing is left to chance.
-    """
+    """Return the registry numbers of materials with a delta part, by its kind and component."""
     found: dict[tuple[int, int], list[int]] = {}
     straight = int(mi.BSDFFlags.Null)
     for bsdf in materials:

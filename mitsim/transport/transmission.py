@@ -36,7 +36,6 @@ def lets_through(material: mi.BSDF) -> bool:
 
 
 def transmits(scene: mi.Scene) -> bool:
-    """Return True if a surface lets light through, or is an instance, which hides its materials."""
     materials = [shape.bsdf() for shape in scene.shapes()]
     return any(bsdf is not None and lets_through(bsdf) for bsdf in materials) or _has_instances(scene)
 
@@ -64,8 +63,6 @@ class Arrival:
 
 @dataclass
 class Passed:
-    """Light beyond a surface: direction, the part left, and the refractive index there over that before."""
-
     direction: mi.Vector3f
     part: mi.Spectrum
     eta: mi.Float
@@ -85,7 +82,6 @@ class Passage:
         self._round = int(mi.ShapeType.Cylinder) in kinds
 
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
-        """Return True where surface points and targets see each other, and the part of the light that arrives."""
         if not self.open:
             return ~self.scene.ray_test(self.leaving_to(si, target), active), mi.Spectrum(1)
         ray = self.leaving_to(si, target)
@@ -176,7 +172,6 @@ class Passage:
         return mi.Ray3f(start, direction, si.time, si.wavelengths)
 
     def leaving(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
-        """Return a ray that leaves the surface; Mitsuba's own where no surface transmits."""
         return self.onward(si, direction) if self.transmits else si.spawn_ray(direction)
 
     def leaving_to(self, si: mi.SurfaceInteraction3f, target: mi.Point3f) -> mi.Ray3f:

@@ -7,7 +7,6 @@ _REGISTERED: set[str] = set()
 
 
 def register() -> None:
-    """Register every plugin for the current variant; raise MitsimError if none is selected."""
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError

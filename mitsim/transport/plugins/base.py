@@ -115,7 +115,6 @@ def generator(seed: mi.UInt32, stream: mi.UInt32) -> mi.PCG32:
 
 
 def streams(seed: int | mi.UInt32, stream: mi.UInt32, sample: mi.UInt32) -> tuple[mi.PCG32, mi.PCG32]:
-    """Return the generator that all samples of a stream share, for :func:`stratified`, and the sample's own."""
     shared = seed_of(seed)
     return generator(shared, stream), generator(shared ^ (sample * 0x9E3779B9 + 1), stream)
 
