@@ -1,8 +1,8 @@
-"""Patterns and light of a rendered Hadamard calibration session on a white board.
+"""Patterns and light of a rendered Hadamard calibration session on a white board (the paper, section IV-A).
 
-The paper's procedure (section IV-A): every column h_i of a Hadamard matrix is shown as horizontal stripes h_i 1^T and
-as vertical ones 1 h_i^T, each +-1 pattern as two shots (or one and a uniform one), all at one exposure, with sensor
-noise. If n is no Hadamard order, the first n rows of the next one are used, because rows stay orthogonal.
+Every column h_i of a Hadamard matrix is shown as stripes h_i 1^T and 1 h_i^T, each +-1 pattern as two shots (or one and
+a shared uniform one). If n is no Hadamard order, the first n rows of the next one are used, because rows stay
+orthogonal.
 """
 
 from __future__ import annotations
@@ -63,14 +63,12 @@ class Session:
 
     Attributes
     ----------
-    seed
-        Seed of its noise and light.
     depth
         Depth of the board [mm]; None for the aligned plane.
     filters
         (pixels, pixels) transmission of colour filters, by which readings are divided; None without filters.
     whole
-        Session of all lines, to whose light this one belongs; None for itself.
+        Session of all lines, whose light includes this session's; None for itself.
     """
 
     bench: Apparatus
@@ -82,12 +80,10 @@ class Session:
 
     @property
     def distance(self) -> float:
-        """Return the distance from the sensor to the board's centre [mm]."""
         return self.depth or self.bench.geometry.scene_distance
 
     @cached_property
     def board(self) -> Apparatus:
-        """Return the bench with the white board instead of its scene."""
         if self.whole is not None:
             return replace(self.bench, loaded=self.whole.board.loaded)
         return before_board(self.bench, self.recipe.board_reflectance, self.recipe.board, self.depth)
@@ -99,7 +95,6 @@ class Session:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return effects of board, mask and sensor that factors do not contain."""
         return (
             *self.board_warnings,
             *self.mask_warnings,
@@ -108,7 +103,6 @@ class Session:
 
     @cached_property
     def board_warnings(self) -> tuple[str, ...]:
-        """Return a warning about projector pixels that miss the board."""
         shape = self.recipe.board
         missed = 0 if shape == BoardShape() else missed_pixels(self.board)
         if not missed:
@@ -140,8 +134,7 @@ class Session:
     def mask_warnings(self) -> tuple[str, ...]:
         """Return a warning if the best separable camera leaves more of the shadow than a calibration accepts.
 
-        It states the residual and the part of it due to diffraction. Stripes show less of it because their lines add
-        up.
+        It states the residual and its part from diffraction. Stripes show less of it because their lines add up.
         """
         geometry, fault = self.bench.geometry, mask_fault(self.bench)
         residual = rays = fault.lost if fault else 0.0
@@ -166,12 +159,7 @@ class Session:
     ) -> SeparableTerms:
         """Return the transmissions from projector pixels at the board's distance to sensor pixels.
 
-        Parameters
-        ----------
-        geometry, spectrum
-            Camera, and light whose waves are simulated; None for rays.
-        places
-            Approximate number of sensor pixels per axis; None for all.
+        ``spectrum`` None uses rays; about ``places`` sensor pixels per axis are used, or all for None.
         """
         rows, columns = (
             Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
@@ -187,7 +175,6 @@ class Session:
 
     @property
     def lit_lines(self) -> float:
-        """Return the mean part of the lines that are +1."""
         return float((1 + self.signs).mean()) / 2
 
     @property
@@ -196,38 +183,32 @@ class Session:
         return self.recipe.signed_capture == "pair"
 
     def through_filters(self, light: FloatArray) -> FloatArray:
-        """Return the part of ``light`` (pixels, pixels) that passes the filters."""
         return light if self.filters is None else light * self.filters
 
     @property
     def shots(self) -> int:
-        """Return the number of frames of the whole session."""
         lit = len(self.order) * self.recipe.repeats
         return (lit + self.recipe.dark_frames) * len(self.recipe.exposure_ladder)
 
     @property
     def order(self) -> list[Half]:
-        """Return the sequence of lit frames: all exposures of a pattern, all repeats of each; dark frames come last."""
+        """Return the order of lit frames: all exposures of a pattern, all repeats of each; dark frames come last."""
         return halves_in_order(self.signs.shape[1], self.pairs, self.recipe.order, self.recipe.order_seed)
 
     @cached_property
     def powers(self) -> Mapping[tuple[str, int], FloatArray]:
-        """Return the (exposures, repeats) power of the projector in each shot, by side and number; 1 at the begin."""
+        """Return the (exposures, repeats) power of the projector in each shot, relative to its begin."""
         drift, order = self.recipe.drift, self.order
         each = len(order), len(self.recipe.exposure_ladder), self.recipe.repeats
         found = levels(self.seed, "session", math.prod(each), drift.session_ramp, drift.session_flicker).reshape(each)
         return {self.shot(half): power for half, power in zip(order, found, strict=True)}
 
     def shot(self, half: Half) -> tuple[str, int]:
-        """Return side and number of the shot that shows a ``half``, which name its noise."""
         side, number, sign = half
         return side, 2 * number + (sign < 0) if self.pairs else number + (sign != UNIFORM)
 
     def plan(self, accuracy: float, job: Job) -> Plan:
-        """Plan the simulation of responses with this relative ``accuracy``, and its cost.
-
-        Raises MitsimError if memory or time exceed the limits of the ``job``.
-        """
+        """Plan the simulation of responses; MitsimError if memory or time exceed the limits of the ``job``."""
         n, count, spent = self.bench.n, self.signs.shape[1], job.clock.seconds()
         self._first_cost.check("calibration", job.limits)
         with job.planning("calibration", first_shadow(self.board, {})):
@@ -250,12 +231,10 @@ class Session:
         return replace(plan, cost=cost)
 
     def trace(self, plan: Plan, job: Job) -> SampledLight:
-        """Trace the board's light by projector pixel as the ``plan`` says."""
         (light,) = self.trace_lines((self.board,), plan, job)
         return light
 
     def trace_lines(self, boards: Sequence[Apparatus], plan: Plan, job: Job) -> list[SampledLight]:
-        """Trace the board's light of every line; ``boards`` show each line alone."""
         with job.clock.stage("transport"):
             sampling, lighting = Sampling(purpose="calibration"), _lines(self.bench.n)
             lights = trace_lines(self.board, boards, plan, lighting, self.seed, sampling, job.progress)
@@ -266,8 +245,7 @@ def _lines(n: int) -> Lighting:
     """Return shots of one row or one column of pixels each, evenly spread.
 
     The accuracy of a session is that of single lines: because patterns are orthogonal, the squared errors of all +-1
-    responses add up to N times those of all lines, and so do the squared responses. Frames of half the pixels are far
-    brighter than the responses from their differences.
+    responses add up to N times those of all lines, and so do the squared responses.
     """
     chosen = np.unique(((np.arange(_LINES) + 0.5) * n / _LINES).astype(np.int64))
     rows = np.zeros((len(chosen), n, n))
@@ -275,7 +253,7 @@ def _lines(n: int) -> Lighting:
     return Lighting(np.arange(n * n), np.concatenate([rows, rows.transpose(0, 2, 1)]).reshape(-1, n * n))
 
 
-# -------- What a calibration session takes
+# -------- Cost of a calibration session
 # The reason of each figure is how :class:`mitsim.calibrate.session.LitSession` works.
 
 _UNIT_COSTS = replace(FIXED, product=1.1e-11)
@@ -297,18 +275,9 @@ _SUMS = 8.0
 def session_seconds(
     board: Apparatus, count: int, shots: int, settings: Settings, largest_terms: float = 1.0
 ) -> dict[str, float]:
-    """Predict the seconds for forming a session's stripes, exposing its shots and adding up responses.
+    """Predict the seconds of forming stripes, exposing shots and adding up responses.
 
-    Parameters
-    ----------
-    board
-        Bench with the board.
-    count, shots
-        +-1 patterns of a side, and frames of the whole session.
-    settings
-        Simulation settings.
-    largest_terms
-        Terms of a shadow that must be drawn on a raster; 1 before it is known.
+    ``count`` is the number of +-1 patterns of a side, and ``largest_terms`` the number of terms of a mask on a raster.
     """
     n, pixels = board.n, board.geometry.frame_side
     cells = max(Simulation(board, settings).grids["fine"].bundle.cells)
@@ -371,18 +340,8 @@ def stripe_frames(
 ) -> Iterator[tuple[int, Frame]]:
     """Yield numbers and frames of patterns without light of black pixels and without Monte Carlo error.
 
-    The bits do not depend on the ``first`` pattern.
-
-    Parameters
-    ----------
-    light, seed
-        Light by projector pixel, and seed of its probes.
-    stripes
-        Line of each projector pixel, and the power 0 or 1 of each line in every pattern.
-    shape
-        Rows and columns of a frame.
-    first
-        Number of the first pattern.
+    The bits do not depend on the ``first`` pattern. ``stripes`` has the line of each projector pixel, and the power 0
+    or 1 of each line in every pattern.
     """
     count, n = stripes.weights.shape
     lines, pixels, removed = None, side_of(shape), False
@@ -394,7 +353,7 @@ def stripe_frames(
             held[numbers] = [frame.irradiance.ravel() for frame in formed]
             removed = removed or any(frame.removed for frame in formed)
         lines = None if removed else held
-    # Lots that hang on the sensor alone: what is formed together shows in the last bits.
+    # Batches depend on the sensor alone, because their size affects the last bits.
     step = count if mixes(n, count, pixels) else at_once(pixels)
     for start in range(0, count, step):
         numbers = np.arange(start, min(start + step, count))

@@ -1,7 +1,7 @@
-"""Rendered calibration sessions: factors of a camera and their error, estimated as from a user's frames.
+"""Rendered calibration sessions, and factors that are estimated from them as from a user's frames.
 
-Finished parts of a session are kept in its CAL folder, so that it can be resumed. A part is a ``.npz`` file with a
-SHA-256 of the session's configuration and of the data; a damaged or foreign part is computed again.
+Finished parts are kept in the CAL folder for a resumed session, as ``.npz`` files with a SHA-256 of configuration and
+data; a damaged or foreign part is computed again.
 """
 
 from __future__ import annotations
@@ -79,7 +79,6 @@ class Checkpoint:
         self._session = json.dumps(plain(self.configuration), sort_keys=True).encode()
 
     def begin(self) -> None:
-        """Mark the folder as an unfinished session."""
         if self.folder is not None:
             remove_page(self.folder)
             head = {"kind": KIND, "status": "incomplete", "configuration": plain(self.configuration)}
@@ -107,7 +106,6 @@ class Checkpoint:
             return dict(arrays)
 
     def clear(self) -> None:
-        """Remove the parts of a complete session."""
         if self.folder is not None:
             for path in self.folder.glob(PARTS):
                 path.unlink()
@@ -120,21 +118,10 @@ class Checkpoint:
 def claimed_session(
     output: Path | None, configuration: Mapping[str, Any], resume: bool = False
 ) -> Iterator[Checkpoint]:
-    """Claim the place for a session's parts before any work; remove a new folder if the session fails before writing.
+    """Claim the folder of a session's parts before any work; remove a new folder if the session fails before writing.
 
-    Parameters
-    ----------
-    output
-        CAL folder; None keeps nothing.
-    configuration
-        All values that determine the factors.
-    resume
-        Allow a folder with a session of the same configuration.
-
-    Raises
-    ------
-    MitsimError
-        If the place cannot be written, or holds other files or another configuration.
+    ``output`` None keeps nothing; ``resume`` allows a folder of the same configuration. MitsimError if the place cannot
+    be written, or holds other files or another configuration.
     """
     if output is None:
         yield Checkpoint(None, configuration)
@@ -169,7 +156,6 @@ def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
 
 
 def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledLight | None:
-    """Return the stored light of a session's board, or None."""
     arrays = checkpoint.load("light")
     if arrays is None:
         return None
@@ -195,7 +181,6 @@ def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledL
 
 
 def keep_light(checkpoint: Checkpoint, light: SampledLight) -> None:
-    """Save a ``light`` of one group in a ``checkpoint``."""
     (group,) = light.groups
     own = ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
     facts = {name: getattr(light, name) for name in own}
@@ -214,7 +199,6 @@ class SessionSums:
     saturated: int
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Save the sums in a ``checkpoint``."""
         arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
         for kind, both in self.sums.items():
             for sums in both:
@@ -223,7 +207,7 @@ class SessionSums:
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint, kinds: Sequence[str]) -> SessionSums | None:
-        """Return the sums of an interrupted session for some ``kinds`` of responses, or None."""
+        """Return the sums of an interrupted session, or None."""
         arrays = checkpoint.load("stripes")
         if arrays is None:
             return None
@@ -247,8 +231,8 @@ class SessionSums:
 def calibrate(bench: Apparatus, request: SessionRequest, task: Task, frames: Path | str | None = None) -> Factors:
     """Run a calibration session and estimate the camera's factors; see :meth:`mitsim.api.bench.Bench.calibrate`.
 
-    Frames are written to a folder ``frames`` that `mitsim calibrate --frames` reads. Raises MitsimError for a recipe
-    with depths, a folder that contains something, and a full disk.
+    ``frames`` is a folder for frames that `mitsim calibrate --frames` reads. MitsimError for a recipe with depths, a
+    folder that contains something, and a full disk.
     """
     session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
     with nullcontext() if frames is None else whole_folder(frames) as folder:
@@ -260,10 +244,10 @@ def calibrate(bench: Apparatus, request: SessionRequest, task: Task, frames: Pat
 
 
 def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> dict[float, Factors]:
-    """Estimate the camera's factors at each of a recipe's ``depths``, by depth [mm], in a folder for each.
+    """Estimate the camera's factors at each of a recipe's ``depths`` [mm], in a folder for each.
 
-    Light and noise of each depth are independent of the others. Raises MitsimError as :func:`calibrate`, for a recipe
-    without depths, and for one at which the mask or no light is.
+    Light and noise of the depths are independent. MitsimError as :func:`calibrate`, for a recipe without depths, and
+    for a depth at which the mask or no light is.
     """
     recipe, found = request.recipe or load_recipe(), {}
     if not recipe.depths:
@@ -282,7 +266,7 @@ def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> d
 
 
 def calibrate_lines(whole: Apparatus, request: SessionRequest, task: Task, mosaic: bool = False) -> dict[str, Factors]:
-    """Estimate factors at each line, by its name, or behind the filters of a ``mosaic``.
+    """Estimate factors at each line, or behind the filters of a ``mosaic``.
 
     See :meth:`mitsim.api.bench.Bench.calibrate_lines` and :meth:`mitsim.api.bench.Bench.calibrate_mosaic`.
     """
@@ -412,10 +396,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
 def estimate(
     lit: LitSession, job: Job, noise_free: bool = False, checkpoint: Checkpoint | None = None
 ) -> tuple[Estimate, int]:
-    """Estimate factors from the responses of a session, and count its shots with saturated pixels.
-
-    ``noise_free`` uses the expected frames; other parameters are those of :func:`session_sums`.
-    """
+    """Estimate factors from noisy or expected responses, and count saturated shots; see :func:`session_sums`."""
     (found,), saturated, _ = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
     return found, saturated
 
@@ -430,7 +411,7 @@ def estimates(
     taken = SessionConditions(
         session.order,
         saturated=bool(found.saturated),
-        # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
+        # A stated drift of the lamp is not divided out, so that the user sees its effect.
         unsteady=bool(drift.session_ramp or drift.session_flicker),
     )
     with job.clock.stage("estimate"):
@@ -439,8 +420,8 @@ def estimates(
             try:
                 judged[0] = check_session(found.sums[NOISY], session.signs, taken)
             except MitsimError as error:
-                # A real session would be refused. A simulated one is flagged, because the bench asks for it, and the
-                # exact factors show what that costs.
+                # A real session would be refused. A simulated one is flagged, because the bench asks for it, and
+                # comparison with exact factors shows the loss.
                 judged[0].doubts += [*session.mask_warnings[:1], str(error)]
         factors = [
             each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
@@ -450,18 +431,9 @@ def estimates(
 
 
 def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None) -> SessionSums:
-    """Return sums over all responses to a session, whose frames are formed once.
+    """Return sums over all responses of a session, whose frames are formed once.
 
-    Parameters
-    ----------
-    lit
-        Session with traced light.
-    job
-        Clock and progress.
-    kinds
-        ``NOISY`` and ``NOISE_FREE``, one or both.
-    checkpoint
-        Store of finished stripes, from which an interrupted session continues.
+    ``kinds`` are ``NOISY``, ``NOISE_FREE`` or both; ``checkpoint`` has finished stripes of an interrupted session.
     """
     session, checkpoint = lit.session, checkpoint or Checkpoint()
     count = session.signs.shape[1]
@@ -501,7 +473,7 @@ def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Ch
 def _factor_error(noisy: Estimate, clean: Estimate) -> float:
     """Return the relative error of both factors in quadrature.
 
-    (left, right) and (-left, -right) are one camera; centred factors have no sum that tells which it is.
+    (left, right) and (-left, -right) are the same camera, and centred factors have no sum that decides the sign.
     """
     sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
     left = np.linalg.norm(sign * noisy.left - clean.left) / np.linalg.norm(clean.left)

@@ -1,7 +1,6 @@
-"""Responses of a calibration session with traced light, noisy as a user has them or noise-free, and its frames.
+"""Noisy and noise-free responses of a calibration session with traced light, and its frames.
 
-Written frames contain only what a real user has: digital numbers, patterns and camera settings; no expected light,
-exact factors, parallax, seeds or plan.
+Written frames contain only the data of a real session: digital numbers, patterns and camera settings.
 """
 
 from __future__ import annotations
@@ -49,7 +48,6 @@ Names = tuple[str | int, ...]
 
 
 def repeat_names(shot: tuple[str, int], exposure: int, repeat: int) -> Names:
-    """Return the names of a frame of a shot."""
     own: Names = ("exposure", exposure) if exposure else ()
     return (*shot, *own, "repeat", repeat) if repeat else (*shot, *own)
 
@@ -75,7 +73,6 @@ class KeptFrames:
             self._dark["dark", exposure, number] = DarkFile(file=file, exposure=exposure)
 
     def write(self, names: Names, numbers: DigitalNumbers) -> None:
-        """Write one frame of digital ``numbers`` (rows, columns)."""
         place = (self._dark if names[0] == "dark" else self._lit)[names].file
         with whole_file(self._folder / place) as part, part.open("wb") as file:
             if self._tiff:
@@ -84,7 +81,6 @@ class KeptFrames:
                 np.save(file, numbers)
 
     def finish(self, digital: Digital) -> None:
-        """Write the list when all frames are complete."""
         session, recipe = self._session, self._session.recipe
         listed = FrameList(
             camera=session.bench.identity(),
@@ -120,8 +116,6 @@ class LitSession:
 
     Attributes
     ----------
-    session
-        The session.
     light
         Light of the board by projector pixel.
     white
@@ -143,7 +137,6 @@ class LitSession:
 
     @classmethod
     def of(cls, session: Session, light: SampledLight, job: Job) -> LitSession:
-        """Choose the exposure of a session in its light."""
         with job.clock.stage("optics"):
             n, signs = session.bench.n, session.signs
             white = next(iter(light.frames(Lighting.uniform(n), session.seed)))
@@ -158,7 +151,7 @@ class LitSession:
         return float(np.sqrt(np.mean([self.response_variance(side).mean() for side in SIDES])))
 
     def response_variance(self, side: str) -> FloatArray:
-        """Return the (m, m') mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form."""
+        """Return the (m, m') sum of :meth:`response_variances` [(electrons / s)^2]."""
         variance: FloatArray = np.zeros(self.uniform_rate.shape)
         for parts in self.response_variances(side):
             for part in parts.values():
@@ -199,18 +192,9 @@ class LitSession:
         return own, shared
 
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
-        """Apply a function to the +-1 patterns of a side in order, some at a time in a thread each.
+        """Apply ``use`` to number and expected frame of the +-1 patterns of a ``side``, in threads.
 
-        Parameters
-        ----------
-        side
-            ``horizontal`` or ``vertical`` stripes.
-        use
-            Function of a pattern's number and the expected frame of its +1 pixels. Number 0 is the uniform pattern.
-        job
-            Clock and progress.
-        first
-            Number of the first pattern.
+        Results are in order. Number 0 is the uniform pattern; the frame is that of a pattern's +1 pixels.
         """
         black = self.light.simulation.physics.black_level
         leak = black * self.white.irradiance
@@ -243,7 +227,6 @@ class LitSession:
         yield from stripe_frames(self.light, stripes, self.session.seed, shape, max(first, 1))
 
     def noisy(self, side: str, number: int, frame: Frame) -> Response:
-        """Return the response to a +-1 pattern as a user of noisy frames has it."""
         rate: FloatArray = np.empty(frame.irradiance.shape)
         if not self.session.pairs:
             shot, uniform = self._expose(frame.irradiance, side, number + 1), self._uniform[side]
@@ -275,7 +258,6 @@ class LitSession:
 
     @cached_property
     def exposures_s(self) -> tuple[float, ...]:
-        """Return every exposure time of a frame [s]."""
         return tuple(self.exposure_s * factor for factor in self.session.recipe.exposure_ladder)
 
     @cached_property
@@ -315,7 +297,6 @@ class LitSession:
 
     @cached_property
     def uniform_rate(self) -> FloatArray:
-        """Return the (m, m') expected photoelectrons per second of the uniform frame."""
         return self._second.electrons(self.white)
 
     @cached_property
@@ -374,14 +355,12 @@ class LitSession:
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """Noisy frames (m, m'): for each exposure the mean of its repeats, merged by a ``ladder``; and saturated frames."""
-
     ladder: Ladder
     digital: tuple[DigitalNumbers, ...]
     saturated: int
 
 
 def _chunks(rates: FloatArray) -> Iterator[slice]:
-    """Yield slices of rows of which each has few enough numbers for the cache."""
+    """Yield slices of rows that fit into the cache."""
     step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
     return (slice(start, start + step) for start in range(0, len(rates), step))

@@ -1,7 +1,7 @@
 """Calibration by a model whose few unknown numbers are fitted to a few frames of a session, simulated or real.
 
-Measured factors need all patterns, because each gives one direction of the projector's pixels. A model has half a dozen
-unknowns, for which a few frames suffice. The residual that it leaves does not shrink with more frames.
+Measured factors need all patterns, a model with half a dozen unknowns only a few. Its residual does not shrink with
+more frames.
 """
 
 from __future__ import annotations
@@ -124,10 +124,7 @@ def calibrate_model(
 
 
 def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
-    """Return the geometric or wave ``model`` of a ``bench`` as designed.
-
-    Raises MitsimError for a mask that is tilted or drawn on a raster, because a fit moves a few profiles.
-    """
+    """Return the geometric or wave ``model`` of a ``bench``; MitsimError for a mask that is tilted or on a raster."""
     geometry = bench.geometry
     if geometry.is_drawn(model == "wave" and geometry.diffracts) or any(geometry.mask_tilt):
         raise MitsimError(
@@ -138,7 +135,7 @@ def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
 
 
 def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
-    """Return noisy responses of a session for a ``modelling``, and their number of frames."""
+    """Return noisy responses of a session, and their number of frames."""
     session, n = lit.session, lit.session.bench.n
     pairs, repeats, signs = session.pairs, session.recipe.repeats, session.signs
     chosen = modelling.used_patterns(_changes(signs), pairs, repeats)
@@ -184,7 +181,6 @@ def _changes(signs: FloatArray) -> list[int]:
 def _shown(
     signs: FloatArray, chosen: Sequence[tuple[Side, int]], rates: Iterable[tuple[FloatArray, float]], centre: bool
 ) -> list[Shown]:
-    """Return the responses to the ``chosen`` patterns, whose ``rates`` come with their noise."""
     shown, even = [], np.ones(len(signs))
     for (side, index), (rate, noise) in zip(chosen, rates, strict=True):
         rows, columns = (signs[:, index], even) if side == SIDES[0] else (even, signs[:, index])
@@ -196,7 +192,6 @@ def _shown(
 def modelled_factors(
     camera: ModelledCamera, fitted: Fitted, frames: int, manifest: CalibrationManifest, job: Job
 ) -> Factors:
-    """Return the factors of a fitted model with their noise."""
     left, right = (side.astype(np.float32).astype(np.float64) for side in camera.factors(fitted.placement))
     noise = _noise(camera, fitted)
     model: Model = "wave" if camera.spectrum else "geometric"
@@ -268,15 +263,13 @@ def _noise(camera: ModelledCamera, fitted: Fitted) -> FactorNoise:
 
 
 # -------- Where mask and projector are
-# Model frames are sums of few products u v^T, so are their changes with every number that is fitted: a response is
-# replaced by its coefficients in the few directions of sensor rows and columns that these span (which is all that the
-# fit can use of it, and leaves white noise white), and the sum of squares over all coefficients is made least by
-# :func:`scipy.optimize.least_squares`, with variables in units of a step each, and bounded, as these directions hold
-# for small steps only. They are taken anew where the fit has ended, until it stays. The covariance of what is fitted is
-# (J^T J)^-1 for data in units of their noise, times chi-square a datum where that is above 1.
+# Model frames and their derivatives are sums of few products u v^T. Therefore each response is replaced by its
+# coefficients in the directions of sensor rows and columns that these span, which loses nothing for the fit and keeps
+# white noise white. :func:`scipy.optimize.least_squares` minimises the sum of squares, with bounded variables in units
+# of a step each, because the directions are valid for small steps only. They are computed again where the fit ended,
+# until it stays there. The covariance is (J^T J)^-1 for data in units of their noise, times a chi-square above 1.
 #
-# A mask that is off by more than half a feature looks like another one: the shift is first looked for over some
-# features.
+# A mask displaced by more than half a feature resembles another mask, so the shift is first searched over several.
 
 STEPS = {
     "mask_distance": 2e-3,
@@ -326,8 +319,6 @@ class Fitted:
 
     Attributes
     ----------
-    placement
-        Best placement.
     free
         Names of the fitted numbers.
     covariance
@@ -346,27 +337,15 @@ class Fitted:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Return the standard error of each fitted number."""
         return dict(zip(self.free, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
 @single_threaded_blas()
 def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str]) -> Fitted:
-    """Fit the placement of mask and projector.
+    """Fit the placement of mask and projector, starting from the design.
 
-    Parameters
-    ----------
-    camera
-        Camera as designed, from which the search starts.
-    shown
-        Responses, the first one to uniform light.
-    free
-        Names of the free numbers, ``gain`` among them.
-
-    Raises
-    ------
-    MitsimError
-        For numbers that these responses cannot distinguish, and a mask that is too far off.
+    The first of ``shown`` is the response to uniform light, and ``gain`` is in ``free``. MitsimError for numbers that
+    these responses cannot distinguish, and a mask that is too far off.
     """
     at = _first_guess(camera, shown[0], free)
     for _ in range(_PASSES):
@@ -390,7 +369,7 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
 
 
 class _Pass:
-    """One least-squares problem: coefficients of responses in directions that are valid near a ``start``."""
+    """Least-squares problem linearised near ``start``."""
 
     def __init__(self, camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str], start: Placement) -> None:
         self._camera, self._start, self._shown = camera, start, shown

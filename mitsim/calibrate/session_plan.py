@@ -1,16 +1,14 @@
 """Plan of the calibration session that an image of a wanted PSNR needs.
 
-A calibration's noise depends on its exposure and repeats. The capture is simulated and the session's responses are
-formed once. Then factors with the noise of any exposure are drawn in closed form, the image is solved with them, and
-compared with the truth. PSNR rises with the light of a session until the noise of the capture or the resolution of the
-camera limits it. The least light that reaches the wanted PSNR is found between two sessions of which one reaches it.
+The capture and the session's responses are simulated once. For any exposure, factors with noise are drawn in closed
+form, and the image is solved and compared with the truth. PSNR rises with the session's light until noise of the
+capture or resolution limits it; the least sufficient light is found by bisection.
 
-Noise of frames is independent between pixels and shots, and factors are linear in responses: u_i = Y_i v / |v|^2,
-Phi_L = U H^T / N. With V[k, l] the variance of a response at a pixel, a number in row k of Phi_L has the variance
-sum_l V[k, l] v_l^2 / (N |v|^4), and numbers are uncorrelated because the rows of H are orthogonal. If each +-1 pattern
-is one shot and all share a uniform one, the noise of the latter enters column p of Phi_L by sum_i H[p, i] / N, that is,
-only the column whose signs are all +1. The noise of v enters at second order and is neglected, as are speckle and noise
-that a sensor row shares.
+Factors are linear in responses: u_i = Y_i v / |v|^2, Phi_L = U H^T / N. With V[k, l] the variance of a response, a
+number in row k of Phi_L has the variance sum_l V[k, l] v_l^2 / (N |v|^4), and numbers are uncorrelated because the rows
+of H are orthogonal. If all +-1 patterns share a uniform shot, its noise enters column p of Phi_L by sum_i H[p, i] / N,
+that is, only the column whose signs are all +1. Noise of v (second order), speckle and noise of sensor rows are
+neglected.
 """
 
 from __future__ import annotations
@@ -286,16 +284,9 @@ class _Search:
 
 
 def least_dose(quality: Callable[[float], float], wanted: float, smallest: float) -> float:
-    """Return the least dose of light that suffices, or the largest one.
+    """Return the least dose of light that suffices, or the largest one (``MOST_REPEATS``).
 
-    Parameters
-    ----------
-    quality
-        PSNR [dB] by dose; it rises and is called repeatedly. Doses beyond 1 are whole repeats.
-    wanted
-        PSNR that suffices [dB].
-    smallest
-        Smallest dose; the largest has ``MOST_REPEATS``.
+    ``quality`` is the PSNR [dB] by dose, and rises. Doses beyond 1 are whole repeats.
     """
     low = high = 1.0
     while quality(low) >= wanted:
@@ -319,15 +310,7 @@ def least_dose(quality: Callable[[float], float], wanted: float, smallest: float
 
 @dataclass(frozen=True, eq=False)
 class PredictedSession:
-    """A session whose responses are known without noise.
-
-    Attributes
-    ----------
-    lit
-        Session in its light, by any recipe of its board and signed capture.
-    sums
-        Sums over its noise-free responses.
-    """
+    """Session with known noise-free ``sums``, by any recipe of its board and signed capture."""
 
     lit: LitSession
     sums: tuple[StripeSums, StripeSums]
@@ -335,11 +318,9 @@ class PredictedSession:
     @classmethod
     @single_threaded_blas()
     def of(cls, lit: LitSession, job: Job) -> PredictedSession:
-        """Form the noise-free responses of a session."""
         return cls(lit, session_sums(lit, job, (NOISE_FREE,)).sums[NOISE_FREE])
 
     def by(self, recipe: SessionRecipe) -> LitSession:
-        """Return the session with exposure and repeats of a ``recipe``, which must be equal otherwise."""
         lit = self.lit
         exposure = Exposure(None, recipe.exposure_fraction).choose(
             lit.session.bench.devices, float(lit.white.irradiance.max())
@@ -355,7 +336,6 @@ class PredictedSession:
         return factors_of_sums(left, right, signs, lit.response_noise)
 
     def factors(self, recipe: SessionRecipe | None, draw: int = 0) -> Factors:
-        """Return the estimate as factors of the camera."""
         lit = None if recipe is None else self.by(recipe)
         session, exposure_s = self.lit.session, (lit or self.lit).exposure_s
         manifest = CalibrationManifest(

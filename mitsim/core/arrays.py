@@ -200,7 +200,7 @@ def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] 
                 pieces = (
                     math.prod(-(-side // part) for side, part in zip(item.shape, chunk, strict=True)) if chunk else 0
                 )
-                # What was never stored is read as the fill value: black frames, of any size.
+                # Chunks that were never stored are read as the fill value: black frames, of any size.
                 stored = item.id.get_num_chunks() == pieces if chunk else item.id.get_storage_size() >= item.nbytes
                 wrong = {
                     "lies in another file": item.is_virtual or item.external,

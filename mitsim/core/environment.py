@@ -388,7 +388,7 @@ def _cached_probe(path: Path) -> Probe:
     return result
 
 
-# -------- Versions of what computes
+# -------- Versions of packages
 
 DECIDING = ("mitsim", "mitsuba", "drjit", "numpy", "scipy")
 """Packages whose version may change frames for a given seed."""

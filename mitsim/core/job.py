@@ -494,7 +494,7 @@ class _Rows(Watch):
         for row in rows:
             rest, elapsed = rests.get(id(row)), row.seconds(now)
             part = 1.0 if rest is None else elapsed / (elapsed + rest) if rest else None if elapsed else 0.0
-            # With 16 colours rich's own for what is finished is that of what is not begun.
+            # With 16 colours rich shows finished and unfinished parts alike by default.
             bar = ProgressBar(1.0, part or 0.0, _BAR, pulse=part is None, finished_style="green")
             table.add_row(Text(printable(row.words)), bar, _text(elapsed) if elapsed else "", left(rest or 0.0))
         # The end is unknown where a stage goes on for an unknown time.

@@ -75,7 +75,7 @@ class _Part(BaseModel):
         return data
 
 
-# ---- How numbers become electrons, and what was projected ----
+# ---- Conversion of numbers to electrons, and patterns ----
 
 
 class Digital(_Part):

@@ -66,8 +66,8 @@ def enter_worker() -> None:
         return
     if "drjit" in sys.modules:
         raise RuntimeError("enter_worker: Dr.Jit is imported already, and its threads do not survive a fork")
-    # A file that is opened later would get the number of a closed standard output, and what is printed. Closed standard
-    # input and error lead to nothing instead.
+    # A file that is opened later would get the number of a closed standard output, and the program's output. Closed
+    # input and error become /dev/null instead.
     for number, mode in ((0, os.O_RDONLY), (1, os.O_WRONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
@@ -88,7 +88,7 @@ def enter_worker() -> None:
             "start; raise the limit, for example with: ulimit -v unlimited"
         )
         sys.exit(2)
-    # Until both processes know what to do with them.
+    # Blocked until both processes have installed their handlers.
     signal.pthread_sigmask(signal.SIG_BLOCK, {*_STOPS, signal.SIGCHLD})
     _advice = mmap.mmap(-1, _LONGEST_ADVICE)  # shared: what the worker notes, its parent reads
     reading, writing = os.pipe()
@@ -172,7 +172,7 @@ def pause_collector() -> Iterator[None]:
     try:
         yield
     finally:
-        # Only where modules came: what nobody holds any more, but for a cycle, stays as well.
+        # Only if modules were imported, because garbage in cycles is kept as well.
         if _advice is not None and len(sys.modules) > known:
             gc.freeze()
         if collecting:

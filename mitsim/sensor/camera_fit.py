@@ -83,7 +83,7 @@ def saturation_of(taken: Sequence[Alike]) -> tuple[int, int | None]:
 
 
 def nonuniform(taken: Sequence[Alike]) -> tuple[int, int]:
-    """Return the dark and the lit set that show nonuniformity: the lit set has most frames near half of saturation."""
+    """Return the dark and the lit set for nonuniformity; the lit set has most frames near half of saturation."""
     mean = np.array([each.mean for each in taken])
     dark = [index for index, each in enumerate(taken) if not each.light]
     lit = [index for index, each in enumerate(taken) if each.light and each.cut[1] < _AT_END]
@@ -103,8 +103,8 @@ def average_moments(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean and variance [DN] averaged over different pixels, and the variance of their means over pixels.
 
-    Offset (`spread` [DN], another black level) and relative `response` share the nodes of a Gauss-Hermite sum, because
-    offsets matter in the dark and responses at saturation.
+    Offset (`spread` [DN]) and relative `response` share the nodes of a Gauss-Hermite sum, because offsets matter in the
+    dark and responses at saturation.
     """
     light = np.asarray(electrons, dtype=np.float64)
     if not spread and not response:
@@ -170,7 +170,6 @@ class Transfer:
 
 
 def fit(taken: Sequence[Alike], bits: int | None, still: int, spatial: Known) -> Transfer:
-    """Fit a camera to sets of frames; `spatial` is the variance over pixels [DN^2] of the dark set `still`."""
     problem = _Problem(taken, bits, still, spatial)
     steady = problem.begin()
     if steady.light_fits or problem.lit.sum() < 4:
@@ -216,7 +215,6 @@ class _Problem:
         self.start = self._lines()
 
     def _lines(self) -> FloatArray:
-        """Return starting values: straight lines through sets that nothing cuts."""
         lit, (mean, variance) = self.lit, self.measured
         first = int(np.argmin(np.where(lit, np.inf, self.time)))
         signal, noise, times = mean[lit] - mean[first], variance[lit], self.time[~lit]
@@ -229,7 +227,6 @@ class _Problem:
         return np.array([gain, read, mean[first], current, max(response, 1e-12), 0.0, 0.0, self.spatial[0]])
 
     def moments(self, values: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Return expected means and variances [DN] of all sets, and the variance over pixels of the dark set."""
         gain, read, black, current, response, *bends = (float(value) for value in values[:-1])
         gain, response, spatial = max(abs(gain), 1e-12), abs(response), float(values[-1])
         bends = bends if any(bends) else []
@@ -259,7 +256,7 @@ class _Problem:
         return replace(best, covariance=best.covariance + np.outer(off, off))
 
     def settle(self, found: Transfer) -> Transfer:
-        """Fit again until the lamp's scatter is as large as the light is off."""
+        """Refit until the lamp's scatter agrees with the deviations of the light."""
         for _ in range(3):
             if found.light_fits:
                 break
@@ -269,7 +266,7 @@ class _Problem:
     def solve(self, start: FloatArray, bend: bool = False, lamp: float | None = None) -> Transfer:
         """Fit means and variances by least squares if the light of sets scatters by a fraction `lamp`.
 
-        The light of a set moves its mean and variance together. Its best deviation follows from the residuals of both.
+        The light of a set moves its mean and variance together. Its best deviation follows from both residuals.
         """
         lit, lamp = self.lit, self.lamp if lamp is None else lamp
         # If all dark readings are one code and rarely the next, their mean shows no current.
@@ -326,8 +323,6 @@ class _Problem:
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """The camera that frames show, with the standard error of each measured field."""
-
     sensor: SensorModel
     errors: dict[str, float]
     transfer: Transfer = field(repr=False)
@@ -347,17 +342,9 @@ class FoundCamera:
 class Pixels:
     """Differences between pixels, and the fields of the camera that follow.
 
-    Hot and dead pixels are counted and then replaced, so that they affect no other number.
-
-    Parameters
-    ----------
-    taken, images, again
-        Statistics of the sets, the mean image of a set, and statistics of the sets with some pixels replaced.
-
-    Attributes
-    ----------
-    uneven, surface
-        Range of the light over the frame, and its relative variances by row, column and pixel.
+    Hot and dead pixels are counted and then replaced, so that they affect no other number. ``again`` are statistics
+    with some pixels replaced; ``uneven`` and ``surface`` are range and relative variances (row, column, pixel) of the
+    light.
     """
 
     def __init__(self, taken: Sequence[Alike], images: Images, again: Callable[[Places], Sequence[Alike]]) -> None:
@@ -411,14 +398,12 @@ class Pixels:
         return sum(self.taken[index].variance / self.taken[index].count for index in sets)
 
     def _shared(self, *sets: int) -> float:
-        """Return the part of :meth:`_noise` that rows share."""
         return sum(self.taken[index].rows / self.taken[index].count for index in sets)
 
     def _mean_variance(self, parts: FloatArray) -> float:
         return max(float((parts / [self.size, *self.shape]).sum()), 0.0)
 
     def camera(self, stated: Mapping[str, Any], photons: bool) -> FoundCamera:
-        """Find the camera; frames do not show the `stated` fields, nor whether light is counted in `photons`."""
         if self.uneven > _MOST_UNEVEN:
             raise MitsimError(
                 f"light differs by {100 * self.uneven:.0f} % over the frame; at most {100 * _MOST_UNEVEN:.0f} % is "
@@ -580,7 +565,6 @@ def _spatial_parts(image: FloatArray, noise: float, rows: float) -> tuple[FloatA
 
 
 def _surface(image: FloatArray) -> FloatArray:
-    """Return the surface of second degree nearest to an image."""
     legendre = [np.polynomial.legendre.legvander(np.linspace(-1, 1, side), 2) for side in image.shape]
     y, x = (np.linalg.pinv(each) for each in legendre)
     keep = np.add.outer(np.arange(3), np.arange(3)) <= 2

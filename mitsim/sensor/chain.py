@@ -47,7 +47,6 @@ def electrons_from_irradiance(
 
 
 def exposure_for_peak(peak_irradiance: float, fraction: float, model: SensorModel, wavelength_nm: float) -> float:
-    """Compute the exposure [s] after which light and dark current fill a fraction of the full well on average."""
     if not 0 < fraction <= 1:
         raise MitsimError(f"exposure: got fraction {fraction} of full well; allowed is above 0, up to 1")
     if not 0 < peak_irradiance < np.inf:
@@ -124,7 +123,6 @@ def specimen(model: SensorModel, shape: tuple[int, int]) -> Specimen:
     count, pixels = math.prod(shape), math.prod(shape) * model.binning**2
 
     def draw(name: str, parts: tuple[float, float, float]) -> Map | None:
-        """Draw normal deviations of pixels, rows and columns."""
         if not any(parts):
             return None
         total, sizes = np.zeros(shape, dtype=np.float32), (shape, (shape[0], 1), (1, shape[1]))
@@ -134,7 +132,6 @@ def specimen(model: SensorModel, shape: tuple[int, int]) -> Specimen:
         return total
 
     def choose(kind: str, part: float) -> Map | None:
-        """Count the defects of a kind in each superpixel."""
         if not part:
             return None
         chosen = stream(model.pattern_seed, kind).choice(pixels, round(part * pixels), replace=False)
@@ -179,7 +176,6 @@ def dark_current_variance(model: SensorModel) -> float:
 
 
 def mean_dark_current(model: SensorModel) -> float:
-    """Return the mean dark current of superpixels, including hot pixels [electrons/s]."""
     hot = model.hot_pixels * model.hot_dark_current_e_per_s * model.binning**2 * model.dark_factor
     return model.superpixel_dark_current_e_per_s + hot
 
@@ -195,7 +191,6 @@ def neighbours(light: FloatArray, part: float) -> FloatArray:
 
 
 def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> FloatArray:
-    """Add dark electrons to expected photoelectrons, mu_e + mu_I t."""
     expected = checked_light(expected_electrons, "expected_electrons")
     return expected + model.superpixel_dark_current_e_per_s * exposure_s
 
@@ -219,7 +214,6 @@ def mean_electrons(
 
 
 def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: SensorModel) -> float:
-    """Return the largest expected number of electrons of a pixel."""
     if model.has_fixed_pattern or model.crosstalk:
         light, dark = mean_electrons(expected_electrons, exposure_s, model)
         return float((light + dark).max())
@@ -227,7 +221,7 @@ def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: Sens
 
 
 def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Generator | None) -> FloatArray | None:
-    """Return the fixed offset and, with `rng`, a row's noise for each pixel, flat [electrons], or None."""
+    """Return the fixed offset and, with `rng`, row noise for each pixel, flat [electrons], or None."""
     fixed = specimen(model, _frame_shape(shape, model)).offset_e if any(model.offset_parts) else None
     offset = None if fixed is None else fixed.astype(np.float64)
     if model.row_noise_e and rng is not None:
@@ -273,7 +267,6 @@ def poisson_quantile(expected: FloatArray, z: FloatArray | float) -> FloatArray:
 
 
 def clip_at_full_well(electrons: Any, model: Any) -> Any:
-    """Return min(N, F)."""
     return operations(electrons).minimum(electrons, model.superpixel_full_well_e)
 
 
@@ -293,7 +286,6 @@ def add_read_noise(electrons: Any, model: Any, z: Any) -> Any:
 
 
 def amplify(electrons: Any, model: Any) -> Any:
-    """Multiply electrons by the gain K and add the black level [DN]."""
     return electrons * model.gain_dn_per_e + model.superpixel_black_level_dn
 
 
@@ -328,7 +320,7 @@ def checked_light(values: npt.ArrayLike, name: str) -> FloatArray:
 
 
 # -------- Compiled kernel of the stages
-# Once light is known, noise is most of what a frame costs: two normal deviates a pixel and some twenty operations.
+# Once light is known, noise takes most of the time of a frame: two normal deviates a pixel and some twenty operations.
 # Dr.Jit makes one kernel of them for all processors, which takes a quarter of the time of numpy in as many threads.
 #
 # Deviates are found by counter (Philox; Salmon, Moraes, Dror and Shaw 2011, "Parallel random numbers: as easy as 1,
@@ -345,7 +337,6 @@ Numbers = Mapping[str, float | tuple[float, ...] | None]
 
 
 def operations(values: Any) -> ModuleType:
-    """Return numpy, or Dr.Jit for its own arrays."""
     return np if isinstance(values, np.ndarray | float) else compiled_arrays()[0]
 
 

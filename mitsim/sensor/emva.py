@@ -38,7 +38,7 @@ _QUIET = 0.99
 
 @dataclass(frozen=True)
 class Pair:
-    """Mean [DN], temporal variance [DN^2] and its part that rows share, of frames under the same light, all (...)."""
+    """Mean [DN], temporal variance [DN^2] and its part shared by rows, of frames under the same light, all (...)."""
 
     mean: FloatArray
     variance: FloatArray
@@ -55,10 +55,7 @@ class Stack:
     columns: FloatArray
 
     def parts(self, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the variances (total, row, column, pixel) [DN^2] for frames of M rows and N columns.
-
-        The means of rows contain 1/N of a pixel's part, those of columns 1/M (EMVA 1288 4.0).
-        """
+        """Return the variances (total, row, column, pixel) [DN^2] for frames of shape (M, N) (EMVA 1288 4.0)."""
         m, n = shape
         pixel = m * n / (m * n - m - n) * (self.total - self.rows - self.columns)
         return self.total, self.rows - pixel / n, self.columns - pixel / m, pixel
@@ -107,16 +104,22 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class Alike:
-    """Statistics of frames that were taken alike.
+    """Statistics of frames under equal conditions.
 
-    Attributes ---------- mean, variance, rows, variance_error : mean [DN], temporal variance [DN^2], its part that rows
-    share, and the standard
-        error of the variance.
-    cut : fractions of all numbers that are 0, and that are the largest code.
-    flicker : standard deviation of the frames' means beyond noise [DN].
-    neighbours : correlation of the noise of neighbours in a row and in a column.
-    comb : amplitude and period [DN] of a pattern in the codes; 1 if every other code is missing.
-    digests : checksum of each frame; empty for a frame with nearly all pixels at one code.
+    Attributes
+    ----------
+    mean, variance, rows, variance_error
+        Mean [DN], temporal variance [DN^2], its part shared by rows, and the standard error of the variance.
+    cut
+        Fractions of all numbers that are 0, and that are the largest code.
+    flicker
+        Standard deviation of the frames' means beyond noise [DN].
+    neighbours
+        Correlation of the noise of neighbours in a row and in a column.
+    comb
+        Amplitude and period [DN] of a pattern in the codes; 1 if every other code is missing.
+    digests
+        Checksum of each frame; empty for a frame with nearly all pixels at one code.
     """
 
     count: int
@@ -136,7 +139,6 @@ class Alike:
 
     @property
     def mean_error(self) -> float:
-        """Standard error of the mean due to noise [DN]."""
         rows = max(self.rows, 0.0)
         own = max(self.variance - rows, 0.0)
         return math.sqrt((own / math.prod(self.shape) + rows / self.shape[0]) / self.count)
@@ -145,10 +147,9 @@ class Alike:
 def alike(
     frames: Iterable[npt.ArrayLike], largest: float = math.inf, light: float = 0.0, exposure_s: float = 0.0
 ) -> Alike:
-    """Compute statistics of frames (M, N) [DN] that were taken alike, one frame at a time.
+    """Return statistics of frames (M, N) [DN] under equal conditions, one frame at a time.
 
-    The temporal variance of two frames is <(a - b)^2>/2 - (<a> - <b>)^2/2, so that fixed patterns and drift have no
-    effect.
+    The temporal variance of two frames is <(a - b)^2>/2 - (<a> - <b>)^2/2, without fixed patterns and drift.
     """
     means, lines, ends = list[float](), list[FloatArray](), np.zeros(2)
     codes, digests = np.zeros(_CODES), list[bytes]()
@@ -211,7 +212,6 @@ def _comb(codes: FloatArray, noise: float) -> tuple[float, float]:
 
 
 def pairs_of(pairs: Sequence[Pair | Alike]) -> Pair:
-    """Return the statistics of several sets in arrays."""
     return Pair(*(np.array([getattr(pair, name) for pair in pairs]) for name in ("mean", "variance", "rows")))
 
 

@@ -233,7 +233,6 @@ def _linear(model: SensorModel) -> tuple[float, float]:
 
 
 def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """Return moments of expected electrons (pixels,) without short cuts."""
     clipped, variance = clipped_moments(expected, model.superpixel_full_well_e)
     read, gain = model.superpixel_reading_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
     mean, noise = np.asarray(amplify(clipped, model)), np.asarray(variance * gain**2 + read**2)
@@ -243,7 +242,7 @@ def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArr
     if model.largest_dn is None:
         return mean, noise
     room, deviation = np.minimum(mean, model.largest_dn - mean), np.sqrt(noise)
-    # Counts are a lattice that only read noise blurs, as long as they are few; and so is what fills the full well.
+    # Few counts form a lattice that only read noise blurs, and so do counts at the full well.
     full = model.superpixel_full_well_e - expected < 8 * np.sqrt(expected)
     hard = (room < 8 * deviation) | (np.where(few | full, read, deviation) < _DITHERED)
     total = np.asarray(noise + 1 / 12)
@@ -255,7 +254,7 @@ def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArr
 def _sum_counts(
     expected: FloatArray, hard: npt.NDArray[np.bool_], moments: tuple[FloatArray, FloatArray], model: SensorModel
 ) -> tuple[FloatArray, FloatArray]:
-    """Replace the moments of hard pixels: by sums over counts as long as these are few, and by a quadrature beyond."""
+    """Replace the moments of hard pixels by sums over counts, or by quadrature if there are many."""
     mean, total = moments
     for part, found in ((hard & (expected < _SOME), _sum_about_mean), (hard & (expected >= _SOME), _average_counts)):
         if part.any():
@@ -295,7 +294,7 @@ def _average_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
 
 
 def _grid(expected: FloatArray) -> FloatArray:
-    """Return expected counts at which moments are computed: those of the pixels, or fewer to interpolate between.
+    """Return expected counts of the pixels, or fewer between which moments are interpolated.
 
     Shot noise has a deviation of 1/2 in the root of the counts, and the steps are 1/20 of that root.
     """
