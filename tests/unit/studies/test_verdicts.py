@@ -124,9 +124,10 @@ def at_depths(value: float, auto: float = 0.0, mapped: float = 9.0, flagged: boo
         case = {"model": model, "patterns": "dots:7", **named}
         found += rows(40, depth=400.0, absolute=False, jitter=True, **case)
         found += [row for depth in (395.0, 405.0) for row in rows(40 - value, depth=depth, absolute=False, **case)]
-    case = {"model": RENDERED, "patterns": "dots:7", "depth": 395.0}
-    found += rows(30, focus="own calibration", absolute=False, **case)
-    found += rows(30 + auto, focus="auto", absolute=False, jitter=True, **case)
+    for depth in (395.0, 405.0):
+        case = {"model": RENDERED, "patterns": "dots:7", "depth": depth}
+        found += rows(30, focus="own calibration", absolute=False, **case)
+        found += rows(30 + auto, focus="auto", absolute=False, jitter=True, **case)
     for family in ("dots:7", "dots:7x14"):
         case = {"model": RENDERED, "patterns": family, "scene": "cards", "flagged": flagged}
         found += rows(20, focus="none", absolute=False, **case)
@@ -242,8 +243,9 @@ BORDERS = [
     ("exposure", 1, shared("49 uniform", "1 uniform"), 0.0, math.inf),
     ("exposure", 2, law, 0.9, 1.1),
     ("depth", 0, at_depths, -math.inf, 3.0),
-    ("depth", 1, lambda value: at_depths(1.0, auto=value), -3.0, math.inf),
-    ("depth", 2, lambda value: at_depths(1.0, mapped=value), 3.0, math.inf),
+    ("depth", 1, at_depths, -math.inf, 3.0),
+    ("depth", 2, lambda value: at_depths(1.0, auto=value), -3.0, math.inf),
+    ("depth", 3, lambda value: at_depths(1.0, mapped=value), 3.0, math.inf),
     ("ambient", 0, lambda value: lamps(1.0, 0.5 + value), -math.inf, 0.0),
     ("ambient", 1, lamps, 0.0, math.inf),
     ("ambient", 2, lamps, -math.inf, 0.0),
