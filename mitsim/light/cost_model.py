@@ -178,7 +178,7 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: U
         many = np.asarray(terms * 16 * pixels * forming.cells * cells > SUMMED_BYTES)
         held = terms if math.isfinite(terms) else 0.0
         sums, sums_of_probes = (np.where(many, math.inf, count * held) for count in (one_term, of_probes))
-        # Frames and what probes see of them each take the cheaper way.
+        # Frames and their probes are each computed in the cheaper order.
         return cast(Number, np.minimum(correlation, sums) + np.minimum(GROUPS * correlation, sums_of_probes))
 
     lit, every, coarse = (forming.lit, forming.lit), (1.0, 1.0), numbers.coarse
@@ -230,7 +230,7 @@ def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Numb
 def checking_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
     rounds = ROUNDS + numbers.indirect
     if tells_all(forming.classes, forming.shots, forming.pixels):
-        # What the last check finds is used again when frames are formed.
+        # The result of the last check is reused when frames are formed.
         return forming_seconds(forming, numbers, _CHECK * (rounds - 1) * forming.classes, costs)
     few, many = (min(shots, forming.shots) for shots in (CHECKED_SHOTS, MOST_CHECKED))
     return forming_seconds(forming, numbers, _CHECK * rounds * (few + numbers.indirect * (many - few)), costs)

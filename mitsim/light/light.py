@@ -231,7 +231,7 @@ def trace_lines(
         more = sampling.excess([checks[line].light for line in sorted(checks)]) if sampling.excess else 1.0
         for line, check in checks.items():
             light, error = check.light, check.light.sampling_error
-            # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
+            # The plan's budget limits the error's bound; a user's own target limits the expected error.
             if sampling.target:
                 target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
             else:
@@ -253,7 +253,7 @@ def trace_lines(
             line: check.light.sampling_error * error_left(done, samples, check.variances)
             for line, check in checks.items()
         }
-        # What the next round replaces is not held beside it: new memory is dear.
+        # Results that the next round replaces are released first, because new memory is expensive.
         del lines, checks, check, lights, light
 
 

@@ -164,9 +164,9 @@ def _sharp(made: Grids) -> Bundle:
 
 
 _GRID_ROWS = (
-    # What the sensor sees on average of direct light, caustics and lamps.
+    # Mean over the sensor of direct light, caustics and lamps.
     GridRow("fine", "fine", _fine, lambda settings, physics: True, lamps=True),
-    # What each anchor sees of direct light beyond that; and of light that is hidden from part of the sensor.
+    # Direct light at each anchor beyond that mean, and light that is hidden from part of the sensor.
     GridRow("anchor_residual", "coarse", lambda made: _coarse(made, made.settings.anchors),
             lambda settings, physics: settings.anchors > 1),
     GridRow("penumbra", "occluded", lambda made: _coarse(made, made.settings.occluded_anchors),
@@ -247,7 +247,7 @@ def _divide(light: Any, count: float) -> Any:
     return sparse.csr_array((light.data * (1 / count), light.indices, light.indptr), shape=light.shape)
 
 
-# -------- What traces
+# -------- Tracers
 
 FromCamera = FromCameraTracer | CombinedTracer
 PassTracer = DirectTracer | IndirectTracer | FromCamera

@@ -101,7 +101,7 @@ class Candidates:
         ]
 
     def best(self, accuracy: float, sure: float = SURE) -> _Prediction:
-        # Most leave out what no choice of numbers makes up for.
+        # Most combinations omit light for which no choice of numbers compensates.
         accurate = [table for table in self._tables if table.accurate(accuracy, sure).any()]
         found = [table.predict(accuracy, sure) for table in accurate]
         if not any(each.fits[each.best] for each in found):
@@ -293,7 +293,7 @@ class _Table:
             needed = self._by_row(name, _samples_for, single * share)
             if name == "direct":
                 needed = np.maximum(needed, 1 / (result.hits * _ONE_HIT * target))
-            # What needs no whole sample does not take two when all others grow.
+            # A pass that needs less than one sample does not get two when all others grow.
             found[name] = np.where(needed < 1, needed, PASSES[name].whole(needed))
         samples = {name: np.asarray(PASSES[name].whole(count)) for name, count in found.items()}
 

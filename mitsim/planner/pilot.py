@@ -115,7 +115,7 @@ class PilotRuns:
             return
         occluded = occluded_pixels(Simulation(bench, self._base), accuracy, integer(seed, "pilot", "occluded"))
         shown = np.isin(sample.shown, occluded)
-        # Unless the sample's shots show some of either kind, nobody knows how many anchors each takes.
+        # The anchors that each kind needs are unknown unless the sample's shots show some of both kinds.
         if shown.any() and not shown.all():
             self._base = replace(self._base, occluded=occluded)
             known = self.anchored
@@ -174,7 +174,7 @@ class PilotRuns:
         }
         return {name: sample_cost for name, sample_cost in found.items() if sample_cost.noise.error}
 
-    # ---- What is measured, and how frames are formed for it ----
+    # ---- Measured quantities, and the frames for them ----
 
     def _measure(self, run: str) -> None:
         bench, base, sample, seed = self.bench, self._base, self.samples[run], self.seed
@@ -240,7 +240,7 @@ class PilotRuns:
             each = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
             missed = left_out_light(simulation.setup, simulation.aim, integer(self.seed, "pilot", "caustics"), each)
         left_out, mirror = missed.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
-        # Light over mirrors alone, and what of it is in no frame or may be in the wrong pixels.
+        # Light over mirrors alone, and the part that is in no frame or may be in the wrong pixels.
         mirrors = self.bench.loaded.mirrors
         alone, unsure = self.bench.specular.irradiance(self.bench.geometry) if mirrors else (0.0, 0.0)
         found = self._light + sharp.irradiance + switched.received + alone
@@ -368,7 +368,7 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     rest = (_LEFT * accuracy) ** 2 * whole
     found = pixels[_most(rough, rest)]
     every, looked = np.zeros(n**2), np.zeros(n**2, dtype=bool)
-    # Few rays miss what is hidden by a little; it lies beside what is hidden by much.
+    # A few rays miss slightly hidden pixels, which are neighbours of strongly hidden ones.
     while len(near := np.intersect1d(with_neighbours(np.isin(np.arange(n**2), found), n), pixels[~looked[pixels]])):
         if looked.sum() + len(near) > 9 * _MOST * n**2:
             return ()
@@ -436,7 +436,7 @@ def sharp_pixels(
         count_apart, apart = np.arange(len(moments) + 1), np.concatenate([[0.0], moments])
         rest = np.maximum(moments[-1] - apart, 0) + light**2 / len(order) * _EVEN
         paths = (np.sqrt(rest * (len(order) - count_apart)) + np.sqrt(apart * count_apart * anchors**2)) ** 2
-        # Pixels whose light replicates may miss, until what is left is negligible or well seen.
+        # Pixels whose light replicates may miss, until the rest is negligible or well sampled.
         light_left, moments_left = (np.cumsum(v[order[:lit]][::-1])[::-1] for v in (sharp.by_pixel, sharp.moments))
         settled = (light_left <= _LEFT_SHARP * accuracy * whole) | (np.square(light_left) >= _SEEN * moments_left)
         count = max(int(np.argmin(paths[1:])) + 1, int(np.argmax(settled)) if settled.any() else lit)
@@ -446,7 +446,7 @@ def sharp_pixels(
         order = np.argsort(-sharp.by_pixel, kind="stable")
         held = np.cumsum(sharp.by_pixel[order])[:lit]
         count = min(int(np.searchsorted(held, sharp.irradiance - _LEFT_SHARP * accuracy * whole)) + 1, lit)
-    # Beside a lobe's light is that of its tails, which ordinary replicates meet as seldom where it is small.
+    # Ordinary replicates meet the tails of a small lobe as seldom as the lobe itself.
     pixels = with_neighbours(np.isin(np.arange(len(order)), order[:count]), simulation.bench.n)
     # One pixel at least stays with the others.
     if len(pixels) == len(order):

@@ -229,7 +229,7 @@ def ladder(
         if former > 0:
             gain = min(norm(last) / former, gain)
         rest = max(gain, least_gain) / (1 - max(gain, least_gain))
-        # Two steps tell what the judge leaves; one alone, what the step before it does.
+        # Two steps give the error that the judge leaves; a single step gives that of the step before it.
         if (rest if earlier else 1 + rest) * norm(last) <= tolerance or judge == counts[-1]:
             break
         following = counts[counts.index(judge) + 1]

@@ -328,7 +328,7 @@ class EffectRuns:
         """Return True if so little light is indirect that one cell a pixel and one layer certainly suffice."""
         direct = sum(float(light.value.sum()) for light in self.direct) / (REPLICATES * self.sample.direct)
         part = self.received / (direct + self.received) if self.received else 0.0
-        # Direct light that lies in its cells tells nothing of indirect light.
+        # Direct light that lies in its cells gives no information about indirect light.
         return 0 < _AS_ROUGH * max(self._as_direct()) * part < GOOD_ENOUGH * self.accuracy
 
     @property
@@ -367,7 +367,7 @@ class EffectRuns:
         more = min(wanted, self.sample.closer(tracer.paths_per_sample), math.ceil(most))
         if more <= first.samples:
             return first, first
-        # Seeds of their own: that the first replicates are vague says nothing of these.
+        # Own seeds, because vague first replicates do not imply that these are vague.
         seeds, few = [integer(seed, "closer") for seed in self.seeds], math.ceil(more / _OF_CLOSER)
         some, whole = tracer.replicates(seeds, few, more)
         return Bounced.of(some, few), Bounced.of(whole, more)
@@ -396,7 +396,7 @@ class EffectRuns:
         sample_cost, shared = self._shared_or_not
         pixels = self.bench.n
         moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._looks[1].indirect]
-        # Judged by replicates that had no say, a half each: a single heavy path recommends only its own block.
+        # Each half is judged by the other replicates, because a single heavy path favours only its own block.
         halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
         judged = [effect_of(adaptive_counts(one), other) for one, other in (halves, halves[::-1])]
         variance, paths = (float(each) for each in np.mean(judged, axis=0))

@@ -128,14 +128,14 @@ def plan_within(
     again = _LONGER * runs.seconds
     candidates = choose.Candidates(runs.pilot_result, switches)
     found = choose.accuracy_for_time(candidates, seconds - around, choose.FIRST_ACCURACY)
-    # What a look tells of finer accuracies than its own is their price, not whether they are kept.
+    # A pilot run predicts the cost of finer accuracies than its own, but not whether they are kept.
     aim = choose.accuracy_for_time(candidates, seconds - around - again, 0.0, kept=False)
     if found.fits and aim.fits and aim.accuracy < choose.FIRST_ACCURACY:
         around += again
         closer = pilot.PilotRuns(bench, lighting, aim.accuracy, seed)
         others = choose.Candidates(closer.pilot_result, switches)
         finer = choose.accuracy_for_time(others, seconds - around, aim.accuracy)
-        # It may say that no accuracy is kept at all, and then has the loosest.
+        # The closer runs may keep no accuracy at all, and then give the loosest.
         if finer.fits and finer.accuracy <= found.accuracy:
             runs, candidates, found = closer, others, finer
     plan = _decide(runs, found.accuracy, candidates).taking(plan=time.perf_counter() - started)
@@ -216,7 +216,7 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
     accumulator = simulation.accumulator(name, labels, 1)
     started = time.perf_counter()
     simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulator), labels, samples)
-    # What is added up on the device is not waited for.
+    # Sums on the device run asynchronously.
     dr.sync_thread()
     return time.perf_counter() - started
 
@@ -239,7 +239,7 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
         if name == "direct":
             ray = alone / paths
     whole = sum(fixed[name] for name in timed)
-    # Where nothing takes any time, what was timed counts alike.
+    # If no pass takes any time, all timed passes have equal weight.
     by = {name: fixed[name] / whole if whole else 1 / len(timed) for name in timed}
     slower = sum(by[name] * ratio for name, ratio in ratios.items()) if timed else 1.0
     found = {
@@ -260,7 +260,7 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
 
     def once(samples: int) -> float:
         seconds = _seconds(simulation, name, seed, labels, samples)
-        # The first may compile the kernel, and what disturbs a moment would be multiplied.
+        # The first launch may compile the kernel, and a short disturbance would be multiplied.
         unusual = seconds > _USUAL * samples * paths_per_sample * cost_model.FIXED.passes[name]
         again = unusual and (samples == 1 or samples <= _TIMED * every)
         return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
@@ -473,7 +473,7 @@ def _refusal(tag: Tag, rule: str, place: str = "shape") -> str:
     return str(tag.refusal(place, repr(tag.attributes.get("type", "")), rule))
 
 
-# -------- What a plan reports of a bench
+# -------- Facts about a bench that a plan reports
 
 
 _GREY = "no surface differs by wavelength; the mask's shadow is the mean over all lines"

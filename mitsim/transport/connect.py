@@ -60,7 +60,7 @@ class SensorPoints:
         return self.place(row, column, mi.Point2f(rng.next_float32(spread), rng.next_float32(spread)))
 
     def place(self, row: mi.UInt32, column: mi.UInt32, point: mi.Point2f) -> mi.Point3f:
-        # Of one number alone Dr.Jit would make another kernel.
+        # For a single number Dr.Jit would compile another kernel.
         positions = mi.Float(np.append(self.positions, 0).astype(np.float32))
         anchor = mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
         return dr.select(dr.opaque(mi.Bool, self.spread), self.inside(point), anchor)
@@ -357,7 +357,7 @@ def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
     facing = -dr.dot(place.n, way)
     met = _in_view(camera, way) & (facing > 0)
     seen, _ = Passage(scene).between(sensor, place.p, met)
-    # Of dA on the lamp, in solid angle and on the plane at unit distance.
+    # Solid angle of dA on the lamp, and its area on the plane at unit distance.
     area = facing / distance**2 / (to_world.inverse() @ way).z ** 3
     total = float(np.array(dr.select(met & seen, area, 0)).mean()) * float(shape.surface_area()[0])
     return total / float(2 * camera.geometry.tan_half_fov) ** 2

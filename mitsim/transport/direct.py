@@ -182,7 +182,7 @@ class FluxTracer:
             return value
         density = at.density(at.si.to_local(reception.way.direction))
         area = 4 * dr.square(dr.opaque(mi.Float, self._sensor.half_width))
-        # As a spectrum: by a number, Dr.Jit would multiply with the reciprocal, which is rounded.
+        # A spectrum is used, because Dr.Jit divides by a number as multiplication with the rounded reciprocal.
         share = mi.UnpolarizedSpectrum(1 + area * density * reception.solid_angle(point))
         # A choice between a spectrum and a number is a plain array, which loops of spectral variants refuse.
         return mi.UnpolarizedSpectrum(dr.select(value > 0, value / share, 0))
@@ -192,10 +192,10 @@ class FluxTracer:
 #
 # Connected to an anchor u of the sensor, light over a lobe of roughness alpha comes from a patch of some alpha r about
 # the point that mirrors the projector into u; even rays of a projector pixel seldom meet it. Where in the pixel it lies
-# is told by a few rays that are sent on along their lobes' axes, past holes and through panes: they arrive at about u0
+# is found by a few rays that are sent on along their lobes' axes, past holes and through panes: they arrive at about u0
 # + J (x - 1/2), x the place in the pixel, so x is drawn from a Cauchy density about 1/2 + J^-1 (u - u0), as wide as the
-# lobe. Any such density leaves the estimate unbiased; a part of the rays stays even, so that what the axes do not tell
-# of is found as well.
+# lobe. Any such density leaves the estimate unbiased; a part of the rays stays even, so that light that the axes miss
+# is found as well.
 
 _EVEN = 0.25
 """Part of the rays that stays even: light that the axes miss is found four times more slowly without."""

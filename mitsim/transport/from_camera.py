@@ -92,7 +92,7 @@ class CameraPaths(integrator.PathIntegrator[State]):
         self.anchor = row, column
         self.tracer, self.geometry, self.connector = tracer, tracer.setup.geometry, tracer.connector
         self.emitters, self.lens = tracer.paths.emitters, tracer.projector.aperture > 0
-        # What a path runs into has been turned once less than what it is connected to.
+        # A light that a path runs into has one turn less than a light that it is connected to.
         self.reach = 0 if self.emitters or self.lens else 1
 
         # ---- Rays from the sensor through the cells
@@ -196,7 +196,7 @@ class CameraPaths(integrator.PathIntegrator[State]):
         lens = self.connector.lens_point(paths.rng)
         way = refracted_way(self.passage, si, self.connector.projector.emitter.world_transform() @ lens, active)
         connection = self.connector.connect(_seen_at(si, way.apparent), paths.rng, active & way.open, lens)
-        # As a path that runs into the lens counts it: by the way's length.
+        # The way's length is counted, as for a path that runs into the lens.
         connection.pdf *= dr.square(way.length) / dr.squared_norm(connection.target - way.apparent)
         connection.direction = way.direction
         return connection, way.part / dr.square(way.eta)

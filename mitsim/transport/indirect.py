@@ -60,7 +60,7 @@ class IndirectTracer(integrator.FollowingTracer):
         if self.adaptive:
             index, sample, weight = self.adaptive.at(index, sample)
         pixel, row, column = self.points.of(index, self.projector.n**2)
-        # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
+        # The first turn is stratified, because a pixel is small but its light leaves the surface in all directions.
         shared, rng = streams(flight.seed, pixel, sample)
         return Emission(pixel, (row, column), rng, sobol_point(sample, shared), weight)
 
@@ -109,7 +109,7 @@ class ProjectorPaths(integrator.PathIntegrator[integrator.PathState]):
         return {kind: paths.rng.next_float32() for kind in ("direct", "indirect")}
 
     def _way(self, paths: integrator.PathState, si: mi.SurfaceInteraction3f, sensor: mi.Point3f) -> Way:
-        # Light that has met nothing but what it passes is the direct tracer's.
+        # Light that has only passed surfaces belongs to the direct tracer.
         active = paths.active & ~paths.straight & self._is_wanted(paths.scattered + 1)
         return self.setup.way(si, sensor, active)
 

@@ -136,7 +136,7 @@ class Tracer(ABC):
                 parts += tracer._launch(flight, accumulator)
         if accumulator is not None:
             accumulator.traced += 1
-        # Where all is fetched, there is nothing to wait for.
+        # If all light is fetched, nothing remains to be awaited.
         if accumulator is None or accumulator.traced % _NOTED == 0:
             compiled_kernels()
         return PathSamples.join(parts)
@@ -279,7 +279,7 @@ class PathIntegrator(ABC, Generic[State]):
                 weight *= dr.select(mirrored | passing, 1, part_over_turn(paths, si, corrected))
         paths.throughput *= weight
 
-        # ---- Russian roulette; chains of mirrors are short and full of light, and what only passes a surface goes on
+        # ---- Russian roulette; chains of mirrors are short and full of light, and light that only passes goes on
         paths.depth += dr.select(passing, mi.UInt32(0), mi.UInt32(1))
         if not first:
             chain = paths.scattered == 0

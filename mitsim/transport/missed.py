@@ -215,8 +215,8 @@ def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
 #
 # The light that a ball of radius r sends to a point comes from a spot of some alpha r: rays that are spread over the
 # projector's window, or over all directions that the ball reflects to, may meet none of many small ones, and nothing
-# tells of it. Where the spot lies is known, so points are drawn about it, as many in each octave of distance from it,
-# and what they send to the sensor's centre is added up with the scene's own materials and shadows.
+# shows it. Where the spot lies is known, so points are drawn about it, as many in each octave of distance from it,
+# and the light that they send to the sensor's centre is added up with the scene's own materials and shadows.
 
 _POINTS, _NEAREST = 512, 1e-4
 """Points about each spot, which measure its light to some 5 %, and the angle from its middle where they begin."""
@@ -279,7 +279,7 @@ def highlights(setup: OpticalSetup) -> Highlights:
     sent, facing = _radiance_toward(scene, rays.origin, aimed, eye, np.repeat(radius, _POINTS))
     local = -back @ turn
     stop = (np.abs(local[:, :2]) <= setup.geometry.tan_half_fov * local[:, 2:]).all(axis=1)
-    # Part of the window that each point stands for, by the tangents of one pixel, and what it brings.
+    # Part of the window that each point represents, by the tangents of one pixel, and its light.
     seen = np.tile(area, len(balls)) * np.repeat(radius, _POINTS) ** 2 * np.maximum(facing, 0) * far / depth**3
     received = sent * (local[:, 2] / near) / near**2
     light = rays.power.mean(axis=1)[pixel] * received * (inside & stop)
@@ -338,7 +338,7 @@ def _radiance_toward(
 # Direct light over sharp lobes, found from the surface: how much of it there is, and whether connections can see it.
 #
 # Direct light is found by connecting lit points to the sensor. A connection rarely meets a lobe that is far narrower
-# than the projector's window: then no estimate holds its light, no spread of estimates tells of it, and the frames
+# than the projector's window: then no estimate holds its light, no spread of estimates shows it, and the frames
 # would lack it in silence. Sampled from the surface instead, such a lobe meets the sensor easily. With I the irradiance
 # that a ray's connection to a sensor point stands for, uniform over the sensor's area A, and q the density [1/mm^2] of
 # meeting that point by sampling the surface, a met point estimates the mean irradiance by x = I / (A q), and the second
@@ -365,7 +365,7 @@ connections that then measure their light to 6 % (compact_disc: 2000, where a qu
 _SHARPEST = 0.1
 
 
-# ---- Light over sharp lobes, and what it is found from
+# ---- Light over sharp lobes, and the data for its search
 
 
 @dataclass(frozen=True, eq=False)

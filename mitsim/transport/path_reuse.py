@@ -150,7 +150,7 @@ class ReusedPaths(ProjectorPaths):
         kept = self.paths.sightings["indirect"]
         place = kept.pixel, kept.row, kept.column, kept.inverse_depth
         self.further = Sightings(dr.select(self.follows, kept.value, 0), *place)
-        # Of unit light, whose mean over wavelengths the sightings hold.
+        # For unit light, whose mean over wavelengths is in the sightings.
         self.beyond = [self.further.value]
         if kept.lines is not None:
             unit = dr.select(self.follows, kept.lines * len(kept.lines), 0)
@@ -174,7 +174,7 @@ class ReusedPaths(ProjectorPaths):
         self.second_hit = self.scene.ray_intersect_preliminary(paths.ray, active=paths.active)
         si = self.second_hit.compute_surface_interaction(paths.ray, active=paths.active)
         paths.active &= si.is_valid()
-        # Outside of a loop what has ended is worked out, too: a throughput of NaN would outlast the light of 0.
+        # Outside of a loop, ended paths are evaluated too, and a NaN throughput would outlast a light of 0.
         paths.throughput = dr.select(paths.active, paths.throughput, 0)
         self.shared = paths.active & (paths.scattered == 1)
         self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)

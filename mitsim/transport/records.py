@@ -398,7 +398,7 @@ class DeviceAccumulator:
         self._width = self._places(bundle)
         self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
         self._labels = mi.UInt32(labels.astype(np.uint32))
-        # A last entry that counts what is no light.
+        # The last entry counts refused light: negative, not finite or too bright.
         self._entries = self._rows * self._width + 1
         self.sums = dr.zeros(mi.UInt64, self._entries * lines)
         self.traced = 0
@@ -517,7 +517,7 @@ class DeviceSums:
     def beyond(self, samples: int = 1) -> FloatArray:
         lit, accumulator = self.lit, self.accumulator
         rows, anchors = accumulator._rows, accumulator._bundle.anchors
-        # Its last one counts what is no light.
+        # The last entry counts refused light: negative, not finite or too bright.
         found = np.zeros(rows * anchors**2 + 1)
         found[lit.numbers[lit.inside :] - np.uint32(rows * accumulator._bundle.size)] = self.units[lit.inside :]
         by_row = np.moveaxis(found[:-1].reshape(anchors, anchors, rows), 2, 0)

@@ -78,7 +78,7 @@ def trace_specular_chains(
 def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
     arcs, close = grazing(tracer, geometry.half_width, _UNIT)
     parts, left = [], np.array([close, 0.0])
-    # Where the window holds the sensor itself, it is looked for as finely as small mirrors are.
+    # A sensor within the window is searched as finely as small mirrors.
     sides = np.array([[geometry.half_width], [2 * geometry.half_width / _ACROSS_SENSOR]])
     arcs.append(_window_boxes(_Spots(tracer.camera_place[None], *sides), tracer.rays))
     for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _COARSE, arcs):
@@ -127,7 +127,7 @@ def _search(
     return _refine(tracer, (chains[chain], row[square], column[square], spread[chosen]), size, n, geometry)
 
 
-# -------- Nodes: what is known at points of the lattice
+# -------- Nodes: quantities at points of the lattice
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +217,7 @@ def _refine(
             at = row[done] + i * half, column[done] + j * half
             quarter = stands_for[done] * _fluxes(tracer, *at, half, n)
             parts.append(Beams(_pixel(*at, n), quarter, corners.sensor, corners.tangent, corners.throughput, 0.0))
-        # Of thin squares every second row or column stands for its neighbour, too.
+        # In thin squares every second row or column also represents its neighbour.
         straight = _departure(nodes.sensor) < _STRAIGHT * extent
         halved = whole & ~done & straight & (stands_for * thin < _THIN * pitch)
         by_row = np.abs(way[:, 0]) >= np.abs(way[:, 1])
@@ -236,7 +236,7 @@ def _refine(
 def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
     """Return the width (q,) of long squares' light [mm], infinite if compact, and the direction of least motion."""
     corners = nodes.sensor[:, ::2, ::2]
-    # What the sensor's place moves by over the square, for a step down and a step across.
+    # Shift of the place on the sensor over the square, for a step down and a step across.
     down, across = ((c[:, 1] - c[:, 0]).mean(axis=1) for c in (corners, corners.transpose(0, 2, 1, 3)))
     a, b, c = (np.square(down).sum(axis=1), (down * across).sum(axis=1), np.square(across).sum(axis=1))
     # Eigenvectors of [[a, b], [b, c]], the smaller value's by half the angle.

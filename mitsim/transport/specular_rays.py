@@ -168,7 +168,7 @@ class SpecularRays:
             chosen = np.flatnonzero(own_lobe & single & ((spectrum @ self.colour) > _FAINTEST))
             traced = vectors(si.to_world(sample.wo), count)[chosen]
             turn = kind[chosen], eta[chosen], rays.direction[chosen]
-            # What Mitsuba did with its own normal tells which law it is; the better normal is for where light goes.
+            # Mitsuba's result with its own normal shows which law applies; the better normal gives the direction.
             as_by_law = np.linalg.norm(_redirect(shading[chosen], *turn) - traced, axis=1) < _AGREEMENT
             direction = np.where(as_by_law[:, None], _redirect(normal[chosen], *turn), traced)
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)

@@ -190,7 +190,7 @@ def _is_round(si: mi.SurfaceInteraction3f) -> mi.Bool:
 
 # -------- Flat panes of glass
 #
-# A window, an aquarium's wall, a cover glass: between a surface and the sensor or the projector stand flat faces that
+# A window, an aquarium's wall, a cover glass: between a surface and the sensor or the projector are flat faces that
 # bend light. A straight connection misses; but for planes there is one direction that arrives, and Newton's method
 # finds it from the straight one. A ray is traced with its two differentials (Igehy 1999), which planes keep exact:
 # where it crosses the target's plane, and how the crossing moves with the direction. After three or four corrections
@@ -365,9 +365,9 @@ class _Search:
         return _Ray(**{**chosen, "active": before})
 
 
-# -------- Surfaces in contact with what lets light through
+# -------- Surfaces in contact with transmitting surfaces
 #
-# A ray that has passed a surface starts a little beyond it, and does not see what stands closer: a print in contact
+# A ray that has passed a surface starts a little beyond it, and misses closer surfaces: a print in contact
 # with glass comes out black. Mitsuba's own integrators start 9e-5 of the coordinates beyond, 0.036 mm at 400 mm, the
 # tracers of this room CLEAR.
 

@@ -72,7 +72,7 @@ class Diffuser:
     def scene(self) -> mi.Scene:
         glass = {"type": "dielectric", "int_ior": self.index, "ext_ior": 1.0}
         side, top = self.relief.side_mm, self.distance_mm + _THICKNESS_MM
-        # Wider than the relief by what tilted light needs.
+        # Wider than the relief by the shift of tilted light.
         flat = mi.ScalarTransform4f().translate([0, 0, top]).scale([2 * side, 2 * side, 1])
         return mi.load_dict(
             {
@@ -145,7 +145,7 @@ def _landing(scene: mi.Scene, places: FloatArray, along: FloatArray) -> tuple[Fl
     unit = along / np.linalg.norm(along)
     ray = mi.Ray3f(mi.Point3f(places.astype(np.float32)), mi.Vector3f(*unit.tolist()))
     part, active = mi.Float(1), mi.Bool(True)
-    # Light, not radiance, and only what is refracted.
+    # Light instead of radiance, and only its refracted part.
     context = mi.BSDFContext(mi.TransportMode.Importance, mi.BSDFFlags.DeltaTransmission)
     for _ in range(2):
         crossing = scene.ray_intersect(ray, active)

@@ -171,7 +171,7 @@ def plugin_class() -> type:
             part, cosine, eta_it, eta_ti = mi.fresnel(si.wi.z, dr.sqrt(self.model.index_squared(wavelength)))
             kinds = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
             may = [ctx.is_enabled(kind, component) for component, kind in enumerate(kinds)]
-            # Where both may be, chance decides and the weight is 1; else the weight is the part.
+            # If both are possible, chance decides and the weight is 1; else the weight is the part.
             reflected = s1 < part if all(may) else mi.Bool(may[0])
             chosen = dr.select(reflected, part, 1 - part)
             active = active & (si.wi.z != 0) & any(may)
@@ -183,7 +183,7 @@ def plugin_class() -> type:
             bs.sampled_type = dr.select(reflected, mi.UInt32(+kinds[0]), mi.UInt32(+kinds[1]))
             weight = mi.Float(1) if all(may) else chosen
             if ctx.mode == mi.TransportMode.Radiance:
-                # Radiance over the square of the index is what a face keeps (E. Veach 1997, 5.2).
+                # A face preserves radiance over the square of the index (E. Veach 1997, 5.2).
                 weight *= dr.select(reflected, 1, dr.square(eta_ti))
             return bs, mi.depolarizer(mi.Spectrum(dr.select(active & (bs.pdf > 0), weight, 0)))
 

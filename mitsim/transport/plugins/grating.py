@@ -194,7 +194,7 @@ def plugin_class() -> type:
             lists = {"efficiencies": parts[zero:].tolist(), "negative_efficiencies": parts[:zero][::-1].tolist()}
             self.model = GratingModel.build(**{**self.model.model_dump(), **values, **lists})
 
-        # ---- what the derivation in the module's docstring says
+        # ---- formula of the module's docstring
 
         def _grating_vector(self, si: mi.SurfaceInteraction3f) -> mi.Vector2f:
             circular = self.model.grooves == "circular"

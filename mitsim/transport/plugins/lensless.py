@@ -193,7 +193,7 @@ def plugin_class() -> type:
         def _direction(self, u: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
             geometry = self.geometry
             stop, side = geometry.tan_half_fov, self._feature
-            # What the field stop shows of the mask, in features from the mask's first corner.
+            # Part of the mask within the field stop, in features from the mask's first corner.
             first = [
                 (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._cover
                 for start, centre in zip(base.rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
@@ -209,7 +209,7 @@ def plugin_class() -> type:
                 tilt = mi.Vector2f(*base.x_y(*(float(np.tan(angle * 1e-3)) for angle in flaws.tilt_mrad)))
                 centre = mi.Point2f(*base.x_y(*self.geometry.mask_offset))
                 along = (distance + dr.dot(tilt, u - centre)) / (1 - dr.dot(tilt, t))
-                # A length along the tilted plane is longer than what it covers of the even one.
+                # A length along the tilted plane is longer than its projection on the even one.
                 point = (u + along * t - centre) * dr.sqrt(1 + dr.square(tilt)) + centre
             else:
                 point = u + distance * t
