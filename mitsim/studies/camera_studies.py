@@ -376,7 +376,7 @@ DEPTH = Study(
             "A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
             {"focus": AUTO},
             {"focus": OWN},
-            where=_MOVED | {"depth": lambda depth: depth != CALIBRATED_MM},
+            where=_MOVED | {"focus": (AUTO, OWN), "depth": lambda depth: depth != CALIBRATED_MM},
             every="depth",
             at_least=-_STABLE_DB,
         ),

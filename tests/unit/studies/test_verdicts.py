@@ -283,6 +283,12 @@ def test_claims_are_decided_on_both_sides_of_each_border(
             assert verdict(border - inwards) == NOT_CONFIRMED
 
 
+@pytest.mark.parametrize(("flagged", "verdict"), [(True, CONFIRMED), (False, NOT_CONFIRMED)])
+def test_images_of_dots_too_near_to_each_other_must_be_flagged(flagged: bool, verdict: str) -> None:
+    claims = find_experiment("depth").judge(Results(at_depths(1.0, flagged=flagged)))
+    assert claims[4].verdict == verdict and "flagged" in claims[4].claim
+
+
 def test_every_study_of_the_paper_is_held() -> None:
     from mitsim.studies import PAPER
 
