@@ -170,7 +170,7 @@ class Session:
 
     @cached_property
     def signs(self) -> FloatArray:
-        """Return the (n, N) first n rows of the smallest Hadamard matrix that has them; column 0 is all +1."""
+        """Return the first n rows of the smallest sufficient Hadamard matrix, (n, N); column 0 is all +1."""
         return stripe_signs(self.bench.n).astype(np.float64)
 
     @property
@@ -179,7 +179,6 @@ class Session:
 
     @property
     def pairs(self) -> bool:
-        """Return True if a +-1 pattern is the difference of two shots."""
         return self.recipe.signed_capture == "pair"
 
     def through_filters(self, light: FloatArray) -> FloatArray:
@@ -197,7 +196,6 @@ class Session:
 
     @cached_property
     def powers(self) -> Mapping[tuple[str, int], FloatArray]:
-        """Return the (exposures, repeats) power of the projector in each shot, relative to its begin."""
         drift, order = self.recipe.drift, self.order
         each = len(order), len(self.recipe.exposure_ladder), self.recipe.repeats
         found = levels(self.seed, "session", math.prod(each), drift.session_ramp, drift.session_flicker).reshape(each)
@@ -208,7 +206,6 @@ class Session:
         return side, 2 * number + (sign < 0) if self.pairs else number + (sign != UNIFORM)
 
     def plan(self, accuracy: float, job: Job) -> Plan:
-        """Plan the simulation of responses; MitsimError if memory or time exceed the limits of the ``job``."""
         n, count, spent = self.bench.n, self.signs.shape[1], job.clock.seconds()
         self._first_cost.check("calibration", job.limits)
         with job.planning("calibration", first_shadow(self.board, {})):
@@ -309,7 +306,6 @@ def session_seconds(
 
 
 def session_cost(board: Apparatus, count: int, settings: Settings, seconds: float, exposures: int = 1) -> Cost:
-    """Predict memory (an upper estimate) and time of a session."""
     n, pixels = board.n, board.geometry.frame_side
     lines = n if lines_held(n, count, pixels) else 0
     at_work = _AT_WORK + _OF_AN_EXPOSURE * (exposures - 1)
@@ -331,7 +327,6 @@ _COLUMNS = 2**14
 
 
 def lines_held(lines: int, patterns: int, pixels: float) -> bool:
-    """Return True if frames of lines are kept in memory and mixed into those of patterns."""
     return mixes(lines, patterns, pixels) or (patterns >= lines and 8 * lines * pixels**2 <= _LINES_BYTES)
 
 

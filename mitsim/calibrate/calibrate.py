@@ -72,8 +72,6 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 class Checkpoint:
-    """Parts of one session; nothing is kept without a folder."""
-
     def __init__(self, folder: Path | None = None, configuration: Mapping[str, Any] | None = None) -> None:
         self.folder, self.configuration = folder, dict(configuration or {})
         self._session = json.dumps(plain(self.configuration), sort_keys=True).encode()
@@ -85,7 +83,6 @@ class Checkpoint:
             write_json(self.folder / MANIFEST, head)
 
     def save(self, name: str, arrays: Mapping[str, npt.ArrayLike]) -> None:
-        """Write ``arrays`` as the part ``name`` atomically; raise MitsimError if that fails."""
         if self.folder is None:
             return
         memory = io.BytesIO()
@@ -95,7 +92,6 @@ class Checkpoint:
             file.write(self._digest(memory.getbuffer()))
 
     def load(self, name: str) -> dict[str, npt.NDArray[Any]] | None:
-        """Return the arrays of the part ``name``; None if it is missing, damaged, or of another session."""
         path = None if self.folder is None else self.folder / f"{name}{_SUFFIX}"
         if path is None or not path.is_file():
             return None
@@ -134,7 +130,6 @@ def claimed_session(
 
 
 def is_finished(output: Path, configuration: Mapping[str, Any]) -> bool:
-    """Return True if the folder holds a finished session; raise MitsimError for another ``configuration``."""
     if not (output / MANIFEST).is_file():
         return False
     _check_same(output, plain(configuration))
@@ -193,8 +188,6 @@ def keep_light(checkpoint: Checkpoint, light: SampledLight) -> None:
 
 @dataclass
 class SessionSums:
-    """Sums over finished stripes by kind and side, and the number of ``saturated`` shots."""
-
     sums: dict[str, tuple[StripeSums, StripeSums]]
     saturated: int
 
@@ -244,10 +237,9 @@ def calibrate(bench: Apparatus, request: SessionRequest, task: Task, frames: Pat
 
 
 def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> dict[float, Factors]:
-    """Estimate the camera's factors at each of a recipe's ``depths`` [mm], in a folder for each.
+    """Estimate factors at each of a recipe's ``depths`` [mm], independently, in a folder for each.
 
-    Light and noise of the depths are independent. MitsimError as :func:`calibrate`, for a recipe without depths, and
-    for a depth at which the mask or no light is.
+    MitsimError as :func:`calibrate`, for a recipe without depths, and for a depth at which the mask or no light is.
     """
     recipe, found = request.recipe or load_recipe(), {}
     if not recipe.depths:
@@ -396,7 +388,6 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
 def estimate(
     lit: LitSession, job: Job, noise_free: bool = False, checkpoint: Checkpoint | None = None
 ) -> tuple[Estimate, int]:
-    """Estimate factors from noisy or expected responses, and count saturated shots; see :func:`session_sums`."""
     (found,), saturated, _ = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
     return found, saturated
 
@@ -405,7 +396,6 @@ def estimate(
 def estimates(
     lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
 ) -> tuple[list[Estimate], int, CheckedSession]:
-    """Estimate factors from each kind of responses, with saturated shots and faults that noisy frames show."""
     session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
     drift = session.recipe.drift
     taken = SessionConditions(

@@ -53,8 +53,6 @@ def repeat_names(shot: tuple[str, int], exposure: int, repeat: int) -> Names:
 
 
 class KeptFrames:
-    """Frames of a ``session`` in a ``folder``, named by the order in which they are taken."""
-
     def __init__(self, session: Session, folder: Path) -> None:
         self._session, self._folder, recipe = session, folder, session.recipe
         largest = session.bench.sensor.largest_dn
@@ -147,7 +145,6 @@ class LitSession:
 
     @property
     def response_noise(self) -> float:
-        """Return the closed-form rms noise of a +-1 response [electrons / s]."""
         return float(np.sqrt(np.mean([self.response_variance(side).mean() for side in SIDES])))
 
     def response_variance(self, side: str) -> FloatArray:
@@ -361,6 +358,5 @@ class _Shot:
 
 
 def _chunks(rates: FloatArray) -> Iterator[slice]:
-    """Yield slices of rows that fit into the cache."""
     step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
     return (slice(start, start + step) for start in range(0, len(rates), step))

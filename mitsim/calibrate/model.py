@@ -135,7 +135,6 @@ def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
 
 
 def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
-    """Return noisy responses of a session, and their number of frames."""
     session, n = lit.session, lit.session.bench.n
     pairs, repeats, signs = session.pairs, session.recipe.repeats, session.signs
     chosen = modelling.used_patterns(_changes(signs), pairs, repeats)
@@ -369,8 +368,6 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
 
 
 class _Pass:
-    """Least-squares problem linearised near ``start``."""
-
     def __init__(self, camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str], start: Placement) -> None:
         self._camera, self._start, self._shown = camera, start, shown
         self.steps = {name: STEPS.get(name, GAIN_STEP * start.gain) for name in free}

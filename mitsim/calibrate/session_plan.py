@@ -310,8 +310,6 @@ def least_dose(quality: Callable[[float], float], wanted: float, smallest: float
 
 @dataclass(frozen=True, eq=False)
 class PredictedSession:
-    """Session with known noise-free ``sums``, by any recipe of its board and signed capture."""
-
     lit: LitSession
     sums: tuple[StripeSums, StripeSums]
 
@@ -328,7 +326,7 @@ class PredictedSession:
         return replace(lit, session=replace(lit.session, recipe=recipe), exposure_s=exposure)
 
     def estimate(self, lit: LitSession | None, draw: int = 0) -> Estimate:
-        """Estimate factors with drawn noise; ``lit`` None omits it, and equal numbers ``draw`` give equal noise."""
+        """Estimate factors with drawn noise; equal numbers ``draw`` give equal noise, and ``lit`` None gives none."""
         signs = self.lit.session.signs
         if lit is None:
             return factors_of_sums(*self.sums, signs, 0.0)
@@ -349,7 +347,7 @@ class PredictedSession:
 
 
 def _noisy(lit: LitSession, sums: StripeSums, draw: int) -> StripeSums:
-    """Return ``sums`` with noise of their responses' own, and with noise that all responses of a side share."""
+    """Add noise of each response, and noise that all responses of a side share."""
     own, shared = (
         np.broadcast_to(np.sum([*np.broadcast_arrays(*parts.values())], axis=0), lit.uniform_rate.shape)
         for parts in lit.response_variances(sums.side)

@@ -83,7 +83,6 @@ class CaptureList(Configuration):
 
 
 def load_capture_list(name: Path | str) -> CaptureList:
-    """Load a list by its shipped ``name``, or from a TOML or JSON file; MitsimError if it is missing or invalid."""
     path = configuration.locate(name, "calibration", ".toml", configuration.LIST)
     data = configuration.read_table(path, "list")
     for name_of_field, kind in _OTHERS.items():
@@ -101,8 +100,6 @@ def _from_folder(holder: Configuration, folder: Path, *names: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class Electronics:
-    """Identity and electronics of a camera; ``largest`` is None for real numbers."""
-
     name: str
     identity: dict[str, Any]
     digital: Digital
@@ -272,7 +269,6 @@ class FrameFacts(Options):
     seed: int | None = _said("root of every random stream", panel=configuration.QUALITY)
 
     def of(self, source: Path) -> RealCapture:
-        """Return the checked facts about ``source``; MitsimError as :meth:`RealCapture.check`, or unused options."""
         listed = CaptureList() if self.list is None else load_capture_list(self.list)
         bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
         if self.shape is None or not bare:

@@ -80,10 +80,7 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
 
 
 def measurements(shots: Capture) -> FloatArray:
-    """Return (K K', rows, columns) electrons a second of every pattern, row-major over (i, j).
-
-    Signed pairs are subtracted, other frames lose the ambient frame. MitsimError for a frame that cannot be read.
-    """
+    """Return (K K', rows, columns) electrons a second without ambient light, patterns row-major over (i, j)."""
     columns = shots.patterns[1].shape[1]
     frames = {each.row * columns + each.column: each.frame for each in shots.pattern_measurements()}
     return np.stack([frames[index] for index in sorted(frames)])
@@ -123,7 +120,6 @@ def label_capture(shots: Capture) -> Dataset:
 
 
 def label_factors(factors: Factors) -> Dataset:
-    """Label a camera's ``factors``, with positions on sensor and scene if known; MitsimError without xarray."""
     numbers: Labels = {
         name: ((axis, f"scene_{axis}"), side, _attributes("electron0.5 s-0.5", f"factor of the {axis}s"))
         for name, axis, side in (("left", "row", factors.left), ("right", "column", factors.right))
@@ -134,7 +130,7 @@ def label_factors(factors: Factors) -> Dataset:
 
 
 def label_image(image: Reconstruction, factors: Factors | None = None) -> Dataset:
-    """Label an image, and its uncertainty and depths if known; ``factors`` provide the positions of its pixels.
+    """Label an image; ``factors`` provide the positions of its pixels.
 
     MitsimError without xarray, and for factors of another number of pixels.
     """
@@ -172,7 +168,6 @@ def _dataset(title: str, numbers: Labels, places: Labels, facts: Mapping[str, An
 
 
 def _sensor_places(camera: Mapping[str, Any], shape: tuple[int, ...]) -> Labels:
-    """Return the centres of a frame's rows and columns on the sensor [mm], if ``camera`` states its pixels."""
     known, found = camera.get("geometry"), Labels()
     for letter, axis, count in zip("yx", ("row", "column"), shape, strict=True):
         if isinstance(known, Mapping) and "pixel_pitch" in known:
@@ -188,7 +183,7 @@ def _sensor_places(camera: Mapping[str, Any], shape: tuple[int, ...]) -> Labels:
 
 
 def _scene_places(factors: Factors) -> Labels:
-    """Return the centres of scene pixels on the calibrated plane [mm], if a calibration states its parallax."""
+    """Return the centres of scene pixels on the calibrated plane [mm], if known."""
     parallax, found = factors.manifest.parallax, Labels()
     if parallax is None:
         return found

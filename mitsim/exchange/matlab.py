@@ -61,10 +61,7 @@ class MatFile:
         return str(value.item())
 
     def array(self, name: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-        """Return an array in ``shape``, because MATLAB drops trailing axes of length 1.
-
-        MitsimError if it is missing, or does not have so many real numbers.
-        """
+        """Return an array in ``shape``, because MATLAB drops trailing axes of length 1, or raise MitsimError."""
         array = np.asarray(self.values.get(name))
         if array.dtype.kind not in "uif" or array.size != math.prod(shape):
             reported = f"is {array.dtype} of shape {array.shape}" if name in self else "is missing"
@@ -72,7 +69,6 @@ class MatFile:
         return array.reshape(shape, order="F")
 
     def matrix(self, name: str) -> FloatArray:
-        """Return a matrix of any size; MitsimError if it is missing or not real."""
         matrix = np.asarray(self.values.get(name))
         if matrix.ndim != 2 or matrix.dtype.kind not in "uif":
             reported = "no matrix of numbers" if name in self else "missing"
@@ -85,7 +81,6 @@ class MatFile:
         return as_channel((self.matrix(name) / scale).astype(np.float32), name, self.path)
 
     def by_line(self, names: Sequence[str]) -> dict[str, MatFile]:
-        """Return the variables of each line, by their names without the ending."""
         return {
             name: MatFile(
                 self.path, {key.removesuffix(end): each for key, each in self.values.items() if key.endswith(end)}
@@ -109,7 +104,6 @@ def variables_in(path: Path) -> dict[str, Any]:
     found = dict[str, Any]()
 
     def kind(dataset: h5py.Dataset) -> str:
-        """Return the class of an array at the file's root, or ""."""
         held = dataset.name.count("/") > 1 or dataset.dtype.kind not in "uif" or "MATLAB_empty" in dataset.attrs
         return "" if held else bytes(dataset.attrs.get("MATLAB_class", b"double")).decode("ascii")
 
@@ -131,7 +125,7 @@ _LONGEST_LINE = 31
 
 
 def endings(names: Sequence[str], path: Path) -> dict[str, str]:
-    """Return the endings of each line's variables, of letters, digits and _; "" for a run without lines.
+    """Return the endings of each line's variables; "" for a run without lines.
 
     MitsimError for a name that no variable can end in, or two that MATLAB does not distinguish.
     """
@@ -156,9 +150,8 @@ def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple
     """Write a run with the paper's variables, whole or not at all; return notes on omitted parts.
 
     With several lines, variables end in the line's name: `phi_left_638nm`. Behind colour filters only truths and
-    factors do, because the frames belong to all lines, and `weights` is (4, lines), the light that each filter passes.
-    MitsimError for a run that mixes whole shots and signed pairs, or is too large for such a file, and for lines whose
-    names cannot end a variable.
+    factors do, because the frames belong to all lines, and `weights` (4, lines) is the light that each filter passes.
+    MitsimError for a run that such a file cannot hold.
     """
     variables: dict[str, Any] = {}
 
@@ -228,11 +221,7 @@ def _run_variables(run: Packed[RunManifest]) -> dict[str, Any]:
 
 @contextmanager
 def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
-    """Read run and calibration in a MATLAB file of `mitsim export`.
-
-    With a ``channel`` the file is the calibration of a real FlatCam, and this plane, or `all`, is read. MitsimError for
-    an unknown or damaged file.
-    """
+    """Read a MATLAB file of `mitsim export`, or with a ``channel`` the calibration of a real FlatCam."""
     if channel is not None:
         yield None, flatcam_calibration(path, channel), ()
         return
@@ -333,7 +322,7 @@ def _calibration_in(own: MatFile, digital: Digital) -> Packed[CalibrationManifes
 
 
 def flatcam_calibration(path: Path, channel: str) -> Calibration:
-    """Return the factors of one plane of a real FlatCam, or of `all`, from its calibration file with `P1*` and `Q1*`.
+    """Return the factors of one plane of a real FlatCam, or of `all`, from its calibration file.
 
     The manifests' configuration holds the angle by which frames are turned first. MitsimError for a file without that
     plane, or with rows and columns exchanged.

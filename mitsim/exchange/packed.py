@@ -42,12 +42,8 @@ class Packed(Generic[Manifest]):
     ----------
     text
         Exact text of `manifest.json`; empty if only the model is known.
-    names
-        File names.
     read
         Function from a file name to channels, (rows, columns) each, and metadata.
-    place
-        Folder or file of origin, for messages.
     """
 
     manifest: Manifest
@@ -57,7 +53,7 @@ class Packed(Generic[Manifest]):
     place: Path
 
     def fill(self, folder: Path) -> None:
-        """Write all files into a ``folder`` that this process holds (:func:`mitsim.core.files.whole_folder`).
+        """Write all files into a ``folder`` that this process holds.
 
         The manifest keeps its text, except checksums of files whose bytes differ because of another OpenEXR or omitted
         channels.
@@ -84,8 +80,6 @@ class Content(manifests.Coloured, Generic[Manifest]):
     ----------
     parts
         Content of each line's folder by the line's name; of the folder itself by "".
-    colours
-        Lines, and filters if there are any; None without lines.
     text
         Exact text of its `colour.json`.
     truths
@@ -102,7 +96,6 @@ class Content(manifests.Coloured, Generic[Manifest]):
         return self.parts.get(name) or self.parts[""]
 
     def fill(self, folder: Path) -> None:
-        """Write all files into a ``folder`` that this process holds, colour.json last."""
         for name, part in self.parts.items():
             (folder / name).mkdir(exist_ok=True)
             part.fill(folder / name)
@@ -138,7 +131,6 @@ def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
 
 
 def run_content(folder: Path) -> Run:
-    """Return the content of a RUN folder, coloured, behind filters, or neither; MitsimError if it is not complete."""
     lines = manifests.open_lines(folder, manifests.RUN, manifests.MOSAIC)
     files = {name: folder / name / TRUTH for name in (lines.names if lines.filters else ())}
     truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
@@ -147,7 +139,6 @@ def run_content(folder: Path) -> Run:
 
 
 def calibration_content(folder: Path) -> Calibration:
-    """Return the content of a CAL folder, coloured or not; MitsimError if it is not complete."""
     lines = manifests.open_lines(folder, manifests.CALIBRATION)
     text = read_text(folder / manifests.COLOUR, MOST_BYTES) if lines.colours else ""
     return Content({name: pack_calibration(part) for name, part in lines.parts.items()}, lines.colours, text)
@@ -156,8 +147,7 @@ def calibration_content(folder: Path) -> Calibration:
 def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Metadata]]:
     """Yield every shot with its channels, (rows, columns) each, and metadata, read one at a time.
 
-    MitsimError for a shot without DN, or with other shape or channels than the first, because other formats use one
-    array.
+    MitsimError for a shot that does not have the shape and channels of the first, because other formats use one array.
     """
     first = ""
     for shot in run.manifest.patterns.captures:
@@ -196,10 +186,9 @@ def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
 
 
 def unpack_colours(text: str, kind: str, place: Path, beside: Sequence[str] = ()) -> ColourManifest:
-    """Return lines and filters from the ``text`` of a colour.json.
+    """Return lines and filters from the ``text`` of a colour.json; ``beside`` are names beside the lines' folders.
 
-    ``beside`` are names of files beside the lines' folders. MitsimError if the text is invalid, not of that ``kind``,
-    or names an impossible folder.
+    MitsimError if the text is invalid, not of that ``kind``, or names an impossible folder.
     """
     try:
         data = parse_json(text)
@@ -293,10 +282,7 @@ def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> 
 
 @contextmanager
 def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
-    """Open the folders in the file ``path``, coloured or not, while the context lasts.
-
-    MitsimError for a file that is missing, unknown or damaged, or leads to other files; and for a ``channel``.
-    """
+    """Open the folders in a file while the context lasts; MitsimError if it is unknown or unsafe."""
     path = Path(path)
     if channel is not None:
         raise ArgumentError("channel", f"{channel}: {path} has frames of one; leave it out")
@@ -393,7 +379,6 @@ def _frame_in(place: h5py.Group, name: str, path: Path) -> tuple[Channels, Metad
 
 
 def _metadata_in(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Value]:
-    """Return the metadata of a frame whose channels were read before."""
     # HDF5 reads zeros beyond the end of a file that was cut short after it was opened.
     if path.stat().st_size < texts.file.id.get_filesize():
         raise ValueError("it was cut short while it was read")

@@ -49,13 +49,11 @@ class Raster:
 
     @classmethod
     def of(cls, projector: str) -> Raster:
-        """Return the raster of a projector's name or TOML file; MitsimError if rows and columns are unknown."""
         path = locate(projector, "calibration", ".toml", PROJECTOR)
         return cls.of_projector(load_model(path, ProjectorModel).model_dump())
 
     @classmethod
     def of_projector(cls, model: Mapping[str, Any]) -> Raster:
-        """Return the raster of a projector's ``model`` in a run's manifest; MitsimError as :meth:`of`."""
         if not model:
             raise ArgumentError("projector", "is not known of a run of imported frames; give its name or file")
         rows, columns = model.get("rows"), model.get("columns")
@@ -72,9 +70,8 @@ def draw_family(
 ) -> dict[str, Any]:
     """Draw every shot of a family to a new folder, `patterns/` and `patterns.json`, whole or not at all.
 
-    ``closing`` adds a last picture for the closing frame. The result has `patterns`, `n`, `pictures`, `projector`
-    (rows, columns, and the grid's place) and `output`. MitsimError for an unknown family, or a projector of unknown or
-    too few pixels.
+    ``closing`` adds a picture for the closing frame. Returns `patterns`, `n`, `pictures`, `projector` and `output`.
+    MitsimError for an unknown family, or a projector of unknown or too few pixels.
     """
     family = parse_patterns(name, n, seed)
     names = [frame_name(index) for index in range(len(family.shots))]
@@ -88,10 +85,10 @@ def draw_family(
 
 
 def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, Any]:
-    """Draw every shot of a calibration session to a new folder, with `session.json`, the list of its frames.
+    """Draw every shot of a calibration session to a new folder, with a list of its frames.
 
-    The order is that of frames in `mitsim calibrate --frames`. Returns and raises as :func:`draw_family`; MitsimError
-    also if no Hadamard matrix has so many rows.
+    The order is that of `mitsim calibrate --frames`. Returns and raises as :func:`draw_family`; MitsimError also if no
+    Hadamard matrix has so many rows.
     """
     n, raster, signs = listed.n, Raster.of(projector), stripe_signs(listed.n)
     light, shots = [], []
@@ -109,10 +106,7 @@ def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, A
 
 
 def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> FrameList:
-    """Return the list of a calibration session's frames in the order of their names; MitsimError for invalid values.
-
-    ``signed_capture`` is `pair` or `uniform`: how a +-1 pattern is captured.
-    """
+    """Return the list of a session's frames in the order of their names; MitsimError for invalid values."""
     sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     digital = digital_of(sensor, check_exposure(exposure_s)).model_dump(exclude_none=True)
     stated = {"camera": {"name": sensor.name}, "n": n, "signed_capture": signed_capture, "digital": digital}
@@ -135,8 +129,8 @@ def draw(
 ) -> dict[str, Any]:
     """Write a picture for each of ``count`` shots, and a black and a white one, to `patterns/` in a folder.
 
-    ``light`` yields (n, n') of 0 and 1. Returns `rows`, `columns`, and the grid's place as :func:`grid_in`. MitsimError
-    if a cell would have no pixel, or the pictures take more than a day or the free memory.
+    ``light`` yields (n, n') of 0 and 1. Returns `rows`, `columns` and :func:`grid_in`. MitsimError if a cell would have
+    no pixel, or the pictures exceed a day or the free memory.
     """
     pixels = raster.rows * raster.columns
     cost = Cost(count * pixels * _SECONDS_PER_PIXEL, _PIXEL_BYTES * pixels)
@@ -194,7 +188,6 @@ def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any
 
 
 def describe_cells(where: Mapping[str, Any]) -> str:
-    """Return size, and shape on the scene, of a cell of the grid (see :func:`grid_in`)."""
     rows, columns, shape = where["cell"], where["cell_columns"], where["cell_shape"]
     size = f"{rows} pixels a side" if rows == columns else f"{rows} x {columns} pixels"
     if abs(math.log(shape)) > SQUARE:
@@ -221,7 +214,6 @@ def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
 
 
 def with_closing(pictures: Iterable[npt.NDArray[Any]], closing: ClosingKind | None) -> Iterator[npt.NDArray[Any]]:
-    """Yield the ``pictures``, then the first one again or a uniform one for a ``closing`` frame."""
     first = None
     for picture in pictures:
         first = picture if first is None else first
@@ -234,7 +226,6 @@ def with_closing(pictures: Iterable[npt.NDArray[Any]], closing: ClosingKind | No
 
 
 def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of `patterns.json` for a family, with the grid's place ``where`` from :func:`draw`."""
     shots = [
         {"file": name, "pattern": picture_name(index), **shot.model_dump(include={"row", "column", "sign"})}
         for index, (name, shot) in enumerate(zip(names, patterns.captures, strict=True))
@@ -260,10 +251,8 @@ _LARGEST = 2**16 - 1
 def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[str, ...]:
     """Write the frames of a run, and its patterns as pictures, to a new folder, whole or not at all.
 
-    The folder has `frames/`, `patterns/`, `patterns.json`, and `ambient.npy` for an ambient frame; for a coloured run,
-    a folder of each line with these, and colour.json. Returns notes on reading frames and on the size of cells.
-    MitsimError for digital numbers above 16 bits, patterns of other values than 0, 1 and -1, or a projector of unknown
-    or too few pixels.
+    Returns notes on reading frames and on the size of cells. MitsimError for digital numbers above 16 bits, patterns of
+    other values than 0, 1 and -1, or a projector of unknown or too few pixels.
     """
     rasters = {name: check_pictures(shots.manifest, projector, str(shots.place)) for name, shots in run.parts.items()}
     notes = [f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN"] if run.colours else []
@@ -304,7 +293,6 @@ def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[st
 
 
 def check_pictures(manifest: RunManifest, projector: str | None, place: str) -> Raster:
-    """Return the raster of a run's pictures; MitsimError if its projector or patterns cannot be drawn."""
     known = manifest.configuration.get("projector_model")
     own = known if isinstance(known, dict) else {}
     raster, sides = Raster.of(projector) if projector else Raster.of_projector(own), manifest.patterns.matrices

@@ -37,11 +37,10 @@ LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 
 
 def import_capture(source: Path, output: Path, known: RealCapture, command: str | None = None) -> dict[str, Any]:
-    """Write the RUN folder of a real capture, whole or not at all.
+    """Write the RUN folder of a real capture, whole or not at all, and return the output of the command line.
 
-    Returns the output of the command line: `frames`, `shape`, `output`, `calibration_output` (None), `holds`,
-    `left_out`, `divided_by`, `planes`, `notes`, `warnings`. MitsimError for invalid values, frames that are missing,
-    too many, unlike each other or beyond the camera's range, or a place that holds something.
+    MitsimError for invalid values, frames that are missing, too many, unlike each other or beyond the camera's range,
+    or a place that holds something.
     """
     known.check(source)
     files = image_files(source, known.wanted)
@@ -129,10 +128,7 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
 
 
 def _range_check(path: Path, frame: Numbers, camera: Electronics) -> Callable[[int, bool], None]:
-    """Return a function that raises MitsimError if a frame's numbers, divided by a factor, exceed the camera's range.
-
-    The numbers of a mean frame need not be whole.
-    """
+    """Return a function that raises MitsimError if numbers, divided by a factor, exceed the camera's range."""
     largest, low, high, kind = camera.largest, float(frame.min()), float(frame.max()), frame.dtype
     whole = kind.kind != "f" or np.array_equal(frame, np.rint(frame))
     cause = "they were scaled, or the camera is another; save them as they are, or give the right camera file"
@@ -165,10 +161,7 @@ def _range_check(path: Path, frame: Numbers, camera: Electronics) -> Callable[[i
 
 
 class _Plane:
-    """One plane of a mosaic by its name, or by "" the whole picture: its calibration, patterns and frames.
-
-    The calibration of the same camera states its identity, the frames' shape and the projector's pixels.
-    """
+    """One plane of a mosaic, or by the name "" the whole picture; a calibration states identity, shape and pixels."""
 
     def __init__(self, known: RealCapture, camera: Electronics, name: str) -> None:
         self.known, self.camera, self.name = known, camera, name
@@ -207,10 +200,7 @@ class _Plane:
         first: Numbers,
         command: str | None,
     ) -> tuple[Packed[RunManifest], tuple[int, ...], int]:
-        """Return the run, the shape of its frames, and the number of uncorrected pixels (too little response).
-
-        ``places`` has file and page of each shot, ``first`` the numbers of the first frame.
-        """
+        """Return the run, the shape of its frames, and the number of pixels with too little response."""
         known, camera, listed, captures = self.known, self.camera, self.known.listed, self.patterns.captures
         preparer = Preparer.of(how, camera.digital, known.wanted)
         kind = np.uint32 if camera.largest is not None and preparer.counts else np.float32
