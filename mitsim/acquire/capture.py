@@ -67,8 +67,6 @@ _NEGLIGIBLE = 0.1
 
 
 class Light(SampledLight):
-    """Sampled light of one scene, ready to be exposed."""
-
     @takes(Request, without="patterns")
     def expose(
         self,
@@ -77,19 +75,10 @@ class Light(SampledLight):
         job: Job | None = None,
         **request: Unpack[ExposureKeys],
     ) -> Capture:
-        """Expose one noisy frame for each shot of the family ``patterns``.
+        """Expose one noisy frame for each shot of the family ``patterns``; ``output`` None keeps them in memory.
 
-        Parameters
-        ----------
-        output
-            Folder for the frames; None keeps them in memory.
-        job
-            Clock, progress and limits.
-
-        Raises
-        ------
-        MitsimError
-            For patterns that do not fit, an output that cannot be written, or a field that needs other light.
+        Raises MitsimError for patterns that do not fit, an output that cannot be written, or a field that needs other
+        light.
         """
         return expose(self, patterns, output, job, **Request(**request).given)
 

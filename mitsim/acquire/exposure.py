@@ -81,7 +81,6 @@ class Exposer:
         return saturated_pixels(digital, electrons, self.exposure_s, self.devices.sensor) > 0
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
-        """Yield the noisy measurement [electrons/s] of every pattern (i, j), from two frames if signed."""
         positive: FloatArray | None = None
 
         def measure(item: tuple[Shot, Frame]) -> FloatArray:
@@ -106,8 +105,6 @@ def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
 
 @dataclass(frozen=True)
 class NoiseTarget:
-    """Monte Carlo error below which more sampling gains nothing: a ``fraction`` of the sensor's relative noise."""
-
     devices: Devices
     exposure: Exposure
     fraction: float
@@ -213,8 +210,6 @@ def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames)
 
 @dataclass(frozen=True)
 class Totals:
-    """Brightest pixel [W m^-2], relative Monte Carlo error and largest negative light over all expected frames."""
-
     peak: float
     mc_error: float
     removed: float

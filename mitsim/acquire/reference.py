@@ -195,7 +195,6 @@ def render(
     effects: Mapping[str, bool] | None = None,
     job: Job | None = None,
 ) -> Rendered:
-    """Render one frame of a bench under its own light; see :meth:`mitsim.api.bench.Bench.render`."""
     job = job or Job()
     spp = _samples(bench, estimator, spp)
     check_accuracy(accuracy)

@@ -87,7 +87,6 @@ class SpectralBench:
 
     @property
     def readings(self) -> tuple[Apparatus, ...]:
-        """Return the bench of each run of frames: all lines behind colour filters, else each line."""
         return (self.whole,) if self.whole.filters else self.benches
 
     def read(self, lights: Sequence[SampledLight]) -> Sequence[SampledLight]:
@@ -137,7 +136,6 @@ class SpectralBench:
 
         Discretisation errs most for such light. Of equal lines the longest is the worst because its fringes are the
         widest.
-        ``lit`` is the part of the pixels that a shot lights on average.
         """
         bench, count = self.whole, len(self.benches)
         simulation = Simulation(bench, Settings(bench.geometry.scene_distance, effects=frozenset({"ambient"})))
@@ -287,10 +285,6 @@ def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames
 
 
 def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
-    """Return the ratio of the error of lamps' light behind filters to that of their mean over all pixels.
-
-    The few wavelengths of a filter are sampled worse than all.
-    """
     light, counted_lamps = lights[0], lights[0].bench.counted_lamps
     if counted_lamps is None or counted_lamps.shares is None:
         return 1.0
@@ -509,8 +503,6 @@ def _runs(bench: Apparatus) -> dict[str, int]:
 
 
 class _ColourPilot(Generic[Opened]):
-    """Frames of few rays by candidate, in electrons up to a common factor."""
-
     def __init__(self, bench: Opened, request: Request) -> None:
         family = bench.family(request.patterns, request.seed).lighting
         shots = len(family.weights)

@@ -99,8 +99,6 @@ FIXED = UnitCosts(
 
 @dataclass(frozen=True)
 class Numbers:
-    """Numbers of settings that cost depends on, of one choice or of (m,) choices; the first six are chosen."""
-
     anchors: Number
     layers: Number
     cells: Number
@@ -147,7 +145,6 @@ def in_waves(effects: frozenset[str]) -> bool:
 
 
 def sample_costs(pilot_result: PilotResult, effects: frozenset[str]) -> dict[str, SampleCost]:
-    """Return the cost of each pass that ``effects`` require; connections are those to one anchor."""
     found = ((name, pilot_result.sample_costs[name]) for name in PASSES if name in pilot_result.sample_costs)
     return {name: sample_cost for name, sample_cost in found if PASSES[name].called_for(effects)}
 
@@ -261,10 +258,7 @@ def traced_for(lines: int, parted: bool = False) -> float:
 
 
 def predicted_rays(pixels: int, samples: float, rate: float) -> float:
-    """Return the rays of the truth for both fluxes (:mod:`mitsim.light.truth`).
-
-    ``samples`` are those of each group of direct light for a pixel; its error falls with their power ``rate``.
-    """
+    """Return the rays of the truth for both fluxes (:mod:`mitsim.light.truth`)."""
     first = TRUTH_GROUPS * pixels * (TRUTH_SAMPLES + BOARD_SAMPLES)
     wanted = _ALLOTTED * GROUPS * pixels * samples * float(TRUTH_PART ** (-1 / rate))
     return min(first + wanted, max(MOST_RAYS, MOST_SAMPLES * pixels))
@@ -404,7 +398,6 @@ _MOST_BYTES = 2.0**32
 
 
 def cells_to_choose(geometry: CameraGeometry, spectrum: Spectrum | None) -> tuple[int, ...]:
-    """Return the raster cells for each pixel that a plan may choose, fewest first."""
     fewest = cells_per_pixel(geometry)
 
     def holds(cells: int) -> bool:

@@ -130,7 +130,6 @@ class SampledLight:
         return self.simulation.bench
 
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
-        """Return the expected frames of some shots; raise ValueError if they split a class of the light."""
         rows = self.rows_of(lighting)
         probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
         return expected_of([(self.simulation, self.groups)], rows, lighting, seed, leaking, probed, self.restated)
@@ -175,7 +174,6 @@ class SampledLight:
 
     @property
     def truth(self) -> FloatArray:
-        """Return the apparent reflectance (n, n), where a calibration board of reflectance 0.99 counts as 1."""
         return self.apparent.reflectance
 
 
@@ -204,10 +202,7 @@ def trace_lines(
     sampling: Sampling | None = None,
     progress: Progress = silent,
 ) -> list[SampledLight]:
-    """Trace each line's light from shared paths until the frames of every line meet the target.
-
-    ``benches`` has the bench with each line alone, or ``bench`` itself if lines are not separated.
-    """
+    """Trace each line's light from shared paths until the frames of every line meet the target."""
     sampling = sampling or Sampling()
     simulation = Simulation(bench, plan.settings)
     own = [simulation if each is bench else Simulation(each, plan.settings) for each in benches]
@@ -353,8 +348,7 @@ def _some(lighting: Lighting, count: int) -> Lighting:
 def _error_growth(light: SampledLight, lighting: Lighting, checked: Lighting) -> tuple[float, float]:
     """Return the growth of the error, and of its bound, from the checked shots to all shots.
 
-    The groups' differences in total light show a heavy path that no checked shot sees. Growth within chance counts as
-    1.
+    The groups' differences in total light show a heavy path that no checked shot sees.
     """
     rows = np.zeros(int(light.labels.max()) + 1, dtype=np.int64)
     rows[light.labels] = lighting.labels

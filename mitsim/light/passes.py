@@ -256,8 +256,7 @@ PassTracer = DirectTracer | IndirectTracer | FromCamera
 class Tracers(Grids):
     """Tracers of a bench with settings.
 
-    ``divides`` divides light that shading normals make heavy between both sides. It is off for a short pilot, which
-    would meet few paths of the camera's part.
+    ``divides`` divides light that shading normals make heavy between both sides; it is off for a short pilot.
     """
 
     divides = True

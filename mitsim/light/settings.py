@@ -49,8 +49,7 @@ class Estimate(NamedTuple):
 class SharpPixels:
     """Projector pixels whose direct light comes over lobes too sharp for the anchors of all others.
 
-    ``window`` has first and last tan-angle of their light along rows, then along columns; ``left`` is the error of
-    interpolation between their anchors, relative to all light.
+    ``window`` has first and last tan-angle of their light along rows, then along columns.
     """
 
     pixels: tuple[Index, ...]
@@ -156,7 +155,6 @@ class Noise:
 
     @classmethod
     def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
-        """Measure the noise of one of several replicates ``seen`` (replicates, ...), relative to the norm ``light``."""
         energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
         mean = float(energies.mean())
         spread = float(energies.var(ddof=1)) / mean**2 if mean else 0.0

@@ -1,7 +1,7 @@
 """Apparent reflectance, the image that a perfect reconstruction shows, with its standard error.
 
-It is each projector pixel's flux of direct light toward the sensor over that of the calibration board. Both fluxes have
-random streams of their own, so that an error of the frames is never an error of the truth.
+It is each projector pixel's flux of direct light toward the sensor over that of the calibration board, with its own
+random streams, so that an error of the frames is never an error of the truth.
 """
 
 from __future__ import annotations

@@ -59,9 +59,8 @@ _SETTLED = 8
 class Candidate:
     """Settings with their predicted error and work.
 
-    ``systematic`` is the error of all that is left out or made coarse, and ``lacking`` the light in it that is known to
-    be missing, by its cause. Sampling may stop at the Monte Carlo error ``target``. ``fits`` ignores errors that no
-    choice avoids. ``work`` is in seconds at fixed unit costs.
+    ``systematic`` is the error of all that is left out or made coarse, and ``lacking`` the missing light in it, by its
+    cause. ``fits`` ignores errors that no choice avoids. ``work`` is in seconds at fixed unit costs.
     """
 
     settings: Settings
@@ -122,7 +121,6 @@ class Candidates:
         return self._chosen[accuracy, sure]
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
-        """Return seconds of the choice and its truth, and True if it keeps ``accuracy``."""
         found = self.best(accuracy)
         truth = cost_model.truth_seconds(self.pilot_result, found.settings, cost_model.FIXED)
         return float(found.work[found.best]) + truth, bool(found.fits[found.best])

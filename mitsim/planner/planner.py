@@ -175,7 +175,6 @@ def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: choose.Candidate
 def _with_heavy_paths(
     runs: pilot.PilotRuns, accuracy: float, chosen: choose.Candidate, switches: Mapping[str, bool]
 ) -> tuple[PilotResult, choose.Candidate]:
-    """Return the pilot result and choice with samples for rare heavy paths, which a run's first samples may miss."""
     plain = cost_model.tracing_seconds(runs.pilot_result, chosen.settings, cost_model.FIXED)
     paths = _HEAVY_PATHS
     while True:

@@ -283,7 +283,6 @@ class ProjectorConnector:
     def hit(
         self, ray: mi.Ray3f, reach: mi.Float, rng: mi.PCG32, active: mi.Bool, since: mi.Float | float = 0.0
     ) -> LensHit:
-        """Return the random rays that meet the finite lens before they meet the scene at ``reach``."""
         inverse = self._to_world.inverse()
         origin, direction = inverse @ ray.o, inverse @ ray.d
         distance = -origin.z / direction.z

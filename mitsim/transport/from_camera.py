@@ -313,8 +313,6 @@ class LampResponse:
 
 
 class LampTracer(FromCameraTracer):
-    """Light of lamps at its own wavelengths; band b has the pixel number n^2 + b."""
-
     of_projector = False
     by_line = True
 

@@ -60,7 +60,6 @@ class LeftOut:
         return cls(*np.zeros((4, 0)))
 
     def unseen(self, fewest: float, of_lens: float) -> tuple[float, int | None]:
-        """Return the irradiance that is not measured, and the shape of its largest part."""
         light = np.where(self.lens_hits < of_lens, self.mirrors, 0) + np.where(self.hits < fewest, self.lobes, 0)
         return float(light.sum()), int(np.argmax(light)) if light.any() else None
 
@@ -121,10 +120,7 @@ class _Landed:
     def light(
         self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum, mi.UInt32]:
-        """Return the radiance that surfaces send on of the light in their cubes, one ray of each drawn for all.
-
-        The radiance of a lens of 1 mm^2 in the pinhole's place, and the mirror, follow.
-        """
+        """Return the radiance that surfaces send on of the light in their cubes, one ray of each drawn for all."""
         code = _cube(si.p, self.side)
         first, end = (dr.gather(mi.UInt32, self.first, code + step, active) for step in (0, 1))
         count = mi.Float(end - first)
@@ -228,10 +224,7 @@ _ON_BALL = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Highlights:
-    """Light of glossy balls on the sensor's centre without the mask, by spot.
-
-    ``moments`` are those of the light of one ray of every projector pixel [W^2 m^-4].
-    """
+    """Light of glossy balls; ``moments`` are those of the light of one ray of every projector pixel [W^2 m^-4]."""
 
     pixels: Labels
     irradiance: FloatArray
@@ -400,10 +393,7 @@ class SharpLight:
 
 @keep_scenes()
 def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
-    """Estimate direct light over lobes too sharp for connections.
-
-    Pixels whose light few rays find, pixels that connections find, and their neighbours get as many rays once more.
-    """
+    """Estimate direct light over lobes too sharp for connections."""
     n, paths_per_sample = setup.projector.n, setup.projector.n**2
     lobes = _Lobes(setup)
     first = lobes.trace(np.arange(paths_per_sample), seed, 0, -(-samples // _FEWER), _WIDER)

@@ -113,7 +113,6 @@ class ReusedPaths(ProjectorPaths):
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
     def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        """Return the light of each pixel's own paths on the host; that of pairs goes into an accumulator."""
         own, count = self._own(), dr.width(self.lit) * MEMBERS
         if accumulator is not None:
             self._accumulate(accumulator)

@@ -202,7 +202,6 @@ class Bundle:
         return len(self.depths) * self.anchors**2 * self.cells[0] * self.cells[1]
 
     def accumulate(self, path_samples: PathSamples, labels: IntArray, samples: int = 1) -> sparse.csr_array:
-        """Return the light (C + lamps, size) of C classes and of lamps, per sample, without that :meth:`outside`."""
         flat, values, pixel = self.entries(path_samples, samples)
         count = int(labels.max()) + 1
         shape = (count + self.lamps, self.size)

@@ -91,10 +91,7 @@ def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> 
 
 
 def turned_by_mirrors(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics) -> Rays:
-    """Return the rays that mirrors have turned, before each surface, for a grid over the window.
-
-    Instead of a spectrum they have their flux [W m^-2 mm^2], and that of 1 mm^2 at unit distance.
-    """
+    """Return the rays that mirrors have turned, before each surface, for a grid over the window."""
     parts = list[Rays]()
     for each in projector.per_wavelength:
         tracer = SpecularRays(scene, camera, each, _MIRRORS)
@@ -263,7 +260,6 @@ def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
 
 
 def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> tuple[Beams, IntArray]:
-    """Convert undivided squares to beams without extent, one at each node (q, 3, 3) that meets the sensor."""
     seen = nodes.valid & (np.abs(nodes.sensor) < geometry.half_width).all(axis=-1)
     seen &= (np.abs(nodes.tangent) <= geometry.tan_half_fov).all(axis=-1)
     light = _SHARES * nodes.throughput * flux[:, None, None]
@@ -290,10 +286,7 @@ def _spread(nodes: _Nodes, before: FloatArray) -> FloatArray:
 
 
 def _near(nodes: _Nodes, spread: FloatArray, geometry: CameraGeometry) -> Mask:
-    """Return (q,) True for squares that may light the sensor within the field stop.
-
-    A whole square bulges by its curvature; one that a rim cuts may be as large as the ``spread`` (q, 2) of its parent.
-    """
+    """Return (q,) True for squares that may light the sensor within the field stop."""
     sine = geometry.tan_half_fov / np.hypot(1, geometry.tan_half_fov)
     whole = nodes.valid.all(axis=(1, 2))
     near = nodes.valid.any(axis=(1, 2))
@@ -359,7 +352,6 @@ class _Spots:
 def first_squares(
     mirrors: Sequence[mi.Shape], rays: PinholeRays, n: int, coarse: int, more: Sequence[Boxes] = ()
 ) -> Iterator[tuple[int, IntArray, IntArray]]:
-    """Return squares that tile the window, small where small mirrors are seen: size, first rows and first columns."""
     size = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(coarse / n)))))
     line = np.arange(0, n * _UNIT, size)
     row, column = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))

@@ -59,8 +59,6 @@ class Crossings:
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays under way, (k, .) each; ``mirror`` numbers the last surface that turned the ray, 0 for none."""
-
     index: IntArray
     mirror: IntArray
     origin: FloatArray

@@ -101,7 +101,6 @@ class Passage:
         return dr.max(part) > 0, part
 
     def along(self, ray: mi.Ray3f, light: mi.Spectrum, state: State, visit: Callable[[Arrival, State], State]) -> State:
-        """Return the state after ``visit`` of every surface on the way of each ray, up to the first opaque one."""
         if not self.open:
             si = self.scene.ray_intersect(ray, mi.RayFlags.All, True)
             return visit(Arrival(si, ray.d, light, si.is_valid()), state)
@@ -380,8 +379,6 @@ _MOST = 16
 
 @dataclass(frozen=True)
 class Contact:
-    """Shape that lets light through, its distance to the nearest surface, and the least allowed [mm]."""
-
     shape: int
     gap: float
     least: float
@@ -395,7 +392,6 @@ class Contact:
 
 
 def contacts(scene: mi.Scene) -> tuple[Contact | None, Contact | None]:
-    """Return a contact that the factored estimator cannot render, and one for the reference; None if there is none."""
     shapes = [shape for shape in scene.shapes() if shape.bsdf() is not None]
     clear = [shape for shape in shapes if lets_through(shape.bsdf())]
     found: list[Contact | None] = [None, None]

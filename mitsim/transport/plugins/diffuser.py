@@ -59,11 +59,7 @@ def random_relief(side_mm: float, correlation_mm: float, slope: float, seed: int
 
 @dataclass(frozen=True, eq=False)
 class Diffuser:
-    """Sheet of an index at a distance [mm] before a sensor.
-
-    By default the caustics fill as much of 300 x 400 pixels of 23.4 um as the public point spread function of
-    DiffuserCam.
-    """
+    """Sheet of an index at a distance [mm] before a sensor; its caustics resemble those of DiffuserCam."""
 
     relief: Relief = field(default_factory=lambda: random_relief(6.0, 0.35, 0.05, 0))
     index: float = 1.5
@@ -116,7 +112,7 @@ def point_spread(
 ) -> FloatArray:
     """Return the irradiance (rows, columns) of a distant point behind a diffuser, over that before it.
 
-    ``tilt`` has tangents of the light's direction; ``rays`` is the number along an axis, one at random in each cell.
+    ``tilt`` has tangents of the light's direction; ``rays`` is the number along an axis.
     """
     scene, side = diffuser.scene(), diffuser.relief.side_mm
     rows, columns = shape
