@@ -46,13 +46,9 @@ if TYPE_CHECKING:
     from mitsim.bench.request import ExposureKeys
 
 _FIREFLIES = 0.72
-"""Part of the variance in one of four groups above which single paths dominate: a heavy path gives 0.75, ordinary noise
-0.3 to 0.5.
-"""
+"""Part of the variance in one of four groups above which single paths dominate (heavy path 0.75, noise 0.3 to 0.5)."""
 _DROWNED = 1.0
-"""Ratio of noise to the projector's light at which ambient light exhausts the dynamic range: 49 dots of lamp_bench give
-29 dB at 0.03, 17 dB at 0.3, and 12 dB at 3.
-"""
+"""Ratio of noise to the projector's light at which ambient light exhausts the dynamic range (12 dB at 3)."""
 _DILUTED = 10.0
 """Error relative to the projector's light, over the accuracy, from which a run is flagged."""
 _NOISIER = 2.0
@@ -67,6 +63,8 @@ _NEGLIGIBLE = 0.1
 
 
 class Light(SampledLight):
+    """Sampled light of one scene, ready to be exposed."""
+
     @takes(Request, without="patterns")
     def expose(
         self,

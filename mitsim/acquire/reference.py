@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from mitsim.scene.load import LoadedScene
 
 _SAMPLERS = ("IndependentSampler", "OrthogonalSampler")
-"""Samplers without correlated dimensions. Others of Mitsuba 3.9.1 permute few strata by a hash: some pairs of a path's
-numbers correlate by 0.8 (stratified), 0.26 (ldsampler) and 0.15 (multijitter) at 4 samples per pixel.
-"""
+"""Samplers without correlated dimensions; others of Mitsuba 3.9.1 correlate pairs by 0.15 to 0.8."""
 _SAMPLES = 64
 """Default samples per pixel, as in the shipped scenes."""
 _UNKNOWN = 1.0

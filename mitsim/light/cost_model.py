@@ -44,18 +44,15 @@ ROUNDS, CHECKED_SHOTS = 1.5, 16
 """Rounds of sampling, one or two (followed light takes one more), and shots whose error each round checks if there are
 many: their errors differ by a few percent, and each takes time."""
 MOST_CHECKED = 64
-"""Checked shots where light is followed over several surfaces, because heavy paths strike single shots (cookie_bag at
-1e-3 met its target in eight of 49, and not in all); also the most classes from whose frames all shots are formed."""
+"""Checked shots of followed light, whose heavy paths strike single shots; most classes that form all shots."""
 _CHECK = 0.4
 """Ratio of the time of checking a frame's error to that of forming it: 0.36 in corner, 0.44 in cookie_bag."""
 MIXING = "black-level"
 """Effect that lights every pixel in every shot, so that shots are no longer single classes."""
 _SPLIT, _EDGES = 2.0, 2.0
-"""Most layers that share the light of one depth, and the factor of a pixel's cells that its light lies in at an edge or
-at another depth than the cells are aligned at (measured: 1.6)."""
+"""Most layers that share the light of one depth, and the factor of a pixel's cells at an edge (measured: 1.6)."""
 _GEOMETRIC_ENTRIES, _MANY_ENTRIES = 0.03, 1.2
-"""Ratio of an entry of a geometric shadow of few or many terms to one of a wave-optical shadow: a sum over features
-instead of samples of a field."""
+"""Ratio of an entry of a geometric shadow of few or many terms to one of a wave-optical shadow."""
 _CELL_S = 5e-8
 """Time of a cell of a raster on which waves are squared, which is sharpened and searched for its largest terms."""
 _FURTHER_LINE = 0.2
@@ -68,16 +65,13 @@ SHARED_COST = 6
 TRUTH_PART = 1 / 6
 """Error of the truth relative to that of the frames' own sampling in any image: it adds at most 0.12 dB."""
 TRUTH_GROUPS = 4
-"""Independent estimates of the truth, whose spread is its standard error. An edge's error falls faster with the samples
-of one estimate than with the number of estimates: four need 0.7 of the rays of eight."""
+"""Independent estimates of the truth, whose spread is its standard error; four need 0.7 of the rays of eight."""
 TRUTH_SAMPLES, BOARD_SAMPLES = 16, 8
-"""First samples for each pixel and group. 64 in all show all but a corner of a hundredth of a pixel; a board has no
-corners."""
+"""First samples for each pixel and group; 64 in all show all but a corner of a hundredth of a pixel."""
 MOST_RAYS, MOST_SAMPLES = 2**22, 128
 """Most rays of each flux, or samples for each pixel if that is more: 1.5 s on two cores."""
 _ALLOTTED = 0.5
-"""Part of the rays that the truth takes because its pixels are sampled where that helps most (photograph 0.5,
-gift_card 0.3)."""
+"""Part of the rays that the truth needs, because samples go where they help most (photograph 0.5, gift_card 0.3)."""
 
 
 @dataclass(frozen=True)

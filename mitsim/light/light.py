@@ -34,12 +34,10 @@ from mitsim.transport.records import DeviceSums, PathSamples
 Target = Callable[[ExpectedFrames], float]
 """Relative Monte Carlo error at which sampling stops, from the frames so far."""
 _TOLD, _OF_HEAVY = 1.2, 0.55
-"""Ratio of bound and error beyond which a few heavy paths dominate both (1.04 to 1.3 for four groups of many paths).
-The bound then falls with the paths to the power 0.8 to 0.93 instead of 0.5 (cookie_bag, seeds 2 and 4)."""
+"""Ratio of bound and error beyond which few heavy paths dominate both; the bound then falls with power 0.8 to 0.93."""
 _VIEW_SAMPLES = 64
 _LOST = 0.1
-"""Part of the accuracy that light beyond all cells may take. A hundredth of the pixels may have all of it, and be wrong
-by ten times as much."""
+"""Part of the accuracy that light beyond all cells may use; a hundredth of the pixels may have all of it."""
 _BY_CHANCE = 1.5
 """Ratio of variances over 49 and 16 shots that four groups of equal shots exceed once in fifty (20000 trials)."""
 
@@ -130,6 +128,7 @@ class SampledLight:
         return self.simulation.bench
 
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
+        """Return the expected frames of some shots; raise ValueError if they split a class of the light."""
         rows = self.rows_of(lighting)
         probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
         return expected_of([(self.simulation, self.groups)], rows, lighting, seed, leaking, probed, self.restated)
@@ -163,6 +162,7 @@ class SampledLight:
 
     @check_arguments
     def speckle(self, family: PatternFamily | None = None) -> float:
+        """Return the contrast of speckle in frames of a family (None for a white picture); 0 if speckle is off."""
         return self.bench.speckle(family) if self.simulation.physics.speckle else 0.0
 
     def merge(self) -> SampledLight:
@@ -174,6 +174,7 @@ class SampledLight:
 
     @property
     def truth(self) -> FloatArray:
+        """Return the apparent reflectance (n, n), where a calibration board of reflectance 0.99 counts as 1."""
         return self.apparent.reflectance
 
 
@@ -438,11 +439,9 @@ _LEAST_LESS, _MOST_LESS = 1.1, 6.0
 _BEYOND = 1.05
 """Variance permitted by the error over the aim, so that another round is rare."""
 _UNEVEN = 1.2
-"""Variance of 3 * 2^k samples over that interpolated from 2^k (power 1.5): 0.49 to 0.70 measured, and 0.36 for doubling
-(cookie_bag, metal_blade)."""
+"""Variance of 3 * 2^k samples over that interpolated from 2^k (measured: 0.49 to 0.70; 0.36 for doubling)."""
 _FIRST = 0.8
-"""Part of the predicted samples in the first round of followed light. At 0.7 the corner needed a second round, whose
-check costs 4 to 17 % of the time."""
+"""Part of the predicted samples in the first round of followed light; at 0.7 the corner needed a second round."""
 
 
 def first_samples(simulation: Simulation) -> dict[str, int]:

@@ -122,6 +122,7 @@ class Plan:
 
     @check_arguments
     def row(self, name: str) -> PlanRow:
+        """Return the row of the effect or number ``name``; raise MitsimError if there is none."""
         rows = {row.name: row for row in self.effects}
         if name not in rows:
             raise MitsimError(f"plan: no row {name!r}; there are {', '.join(rows)}")

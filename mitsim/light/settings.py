@@ -21,16 +21,13 @@ Count = Annotated[int, Field(ge=1, le=4096)]
 Index = Annotated[int, Field(ge=0, lt=4096**2)]
 """Number of a projector pixel in a plan's file."""
 GROUPS = 4
-"""Independent estimates of the light, whose spread is the Monte Carlo error. Four measure it as well as more do
-(docs/physics.md), and each must be accumulated, formed and probed."""
+"""Independent estimates of the light, whose spread is the Monte Carlo error (four suffice: docs/physics.md)."""
 PATHS_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 FOLLOWED_WIDTH = 4
-"""Projector pixels along a cell for followed light beyond its mean, which is little light of many anchors. If coarse
-light has finer cells, so has this."""
+"""Projector pixels along a cell for followed light beyond its mean, which is little light of many anchors."""
 CELLS_OF_COARSE = 4
-"""Fine cells along a cell of coarse light with all layers: at accuracies of 1e-3 and above there is then one cell a
-projector pixel, at 3e-4 two along an axis."""
+"""Fine cells along a cell of coarse light with all layers: one cell a projector pixel at accuracies from 1e-3."""
 MOST_PATHS = 2**32
 """Paths at which sampling stops and is flagged: half an hour on two cores."""
 
@@ -132,11 +129,9 @@ _AT_ONCE = 2**13
 REPLICATES = 4
 """Independent replicates of the pilot, the fewest whose spread is a usable standard error."""
 SURE = 2.35
-"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``REPLICATES`` - 1 degrees of
-freedom."""
+"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``REPLICATES`` - 1 degrees."""
 RASTER_RATE = 1.5
-"""Power of the cells along a pixel with which a raster's error falls: from 6 to 12 cells, in frames of dots, 1.4 (a
-picture of light) to 2.9 (a mask turned by 0.3 degrees)."""
+"""Power of the cells along a pixel with which a raster's error falls (measured from 6 to 12 cells: 1.4 to 2.9)."""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from mitsim.transport.direct import FluxTracer, IntArray
 _FINEST = 1e-4
 _BOARD_PART = 0.5
 _RATE = 2.0
-"""Power of the samples with which a pixel's variance falls: 1 for random points, 2 about an edge, 3 over smooth
-light."""
+"""Power of the samples with which a pixel's variance falls: 1 random, 2 about an edge, 3 over smooth light."""
 _ANYWHERE = 0.01
 _AIM = 0.98
 _DOUBLINGS, _AT_ONCE = 8, 4

@@ -45,13 +45,11 @@ _AS_GOOD = 1.1
 _ONE_HIT = 0.25
 """Part of the Monte Carlo error that one hit of a small target may be."""
 _OFF_BY_HITS = Estimate(0.75, 1.5)
-"""Error of a small target's light [hits in a group] that the spread of groups does not show: root mean square of 40
-runs with 400 to 1600 hits, and twice that."""
+"""Error of a small target's light [hits in a group] beyond the spread of groups: rms of 40 runs, and twice that."""
 _BOUND_OVER_ERROR = 1.1
 """Ratio of the 95 % bound, by which sampling stops, to the error (measured: 1.04 to 1.3)."""
 _UNEVEN_GROUPS = 2.717430025
-"""Growth of the squared bound over the error's per relative deviation of the groups' noise: Student's 95 % quantile for
-four groups times (4/3)^(1/2)."""
+"""Growth of (bound / error)^2 per relative deviation of the groups' noise: Student's 95 % of 4 groups x (4/3)^(1/2)."""
 _SETTLED = 8
 
 

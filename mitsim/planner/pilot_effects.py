@@ -42,8 +42,7 @@ from mitsim.transport.records import PathSamples
 _JUDGE = 2
 _AT_ONCE = 2**20
 _AS_ROUGH = 15.0
-"""Limit of the change by one cell, or layer, of what a few anchors see beyond their mean, over that of all their light;
-and of indirect over direct light (measured: at most 9)."""
+"""Limit of the change by one cell or layer of light beyond its mean over all, or indirect over direct (at most 9)."""
 _FAINT = 0.6
 _FOLLOWED_JUDGE = 1
 _FOLLOWED = tuple(name for name, row in PASSES.items() if not (row.even or row.anchors))

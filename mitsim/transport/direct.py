@@ -24,8 +24,7 @@ from mitsim.transport.transmission import Arrival
 
 IntArray = npt.NDArray[np.int64]
 _LOBE = 2.0**8
-"""Bright light over a board's. Mitsuba's sharpest lobe (roughness 1e-4) is 2.5e7 times as bright as a board;
-accumulators hold 2^22 times bright light, 40 times that."""
+"""Bright light over a board's; accumulators hold 2^22 times that, 40 times Mitsuba's sharpest lobe."""
 
 
 class DirectTracer(Tracer):
@@ -200,8 +199,7 @@ class FluxTracer:
 _EVEN = 0.25
 """Part of the rays that stays even: light that the axes miss is found four times more slowly without."""
 _NEAR, _SELDOM = 6, 16
-"""Lobe widths beyond which a fortieth of a GGX lobe lies (1 / (1 + 6^2)): of these pairs of pixel and anchor one in so
-many is connected, and stands for all."""
+"""Lobe widths beyond which a fortieth of a GGX lobe lies: one in so many of these pairs is connected."""
 _AXES = 64
 _FEWEST = 6
 _SHARP_AXIS = 100.0

@@ -30,8 +30,7 @@ from mitsim.transport.records import CellAxis, CellGrid, DeviceAccumulator, Path
 from mitsim.transport.transmission import refracted_way
 
 _SELDOM = 0.125
-"""Chance to go on for a path whose last turn before the sensor belongs to the projector's side; earlier turns leave
-some 0.02 % of indirect light here."""
+"""Chance to continue a path whose last turn belongs to the projector's side (0.02 % of indirect light remains)."""
 _MARGIN = 1e-4
 
 

@@ -30,11 +30,9 @@ if TYPE_CHECKING:
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 PATHS_PER_LAUNCH = 2**22
 _SHARP = 1.0
-"""Density [1/sr] of a turn above which its light is followed from the camera: three times a matt surface's 0.32, so
-that connections keep all matt light."""
+"""Density [1/sr] of a turn above which the camera follows its light: three times a matt surface's 0.32."""
 _STEEP = 64.0
-"""Factor of a later turn's shading normal above which light is followed from the camera: 0.02 % of cookie_bag's
-indirect light, in which ten of seventeen million paths made half of the variance."""
+"""Factor of a later turn's shading normal above which the camera follows its light (cookie_bag: 0.02 %)."""
 _MIRRORS = 16
 _LONGEST = 0.999
 """Largest chance to go on, so that paths end even where nothing is absorbed.

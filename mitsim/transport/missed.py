@@ -36,8 +36,7 @@ from mitsim.transport.specular import turned_by_mirrors
 from mitsim.transport.transmission import Arrival
 
 _CUBE, _CUBES = 5e-3, 2**20
-"""Side of cubes over the scene's distance, 2 mm at 400, and their codes. A surface that crosses a cube counts with the
-area of its square (at 45 degrees 0.94 of that in the mean)."""
+"""Side of cubes over the scene's distance, 2 mm at 400, and the number of their codes."""
 _GRAZING = 1e-3
 _LENS = 0.02
 """Radius of the lens over the scene's distance: 8 mm at 400, which one path in 3000 meets from a matt surface."""
@@ -344,17 +343,13 @@ light). Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: co
 _PLENTY = 2**12
 _CONNECTIONS = 2**18
 _SEARCHING = 2**20
-"""Connections that search faint lobes, some 0.1 s: varnish of roughness 0.005 that reflects a twentieth, on a ball of
-100 mm at 390, is met eleven times, and sampled twice."""
+"""Connections that search faint lobes, 0.1 s: varnish of roughness 0.005 on a ball of 100 mm is met eleven times."""
 _QUARTER, _ENOUGH_MET = 4, 16
-"""Factor of fewer rays in the first search, and rays met on the sensor from which so few suffice (compact_disc: 21 to
-38)."""
+"""Factor of fewer rays in the first search, and rays met on the sensor from which so few suffice."""
 _FEWER, _WIDER = 16, 16.0
-"""Factor by which a first search has a wider sensor and fewer rays, and meets 16 times as much: where it meets nothing,
-the longer search is omitted."""
+"""Factors of fewer rays and a wider sensor in a first search, which meets 16 times as much."""
 _BROAD, _WELL_MET = 2.0, 256.0
-"""Radius of all lobes on the sensor's plane, over its half-width, beyond which none is searched, and hits of
-connections that then measure their light to 6 % (compact_disc: 2000, where a quarter of all rays meets 24)."""
+"""Radius of lobes over the sensor's half-width beyond which none is searched, and hits that measure light to 6 %."""
 _SHARPEST = 0.1
 
 

@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     Turner = Callable[[mi.UInt32, mi.Bool], tuple[ByLine, ByLine]]
 
 _STEP, _TURN = 5, 16
-"""Members of a block take the points of their common sequence in turn. Each sample begins five members on, and sixteen
-samples one more, which spreads each pixel's points over the sequence."""
+"""Each sample begins five members on, and every sixteenth one more, which spreads points over the sequence."""
 _PATHS_PER_LAUNCH = 2**20
 _MOST_COMPARED = 32
 _REFLECTANCE = re.compile(r"(brdf_\d\.)?reflectance\.")

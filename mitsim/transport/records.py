@@ -346,14 +346,11 @@ def aligned_grid(
 
 MOST_PLACES = 2**26
 _UNIT_BITS = 30
-"""Power of two of units in a bright path's light: rounding moves a path's by 5e-10 of it at most, and a place holds
-2^34 times as much."""
+"""Power of two of units in a bright path's light, whose rounding is 5e-10 at most; a place holds 2^34 such paths."""
 _PAYS = 4
-"""Places for each part of a path below which an accumulator pays: fetching a place takes 0.03 us, and a part of a path
-on the host 0.1 us or more (balls of the highlight)."""
+"""Places for each part of a path below which an accumulator pays: 0.03 us a place, 0.1 us a part on the host."""
 _MOST_BITS = 52
-"""Power of two of units that one path may bring, four million times a bright path's; a place would hold 4096 of
-them."""
+"""Power of two of units that one path may bring, four million times a bright path's."""
 
 
 @dataclass(frozen=True, eq=False)

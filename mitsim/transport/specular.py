@@ -47,8 +47,7 @@ _SMALL = 2.0
 """Sensor pixels below which whole beams are not divided."""
 _PAINT = 0.5
 _RIM = 1 / 16
-"""The limit for beams that a rim cuts, whose inner part is represented by points: 1.5 % of a pixel along a straight
-rim; each halving doubles the beams."""
+"""The limit for beams that a rim cuts: 1.5 % of a pixel along a straight rim; each halving doubles the beams."""
 _THIN, _MANY = 0.25, 8.0
 """Sensor pixels across, and ratio of length, of squares that are thinned out: half a pixel wide at most."""
 _STRAIGHT = 0.1

@@ -352,8 +352,7 @@ class _Mesh:
 _ACROSS = 2**10
 _TO_RIM = 0.25
 _TOO_CLOSE = 1 / 64
-"""Distance to the rim, in radii, within which light is counted but not traced: for glass of index 1.5 it is 4 % of the
-returned light, and 98 % of the squares."""
+"""Distance to the rim [radii] within which light is counted but not traced: 4 % of it, and 98 % of the squares."""
 _FINEST = 2**10
 _PIECE, _MOST_PIECES = 4.0, 2**10
 Boxes = tuple[FloatArray, FloatArray, FloatArray]
