@@ -186,6 +186,8 @@ _MATTERS = 0.5
 """Error over that by noise from which it is reported: both in quadrature are 12 % more."""
 _DEVIATIONS = 8.0
 """Robust deviations from the other pairs that make a fault: noise alone goes so far in one session of 10^12."""
+_STRAYS = 4.265
+"""Standard deviations from which places move: one side in 1e5 by chance."""
 _SURE = 5.0
 """Standard deviations at which a pooled number counts as measured."""
 _ALONE = 0.9
@@ -435,7 +437,9 @@ class _Side:
         few, late = max(2, len(times) // 8), np.argsort(times)
         ends = np.array([np.median(places[late[:few]]), np.median(places[late[-few:]]), -self.place])
         away = np.square(np.append(places, ends[2]) - np.median(places)) / np.append(variances, 2 * variances.max())
-        if away.mean() > 1 + _SURE * np.sqrt(2 / away.size):
+        # The cube root of a mean square is nearly normal (Wilson and Hilferty 1931), also for the few patterns of a small n.
+        spread = 2 / (9 * away.size)
+        if np.cbrt(away.mean()) > 1 - spread + _STRAYS * np.sqrt(spread):
             beyond = [np.average(np.square(places - end) - variances, weights=1 / variances) for end in ends]
             # Differences of neighbours: those of every second pixel do not see the finest detail.
             energy = float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum())
