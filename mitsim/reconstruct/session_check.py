@@ -587,7 +587,15 @@ class _Check:
         sure = usable & (np.square(self.ratios) > _SURE**2 * ratio_variances)
         powers, usual = self.powers / (1 - np.where(sure, np.square(self.ratios), 0.0)), usable
         for _ in range(2):  # the second time without single frames of other power
-            line = np.polyval(np.polyfit(times[usual], powers[usual], 1), times)
+            # Noise of the uniform frames is common to a side, so that only a slope within both sides is a drift.
+            centred = [np.where(usual, values, 0.0) for values in (times, powers)]
+            centred = [
+                each - usual * each.sum(axis=1, keepdims=True) / usual.sum(axis=1, keepdims=True) for each in centred
+            ]
+            slope = float(np.vdot(*centred)) / max(float(np.square(centred[0]).sum()), 1e-300)
+            rest = float(np.square(centred[1] - slope * centred[0]).sum()) / max(usual.sum() - 3, 1)
+            drifts = slope**2 * np.square(centred[0]).sum() > _SURE**2 * rest
+            line = np.polyval(np.polyfit(times[usual], powers[usual], int(drifts)), times)
             away = powers - line - np.median((powers - line)[usable])
             usual = usable & (np.abs(away) <= _DEVIATIONS * robust_scatter(away[usable]) + 1e-12)
         powers, line = powers / np.mean(line), line / np.mean(line)
@@ -615,7 +623,8 @@ class _Check:
             own.add(_BENT, bent**2 / 2 * own.size)
             parts = np.stack([(1 + sign * ratio) * c / slow - 1 for sign in (1, -1)])
             parts[1, 0] = 0.0  # the uniform pattern has one lit frame
-            wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
+            least = max(_SLIGHT, _DEVIATIONS * flicker, _SURE * float(np.sqrt(_STEP * np.median(variances) / 2)))
+            wrong = np.abs(parts) > np.maximum(least, 4 * np.abs(parts[::-1]))
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
                 self._mend(own, int(index), 1 - 2 * int(half), ("power", detail, "its response is divided by that"))
