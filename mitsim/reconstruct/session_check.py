@@ -437,7 +437,7 @@ class _Side:
         few, late = max(2, len(times) // 8), np.argsort(times)
         ends = np.array([np.median(places[late[:few]]), np.median(places[late[-few:]]), -self.place])
         away = np.square(np.append(places, ends[2]) - np.median(places)) / np.append(variances, 2 * variances.max())
-        # The cube root of a mean square is nearly normal (Wilson and Hilferty 1931), also for the few patterns of a small n.
+        # The cube root of a mean square is nearly normal (Wilson and Hilferty 1931), also for few patterns.
         spread = 2 / (9 * away.size)
         if np.cbrt(away.mean()) > 1 - spread + _STRAYS * np.sqrt(spread):
             beyond = [np.average(np.square(places - end) - variances, weights=1 / variances) for end in ends]
@@ -589,9 +589,8 @@ class _Check:
         for _ in range(2):  # the second time without single frames of other power
             # Noise of the uniform frames is common to a side, so that only a slope within both sides is a drift.
             centred = [np.where(usual, values, 0.0) for values in (times, powers)]
-            centred = [
-                each - usual * each.sum(axis=1, keepdims=True) / usual.sum(axis=1, keepdims=True) for each in centred
-            ]
+            counts = np.maximum(usual.sum(axis=1, keepdims=True), 1)
+            centred = [each - usual * each.sum(axis=1, keepdims=True) / counts for each in centred]
             slope = float(np.vdot(*centred)) / max(float(np.square(centred[0]).sum()), 1e-300)
             rest = float(np.square(centred[1] - slope * centred[0]).sum()) / max(usual.sum() - 3, 1)
             drifts = slope**2 * np.square(centred[0]).sum() > _SURE**2 * rest
