@@ -2,23 +2,21 @@
 
 Goodman, Introduction to Fourier Optics, 4.2 and 4.5. A point source is at tan-angle tau and depth z, and a mask whose
 amplitude transmission is a sum of separable terms is at distance d. The field of a term on the sensor is a product of
-two 1-D fields. Each is a function of s = u (1 - d/z) + d tau alone, with the effective distance D = d (z - d) / z. A
-profile that jumps by J_k at e_k gives, relative to an unbounded open mask::
+two 1-D functions of s = u (1 - d/z) + d tau, with the effective distance D = d (z - d) / z. A profile that jumps by
+J_k at e_k gives, relative to an unbounded open mask::
 
     U(s) = sum_k J_k E(s - e_k),    E(x) = 1/2 + (1 - i)/2 (C + i S)(x sqrt(2 / (lambda D)))
 
-with Fresnel's integrals C and S. E is split into its geometric shadow, the unit step, and the wave from the edge,
-g = E - step, so that U is the profile plus one convolution of the jumps with g on a fine grid. Beyond |x| = R,
-lambda D / 2 over the grid's step, the edge wave oscillates faster than the grid resolves. Therefore it is faded out
-from 3 R / 4 to R. The light that is lost left the mask at tangents above 0.8 (a quarter micrometre, 550 nm), where the
-paraxial approximation fails: 4.5e-4 of the light, spread evenly.
+with Fresnel's integrals C and S. E is the unit step plus the wave from the edge, so that U is the profile plus one
+convolution of the jumps on a fine grid. Beyond |x| = R, lambda D / 2 over the grid's step, the grid does not resolve
+the edge wave, so that it is faded out from 3 R / 4 to R. The lost light (4.5e-4 for a quarter micrometre and 550 nm)
+left the mask at tangents above 0.8, where the paraxial approximation fails. It is spread evenly.
 
 The intensity of ``t = sum_k w_k r_k c_k`` (real) is::
 
     |U|^2 = sum_k w_k^2 |R_k|^2 |C_k|^2 + sum_(k<l) 2 w_k w_l (Re[R_k R_l*] Re[C_k C_l*] - Im[R_k R_l*] Im[C_k C_l*])
 
-which is one separable term for one field and four for two (FlatCam). Through a thick mask, the field is that behind
-the clear aperture of both faces, propagated from the exit face; diffraction inside the mask is neglected.
+Behind a thick mask, the field is that of the clear aperture of both faces, propagated from the exit face.
 """
 
 from __future__ import annotations
@@ -46,45 +44,26 @@ ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4
 """Widest grid cell: it changes the anchor geometry's shadow by 3.2e-4 (tests/physics/test_diffraction.py)."""
 _STEPS_PER_FRESNEL_LENGTH = 130
-"""Grid cells in sqrt(lambda D) where that is finer than :data:`_STEP_MM`."""
 _THICK_STEPS = 2
-"""Grid step of a thick mask in steps of a thin one, because each direction needs fields of its own."""
+"""Grid step in steps of a thin mask, because each direction needs fields of its own."""
 _DISTANCES = 3
-"""Distances at which the waves of a tilted mask are computed."""
 _NARROWEST = 0.5
 """Least mean width of the openings in wavelengths. Between conducting edges, half a wavelength is the cutoff of light
 polarised along them (Jackson, Classical Electrodynamics, 8.3), so that scalar theory fails below it.
 """
 _NODES = 12
-"""Nodes of the midpoint rule, whose error is exp(-pi 12.5) = 9e-18."""
+"""Nodes of the midpoint rule; the error is exp(-pi 12.5) = 9e-18."""
 _LARGEST_GRID = 1 << 24
-"""Cells of a grid: 256 MiB for each of a few complex arrays."""
 _KEPT, _LARGEST_KEPT = 24, 1 << 18
-"""Cached shadows (three lines at eight depths), and cells of the largest one, 6 MiB each."""
 _PART_OF_RANGE = 1 / 4
-"""A cached grid starts and ends at multiples of this part of its range, so that axes and cells of all sizes share
-it. The grid becomes at most a quarter longer.
+"""Cached grids start and end at multiples of this part of their range, so that axes and cells of all sizes share them.
 """
 
 
 class EdgeWaves:
-    """Fresnel fields of 1-D apertures on a grid, prepared once.
+    """Fresnel fields of 1-D apertures on ``count`` cells of ``step_mm``, for edges up to ``span_mm`` away.
 
-    Parameters
-    ----------
-    wavelength_nm, distance_mm
-        Wavelength, and effective distance D.
-    step_mm, count
-        Width and number of the grid cells.
-    span_mm
-        Greatest distance from a cell to an edge that matters.
-    single
-        Compute fields in single precision: half the time, relative error 1e-6.
-
-    Raises
-    ------
-    MitsimError
-        If the grid exceeds the memory limit.
+    Raises MitsimError if the grid exceeds the memory limit.
     """
 
     def __init__(
@@ -107,11 +86,10 @@ class EdgeWaves:
         self._kernel = kernel.astype(np.complex64) if single else kernel
 
     def field(self, aperture: Steps, start_mm: float) -> ComplexArray:
-        """Return the (count,) field behind ``aperture`` at the cell centres from ``start_mm``; 1 without a mask."""
+        """Return the (count,) field at the cell centres from ``start_mm``; 1 without a mask."""
         return np.asarray(self.fields([aperture], start_mm)[0])
 
     def fields(self, apertures: Sequence[Steps], start_mm: float) -> ComplexArray:
-        """Return the (apertures, count) fields of several apertures in one transform."""
         reach, count = self._reach, self._count
         start = start_mm - reach * self.step_mm
         profiles = np.stack([each.amplitude_means(start, self.step_mm, count + 2 * reach) for each in apertures])
@@ -130,11 +108,11 @@ class EdgeWaves:
 
 
 def edge_wave(x: FloatArray) -> ComplexArray:
-    """Return the wave from an edge, E - 1 = (1 - i)/2 (C + i S)(x) - 1/2, at ``x`` > 0 in units of sqrt(lambda D / 2).
+    """Return E - 1 = (1 - i)/2 (C + i S)(x) - 1/2 at ``x`` > 0 in units of sqrt(lambda D / 2).
 
-    The value is -erfc(z)/2 at z = exp(-i pi/4) sqrt(pi/2) x: the midpoint rule for an integral over
-    exp(-t^2)/(t^2 + z^2), plus the pole that the rule misses (Alazah, Chandler-Wilde and La Porte 2014, Numerische
-    Mathematik 128, 635). The error is 3e-16. scipy.special is avoided because its import takes 0.1 s.
+    The value is -erfc(z)/2 at z = exp(-i pi/4) sqrt(pi/2) x, by the midpoint rule plus the pole that the rule misses
+    (Alazah, Chandler-Wilde and La Porte 2014, Numerische Mathematik 128, 635). The error is 3e-16. scipy.special is
+    avoided because its import takes 0.1 s.
     """
     scale = ((_NODES + 0.5) * np.pi) ** 0.5
     y = (np.pi / 2) ** 0.5 * x
@@ -153,7 +131,7 @@ def edge_wave(x: FloatArray) -> ComplexArray:
 
 @cache
 def fast_length(least: int) -> int:
-    """Return the first number from ``least`` without prime factors above 11, for fast transforms."""
+    """Return the first number from ``least`` without prime factors above 11."""
     left, length = 0, least - 1
     while left != 1:
         length += 1
@@ -165,10 +143,7 @@ def fast_length(least: int) -> int:
 
 
 def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, spectrum: Spectrum) -> SeparableTerms:
-    """Return the wave-optical shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left.
-
-    The terms of each line of the spectrum are in the order of the module's formula.
-    """
+    """Return separable terms [(left (m, r), right (m, c)), ...] in the order of the module's formula."""
     shadow = _of_fields(shadow)
     weights = _pair_weights(shadow.weights())
     means = _thick_means if shadow.thickness_mm else _thin_means
@@ -184,21 +159,11 @@ def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, sp
 def wave_profiles(
     shadow: ShadowGeometry, wavelength_nm: float, low_mm: float, high_mm: float, tau: float
 ) -> tuple[list[tuple[float, FloatArray]], float, float]:
-    """Compute the intensity of a point source's shadow over the mask coordinate, before averaging over pixel and cell.
+    """Return (weight, (cells,) profile) of each term of a point source's shadow, and start and step [mm] of the grid.
 
-    Parameters
-    ----------
-    shadow, wavelength_nm
-        Sensor, mask and depth of the source; wavelength.
-    low_mm, high_mm
-        Range of the mask coordinate.
-    tau
-        Tan-angle of the source, which matters for thick masks.
-
-    Returns
-    -------
-    tuple
-        (weight, (cells,) profile) of each separable term, and the start and step [mm] of the grid.
+    The intensity is a function of the mask coordinate between ``low_mm`` and ``high_mm``, not yet averaged over
+    pixel and
+    cell. The tan-angle ``tau`` matters for thick masks.
     """
     shadow = _of_fields(shadow)
     light = _Propagation.of(shadow, wavelength_nm)
@@ -217,12 +182,12 @@ def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
 
 
 def narrowest_mm(wavelength_nm: float) -> float:
-    """Return the least mean width [mm] of openings for which waves of ``wavelength_nm`` are computed."""
+    """Return the least mean width [mm] of openings for which waves are computed."""
     return _NARROWEST * wavelength_nm * 1e-6
 
 
 def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
-    """Raise MitsimError if the openings of a ``mask`` are too narrow for scalar waves of ``wavelength_nm``."""
+    """Raise MitsimError if the openings are too narrow for scalar waves."""
     if mask.opening_mm < narrowest_mm(wavelength_nm):
         least = f"{wavelength_nm:.0f} nm needs {narrowest_mm(wavelength_nm):.3g}, half a wavelength"
         problem = f"mask: its openings are {mask.opening_mm:.3g} mm wide, and diffraction of {least}"
@@ -231,13 +196,7 @@ def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
 
 
 def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
-    """Return the width [mm] of a grid cell, of which a wider feature holds a whole number.
-
-    Raises
-    ------
-    MitsimError
-        If the openings of the mask are too narrow for scalar waves.
-    """
+    """Return the width [mm] of a grid cell; a wider feature holds a whole number of cells."""
     check_openings(shadow.mask, wavelength_nm)
     feature = shadow.mask.feature_mm
     fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5
@@ -277,7 +236,7 @@ _keep_integrated = lru_cache(maxsize=_KEPT)(_integrate)
 
 
 def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, nm: float) -> FloatArray:
-    """Return the (pairs, m, c) mean products of fields; one grid serves all directions.
+    """Return the (pairs, m, c) mean products of fields on one grid.
 
     Behind a tilted mask they are interpolated between those of a few distances.
     """

@@ -1,11 +1,9 @@
-"""Transmission of one axis of a mask as a piecewise constant function of the mask coordinate, and its means.
+"""Piecewise constant transmission of one axis of a mask, and its means over a sensor pixel and a cell.
 
-A thick mask multiplies two :class:`Steps` because light has to pass both faces. Means over a sensor pixel and a cell
-(two boxes in succession) follow from the second antiderivative. The mean of the values is subtracted first, so that
-the second difference cancels little: 1e-11 remains for values of order 1 (tests/unit/optics/test_profile.py).
-
-Blurred by a Gaussian of standard deviation sigma, a unit step is the normal distribution function Phi(x / sigma). Its
-means over one and two boxes are differences of its antiderivatives, with phi the normal density::
+Means over the two boxes follow from the second antiderivative. The mean of the values is subtracted first, so that
+the
+second difference errs by 1e-11 for values of order 1. A unit step that is blurred by a Gaussian of standard deviation
+sigma is Phi(x / sigma), and its means are differences of these antiderivatives, with phi the normal density::
 
     x Phi + sigma phi    and    ((x^2 + sigma^2) Phi + x sigma phi) / 2
 """
@@ -23,15 +21,12 @@ from mitsim.core.arrays import ByValue, FloatArray
 _FEW = 4
 """Edges in the narrower box up to which edges are summed one by one; beyond, a second difference keeps 1e-11."""
 _DENSE = 2
-"""Points per grid cell from which means are computed once per cell and interpolated."""
 _WIDE = 16
 """Product of the half-widths of two boxes, in grid steps, from which cubic interpolation errs by less than 4e-5."""
 _BEYOND = 8.3
-"""Standard deviations beyond which a blurred step is 0 or 1 to rounding."""
 _POINTLIKE = 1e-4
-"""Half-width of a box in standard deviations of the blur below which the box is neglected (error 2e-9)."""
+"""Half-width in standard deviations of the blur below which a box is neglected (error 2e-9)."""
 _PER_CELL = 4
-"""Points per grid cell at which the root of a blurred profile is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +42,6 @@ class Steps(ByValue):
 
     @classmethod
     def between(cls, profile: npt.ArrayLike, lines_mm: FloatArray, blur_mm: float = 0.0) -> Steps:
-        """Return the profile of (N,) values between (N + 1,) lines, with equal neighbours merged."""
         values = np.asarray(profile, dtype=np.float64)
         starts = np.flatnonzero(np.diff(values, prepend=np.nan))
         return cls(np.append(lines_mm[starts], lines_mm[-1]), values[starts], blur_mm)
@@ -60,13 +54,13 @@ class Steps(ByValue):
         return np.asarray(padded[np.searchsorted(self.edges, s, side="right")])
 
     def seen_through(self, far: Steps, scale: float, shift: float) -> Steps:
-        """Return the product ``self(s) * far(scale * s + shift)``, with scale > 0 and shift in mm."""
+        """Return ``self(s) * far(scale * s + shift)``, with scale > 0 and shift in mm."""
         edges = np.unique(np.concatenate((self.edges, (far.edges - shift) / scale)))
         middle = (edges[:-1] + edges[1:]) / 2
         return Steps(edges, self.at(middle) * far.at(scale * middle + shift))
 
     def cell_means(self, start: float, step: float, count: int) -> FloatArray:
-        """Return the (count,) means over equal cells of width ``step`` from ``start`` [mm]."""
+        """Return the (count,) means over cells of width ``step`` from ``start`` [mm]."""
         if self.blur_mm:
             return self._blurred_means(np.asarray(start + step * (np.arange(count) + 0.5)), step / 2, 0.0)
         bounds = start + step * np.arange(count + 1)
@@ -80,7 +74,7 @@ class Steps(ByValue):
         return np.asarray(means)
 
     def amplitude_means(self, start: float, step: float, count: int) -> FloatArray:
-        """Return the means of the root of the blurred profile, because a blur acts on power and not on the field."""
+        """Return means of the root of the blurred profile, because a blur acts on power."""
         if not self.blur_mm:
             return self.cell_means(start, step, count)
         power = Steps(self.edges, np.square(self.values), self.blur_mm)
@@ -88,7 +82,7 @@ class Steps(ByValue):
         return np.asarray(np.sqrt(np.maximum(power.at(points), 0)).reshape(count, _PER_CELL).mean(axis=1))
 
     def over(self, centres: FloatArray, half: FloatArray) -> FloatArray:
-        """Return the means over boxes of half-widths ``half`` [mm] about ``centres``; at 0 the value."""
+        """Return the means over boxes about ``centres`` [mm]; at half-width 0 the value."""
         return self._blurred_means(centres, half, 0.0)
 
     def _blurred_means(self, centres: FloatArray, half: FloatArray | float, other: float) -> FloatArray:
@@ -104,7 +98,7 @@ class Steps(ByValue):
         return np.asarray(total)
 
     def box_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """Return the means over two boxes in succession, of the shape of ``centres`` [mm]; half-widths in mm."""
+        """Return the means over two boxes in succession; lengths in mm."""
         if self.blur_mm:
             return self._blurred_means(centres, half_pixel, half_cell)
         reach = half_pixel + half_cell
@@ -116,16 +110,9 @@ class Steps(ByValue):
 
 
 def blurred_step(x: FloatArray, half: FloatArray | float, other: float, blur: float) -> FloatArray:
-    """Return the mean over two boxes about x of a unit step at 0 that a Gaussian blurs; all lengths in one unit.
+    """Return the mean over boxes of half-widths ``half`` and ``other`` about x of a unit step that a Gaussian blurs.
 
-    Parameters
-    ----------
-    x
-        Centres of the boxes; -inf is allowed.
-    half, other
-        Half-widths. Below a ten-thousandth of the blur a box is neglected.
-    blur
-        Standard deviation; 0 only if there is no second box.
+    Lengths have one unit, x may be -inf, and ``blur`` may be 0 only if there is no second box.
     """
     if other > _POINTLIKE * blur and other > 0:
         ends = (_twice(x + half + other, blur) - _twice(x + half - other, blur)) / (2 * other)
@@ -147,7 +134,6 @@ def _once(x: FloatArray, blur: float) -> FloatArray:
 
 
 def _twice(x: FloatArray, blur: float) -> FloatArray:
-    """Return the second antiderivative of the blurred step."""
     if not blur:
         return np.asarray(np.square(np.maximum(x, 0)) / 2)
     z = np.maximum(x / blur, -2 * _BEYOND)
@@ -181,7 +167,7 @@ class Antiderivative:
     """First and second antiderivative of piecewise constant functions whose means are subtracted."""
 
     def __init__(self, edges: FloatArray, values: FloatArray, step: float | None = None) -> None:
-        """Integrate (functions, n) values between (n + 1,) edges [mm]; ``step`` is the width of equal pieces."""
+        """Integrate (functions, n) values between (n + 1,) edges [mm]; equal pieces have width ``step``."""
         width = np.diff(edges)
         self._edges, self._step = edges, step
         self._mean = (values @ width) / (edges[-1] - edges[0])
@@ -193,17 +179,15 @@ class Antiderivative:
 
     @classmethod
     def of_samples(cls, values: FloatArray, start: float, step: float) -> Antiderivative:
-        """Integrate (functions, n) samples on equal cells of width ``step`` from ``start`` [mm]."""
         return cls(start + step * np.arange(values.shape[1] + 1), values, step)
 
     def means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """Return the (functions, *centres.shape) means over two boxes in succession."""
         wide, narrow = max(half_pixel, half_cell), min(half_pixel, half_cell)
         total = (self._ends(centres + wide, narrow) - self._ends(centres - wide, narrow)) / (2 * wide)
         return np.asarray(total + self._mean.reshape(-1, *[1] * centres.ndim))
 
     def smooth_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """Return the means of sampled functions without jumps; many points are interpolated between cells."""
+        """Return means of sampled functions without jumps, interpolated between cells for many points."""
         step, low = self._step, float(centres.min())
         assert step is not None, "on equal cells"
         count = int((float(centres.max()) - low) / step) + 4

@@ -1,16 +1,13 @@
 """Shadow of masks without few separable terms, drawn on a raster of square cells.
 
-A turned mask, waves behind a mask of many terms, and a picture of a point spread function have no short closed form,
-and the geometric shadow of a mask of many terms has a long one. Each is drawn on square cells, a whole number of which
-is a sensor pixel as seen on the mask, because the correlation below needs that; the value of a cell is its mean. A
-point at depth z and tan-angle tau shades sensor point u by the raster's value at s = u (1 - d/z) + d tau.
+The raster serves turned masks, waves behind masks of many terms, and pictures of a point spread function. A sensor
+pixel as seen on the mask is a whole number of cells, because the correlation below needs that; the value of a cell is
+its mean. A point at depth z and tan-angle tau shades sensor point u by the raster's value at s = u (1 - d/z) + d tau.
+Means over cells add a variance of h^2 / 6 to an edge. A twelfth of the second difference along each axis is
+subtracted, which corrects half of it.
 
-Means over cells blur an edge by the box of the cell and by that of the raster, which adds a variance of h^2 / 6. A
-twelfth of the second difference along each axis is subtracted, which corrects half of it.
-
-**Waves.** Behind a mask whose amplitude is a sum of K terms, the field of a point source is the sum of products of the
-1-D fields of :mod:`mitsim.optics.diffraction`. |U|^2 is averaged over points in each cell and over the lines of the
-light. Behind a turned mask, the same light is turned.
+**Waves.** The field behind a sum of K terms is the sum of products of the 1-D fields of
+:mod:`mitsim.optics.diffraction`. |U|^2 is averaged over points in each cell and over the lines of the light.
 """
 
 from __future__ import annotations
@@ -40,53 +37,35 @@ _CELLS_PER_PIXEL = 6
 of 1 and 4 um features err by 2e-4 and 1e-3 in waves at 6.
 """
 _FEW_CELLS = 2
-"""Cells along a pixel where frames are only compared with each other, for a ninth of the work."""
 _LEFT_BEYOND = 1e-3
-"""Bound of the part of the light that waves carry beyond the edge of a raster."""
 _LARGEST = 8192
 """Cells per side: 512 MiB."""
 _POINTS, _LATTICE = 16, 7
-"""Points per cell at which a turned mask is sampled, and columns between successive points."""
 _POINTS_PER_FRESNEL_LENGTH = 80
 """Points in sqrt(lambda D) at which waves are squared; the error is about 3e-4 (tests/physics/test_raster.py)."""
 _MOST_WAVE_POINTS = 1 << 16
-"""Largest number of points per side: 4e9 points take a minute per line."""
+"""Largest number of points per side: a minute per line."""
 _MOST_WAVE_TERMS = 2.0**39
-"""Largest number of points times terms: 40 processor seconds per line, at 8e-11 s each (mitsim.light.cost_model)."""
+"""Largest number of points times terms: 40 processor seconds per line (mitsim.light.cost_model)."""
 _LEAST_WAVE_POINTS = 2
 """Least number of points along a cell."""
 _GRID_CELLS = 3
 """Least number of the field's grid cells between points."""
 _AROUND = 8
-"""Cells by which a raster exceeds its turned one, for the ends of splines."""
 CORRELATION_PRODUCTS = 30.0
-"""Cost of each phase of a correlation in multiplications per pixel, for each pair of anchors and layer: 0.017 processor
-seconds for 512 x 512 pixels and 36 phases (benchmarks/masks.py).
+"""Cost of a correlation in multiplications per pixel and phase, for each pair of anchors and layer
+(benchmarks/masks.py).
 """
 RASTERS_KEPT = 8
-"""Number of cached rasters, some 100 MiB each at 512 pixels."""
 _FIELDS_AT_ONCE = 8
 """Fields that are computed together."""
 _AT_ONCE = 2**20
-"""Points that are sampled at a time, 8 MiB of each of some ten arrays."""
 
 
 def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
-    """Return the shadow of a point at one depth as a plate of square cells about the mask's centre.
+    """Return the shadow of a point at ``depth`` [mm] as a plate of square cells; geometric if ``spectrum`` is None.
 
-    Parameters
-    ----------
-    geometry
-        The camera.
-    depth
-        Depth of the point [mm].
-    spectrum
-        Lines of its light; None for a geometric shadow.
-
-    Raises
-    ------
-    MitsimError
-        If the raster has too many cells, or waves behind the mask cannot be computed.
+    Raises MitsimError if the raster has too many cells, or waves behind the mask cannot be computed.
     """
     # However it was chosen to be drawn: a run then has its plan's.
     chosen = {"mask_fft": False, "mask_cells": cells_per_pixel(geometry)}
@@ -95,7 +74,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 
 @lru_cache(maxsize=RASTERS_KEPT)
 def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
-    """Draw the :func:`raster` of a camera that states its cells; the last rasters are cached."""
+    """Draw the :func:`raster` of a camera that states its cells."""
     mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
     assert isinstance(mask, Plate), "other masks have a closed form"
     pixel = geometry.pixel_pitch * shadow.shrink
@@ -116,7 +95,7 @@ def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | Non
 
 
 def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
-    """Return the number of raster cells per side of the shadow of far points; nearer points have slightly more."""
+    """Return the raster cells per side for far points; nearer points have slightly more."""
     mask = geometry.build_mask()
     assert isinstance(mask, Plate)
     return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry), spectrum)
@@ -125,7 +104,7 @@ def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
 def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectrum | None) -> int:
     """Return the cells per side for the visible part of a ``mask`` and the light that waves carry beyond.
 
-    An edge sends lambda D / (4 pi^2 x) of light, as a length, beyond x of it; a mean opening has two edges per axis.
+    An edge sends lambda D / (4 pi^2 x) of light, as a length, beyond x; a mean opening has two edges per axis.
     """
     half = mask.flaws.reach(mask.extent_mm) / 2
     if spectrum is not None and not mask.irradiance:
@@ -135,7 +114,7 @@ def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectru
 
 
 def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
-    """Raise MitsimError if waves of a ``spectrum`` behind this mask would take longer than a minute per line."""
+    """Raise MitsimError if waves behind this mask would take longer than a minute per line."""
     mask = geometry.build_mask()
     if not isinstance(mask, Plate) or mask.irradiance or not geometry.is_drawn(waves=True):
         return
@@ -150,32 +129,23 @@ def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
 
 
 def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
-    """Return the number of points along a raster cell at which waves are squared.
-
-    Parameters
-    ----------
-    wavelength_nm, distance_mm
-        Wavelength, and distance behind the mask plane at which waves have the same fringes.
-    step_mm
-        Side of the cell.
-    """
+    """Return the number of points along a raster cell at which waves are squared."""
     apart = (wavelength_nm * 1e-6 * distance_mm) ** 0.5 / _POINTS_PER_FRESNEL_LENGTH
     return max(int(np.ceil(step_mm / apart)), _LEAST_WAVE_POINTS)
 
 
 def cells_per_pixel(geometry: CameraGeometry) -> int:
-    """Return the number of raster cells along a pixel: as chosen, else the fewest."""
     return geometry.mask_cells or _CELLS_PER_PIXEL
 
 
 def with_few_cells(geometry: CameraGeometry, spectrum: Spectrum | None) -> CameraGeometry:
-    """Return a camera with a third of the raster cells per pixel, for frames that are only compared with each other."""
+    """Return a camera with a third of the raster cells per pixel, for frames that are only compared."""
     drawn = geometry.is_correlated(spectrum is not None)
     return geometry.model_copy(update={"mask_cells": _FEW_CELLS}) if drawn else geometry
 
 
 def sharpen(values: FloatArray) -> FloatArray:
-    """Return (n, n) means over cells, corrected to second order for the blur by the cells."""
+    """Return (n, n) means over cells, corrected to second order for their blur."""
     for _ in ("rows", "columns"):
         padded = np.pad(values, ((1, 1), (0, 0)))
         values = (values - (padded[2:] - 2 * values + padded[:-2]) / 12).T
@@ -265,10 +235,9 @@ def _intensity(shadow: ShadowGeometry, mask: Plate, wavelength_nm: float, step: 
 
 
 def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
-    """Return the (n,) means of a ``field`` (n * between,), corrected to second order for their blur.
+    """Return the (n,) means of a ``field`` (n * between,), corrected to second order.
 
-    Fringes of far edges are finer than the points. Sampled values would add up where the code's lattice meets that of
-    the points, but means vanish, and their light is returned evenly.
+    Means are used because sampled fringes would add up where the code's lattice meets that of the points.
     """
     means = field.reshape(-1, between).mean(axis=1)
     means[1:-1] -= np.diff(means, 2) / 24
@@ -295,17 +264,7 @@ _Pair = tuple[int, int]
 
 
 class Correlation:
-    """Shadow of a raster at one depth, prepared once; a pixel is a whole number of cells.
-
-    Parameters
-    ----------
-    shadow
-        Shadow geometry of a camera whose mask is the raster.
-    rows, columns
-        Directions of the cells.
-    fill_factor
-        Active part of a pixel, which scales frames.
-    """
+    """Shadow of a raster at one depth, prepared once; ``fill_factor`` scales frames."""
 
     def __init__(self, shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float = 1.0) -> None:
         sides = _Side.both(shadow, rows, columns)
@@ -324,7 +283,7 @@ class Correlation:
         self._spectra = _spectra(cast("Plate", shadow.mask), (firsts[0], firsts[1]), self._size, self._phases)
 
     def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
-        """Return the (m, m') irradiance of ``light`` (r, c) in the cells ``rows`` (r,) x ``columns`` (c,)."""
+        """Return the (m, m') irradiance of ``light`` (r, c) in the cells ``rows`` x ``columns``."""
         left, right = self._spread[0][:, np.asarray(rows)], self._spread[1][:, np.asarray(columns)]
         brightest = float(np.abs(light).max()) or 1.0
         cells = _by_phase(left @ (light / brightest).astype(np.float32) @ right.T, self._phases)
@@ -351,8 +310,6 @@ def _spectra(drawn: Plate, firsts: _Pair, size: _Pair, phases: _Pair) -> npt.NDA
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """One axis: pixels, raster cells per pixel, first cell of pixel 0, and weights (cells, c) per direction."""
-
     pixels: int
     phases: int
     first: int
@@ -393,10 +350,7 @@ def terms_of_raster(
     places: Places | None,
     terms: Sequence[Term],
 ) -> SeparableTerms:
-    """Return some separable ``terms`` of a raster's shadow, [(left (m, r), right (m', c)), ...].
-
-    ``places`` selects rows and columns of a frame; other parameters are those of :class:`Correlation`.
-    """
+    """Return separable ``terms`` of a raster's shadow, [(left (m, r), right (m', c)), ...]."""
     sides = _Side.both(shadow, rows, columns)
     at = [np.arange(side.pixels) if places is None else np.asarray(places[axis]) for axis, side in enumerate(sides)]
 
@@ -428,19 +382,7 @@ SampledTerms = list[SampledTerm]
 
 
 class ProfileSampler:
-    """Exact means of a piecewise constant mask profile, zero outside its features.
-
-    Parameters
-    ----------
-    profile
-        (N,) transmission of each feature.
-    feature_mm
-        Feature size.
-    start_mm
-        Start of the first feature, relative to the centre; None for a centred profile.
-    centre_mm
-        Centre of the mask.
-    """
+    """Exact means of a piecewise constant (N,) ``profile`` from ``start_mm`` (None: centred), zero outside."""
 
     def __init__(
         self, profile: npt.ArrayLike, feature_mm: float, start_mm: float | None = None, centre_mm: float = 0.0
@@ -451,7 +393,7 @@ class ProfileSampler:
         self._start = (-self._count / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
 
     def __call__(self, s: FloatArray, width: FloatArray) -> FloatArray:
-        """Return the mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value."""
+        """Return the means over [s - width/2, s + width/2]; at width 0 the value."""
         centre, half = s / self._feature - self._start, np.abs(width) / self._feature / 2
         low, high = centre - half, centre + half
         first, last = self._index(low), self._index(high)
@@ -465,7 +407,7 @@ class ProfileSampler:
 
 
 def wave_samplers(geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: Sequence[float]) -> SampledTerms:
-    """Return the wave-optical shadow of a (virtual) source at ``depth`` [mm] and tan-angles ``tau`` as samplers."""
+    """Return the wave-optical shadow of a source at ``depth`` [mm] and tan-angles ``tau`` as samplers."""
     if geometry.is_drawn(spectrum is not None):
         return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
     shadow = ShadowGeometry.of(geometry, depth)
@@ -485,7 +427,6 @@ def wave_samplers(geometry: CameraGeometry, spectrum: Spectrum, depth: float, ta
 
 
 def geometric_samplers(geometry: CameraGeometry) -> list[SampledTerm]:
-    """Return the geometric shadow of the mask of ``geometry`` as samplers."""
     drawn = geometry.is_drawn(waves=False)
     mask = raster(geometry, geometry.scene_distance) if drawn else geometry.build_mask()
     return _of_plate(mask, geometry.mask_offset)

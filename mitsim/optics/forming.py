@@ -1,8 +1,7 @@
 """Frames of mixtures of light, formed by the closed form of :mod:`mitsim.optics.image_formation`.
 
-A *basis* is a matrix (b, rows) of mixtures of rows of light. Shots that are sums of few frames of a basis are added up
-afterwards (:class:`Mixture`). The *replicates* of a frame, formed from single groups of the light, are only multiplied
-by probing vectors and never formed as a whole.
+A *basis* is a matrix (b, rows) of mixtures of rows of light. *Replicates*, the frames of single groups of the light,
+are only multiplied by probing vectors and never formed.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from mitsim.core.seeds import stream
 from mitsim.optics.image_formation import Entries, FrameOptics
 
 _FEW = 2
-"""Classes per shot, beside those that all shots share, up to which adding frames is faster than a matrix product."""
 _COLUMNS = 2**14
 """Columns per product. The size is fixed because it affects the last bits, which must not depend on the threads."""
 _MOST_COLUMNS = 2**22
@@ -30,15 +28,7 @@ _MOST_COLUMNS = 2**22
 
 @dataclass(frozen=True, eq=False)
 class AccumulatedLight:
-    """Light and the optics that forms its frames.
-
-    Attributes
-    ----------
-    optics
-        Optics for the cells in which the light is accumulated.
-    groups
-        Independent estimates of the light, (rows, cells) each; their mean is used.
-    """
+    """Independent estimates ``groups`` of light (rows, cells), and the optics of its cells."""
 
     optics: FrameOptics
     groups: tuple[sparse.csr_array, ...]
@@ -50,7 +40,7 @@ Formed = tuple[FloatArray, FloatArray]
 
 
 def form_frames(lights: Lights, basis: sparse.csr_array, probes: FloatArray | None) -> Formed:
-    """Form frames of mixtures of light, and its replicates times probes.
+    """Form frames of mixtures of light, and their replicates times probes.
 
     Parameters
     ----------
@@ -84,13 +74,7 @@ def form_frames(lights: Lights, basis: sparse.csr_array, probes: FloatArray | No
 
 
 def probe_frames(lights: Lights, basis: sparse.csr_array, probes: FloatArray) -> Formed:
-    """Return the replicates of mixtures of light without forming the frames.
-
-    Returns
-    -------
-    tuple
-        (b, m * groups * probes) of single groups, and (b, lights, groups, groups) inner products of their differences.
-    """
+    """Return (b, m * groups * probes) replicates, and inner products (b, lights, groups, groups) of differences."""
     rows, groups = lights[0].optics.frame_shape[0], len(lights[0].groups)
     mixed, count = _mix_lights(lights, basis), basis.shape[0]
     probed, noise = np.zeros((count, rows * groups * probes.shape[1])), np.zeros((count, len(lights), groups, groups))
@@ -139,17 +123,7 @@ def _row(matrix: sparse.csr_array, row: int) -> Entries:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Shots as sums of frames in memory.
-
-    Attributes
-    ----------
-    weights
-        (shots, b) weight of each frame in each shot.
-    least
-        (b,) part of the weights that all shots share and that is added once.
-    own
-        The weights without the shared part.
-    """
+    """Shots as ``weights`` (shots, b) of frames; ``least`` (b,) is shared by all shots, ``own`` is the rest."""
 
     weights: FloatArray
     least: FloatArray
@@ -157,11 +131,10 @@ class Mixture:
 
     @property
     def sparse(self) -> bool:
-        """Return True if shots have so few frames of their own that adding is faster than a matrix product."""
+        """Return True if adding the few frames of each shot is faster than a matrix product."""
         return bool(self.own.nnz <= _FEW * len(self.weights))
 
     def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
-        """Return the shots ``start`` to ``stop`` from the frames ``basis`` (b, ...)."""
         if not self.sparse:
             return list(mix_frames(self.weights[start:stop], basis))
         common = mix_frames(self.least[None], basis)[0] if self.least.any() else None
@@ -182,11 +155,9 @@ class Mixture:
 
 
 def pair_shots(weights: FloatArray) -> tuple[FloatArray, Mixture] | None:
-    """Find pairs of complementary shots, so that only half of the shots need a matrix product.
+    """Find pairs of complementary shots, which add up to the light of all pixels and halve the matrix product.
 
-    Patterns of +1 and -1 are shown as two shots that add up to the light of all pixels (of Hadamard patterns the first
-    is that light). Returns None where ``weights`` (shots, classes) have other than two values, or more pairs than
-    classes.
+    Return None where ``weights`` (shots, classes) have other than two values, or more pairs than classes.
     """
     low, high = float(weights.min()), float(weights.max())
     lit = weights == high
@@ -213,7 +184,6 @@ def pair_shots(weights: FloatArray) -> tuple[FloatArray, Mixture] | None:
 
 
 def mix_frames(weights: FloatArray, basis: FloatArray, out: FloatArray | None = None) -> FloatArray:
-    """Return (shots, ...) sums of ``basis`` (b, ...) by ``weights`` (shots, b), in ``out`` if given."""
     flat = basis.reshape(len(basis), -1)
     mixed = np.empty((len(weights), flat.shape[1])) if out is None else out.reshape(len(weights), -1)
 
@@ -237,16 +207,15 @@ PROBES = 8
 _STUDENT = 12.706205, 4.302653, 3.182446
 """97.5 % quantiles of Student's t with 1, 2, 3 and more degrees of freedom."""
 _OF_ONE_KIND = 0.625
-"""Power of the share of one kind of noise with which the squared bound grows. The bound of four groups then holds in 95
-to 99 % of draws with 1 to 500 equal kinds, and in 93 to 95 % where one kind has a tenth to nine tenths of the noise. A
-power of 0.75 gives 91 % there."""
+"""Power of the share of one kind of noise with which the squared bound grows: with four groups it holds in 93 to 99 %
+of draws (91 % for a power of 0.75).
+"""
 
 
 def probe_vectors(pixels: int, seed: int) -> FloatArray:
     """Return (pixels, 1 + 8) vectors v with E sum |A v|^2 = ||A||^2: a constant one, and random signs.
 
-    The constant vector is exact because most of a frame's error is common to its columns, where few signs scatter by 12
-    %.
+    The constant vector is exact because most of a frame's error is common to its columns.
     """
     constant = np.full((pixels, 1), pixels**-0.5)
     signs = stream(seed, "probe").choice((-1.0, 1.0), size=(pixels, PROBES)) / PROBES**0.5
@@ -257,13 +226,6 @@ def noise_of_groups(probed: FloatArray, rows: int, groups: int) -> FloatArray:
     """Return the (groups, groups) inner products of the differences of groups' frames from their mean.
 
     No matrix product is used because the order in which BLAS adds depends on its threads.
-
-    Parameters
-    ----------
-    probed
-        (rows * groups * probes,) frames of the groups times :func:`probe_vectors`.
-    rows, groups
-        Rows of a frame, and groups of the light.
     """
     by_group = probed.reshape(rows, groups, -1)
     off = by_group - by_group.mean(axis=1, keepdims=True)
@@ -271,20 +233,13 @@ def noise_of_groups(probed: FloatArray, rows: int, groups: int) -> FloatArray:
 
 
 def bound_of(products: FloatArray, energy: float) -> float:
-    """Return the 95 % bound of a relative Monte Carlo error.
+    """Return the 95 % bound of a relative error from (G, G) inner ``products`` and the frames' squared norm.
 
-    The actual error is one draw, and its estimate another. The ratio of bound to estimate depends on the number of
-    kinds of noise. With many kinds, all groups differ alike, and the inner products of their differences have G - 1
-    equal eigenvalues. With a single kind, all differences are multiples of one frame, and the bound is that of
-    Student's t with G - 1 degrees of freedom. In between, the squared bound grows with the squared norm of the
-    products, faster at first, because three differences do not always show a kind that has most of the noise.
-
-    Parameters
-    ----------
-    products
-        (G, G) inner products of the groups' contributions to the error; their trace is its square, not yet relative.
-    energy
-        Squared norm of the frames.
+    With many kinds of noise, the products have G - 1 equal eigenvalues. With one kind, the bound is that of
+    Student's t
+    with G - 1 degrees of freedom. In between, the squared bound grows with the squared norm of the products, faster
+    at
+    first, because three differences do not always show a kind that has most of the noise.
     """
     variance, freedom = float(np.trace(products)), len(products) - 1
     if not energy or not variance or not freedom:

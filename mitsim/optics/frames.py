@@ -22,9 +22,8 @@ from mitsim.optics import forming
 from mitsim.optics.image_formation import IntArray
 
 _AT_ONCE, _BYTES_AT_ONCE = 32, 2**27
-"""Frames formed at a time, and their bytes: enough to occupy all processors."""
 _LARGEST_BASIS, _BASIS_BYTES = 256, 7 * 2**28
-"""Largest number of class frames in memory, and their bytes. Beyond, frames are formed twice."""
+"""Largest number of class frames in memory, and their bytes."""
 _FLOAT = 8
 """Bytes per pixel."""
 _ALL = sparse.csr_array(np.ones((1, 1)))
@@ -33,21 +32,12 @@ _ALL = sparse.csr_array(np.ones((1, 1)))
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Expected frame of one shot.
+    """Expected irradiance (m, m') [W m^-2] of one shot, and its Monte Carlo variance (mean over pixels).
 
-    Attributes
-    ----------
-    irradiance
-        (m, m') expected irradiance [W m^-2].
-    variance
-        Monte Carlo variance, mean over pixels.
-    removed
-        Light that was set to zero, relative to the frame's sum. Interpolation between anchors can leave values slightly
-        below zero where a pixel sees almost no light.
-    heaviest
-        Largest part of the variance from one group of the light: (G - 1) / G if one path dominates.
-    by_group
-        (G, G) inner products of the groups' contributions; the variance is their trace.
+    ``removed`` is the part of the light below zero, which interpolation between anchors can leave. ``heaviest`` is
+    the
+    largest part of the variance from one group of the light: (G - 1) / G if one path dominates. ``by_group`` has the
+    (G, G) inner products of the groups' contributions.
     """
 
     irradiance: FloatArray
@@ -59,15 +49,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class ClassFrames:
-    """Frames of some classes at full power, without Monte Carlo error.
-
-    Attributes
-    ----------
-    classes
-        (c,) increasing class numbers; the frames of all other classes are zero.
-    irradiance
-        (c, m, m') irradiance [W m^-2].
-    """
+    """Irradiance (c, m, m') [W m^-2] of increasing ``classes`` at full power; all others are zero."""
 
     classes: IntArray
     irradiance: FloatArray
@@ -77,7 +59,6 @@ class ClassFrames:
 
 
 def at_once(pixels: float) -> int:
-    """Return the number of frames of ``pixels`` per side that are formed at a time."""
     return max(1, min(_AT_ONCE, int(_BYTES_AT_ONCE // (_FLOAT * pixels**2))))
 
 
@@ -87,12 +68,11 @@ def frames_in_memory(classes: int, shots: int, pixels: float) -> int:
 
 
 def formed_frames(classes: int, shots: int, pixels: float) -> int:
-    """Return the number of frames that are formed for a run, which asks for its frames twice."""
+    """Return the number of frames that are formed for a run, which asks for them twice."""
     return classes if mixes(classes, shots, pixels) else 2 * shots
 
 
 def mixes(classes: int, shots: int, pixels: float) -> bool:
-    """Return True if shots are mixed from class frames in memory rather than formed one by one."""
     return classes <= min(_LARGEST_BASIS, shots, _BASIS_BYTES // (_FLOAT * pixels**2))
 
 
@@ -100,19 +80,19 @@ def mixes(classes: int, shots: int, pixels: float) -> bool:
 
 
 class ExpectedFrames:
-    """Frames of every shot of a family, each with the Monte Carlo variance of its mean; iterate as often as needed.
+    """Frames of every shot of a family, each with the Monte Carlo variance of its mean.
 
-    Because light is linear, frames are formed once for a *basis* of light distributions and mixed: the classes of
-    projector pixels that a family always lights together. A family with too many classes is formed shot by shot.
-
-    The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``; it is 0 for one group.
-    Squared norms are estimated without bias from products with random signs (Hutchinson's estimator), because forming G
-    times as many frames would cost more than the frames themselves.
+    Because light is linear, frames are formed once for a *basis*, the classes of projector pixels that a family
+    always
+    lights together, and mixed. A family with too many classes is formed shot by shot. The variance of the mean of G
+    groups
+    is ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``, and 0 for one group. Squared norms are estimated without bias from
+    products with random signs (Hutchinson's estimator).
 
     Parameters
     ----------
     lights
-        Light of the same rows (projector pixels or classes), in one or several kinds of cells; their groups are paired.
+        Light of the same rows in one or several kinds of cells; their groups are paired.
     lighting
         Class of each row, and the fraction of full power that each class emits in each shot.
     seed
@@ -160,18 +140,15 @@ class ExpectedFrames:
 
     @property
     def has_ambient(self) -> bool:
-        """Return True if emitters other than the projector light every frame."""
         return bool(self._ambient)
 
     @property
     def projector_off(self) -> Frame:
-        """Return the frame of ambient light alone, with the Monte Carlo error of all frames."""
         light = np.zeros(self._shape) if self._ambient_light is None else self._ambient_light[0][0]
         return Frame(np.maximum(light, 0.0), 0.0, 0.0, 0.0)
 
     @property
     def of_projector(self) -> ExpectedFrames:
-        """Return the same shots without ambient light."""
         dark = copy(self)
         dark._ambient = ()
         for with_ambient in ("_ambient_light", "_energies"):
@@ -192,19 +169,13 @@ class ExpectedFrames:
     # ---- Monte Carlo error, from random signs alone ----
 
     def sampling_error(self) -> tuple[float, float]:
-        """Return the relative Monte Carlo error of all frames and its 95 % bound without forming frames.
-
-        Random signs estimate the frames' energy too, to a few percent.
-        """
+        """Return the relative Monte Carlo error of all frames and its 95 % bound without forming frames."""
         parts, energy, _ = self._energies
         return (float(np.sqrt(np.trace(parts) / energy)), forming.bound_of(parts, energy)) if energy else (0.0, 0.0)
 
     @property
     def noise(self) -> tuple[FloatArray, FloatArray]:
-        """Return (lights, G, G) and (ambient, G, G) parts of the Monte Carlo variance of all frames, up to one factor.
-
-        Parts that were probed before are 0.
-        """
+        """Return (lights, G, G) and (ambient, G, G) parts of the variance, up to a factor; 0 if probed before."""
         of_lights = self._energies[2]
         return of_lights[: len(self._lights)], of_lights[len(self._lights) :]
 
@@ -224,10 +195,7 @@ class ExpectedFrames:
 
     @property
     def probed(self) -> FloatArray | None:
-        """Return (classes, m * groups * probes) products of class frames of single groups with random signs.
-
-        The value is None if shots are formed one by one.
-        """
+        """Return (classes, m * groups * probes) products with random signs; None if shots are formed one by one."""
         if self._mixed and self._probed is None:
             self._probed, self._noise = forming.probe_frames(self._lights, self._basis, self._probes)
         return self._probed
@@ -329,7 +297,7 @@ class ExpectedFrames:
 
 
 def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
-    """Return the Monte Carlo part of ||a - b|| / ||b|| over all pixels of all ``frames``."""
+    """Return the Monte Carlo part of ||a - b|| / ||b|| over all ``frames``."""
     variance = energy = 0.0
     for frame in frames:
         variance += frame.variance * frame.irradiance.size
@@ -338,7 +306,7 @@ def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
 
 
 def monte_carlo_bound(frames: Sequence[Frame] | ExpectedFrames) -> float:
-    """Return the 95 % bound of the Monte Carlo error of all ``frames``; see :func:`bound_of`."""
+    """Return the 95 % bound of the Monte Carlo error of all ``frames``."""
     parts, energy = np.zeros((1, 1)), 0.0
     for frame in frames:
         parts = parts + frame.by_group * frame.irradiance.size
@@ -378,24 +346,17 @@ Kernel = Callable[[FloatArray], FloatArray]
 
 
 def add_speckle(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
-    """Multiply ``irradiance`` (any shape and unit) by a gamma field of mean 1 and standard deviation ``contrast``."""
+    """Multiply ``irradiance`` by a gamma field of mean 1 and standard deviation ``contrast``."""
     if contrast == 0:
         return irradiance
     return np.asarray(irradiance * rng.gamma(contrast**-2, contrast**2, size=irradiance.shape))
 
 
 def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray) -> float:
-    """Return the mean contrast of speckle in one sensor pixel by the module's formula.
+    """Return the mean contrast of speckle in one sensor pixel by the formula above.
 
-    Parameters
-    ----------
-    devices
-        Camera and projector, whose table ``speckle`` states the coherence of its light.
-    pixels_mm
-        Height and width of a projector pixel on the aligned plane [mm].
-    lit
-        (n, n) light of each projector pixel, any unit.
-
+    ``pixels_mm`` is the size of a projector pixel on the aligned plane, and ``lit`` the (n, n) light of each, any
+    unit.
     """
     coherence, spectrum = devices.projector.speckle or Coherence(), devices.projector.spectrum
     wavelengths = spectrum.wavelengths_nm
@@ -414,10 +375,7 @@ def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArra
 
 
 def _space(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray, wavelength_mm: float) -> float:
-    """Return the mean over pairs of points for one wavelength [mm].
-
-    It is relative to the sum of the squares of all pixels' light, because pixels of the mask's shadow differ.
-    """
+    """Return the mean over pairs of points for one wavelength, relative to the sum of squares of all pixels' light."""
     camera, radius = devices.camera, (devices.projector.speckle or Coherence()).beam_radius_mm
 
     def grains(distance: FloatArray, width: float) -> FloatArray:

@@ -1,10 +1,10 @@
 """Closed form of image formation: irradiance on every sensor pixel from light per (layer, anchor, tan-angle cell).
 
-The shadow of a cell on the sensor is separable, and so is the interpolation between anchors. The frame of one light
-distribution T is ``sum over layers and mask terms of L T R^T``, where the rows of T run over (anchor row, cell row) and
-its columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that
-hold light enter the product: one in k of each for k x k shifting dots. Behind a mask that is drawn on a raster
-(:mod:`mitsim.optics.fft_shadow`), the frame of each pair of anchors is a correlation.
+The shadow of a cell is separable, and so is the interpolation between anchors. The frame of one light distribution T
+is ``sum over layers and mask terms of L T R^T``, where the rows of T run over (anchor row, cell row) and its columns
+over (anchor column, cell column). Only rows and columns that hold light enter the product. Behind a mask that is
+drawn
+on a raster (:mod:`mitsim.optics.fft_shadow`), the frame of each pair of anchors is a correlation.
 """
 
 from __future__ import annotations
@@ -39,16 +39,12 @@ IntArray = npt.NDArray[np.integer]
 Entries = tuple[IntArray, FloatArray]
 """Increasing indices into (layers, rows, columns), and the light [W m^-2] at each."""
 _FILLED = 1 / 8
-"""Part of all places above which light is laid out whole, because it then occupies every row and column."""
+"""Part of all places above which light is laid out whole."""
 _keep_shadow = lru_cache(maxsize=24)(shadow_terms)
-"""Cache of shadows, a few MiB each, because a plan asks for the same ones repeatedly."""
 SUMMED_BYTES = 2**28
-"""Memory limits of a raster's terms, and of the terms of the lit rows and columns."""
 
 _JUDGED = 64
-"""Pixels per side on which a raster is judged."""
 _FINER = 2
-"""Factor of cells per side of the raster that judges."""
 
 
 # -------- One layer behind a mask, as terms or on a raster
@@ -67,7 +63,7 @@ class _Lit:
 
 @dataclass(frozen=True, eq=False)
 class _Terms:
-    """One layer behind a mask of separable terms: factors (m, cells) and (m', cells), and anchors' weights."""
+    """One layer behind a mask of separable terms."""
 
     terms: SeparableTerms
     weights: tuple[FloatArray, FloatArray]
@@ -106,19 +102,7 @@ class _Terms:
 
 @dataclass(frozen=True, eq=False)
 class _Raster:
-    """One layer behind a mask on a raster, as a sum of the largest terms or as a correlation, whichever is faster.
-
-    Attributes
-    ----------
-    shadow
-        Camera, directions of rows and of columns, depth, and lines of the light.
-    weights
-        Weights (m, anchors) and (m', anchors) of the anchors.
-    places
-        Rows and columns of a frame; None for all.
-    summed
-        The terms; None if there are too many.
-    """
+    """One layer behind a mask on a raster, as a sum of the largest terms (``summed``) or a correlation."""
 
     shadow: tuple[CameraGeometry, Directions, Directions, float, Spectrum | None]
     weights: tuple[FloatArray, FloatArray]
@@ -214,7 +198,7 @@ class FrameOptics:
 
     @classmethod
     def of_terms(cls, layers: Sequence[SeparableTerms], weights: tuple[FloatArray, FloatArray]) -> FrameOptics:
-        """Return optics from known ``layers`` of terms and ``weights`` (m, anchors), (m', anchors) of the anchors."""
+        """Return optics from known ``layers`` of terms and ``weights`` of the anchors."""
         found = cls.__new__(cls)
         cells = layers[0][0][0].shape[1], layers[0][0][1].shape[1]
         found._prepare([_Terms(terms, weights) for terms in layers], cells)
@@ -229,19 +213,16 @@ class FrameOptics:
 
     @property
     def terms(self) -> list[SeparableTerms] | None:
-        """Return the shadow of each layer as separable terms; None if one is drawn on a raster."""
+        """Return the terms of each layer; None if one is drawn on a raster."""
         found = [layer.terms for layer in self._layers if isinstance(layer, _Terms)]
         return found if len(found) == len(self._layers) else None
 
     def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
-        """Return the (m, m') irradiance of ``light`` [W m^-2] at increasing indices ``flat`` into (layers, *shape)."""
+        """Return the (m, m') irradiance of ``light`` [W m^-2] at increasing indices into (layers, *shape)."""
         return self.frame_and_products([(flat, light)], None)[0]
 
     def probe(self, estimates: Sequence[Entries], vectors: FloatArray | None = None) -> FloatArray:
-        """Return the (m, estimates * probes) products of frames of several ``estimates`` with ``vectors`` (m', probes).
-
-        The frames are not formed because that would cost far more; without ``vectors`` they are returned side by side.
-        """
+        """Return the (m, estimates * probes) products of frames with ``vectors`` without forming the frames."""
         rows, columns = self.frame_shape
         total = np.zeros((rows, len(estimates) * (columns if vectors is None else vectors.shape[1])))
         for layer, lit in self._lit_layers(estimates):
@@ -251,21 +232,9 @@ class FrameOptics:
     def frame_and_products(
         self, estimates: Sequence[Entries], vectors: FloatArray | None, out: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the frame of the mean of several estimates, and the product of each one's frame with some vectors.
+        """Return the (m, m') mean frame of ``estimates``, and (m, estimates * probes) products of each one's.
 
-        Parameters
-        ----------
-        estimates
-            Estimates of one light.
-        vectors
-            (m', probes), or None for no products.
-        out
-            (m, m') zeros in which the frame is returned; None for a new array.
-
-        Returns
-        -------
-        tuple
-            (m, m') and (m, estimates * probes).
+        ``out``, if given, has to hold zeros.
         """
         probes = 0 if vectors is None else vectors.shape[1]
         frame, probed = None, np.zeros((self.frame_shape[0], len(estimates) * probes))
@@ -321,7 +290,7 @@ def raster_error(
     spectrum: Spectrum | None,
     light: FloatArray,
 ) -> tuple[float, bool]:
-    """Return the relative rms error of a raster's frame of a ``light`` (r, c) on a few pixels about the axis.
+    """Return the relative rms error of a raster's frame on a few pixels about the axis.
 
     The second value is True if the reference is the sum of the mask's terms, and False if it is a raster of half the
     cells.
@@ -350,7 +319,6 @@ def raster_error(
 
 
 def number_of_terms(drawn: Plate) -> float:
-    """Return the number of terms of a shadow that is ``drawn`` on a raster; infinite if they are too many."""
     return drawn.largest.count if drawn.largest.left_out <= RASTER_LEFT_OUT else math.inf
 
 
@@ -362,10 +330,7 @@ def largest_terms(
     spectrum: Spectrum | None = None,
     places: Places | None = None,
 ) -> SeparableTerms | None:
-    """Return the separable terms of a raster's shadow up to 1e-4 of it; None if they exceed the memory limit.
-
-    The parameters are those of :func:`mitsim.optics.terms.shadow_terms`.
-    """
+    """Return the separable terms of a raster's shadow up to 1e-4; None if they exceed the memory limit."""
     drawn = raster(geometry, depth, spectrum)
     shape = geometry.frame_shape if places is None else map(len, places)
     sides = sum(side * len(each.centres) for side, each in zip(shape, (rows, columns), strict=True))
@@ -391,11 +356,11 @@ def _stack(parts: Sequence[FloatArray]) -> FloatArray:
 
 
 def anchor_positions(count: int, half_width: float) -> FloatArray:
-    """Return the (``count``,) coordinates of anchors on a sensor of ``half_width``: Chebyshev nodes."""
+    """Return the coordinates of anchors on a sensor of ``half_width``: Chebyshev nodes."""
     k = np.arange(count)
     return -half_width * np.cos(np.pi * (2 * k + 1) / (2 * count))
 
 
 def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
-    """Return (len(at), len(anchors)) Lagrange weights that interpolate from ``anchors`` to the points ``at``."""
+    """Return (len(at), len(anchors)) Lagrange weights."""
     return np.stack(lagrange_weights(at, np.asarray(anchors, dtype=np.float64)), axis=1)

@@ -1,13 +1,10 @@
 """Irradiance on every sensor pixel from beams that mirrors carry to the sensor.
 
-A beam is a thin bundle of rays from a pinhole projector: a quadrilateral of one projector pixel's window. Its flux is
-known, its four corner rays give the place where it lands, and all quantities between them are bilinear. A beam is cut
-into boxes of at most half a sensor pixel, and each box gives every pixel that it overlaps its part of the flux times
-the mask's mean over the part. Because boxes tile the beam, flux is conserved for any shape.
-
-The mask enters as separable terms of samplers (:mod:`mitsim.optics.fft_shadow`); a wave-optical mask needs the
-distance of the virtual source, :attr:`Beams.inverse_depth`. Coordinates are centred index coordinates (s_row = -y,
-s_col = -x) in mm.
+A beam is a quadrilateral of one projector pixel's window with a known flux. Its four corner rays give the place where
+it lands, and quantities between them are bilinear. A beam is cut into boxes of at most half a sensor pixel, and each
+box gives the pixels that it overlaps their part of the flux times the mask's mean. Because boxes tile the beam, flux
+is
+conserved. Coordinates are centred index coordinates (s_row = -y, s_col = -x) in mm.
 """
 
 from __future__ import annotations
@@ -30,9 +27,7 @@ from mitsim.optics.frames import ClassFrames
 from mitsim.optics.image_formation import IntArray
 
 _BOXES_AT_ONCE = 2**18
-"""Boxes in memory at a time: some tens of MiB."""
 _POINT = 1e-9
-"""Relative length below which a beam counts as a point."""
 _ASKEW_BOXES = 2
 """Factor of boxes per side for an askew beam, which otherwise shows a moire of 1 %."""
 
@@ -46,17 +41,17 @@ class Beams:
     pixel
         (q,) projector pixel (row * n + column) that each beam leaves.
     flux
-        (q,) flux that the projector puts into each beam at full power [W m^-2 mm^2].
+        (q,) flux at full power [W m^-2 mm^2].
     sensor
         (q, 2, 2, 2) points where the corner rays cross the sensor plane [mm].
     tangent
-        (q, 2, 2, 2) tan-angles (x/z, y/z, in index coordinates) seen from these points.
+        (q, 2, 2, 2) tan-angles seen from these points, in index coordinates.
     throughput
         (q, 2, 2) part of the light that remains at each corner.
     unresolved
-        Flux on the sensor that is in no beam, because the place where it lands was not found.
+        Flux on the sensor whose place was not found.
     error
-        Standard error of the flux on the sensor from beams that an edge cuts and that were not divided further.
+        Standard error of the flux from beams that an edge cuts and that were not divided further.
     """
 
     pixel: IntArray
@@ -72,17 +67,16 @@ class Beams:
 
     @property
     def delivered(self) -> FloatArray:
-        """Return the (q,) flux that arrives at the sensor plane, on the sensor or beside it [W m^-2 mm^2]."""
+        """Return the (q,) flux that arrives at the sensor plane [W m^-2 mm^2]."""
         return np.asarray(self.flux * self.throughput.mean(axis=(1, 2)))
 
     @property
     def wide(self) -> npt.NDArray[np.bool_]:
-        """Return (q,) True for beams that are larger than points."""
         return np.asarray((np.ptp(self.sensor.reshape(len(self), 4, 2), axis=1) > 0).any(axis=1))
 
     @property
     def inverse_depth(self) -> FloatArray:
-        """Return (q, 2) 1/z [1/mm] of the virtual source along both axes, from dt/du = -1/z at the beam's centre."""
+        """Return (q, 2) 1/z [1/mm] of the virtual source, from dt/du = -1/z at the beam's centre."""
         return -_slope(self.sensor, self.tangent)
 
 
@@ -90,14 +84,9 @@ class Beams:
 class SpecularFrames(ClassFrames):
     """Irradiance by mirrors, one frame for each class of projector pixels that reaches the sensor.
 
-    Attributes
-    ----------
-    lit_pixels
-        (p,) projector pixels whose light meets the sensor plane within the sensor, behind the mask or not.
-    flux
-        Flux on the sensor without the mask, all classes at full power [W m^-2 mm^2].
-    unresolved, error
-        Flux that is left out, and standard error of the rest from beams that edges cut; same unit.
+    ``lit_pixels`` are the projector pixels whose light meets the sensor. ``flux`` is that on the sensor without the
+    mask
+    [W m^-2 mm^2], ``unresolved`` the part that is left out, and ``error`` the standard error of the rest.
     """
 
     lit_pixels: IntArray
@@ -109,22 +98,20 @@ class SpecularFrames(ClassFrames):
 def specular_frames(
     beams: Beams, geometry: CameraGeometry, terms: Sequence[SampledTerm], labels: IntArray, boxes_per_pixel: int = 2
 ) -> SpecularFrames:
-    """Form the frames of the classes that mirrors bring to the sensor; memory is one frame per class.
+    """Form the frames of the classes that mirrors bring to the sensor.
 
     Parameters
     ----------
     beams
         Result of ``mitsim.transport.specular.trace_specular_chains``.
     geometry
-        The camera; irradiance is the mean over a pixel's active square, times fill factor and response.
+        The camera.
     terms
         Samplers of the mask; ``[]`` gives no light.
     labels
         (n * n,) class of each projector pixel.
     boxes_per_pixel
-        Boxes along a sensor pixel, at least 2, because a box turned by 45 degrees must not reach a third pixel. Any
-        number is exact where beams are aligned with the pixels' rows and columns.
-
+        Boxes along a sensor pixel, at least 2, because a box turned by 45 degrees must not reach a third pixel.
     """
     labels = np.asarray(labels)
     corners = beams.sensor.reshape(len(beams), 4, 2)
@@ -183,8 +170,9 @@ class _Boxes(NamedTuple):
 def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
     """Yield all boxes of the beams ``reached``, no side longer than ``box`` [mm], in portions that fit into memory.
 
-    Numbers of boxes per side are rounded up to three leading bits, so that many beams share one. Askew beams get up to
-    three times as many, because boxes then overlap and leave gaps.
+    Numbers of boxes are rounded up to three leading bits, so that many beams share one. Askew beams get up to three
+    times
+    as many, because boxes then overlap and leave gaps.
     """
     corners = beams.sensor[reached]
     sides = [np.diff(corners, axis=axis).reshape(len(reached), 2, 2) for axis in (1, 2)]
@@ -255,9 +243,9 @@ def _gradients(corners: FloatArray, a: FloatArray, b: FloatArray) -> tuple[Float
 
 
 def _slope(sensor: FloatArray, tangent: FloatArray) -> FloatArray:
-    """Return (q, 2) dt/du along rows and columns at the beams' centres; 0 where a beam is folded to a line.
+    """Return (q, 2) dt/du at the beams' centres; 0 where a beam is folded to a line.
 
-    The cross term dt_row/du_column of a curved mirror is neglected because it matters only over less than a box.
+    The cross term of a curved mirror is neglected because it matters only over less than a box.
     """
     middle = np.array([0.5])
     (ua, ub), (ta, tb) = ([g[:, 0, 0] for g in _gradients(c, middle, middle)] for c in (sensor, tangent))
@@ -272,37 +260,22 @@ def _slope(sensor: FloatArray, tangent: FloatArray) -> FloatArray:
 # -------- Frames of a projector's beams
 
 _KEPT = 4
-"""Number of lightings and cameras whose frames are cached."""
 
 
 class SpecularLight:
-    """Frames from ``beams``, of which the last few are cached because forming them takes as long as tracing.
-
-    ``seconds`` is the time that forming all frames took last; 0 before.
-    """
+    """Frames from ``beams``; the last few are cached because forming them takes as long as tracing."""
 
     def __init__(self, beams: Beams) -> None:
         self.beams, self.seconds = beams, 0.0
         self._kept = lru_cache(_KEPT)(self._form)
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
-        """Return the frames by class of projector pixels; None if no beam reaches the sensor.
-
-        Parameters
-        ----------
-        labels
-            (n^2,) class of each pixel.
-        geometry
-            The camera.
-        spectrum
-            Light whose diffraction is simulated; None for a geometric shadow.
-        """
+        """Return the frames of classes ``labels`` (n^2,); None if no beam reaches the sensor."""
         if not len(self.beams):
             return None
         return self._kept(np.asarray(labels, np.int64).tobytes(), geometry, spectrum)
 
     def irradiance(self, geometry: CameraGeometry) -> tuple[float, float]:
-        """Return the mean irradiance without the mask, and its missing or uncertain part in each pixel [W m^-2]."""
         beams = self.beams
         area, pixels = math.prod(geometry.pitches), math.prod(geometry.frame_shape)
         met = (np.abs(beams.sensor.mean(axis=(1, 2))) < geometry.half_width).all(axis=1)

@@ -1,26 +1,22 @@
 """Geometric shadow of a mask: mean transmissions from sensor pixels and directions, as separable terms.
 
-The ray from sensor coordinate u toward the direction tau = x/z, which meets the scene at depth z, crosses the mask
-plane (distance d) at s = u (1 - d/z) + d tau. The mean over a sensor pixel and a cell is the profile weighted by the
-density of s, which is the convolution of two boxes: a trapezoid. Its integral over each feature is a difference of a
-piecewise quadratic distribution function, so that the mean is exact. (A second cumulative sum of the profile gives the
-same in exact arithmetic but cancels in float64.) Point directions leave the box of the pixel. Profiles with uneven or
-blurred features are handled by :mod:`mitsim.optics.edge_profile`.
+The ray from sensor coordinate u toward tau = x/z, which meets the scene at depth z, crosses the mask plane (distance
+d) at s = u (1 - d/z) + d tau. The mean over a pixel and a cell is the profile weighted by a trapezoid, the
+convolution
+of two boxes. Its integral over each feature is a difference of a piecewise quadratic function, so that the mean is
+exact. (A second cumulative sum of the profile would cancel in float64.) Profiles with uneven or blurred features are
+handled by :mod:`mitsim.optics.edge_profile`.
 
-A thick mask has two faces; the entrance is ``thickness`` further from the sensor than the exit. A ray of slope t (x/z
-seen from its sensor point) that leaves through s entered at s' = s + thickness t. For a point source at (tau z, z)
-this is a function of s alone::
+The entrance face of a thick mask is ``thickness`` further from the sensor than the exit. For a point source at
+(tau z, z), a ray that leaves through s entered at::
 
     s' = s (1 - thickness / (z - d)) + thickness tau / (1 - d/z)
 
-Therefore each direction has its own clear profile M(s) M(s') on the exit face, whose shadow is that of a thin mask. A
-cell takes the clear profile of its centre.
+Therefore each direction has its own clear profile M(s) M(s') on the exit face. A cell takes that of its centre.
 
 A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. A mask that is
 tilted along the axis, at distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t),
-times sqrt(1 + a^2) along it (:mod:`mitsim.optics.terms`).
-
-All coordinates are centred index coordinates in mm; tau is a pure number.
+times sqrt(1 + a^2) along it. All coordinates are centred index coordinates in mm.
 """
 
 from __future__ import annotations
@@ -44,20 +40,11 @@ EVEN = ((0.0, 0.0), (0.0, 0.0))
 Places = tuple[tuple[int, ...], tuple[int, ...]]
 """Increasing rows and columns of a frame."""
 _WIDE = 32
-"""Features in half a trapezoid from which antiderivatives are used, because their cost does not grow."""
 
 
 @dataclass(frozen=True, eq=False)
 class Directions(ByValue):
-    """Directions along one axis, seen from the sensor's centre: equal cells, or points.
-
-    Attributes
-    ----------
-    centres
-        (c,) increasing tan-angles x/z (index coordinates), read-only.
-    width
-        Width of each cell in tan-angle; 0 for points.
-    """
+    """Directions along one axis: increasing tan-angles ``centres`` (c,) of cells of one ``width``, 0 for points."""
 
     centres: FloatArray
     width: float
@@ -80,22 +67,18 @@ class ShadowGeometry:
 
     Attributes
     ----------
-    mask
-        The mask; both faces of a thick one carry it.
-    pixel_centres_mm
-        (m,) sensor coordinates.
+    pixel_centres_mm, columns_mm
+        (m,) sensor coordinates; those of columns if they differ from those of rows.
     active_mm
-        Length of the active part of a pixel [mm], over which the shadow is averaged.
+        Length of the active part of a pixel, over which the shadow is averaged.
     distance_mm, thickness_mm
-        Distance from the sensor to the exit face, d, and thickness of the mask [mm].
+        Distance from the sensor to the exit face, d, and thickness of the mask.
     depth_mm
-        Distance from the sensor to the scene, z [mm]; ``inf`` is allowed.
+        Distance from the sensor to the scene, z; ``inf`` is allowed.
     offset_mm
         (row, column) of the mask's centre.
     tilt
         For rows and columns: growth of the mask's distance with the coordinate, and its excess at the centre [mm].
-    columns_mm
-        Pixel coordinates of columns if they differ from those of rows.
     """
 
     mask: Mask | Plate
@@ -110,7 +93,7 @@ class ShadowGeometry:
 
     @classmethod
     def of(cls, camera: CameraGeometry, depth_mm: float, places: Places | None = None) -> ShadowGeometry:
-        """Return the shadow geometry of a camera for points at ``depth_mm``; ``places`` selects rows and columns."""
+        """Return the shadow geometry for points at ``depth_mm``; ``places`` selects rows and columns."""
         rows, columns = (camera.centres(axis) for axis in (0, 1))
         if places is not None:
             rows, columns = rows[np.asarray(places[0])], columns[np.asarray(places[1])]
@@ -131,15 +114,12 @@ class ShadowGeometry:
 
     @property
     def half_pixel(self) -> float:
-        """Return half an active side as seen on the mask [mm]."""
         return self.active_mm * self.shrink / 2
 
     def half_cell(self, directions: Directions) -> float:
-        """Return half a cell of ``directions`` as seen on the mask [mm]."""
         return self.distance_mm * directions.width / 2
 
     def along(self, axis: int) -> ShadowGeometry:
-        """Return a copy that has the pixels of one ``axis`` (0 rows, 1 columns) on both axes."""
         if self.columns_mm is None:
             return self
         if not axis:
@@ -147,7 +127,7 @@ class ShadowGeometry:
         return replace(self, pixel_centres_mm=self.columns_mm[0], active_mm=self.columns_mm[1], columns_mm=None)
 
     def from_mask(self, directions: Directions, axis: int) -> tuple[ShadowGeometry, Directions]:
-        """Return shadow and directions along one ``axis`` (0 rows, 1 columns) in coordinates of the mask's centre."""
+        """Return shadow and directions along one ``axis`` in coordinates of the mask's centre."""
         offset, tilt, own = self.offset_mm[axis], (self.tilt[axis],) * 2, self.along(axis)
         if not offset:
             return (own if tilt == own.tilt else replace(own, tilt=tilt)), directions
@@ -155,11 +135,10 @@ class ShadowGeometry:
         return moved, Directions(directions.centres - offset / self.depth_mm, directions.width)
 
     def crossings(self, directions: Directions) -> FloatArray:
-        """Return the (m, c) points [mm] at which rays from pixel centres toward ``directions`` cross an even mask."""
+        """Return the (m, c) points [mm] at which rays from pixel centres cross an even mask."""
         return self.shrink * self.pixel_centres_mm[:, None] + self.distance_mm * directions.centres[None, :]
 
     def on_tilted_mask(self, directions: Directions) -> FloatArray:
-        """Return the crossings on the tilted mask, for ``directions`` along an axis of :meth:`from_mask`."""
         (growth, beyond), even = self.tilt[0], self.crossings(directions)
         if not (growth or beyond):
             return even
@@ -167,12 +146,11 @@ class ShadowGeometry:
         return np.asarray((even + slope * (growth * even + beyond) / (1 - growth * slope)) * np.hypot(1, growth))
 
     def weights(self) -> list[float]:
-        """Return the weight of each term of the clear aperture: for a thick mask, products of two weights."""
         weights = [weight for weight, _, _ in self.mask.terms]
         return [a * b for a in weights for b in weights] if self.thickness_mm else weights
 
     def clear(self, profiles: Sequence[FloatArray], tau: float) -> list[Steps]:
-        """Return the part of ``profiles`` that both faces leave clear toward ``tau``, ordered as :meth:`weights`."""
+        """Return the part of ``profiles`` that both faces leave clear toward ``tau``."""
         faces = [Steps.between(profile, self.mask.lines, self.mask.blur_mm) for profile in profiles]
         if not self.thickness_mm:
             return faces
@@ -187,10 +165,7 @@ def both_axes(
     columns: Directions,
     axis: Callable[[ShadowGeometry, list[FloatArray], Directions], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute a shadow along rows and along columns, once if both axes are equal.
-
-    ``axis`` returns the shadow of profiles of a centred mask toward directions.
-    """
+    """Compute a shadow along rows and columns, once if both are equal."""
     terms = shadow.mask.terms
     row_profiles, column_profiles = [row for _, row, _ in terms], [column for _, _, column in terms]
     by_row, seen_rows = shadow.from_mask(rows, 0)
@@ -203,7 +178,7 @@ def both_axes(
 
 
 def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions) -> SeparableTerms:
-    """Return the geometric shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left."""
+    """Return the separable terms [(left (m, r), right (m, c)), ...], weights folded into left."""
     means = _thick_means if shadow.thickness_mm else _thin_means
     left, right = both_axes(shadow, rows, columns, means)
     return [(weight * a, b) for weight, a, b in zip(shadow.weights(), left, right, strict=True)]
@@ -228,14 +203,10 @@ def _thick_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions:
 
 
 def trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:
-    """Return the mean of the profile around each crossing over two boxes of the given half-widths, in features.
-
-    ``half_b`` may be 0.
-    """
+    """Return the mean of the profile around each crossing over two boxes, in features; ``half_b`` may be 0."""
     short, long = np.minimum(half_a, half_b), np.maximum(half_a, half_b)
 
     def below(x: FloatArray) -> FloatArray:
-        """Return the part of the trapezoid below ``x``."""
         distance = np.abs(x)
         # The tail is used only where it is not empty and at most 2 short wide, so neither bound changes a value.
         tail = np.square(np.clip(short + long - distance, 0, 2 * short))
@@ -258,13 +229,13 @@ def trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray
 
 
 def nodes_between(places: FloatArray, count: int) -> FloatArray:
-    """Return (``count``,) Chebyshev nodes between the ``places`` that are farthest from 0; 0 for one."""
+    """Return Chebyshev nodes between the ``places`` that are farthest from 0; 0 for one."""
     reach = float(np.abs(places).max())
     return np.asarray(reach * np.cos(np.pi * (np.arange(count) + 0.5) / count) if count > 1 else np.zeros(1))
 
 
 def lagrange_weights(places: FloatArray, nodes: FloatArray) -> list[FloatArray]:
-    """Return for each node the weights that interpolate to ``places`` by Lagrange polynomials."""
+    """Return for each node the Lagrange weights that interpolate to ``places``."""
     weights = []
     for node in nodes:
         parts = [(places - other) / (node - other) for other in nodes[nodes != node]]

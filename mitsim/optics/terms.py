@@ -55,8 +55,8 @@ def shadow_terms(
 ) -> SeparableTerms:
     """Return the shadow of directions at one depth as separable terms [(left (m, r), right (m', c)), ...].
 
-    Each value is the mean over a pixel's active area times the fill factor, because irradiance is per pixel area.
-    Weights are folded into left. The angular response belongs to the light and is not included.
+    Each value is the mean over a pixel's active area times the fill factor, because irradiance is per pixel area. The
+    angular response belongs to the light and is not included.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def shadow_terms(
     depth
         Distance of the scene [mm].
     spectrum
-        Lines of a wave-optical shadow, each with its own terms weighted by its share; None for a geometric shadow.
+        Lines of a wave-optical shadow, each with its own terms; None for a geometric shadow.
     places
         Increasing rows and columns of the frame; None for all.
     """
@@ -120,7 +120,6 @@ def shadow_terms(
 NODE_UM = 0.5
 """Shift between nodes: it errs by less than 1 % of the effect of a rotation by 1 mrad."""
 _SHAKES = np.linspace(-4.0, 4.0, 25)
-"""Places over which a shaking mask is averaged, in standard deviations."""
 
 
 def _moving_terms(
@@ -162,7 +161,6 @@ def _moving_terms(
 
 
 def _crossings(shadow: ShadowGeometry, rows: Directions, columns: Directions) -> list[FloatArray]:
-    """Return where rays toward rows and toward columns cross the mask, from its centre [mm]."""
     both = enumerate((rows, columns))
     return [shadow.along(axis).crossings(directions) - shadow.offset_mm[axis] for axis, directions in both]
 
@@ -184,14 +182,13 @@ def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
 _LEFT_OUT = 0.03
 """Part of the residual (rms) that its terms may neglect: a thousandth of its energy."""
 _TURNS = 2
-"""Iterations for the brightness of a session's pixels: the third changes the residual by 1e-7."""
 
 
 @dataclass(frozen=True, eq=False)
 class BestTerm:
-    """The separable term ``left (x) right`` nearest to an operator A in the Frobenius norm.
+    """The separable term nearest to an operator A in the Frobenius norm, both factors of equal norm.
 
-    Both factors have equal norms; ``residual`` is ||A - left (x) right|| / ||A||.
+    ``residual`` is ||A - left (x) right|| / ||A||.
     """
 
     left: FloatArray
@@ -201,10 +198,7 @@ class BestTerm:
 
 @dataclass(frozen=True, eq=False)
 class Lacking:
-    """Part of a camera's operator that its factors lack.
-
-    ``terms`` hold the difference but for 3 % of it (rms); ``residual`` is its Frobenius norm relative to the operator.
-    """
+    """Part of a camera's operator that its factors lack, but for 3 % (rms), and its relative norm."""
 
     terms: SeparableTerms
     residual: float
@@ -213,8 +207,7 @@ class Lacking:
 def best_term(terms: SeparableTerms) -> BestTerm:
     """Return the separable term that is closest to the sum of ``terms``, with the sign of the largest term.
 
-    The singular values follow from a product of two small triangles from QR factorisations. Gram matrices would square
-    the condition number and leave 1e-8 where the residual is zero.
+    Singular values come from QR factorisations, because Gram matrices would leave 1e-8 where the residual is zero.
     """
     values, split = _singular(terms)
     left, right = split(0)
@@ -224,17 +217,11 @@ def best_term(terms: SeparableTerms) -> BestTerm:
 
 
 def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacking:
-    """Return the part of an operator that factors estimated from a session's stripes lack.
+    """Return the part of an operator that factors (m, n) and (m', n') estimated from a session's stripes lack.
 
-    Stripes give factors of an operator in closed form (:func:`_of_stripes`). Comparing those of ``terms``, which assume
-    pixels of one brightness, with the found factors gives the brightness of each column in the session.
-
-    Parameters
-    ----------
-    terms
-        The operator [(left (m, n), right (m', n')), ...].
-    left, right
-        The factors (m, n) and (m', n'), centred like the terms.
+    Comparing the factors that stripes give of ``terms``, which assume pixels of one brightness, with the found
+    factors
+    gives the brightness of each column in the session.
     """
     whole = terms
     for _ in range(_TURNS):
@@ -253,7 +240,8 @@ def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
     """Return the factors that stripes give of an operator (:mod:`mitsim.reconstruct.factors`).
 
     The uniform response sum_k (L_k 1) (R_k 1)^T splits into a v^T, and stripes h 1^T into u v^T with
-    u = sum_k L_k h <R_k 1, v> / |v|^2. So the left factor is the sum of L_k with these weights; the right one likewise.
+    u = sum_k L_k h <R_k 1, v> / |v|^2. Therefore the left factor is the sum of L_k with these weights, and likewise
+    right.
     """
     uniform = best_term([(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True)) for a, b in terms])
     split = uniform.left[:, 0], uniform.right[:, 0]
@@ -277,13 +265,13 @@ def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], Separa
 
 
 def relative_difference(terms: SeparableTerms, reference: SeparableTerms) -> float:
-    """Return ||A - B|| / ||B|| of two operators; rounding hides values below 1e-7."""
+    """Return ||A - B|| / ||B||; rounding hides values below 1e-7."""
     minus = [(-left, right) for left, right in reference]
     return float(np.sqrt(_energy([*terms, *minus]) / _energy(reference)))
 
 
 def centre_terms(terms: SeparableTerms) -> SeparableTerms:
-    """Return the ``terms`` of frames without means of rows and columns: every factor's columns lose theirs."""
+    """Return the ``terms`` of frames without means of rows and columns."""
     return [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
 
 
@@ -305,31 +293,19 @@ def _energy(terms: SeparableTerms) -> float:
 # of rays from pixels to directions.
 
 _ANGLE = 2.0
-"""Half the power of the cosine: light from a flat board to a flat sensor falls with the fourth power."""
 _DERIVED_MM = 5e-4
-"""Shift of the mask for derivatives: a twentieth of a pixel."""
 _KEPT = 12
-"""Cached factors: one point, and one step of each number."""
 
 
 @dataclass(frozen=True)
 class Placement:
     """Positions of mask and projector, and brightness of the board.
 
-    Attributes
-    ----------
-    mask_distance
-        Sensor to mask [mm].
-    mask_shift_row, mask_shift_column
-        Shift of the mask's centre beyond the camera's own offset [mm], index coordinates.
-    mask_rotation
-        Rotation about its centre from rows toward columns [rad].
-    magnification
-        Scale of the projector's window about its centre.
-    projector_row, projector_column
-        Shift of the window [tangent of the angle].
-    gain
-        Electrons per second that a projector pixel on the board makes on a sensor pixel without the mask.
+    ``mask_distance`` and the shifts of the mask's centre beyond the camera's own offset are in mm. ``mask_rotation``
+    runs
+    from rows toward columns [rad]. ``magnification`` scales the projector's window, whose shift is a tangent.
+    ``gain`` is
+    in electrons per second that a projector pixel makes on a sensor pixel without the mask.
     """
 
     mask_distance: float
@@ -342,25 +318,12 @@ class Placement:
     gain: float = 1.0
 
     def move(self, steps: Mapping[str, float]) -> Placement:
-        """Return a placement with ``steps`` added to some of its numbers, by name."""
         return replace(self, **{name: getattr(self, name) + step for name, step in steps.items()})
 
 
 @dataclass(frozen=True, eq=False)
 class ModelledCamera:
-    """Model of a camera as designed.
-
-    Attributes
-    ----------
-    geometry
-        The camera.
-    windows
-        Row and column tan-angles of the projector's window on the aligned plane.
-    n
-        Projector pixels per side.
-    spectrum
-        Lines of a wave-optical shadow; None for a geometric shadow.
-    """
+    """Model of a camera as designed, with tan-angles ``windows`` of the projector on the aligned plane."""
 
     geometry: CameraGeometry
     windows: tuple[tuple[float, float], tuple[float, float]]
@@ -369,11 +332,10 @@ class ModelledCamera:
 
     @property
     def built(self) -> Placement:
-        """Return the placement as designed."""
         return Placement(self.geometry.mask_distance)
 
     def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
-        """Return the (m, n) left and (m', n) right factor [sqrt(electrons / s)] of an unturned mask."""
+        """Return the (m, n) and (m', n') factors [sqrt(electrons / s)] of an unturned mask."""
         left, right = self._cached_factors(replace(placement, gain=1.0, mask_rotation=0.0))
         root = np.sqrt(placement.gain)
         return left * root, right * root
@@ -401,7 +363,7 @@ class ModelledCamera:
         return form
 
     def rotation_terms(self, placement: Placement) -> SeparableTerms:
-        """Return the change of the product of the factors per radian of rotation of the mask at a ``placement``."""
+        """Return the change of the product of the factors per radian of rotation of the mask."""
         step = {"mask_shift_row": _DERIVED_MM, "mask_shift_column": _DERIVED_MM}
         ahead = self.factors(placement.move(step))
         behind = self.factors(placement.move({name: -value for name, value in step.items()}))
