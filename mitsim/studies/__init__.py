@@ -1,14 +1,14 @@
-"""Experiments: capture, calibrate and reconstruct together, judged against the truth and shown to people.
+"""Experiments: capture, calibrate and reconstruct together, judged against the truth.
 
-This file has their names alone. The study NAME is the module ``mitsim.studies.NAME_study``, or one of :data:`SHARED`.
+The study NAME is the module ``mitsim.studies.NAME_study``, or one of :data:`SHARED`.
 """
 
 from __future__ import annotations
 
 OF_NO_SCENE = ("twin",)
-"""Those whose bench is None."""
+"""Studies whose bench is None."""
 OF_CAPTURES = ("learned", "twin")
-"""Those of real captures (`--data`)."""
+"""Studies of real captures (`--data`)."""
 PAPER = (
     "patterns",
     "distance",
@@ -22,23 +22,21 @@ PAPER = (
     "depth",
     "waterfall",
 )
-"""Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
-order."""
+"""Studies that `mitsim study all` puts on one page, in this order."""
 EXPERIMENTS = (*PAPER, "accuracy", "calibration", "colour", "drift", "learned", "sweep", "twin")
-"""Studies of many points: their modules have a ``STUDY``. ``learned`` is not on the page of all: it takes hours,
-and torch, which may be missing."""
+"""Studies of many points, whose modules have a ``STUDY``. The page of all lacks ``learned``, because it takes hours and
+needs torch."""
 SHARED = {
     **dict.fromkeys(("distance", "binning", "resolution", "depth"), "camera_studies"),
     **dict.fromkeys(("patterns", "exposure", "ambient", "reflectivity"), "light_studies"),
     **dict.fromkeys(("multishot", "convolutional"), "other_cameras"),
 }
-"""Modules of several studies of many points, whose ``STUDIES`` have each by its name."""
+"""Modules of several studies, whose ``STUDIES`` have each by its name."""
 GONE = {
     **dict.fromkeys(("diffraction", "models"), "calibration SCENE"),
     "regularisation": "sweep SCENE --over method=tikhonov,tv",
     "separation": "reflectivity",
     "transfer": "learned --data DIR",
 }
-"""Names of studies that became part of others, and the arguments of `mitsim study` that replace them."""
+"""Former studies, and the arguments of `mitsim study` that replace them."""
 ALL = "all"
-"""What the study of all experiments of the paper is called."""

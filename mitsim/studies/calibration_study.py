@@ -1,18 +1,15 @@
-"""What limits a calibration session and an image that is made with its factors, on one bench.
+"""Limits of a calibration session, and of an image that is made with its factors, on one bench.
 
-*entries*, *singular*: factors of noisy frames against factors of the expected frames of the same light, beside the
-errors that the sensor's closed form predicts before any frame is drawn. *causes*: what no separable camera explains of
-the expected frames, formed again without one cause. *models*: images with factors of models that are fitted to a few
-frames. *shadows*: diffraction at the mask. *losses*: what each source costs one image.
+*entries*, *singular*: factors of noisy frames against those of expected frames, beside predicted errors. *causes*:
+residual of a separable camera without one cause. *models*: factors of models fitted to a few frames. *shadows*:
+diffraction at the mask. *losses*: cost of each source in one image.
 
-The squared error E of the image is divided into parts V, which add up. Parts of noise are expected values of a
-perturbation of the solver with a fixed lambda (:mod:`mitsim.studies.causes`). What the light of the scene has that
-factors, measured on an even white board, do not hold (detail inside projector pixels, depth, light over several
-surfaces) is found from frames without noise of the traced light, solved with factors without noise: of the same light
-without one cause after another, less what lambda alone removes. What is left of E is not explained. Noise is drawn
-once, so every V, and what is left, scatter by chance. A source costs ``10 log10(E / (E - V))``, the gain of the image
-without the source; these decibels do not add up. A drift that adds the squared error A costs ``10 log10((E + A) / E)``.
-Any share of what is not explained may belong to any source; the uncertainty is what that changes, and chance.
+The squared error E of the image is the sum of parts V. Parts of noise are expected values of a perturbation of the
+solver with a fixed lambda (:mod:`mitsim.studies.causes`). Parts of the scene's light that the factors lack (detail
+inside projector pixels, depth, light over several surfaces) follow from noiseless frames without one cause after
+another, less the part that lambda alone removes. The rest of E is unexplained and may belong to any source. Noise is
+drawn once, so that every V scatters by chance. A source costs ``10 log10(E / (E - V))``, the gain of the image without
+the source; these decibels do not add up. A drift that adds the squared error A costs ``10 log10((E + A) / E)``.
 """
 
 from __future__ import annotations
@@ -74,9 +71,8 @@ Row = dict[str, Value]
 # -------- What each source costs an image
 
 CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"
-"""Where a loss comes from, beside the session."""
 RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
-"""Sampling of simulated light; what the solver takes away of the scene itself; and what no named cause has."""
+"""Sampling of simulated light; the solver's regularisation; and the part without a named cause."""
 ERROR_SOURCES = MappingProxyType(
     {
         causes.DETAIL: "detail inside projector pixels",
@@ -88,20 +84,19 @@ ERROR_SOURCES = MappingProxyType(
         causes.BLACK_LEVEL: "light that black pixels leak",
     }
 )
-"""Effects of the scene's light that factors do not hold, in the order in which they are taken out, in words. The others
-are in the light of the white board as well."""
+"""Effects of the scene's light that factors lack, in the order of their removal."""
 SURE = 3.0
-"""Standard errors from which what is not explained is no chance: 1 of 370 studies has more of normal scatter."""
+"""Standard errors from which the unexplained part is not chance (1 of 370 normal studies)."""
 _LEAST_LEFT = 1e-9
-"""Part of an image's error that is left without a source, at least: 90 dB, for images that one source explains."""
+"""Least part of an image's error that is left without a source: 90 dB."""
 
 
 @dataclass(frozen=True)
 class LossRow:
     """Loss of an image [dB] by a ``source`` of noise, or by a drift of an ``amount``, and its standard error.
 
-    ``of`` is capture, session, scene, drift, solver or unexplained. ``squared_error`` is that of the source, mean over
-    the image, below 0 where the image has more without the source, and ``deviation`` its standard error by chance.
+    ``of`` is capture, session, scene, drift, solver or unexplained. ``squared_error`` is the source's, mean over the
+    image, below 0 where the image is worse without the source.
     """
 
     of: str
@@ -114,7 +109,6 @@ class LossRow:
 
     @property
     def name(self) -> str:
-        """Name of the row in words."""
         if self.of == UNEXPLAINED:
             return self.source
         what = DRIFT_WORDS.get(self.source, self.source) if self.of == DRIFT else f"{self.of}: {self.source}"
@@ -123,7 +117,7 @@ class LossRow:
 
 @dataclass(frozen=True)
 class Share:
-    """A part of an image's squared error, mean over the image, and the deviation by chance."""
+    """Part of an image's squared error, mean over the image, and its standard deviation."""
 
     square: float
     deviation: float = 0.0
@@ -131,17 +125,7 @@ class Share:
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """Parts of one image's squared error.
-
-    Attributes
-    ----------
-    parts
-        shares by where they come from and by source.
-    scatter, drawn
-        scatter of images by factors without noise, and all noise that is drawn.
-    steady
-        (n, n') error that is no noise.
-    """
+    """Parts of one image's squared error by origin and source, all drawn noise, and (n, n') the ``steady`` error."""
 
     parts: dict[tuple[str, str], Share]
     scatter: Scatter
@@ -150,15 +134,9 @@ class Budget:
 
 
 def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[LossRow], list[str]]:
-    """Return the rows of noise, scene, every drift of the recipe and the unexplained rest, and reasons why some drifts
-    could not be predicted.
+    """Return rows of noise, scene, drifts and the unexplained rest, and reasons why some drifts were not predicted.
 
-    Parameters
-    ----------
-    stand
-        scene in its light, camera and patterns; its recipe states the drift.
-    lit, clear
-        session that the stand's factors are of, and its factors without noise.
+    ``clear`` are the factors of the session ``lit`` without noise.
     """
     budget = _budget(stand, lit, clear)
     measured, explained = squared_error(stand.before_db), sum(part.square for part in budget.parts.values())
@@ -175,11 +153,10 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[Los
 
 
 def _drifts(stand: DriftStand, budget: Budget, measured: float) -> tuple[list[LossRow], list[str]]:
-    """Return rows of drifts for the squared error that is ``measured``, and why some could not be predicted.
+    """Return rows of drifts for the ``measured`` squared error, and reasons why some were not predicted.
 
-    The error that a drift adds, and what that has in common with the error without drift, are those of the model. But
-    the model's drift does not move what the model leaves out of the scene's light, as the true one does. Therefore the
-    uncertainty is all that these have in common, and chance.
+    The model's drift does not move light that the model lacks. Therefore the uncertainty is all that the model's error
+    and the rest have in common, and chance.
     """
     still, found, refused = stand.expected_image(Drift()), list[LossRow](), list[str]()
     target, scene, pixels = still.image - budget.steady, stand.lit.truth, budget.steady.size
@@ -204,7 +181,6 @@ def _drifts(stand: DriftStand, budget: Budget, measured: float) -> tuple[list[Lo
 
 
 def _unexplained_row(measured: float, explained: float, chance: float) -> LossRow:
-    """Return the row of squared error that is ``measured`` and not ``explained``, whose deviation is ``chance``."""
     left = measured - explained
     lost = _decibels(left / measured)
     error = abs(_decibels((left + chance) / measured) - lost)
@@ -235,7 +211,7 @@ def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> Budget:
 
 
 def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]:
-    """Yield images without noise of the scene's light, and of this light without one cause after another."""
+    """Yield noiseless images of the scene's light, and of it without one cause after another."""
     scene_ablation, off = Ablation.of(stand.lit.light), frozenset[str]()
     yield "", stand.clear(clear, stand.lit.light)
     for name in ERROR_SOURCES:
@@ -245,11 +221,7 @@ def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, Floa
 
 
 def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) -> dict[tuple[str, str], Share]:
-    """Return the shares of a scene's light beside that of a white board, by cause, and of lambda.
-
-    ``seen`` are images of the light with its causes, then without one after another; ``sampled`` is the noise of its
-    rendering, which all of these images share.
-    """
+    """Return the shares of a scene's light by cause, and of lambda; ``sampled`` is the rendering noise of all images."""
     exact, scene, found = scatter.solver, scatter.scene, {(SCENE, ERROR_SOURCES[causes.DETAIL]): Share(0.0)}
     (_, last), *others = seen.items()
     for name, image in others:
@@ -268,14 +240,10 @@ def _square(error: FloatArray) -> float:
 
 
 def gain_without(part: float, measured: float, explained: float, deviation: float = 0.0) -> tuple[float, float]:
-    """Return the decibels that an image would gain without a source, and their standard error.
+    """Return the gain of an image without a source [dB], and its standard error.
 
-    Parameters
-    ----------
-    part, deviation
-        predicted squared error of the source, and its deviation by chance.
-    measured, explained
-        squared error of the image as it is, and as predicted of all sources together.
+    ``part`` and ``deviation`` are the source's predicted squared error and its chance; ``measured`` and ``explained``
+    are the image's squared error and its prediction from all sources.
     """
     most = max(measured, explained)
     lost = _decibels(part / most)
@@ -287,12 +255,10 @@ def gain_without(part: float, measured: float, explained: float, deviation: floa
 
 
 def _decibels(part: float) -> float:
-    """Return the gain of an image without a ``part`` of its squared error."""
     return -10 * math.log10(max(1 - part, _LEAST_LEFT)) if part else 0.0
 
 
 def _noises(stand: DriftStand, lit: LitSession) -> Mapping[tuple[str, str], Noise]:
-    """Return noise by where it comes from and by source."""
     found = dict[tuple[str, str], Noise]()
     for name, noise in stand.noises.items():
         if name != SESSION and (name not in (AMBIENT, SPECKLE) or noise != Noise()):
@@ -312,14 +278,8 @@ def session_rendering(flux: FloatArray, flux_error: FloatArray, factors: tuple[F
     """Return the noise that sampling of a session's light leaves in its ``factors``.
 
     Where pixel (x, y) of the board is lit by 1 + e_xy of its light, column x of the left factor is multiplied by
-    1 + sum_y e_xy w_y, w_y = Phi_R(y) . v / |v|^2, v the sum of all columns of Phi_R.
-
-    Parameters
-    ----------
-    flux, flux_error
-        (n^2,) of each projector pixel, and its standard error.
-    factors
-        left and right, (m, n) and (m', n').
+    1 + sum_y e_xy w_y, w_y = Phi_R(y) . v / |v|^2, v the sum of all columns of Phi_R. ``flux`` and ``flux_error``
+    (n^2,) are of each projector pixel.
     """
     lit = flux > 0
     error = float(np.mean(np.square(flux_error[lit] / flux[lit]))) if lit.any() else 0.0
@@ -331,18 +291,11 @@ def session_rendering(flux: FloatArray, flux_error: FloatArray, factors: tuple[F
 
 
 def entry_variances(lit: LitSession, factors: tuple[FloatArray, FloatArray], side: str) -> dict[str, FloatArray]:
-    """Return the predicted variance (m, n) of the entries of a factor by source.
+    """Return the predicted variance (m, n) of the entries of the factor of a ``side``, by source.
 
-    u_i = Y_i v / |v|^2 has the variance sum_c V_rc v_c^2 / |v|^4 in row r, V being that of a response's pixels, and
-    U H^T / N averages N of them with signs. Noise that all responses share comes into column p by the mean of its
-    signs: all of it where they are all +1, and nothing elsewhere.
-
-    Parameters
-    ----------
-    lit, factors
-        the session, and left and right factor.
-    side
-        whose stripes give the factor.
+    u_i = Y_i v / |v|^2 has the variance sum_c V_rc v_c^2 / |v|^4 in row r, V being that of a response's pixels, and U
+    H^T / N averages N of them with signs. Noise that all responses share enters column p by the mean of its signs:
+    fully where they are all +1, and not at all elsewhere.
     """
     signs, common = lit.session.signs, (factors[1] if side == SIDES[0] else factors[0]).sum(axis=1)
 
@@ -360,26 +313,24 @@ def entry_variances(lit: LitSession, factors: tuple[FloatArray, FloatArray], sid
 
 
 def as_built(bench: AnyBench) -> AnyBench:
-    """Return a ``bench`` whose mask is off its place by :data:`OFF_MM`."""
     camera = bench.geometry
     changed = camera.model_copy(update={name: getattr(camera, name) + off for name, off in OFF_MM.items()})
     return replace(bench, devices=replace(bench.devices, camera=changed))
 
 
 OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}
-"""Differences of a camera and its plan, as of a mask that is glued on by hand, under a microscope."""
+"""Placement errors of a mask that is glued on by hand, under a microscope."""
 _MODEL_FRAMES = (2, 16)
-"""Frames that models are fitted to: uniform light alone, and a few stripes."""
 _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
-"""Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
+"""Effects of which frames are formed again in the same light; for others light is traced again."""
 _PROFILE_MM, _SAID_DB = 0.7, 0.005
-"""Half of the range of a point's shadow that is kept: a dozen mask features; loss from which a bar is drawn."""
+"""Half of the range of a point's shadow that is kept: a dozen mask features; least loss that is drawn."""
 
 
 def measure_session(
     bench: Bench, recipe: SessionRecipe, patterns: str, seed: int, accuracy: float
 ) -> tuple[list[Row], dict[str, FloatArray]]:
-    """Return the rows of a session and of an image that is made with its factors, and maps of the factors' errors.
+    """Return the rows of a session and of an image with its factors, and maps of the factors' errors.
 
     The session is taken without the drift of its ``recipe``, whose cost is predicted.
     """
@@ -423,8 +374,7 @@ def _factors(lit: LitSession, estimate: Estimate) -> Factors:
 
 
 def fit_models(lit: LitSession, stand: DriftStand) -> tuple[list[Row], list[str]]:
-    """Return rows of images with factors of models that are fitted to a few frames of a session, starting from a plan
-    that the camera differs from, and the reasons why some can't be fitted."""
+    """Return rows of images with models fitted to a few frames, from a wrong plan, and reasons why some failed."""
     rows: list[Row] = []
     refused, planned = [], as_built(lit.session.bench)
     for model, wanted in product(get_args(Model), _MODEL_FRAMES):
@@ -445,8 +395,9 @@ def fit_models(lit: LitSession, stand: DriftStand) -> tuple[list[Row], list[str]
 
 
 def compare_shadows(bench: Bench) -> list[Row]:
-    """Return rows of the shadow of the mask of a ``bench`` in each light against the geometric one, and of a point's
-    shadow down the rows in the middle of the sensor, relative to the open sensor's irradiance."""
+    """Return rows of the mask's shadow in each light against the geometric one, and of a point's shadow relative to the
+    open sensor's irradiance.
+    """
     cameras = {name: IdealCamera(bench, bench.geometry.mask, spectrum) for name, spectrum in lights(bench).items()}
     rows: list[Row] = [{"kind": "shadows", **shadow_row(name, cameras)} for name in cameras]
     places = np.asarray(bench.geometry.centres(0))
@@ -462,8 +413,9 @@ def compare_shadows(bench: Bench) -> list[Row]:
 
 @single_threaded_blas()
 def judge_session(lit: LitSession, noisy: Estimate, clean: Estimate) -> tuple[list[Row], dict[str, FloatArray]]:
-    """Return rows of a session: errors of ``noisy`` factors against ``clean`` ones beside their prediction, and its
-    cost; and maps (m, n) of the entries' errors in predicted deviations, by factor."""
+    """Return rows of the errors of ``noisy`` factors against ``clean`` ones and their prediction, and maps (m, n) of
+    the errors in predicted deviations.
+    """
     rows, maps = [session_cost(lit, noisy, clean)], {}
     pairs = zip(FACTORS, SIDES, (clean.left, clean.right), (noisy.left, noisy.right), strict=True)
     for name, side, exact, found in pairs:
@@ -483,19 +435,12 @@ def judge_session(lit: LitSession, noisy: Estimate, clean: Estimate) -> tuple[li
 
 
 def singular_rows(exact: FloatArray, found: FloatArray, deviation: FloatArray) -> Iterator[Row]:
-    """Yield singular values and vectors of a factor with noise beside those without.
+    """Yield singular values and vectors of a factor with noise (``found``) beside those without (``exact``).
 
     With a_jk = u_j^T E v_k, to first order s_k moves by a_kk, to second order by the mean of sum_j (s_k (a_jk^2 +
     a_kj^2) + 2 s_j a_jk a_kj) / (2 (s_k^2 - s_j^2)) + |(1 - U U^T) E v_k|^2 / (2 s_k), and v_k turns by the root of
     sum_j (s_k a_kj + s_j a_jk)^2 / (s_k^2 - s_j^2)^2 (Stewart and Sun 1990, Matrix Perturbation Theory, chapter V).
-    Both want gaps between values that are larger than their errors.
-
-    Parameters
-    ----------
-    exact, found
-        (m, n) without and with noise.
-    deviation
-        (m, n) of each entry, independent.
+    Gaps between values must exceed their errors. ``deviation`` (m, n) is of independent entries.
     """
     left, values, right = np.linalg.svd(exact, full_matrices=False)
     _, noisy, turned = np.linalg.svd(found, full_matrices=False)
@@ -524,8 +469,9 @@ def singular_rows(exact: FloatArray, found: FloatArray, deviation: FloatArray) -
 
 
 def session_cost(lit: LitSession, noisy: Estimate, clean: Estimate) -> Row:
-    """Return the row of a session: frames, seconds of exposure without read-out, expected photoelectrons and photons,
-    and the separability residuals of its frames with noise and without."""
+    """Return the row of a session: frames, seconds without read-out, expected photoelectrons and photons, and
+    separability residuals with noise and without.
+    """
     recipe, order = lit.session.recipe, len(lit.session.order)
     lit_s = sum(lit.exposures_s) * recipe.repeats
     # Shots of uniform light: both of a pair together are one.
@@ -543,7 +489,7 @@ def session_cost(lit: LitSession, noisy: Estimate, clean: Estimate) -> Row:
 
 
 def residuals(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[Row]:
-    """Yield rows of the separability residual of expected frames without each cause, and of what noise adds to it."""
+    """Yield rows of the separability residual without each cause, and of the part that noise adds."""
     whole, simulation, session = clean.separability_residual, lit.light.simulation, lit.session
 
     def without(session: Session, light: SampledLight) -> float:
@@ -562,8 +508,7 @@ def residuals(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> It
 
 
 def residual_row(cause: str, residual: float, left: float) -> Row:
-    """Return the row of a ``cause`` without which so much of a residual is ``left``; ``part`` is the root of the
-    difference of the squares, below 0 where the residual grows without the cause."""
+    """Return the row of a ``cause``: ``part`` is the root of the difference of the squared residuals, signed."""
     less = residual**2 - left**2
     return {"kind": "causes", "cause": cause, "residual": left, "part": float(np.copysign(np.sqrt(abs(less)), less))}
 
@@ -573,7 +518,6 @@ def _is_missing(row: LossRow) -> bool:
 
 
 def verdict_of(row: LossRow) -> str:
-    """Return the verdict on the part of an image's squared error that is not explained."""
     errors = abs(row.squared_error) / row.deviation if row.deviation else 0.0
     if errors <= 1:
         return "what is not explained is within its standard error"
@@ -603,7 +547,7 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 _SHOWN_DEVIATIONS = 4.0
-"""Range of the maps: one of 16 000 entries lies beyond."""
+"""Range of the maps [deviations]: one of 16 000 entries lies beyond."""
 _TABLES = {
     "losses": ("What an image loses", "of source amount lost_db error_db squared_error deviation"),
     "session": (
@@ -623,7 +567,6 @@ _TABLES = {
 
 
 def _tables(results: Results) -> list[Part]:
-    """Return the rows of each kind as a table, the dearest losses first."""
     rows = sorted(results.rows, key=lambda row: -float(str(row.get("lost_db") or 0)))
     shown = {
         kind: [tuple(_text(row.get(name)) for name in columns.split()) for row in rows if row["kind"] == kind]

@@ -1,69 +1,63 @@
-"""Effects of causes on light and on images: light of a scene without some of its effects, and images of changed frames.
+"""Effects of causes on light and on images: light without some of its effects, and expected errors of changed frames.
 
-**Light without effects** (:class:`Ablation`). Without any effect it is the paper's idealised model: an evenly lit sheet
-at the aligned distance that shows the truth, under the geometric shadow of the mask. Between that model and the light
-itself nothing is changed but what is removed:
+**Light without effects** (:class:`Ablation`). Light without any effect is the paper's idealised model: an evenly lit
+sheet at the aligned distance that shows the truth, under the geometric shadow of the mask. Removing an effect means:
 
-- *falloff*: every projector pixel is as bright on a white board as their mean (its light is divided by its own flux
-  there, times the mean), and the sensor sees it everywhere as in the mean over the sensor (that in matt scenes only).
-- *diffraction*, *black level*, *speckle*: their neutral values (:data:`mitsim.bench.effects.EFFECTS`).
+- *falloff*: every projector pixel is as bright on a white board as their mean, and (in matt scenes only) the sensor
+  sees it everywhere as in the mean over the sensor.
+- *diffraction*, *black level*, *speckle*: neutral values (:data:`mitsim.bench.effects.EFFECTS`).
 - *keystone*: light lies where its projector pixel would, if the window filled its bounding box evenly.
 - *depth*: light lies where its ray from the projector meets the aligned plane.
 - *occlusion*: pixels that an edge hides from part of the sensor are as bright everywhere as in the mean over it.
-- *detail*: the light of a projector pixel is even over the pixel; with depth or defocus on, over all points of it that
-  send any (where the plan has several cells a pixel; one cell holds no detail).
-- *interreflection*, *mirrors*, *ambient*: light over several surfaces, over mirrors, of lamps is none.
-- *gloss*: every point of the sensor sees what it sees in the mean over the sensor, in scenes with glossy surfaces (the
-  falloff over the sensor, below 1e-3 of the frames, goes with it). The truth shows that mean, so gloss over the scene
-  is no error.
-- *defocus*: a pinhole for the projector's lens, and sharp pixels.
-- *render noise*: each projector pixel has the flux that the truth states, without the sampling error of the light: no
-  effect of nature, but what the simulation adds at its accuracy.
+- *detail*: the light of a projector pixel is even over the pixel; with depth or defocus on, over its points that send
+  light (only where the plan has several cells per pixel).
+- *interreflection*, *mirrors*, *ambient*: no light over several surfaces, over mirrors, or from lamps.
+- *gloss*: every point of the sensor sees the mean over the sensor, in scenes with glossy surfaces (the falloff over the
+  sensor, below 1e-3 of the frames, goes as well). The truth shows that mean.
+- *defocus*: a pinhole replaces the projector's lens, and pixels are sharp.
+- *render noise*: each projector pixel has the flux that the truth states, without the sampling error of the light.
 
-The truth is the same for all. Not taken out: what lies in the idealised model as well (response of pixels, thickness of
-the mask), and glare; it and light of sharp lobes are not moved, and indirect light stays where it is seen.
+The truth is the same for all. Glare and the parts of the idealised model (response of pixels, thickness of the mask)
+are not removed. Glare and light of sharp lobes are not moved, and indirect light stays where it is seen.
 
-**Images of changed frames** (:class:`LinearImage`). The squared error that an image is expected to have follows from
-its factors and from what its frames differ by; no frame is formed, no noise drawn and nothing solved. With lambda fixed
-the solver is linear. With B_L = [Phi_L diag(p_i)]_i = U_L S_L V_L^T (row blocks U_Li of U_L), and the same on the
-right, it makes of frames Y_ij the image
+**Images of changed frames** (:class:`LinearImage`). With lambda fixed the solver is linear, so that the expected
+squared error follows from the factors without forming frames. With B_L = [Phi_L diag(p_i)]_i = U_L S_L V_L^T (row
+blocks U_Li of U_L), and the same on the right, the image of frames Y_ij is
 
     X^ = V_L [F o W] V_R^T,  W = sum_ij U_Li^T Y_ij U_Rj,  F = s_L s_R^T / (s_L^2 s_R^2^T + lambda).
 
-What any change of the frames does to W is a product of small matrices:
+Changes of the frames affect W as follows:
 
-* frames L (P_ij o X) R^T of other factors: W = G(L) X G(R)^T with ``G(L) = sum_i U_Li^T L diag(p_i)``; of the solver's
-  own ones G = S V^T;
-* frames times gains g_ij: W = sum_ij g_ij G_i X G_j^T, with the terms of G one by one;
+* frames L (P_ij o X) R^T of other factors: W = G(L) X G(R)^T with ``G(L) = sum_i U_Li^T L diag(p_i)``; the solver's own
+  factors have G = S V^T;
+* gains g_ij of frames: W = sum_ij g_ij G_i X G_j^T, with the terms G_i of G;
 * gains of rows, 1 + u_ij d with a vector d of the rows and u_ij of variance 1 from frame to frame: the square of each
-  frame's term of W with diag(d) L in place of L; a ripple of the light has two such d, its cosine and its sine;
+  frame's term of W with diag(d) L in place of L; a ripple of the light has two such d, cosine and sine;
 * a frame E added to all: W = (sum_i U_Li)^T E (sum_j U_Rj);
-* pixels whose responses differ by R from what the factors know: W = sum_ij U_Li^T (R o Y_ij) U_Rj;
-* noise of variance v in each datum: the variance of each number of W is v, as U_L and U_R are orthonormal; of a frame
-  that is taken off all others v |sum_i U_Li|^2 |sum_j U_Rj|^2, column by column;
-* noise of variance nu^2 in each number of the left factor that the frames do not know of: that of G is
-  nu^2 |sum_i p_i(x) U_Li|^2, and so on through the product, and the same of the right one;
-* an error of variance e^2 in each scene pixel's light, equal in all frames: that of W is e^2 s_L^2 s_R^2^T;
-* columns x of the left factor times 1 + eta_x of variance eta^2: eta^2 sum_x (s_L V_L(x))^2 (X V_R S_R)(x)^2; and of
-  the right one.
+* pixels whose responses differ by R from those in the factors: W = sum_ij U_Li^T (R o Y_ij) U_Rj;
+* noise of variance v in each datum: variance v of each number of W, as U_L and U_R are orthonormal; in a frame that is
+  subtracted from all others v |sum_i U_Li|^2 |sum_j U_Rj|^2, column by column;
+* noise of variance nu^2 in each number of the left factor that the frames do not share: that of G is nu^2 |sum_i p_i(x)
+  U_Li|^2, and so on through the product; likewise on the right;
+* an error of variance e^2 in each scene pixel's light, equal in all frames: e^2 s_L^2 s_R^2^T;
+* columns x of the left factor times 1 + eta_x of variance eta^2: eta^2 sum_x (s_L V_L(x))^2 (X V_R S_R)(x)^2; likewise
+  on the right.
 
-A pattern of +-1 is the difference of two frames (1 +- P) / 2. What is added to both is gone, their noise and their
-flicker add up, and with gains g+ and g- it is (g+ + g-) / 2 of the pattern and (g+ - g-) / 2 of uniform light.
+A pattern of +-1 is the difference of two frames (1 +- P) / 2: constant additions cancel, noise and flicker add up, and
+gains g+ and g- give (g+ + g-) / 2 of the pattern and (g+ - g-) / 2 of uniform light. The expected squared error of X^
+is that of its mean plus, as V is orthonormal, the sum of F^2 times these variances.
 
-The expected squared error of X^ is that of its mean and, as V is orthonormal, the sum of F^2 times these variances.
+Scatter of the squared error about its expectation: with b the error that is not noise and C the covariance of normal
+noise e, |b + e|^2 has the variance 2 tr(C^2) + 4 b^T C b. In the coefficients above, e = F o dW:
 
-How far the squared error of one image scatters about what is expected of it: with b the part of an image's error that
-is no noise, and C the covariance of the noise in its numbers, the squared error |b + e|^2 of normal e has the variance
-2 tr(C^2) + 4 b^T C b. In the coefficients above, e = F o dW,
-
-* noise of data and of the scene's light is independent from one number of W to the next, of variance v_kl, so that
-  tr(C^2) = sum F_kl^4 v_kl^2; so are different kinds of noise, whose variances add up;
-* noise of variance nu_kx^2 of the left factor's G has row k of W see scene pixel x through a_x = (X V_R S_R)(x): C_k =
+* noise of data and of the scene's light is independent between numbers of W, of variance v_kl: tr(C^2) = sum F_kl^4
+  v_kl^2; variances of independent kinds of noise add up;
+* noise of variance nu_kx^2 of the left factor's G: row k of W sees scene pixel x through a_x = (X V_R S_R)(x), C_k =
   F_k o (sum_x nu_kx^2 a_x a_x^T) o F_k, hence tr(C_k^2) = nu_k^2^T (K_k o K_k) nu_k^2 with K_k(x, y) = sum_l F_kl^2
-  a_xl a_yl; rows are taken for independent, as they are where patterns share no pixels;
-* columns of the left factor off by eta_x each add one number times s_k V_L(x, k) a_x, so that tr(C^2) = eta^4 sum_xy
-  (sum_k s_k^2 V_L(x, k) V_L(y, k) K_k(x, y))^2;
-* and the same of the right factor. In b^T C b stands the square of sum_l F_kl b_kl a_xl, weighed likewise.
+  a_xl a_yl; rows are assumed independent, as they are where patterns share no pixels;
+* columns of the left factor off by eta_x add one number each times s_k V_L(x, k) a_x: tr(C^2) = eta^4 sum_xy (sum_k
+  s_k^2 V_L(x, k) V_L(y, k) K_k(x, y))^2;
+* likewise for the right factor. b^T C b contains the square of sum_l F_kl b_kl a_xl with the same weights.
 """
 
 from __future__ import annotations
@@ -111,37 +105,27 @@ REGISTERED = MappingProxyType(
         SPECKLE: frozenset({"speckle"}),
     }
 )
-"""Effects of :data:`mitsim.bench.effects.EFFECTS` that a name stands for."""
+"""Effects of :data:`mitsim.bench.effects.EFFECTS` by name."""
 _MOVED = frozenset({KEYSTONE, DEPTH, DETAIL, DEFOCUS})
-"""Effects on where light lies, for which it is accumulated anew."""
 _FURTHER = frozenset({"interreflection", "mirrors", "ambient"})
 _WHOLE = "pixels that are lit all over"
-"""Beside :data:`DETAIL`, where nothing moves or hides a pixel's points."""
 _POINTS = 2
-"""Points a side of a cell that stand for even light, none on an edge; a keystone leaves 1e-3 of cells uneven."""
+"""Points per side of a cell that represent even light; a keystone leaves 1e-3 of the cells uneven."""
 _SIMULATIONS = 4
-"""Kept, as shadows seen from many anchors take seconds to prepare, but up to half a GB each (cookie_bag)."""
 _IN_PLACE = 1e-3
-"""Projector pixels that light may lie beside its place on the aligned plane and count as on it: float32 leaves 1e-4."""
+"""Tolerated distance from the aligned plane [projector pixels], because float32 leaves 1e-4."""
 
 
 class Ablation:
-    """A light from which any of its effects can be removed; what was traced again for that is kept.
+    """Light from which any of its effects can be removed; retraced light is kept.
 
     Parameters
     ----------
-    light
-        light by projector pixel, with its samples.
     exact, board
         (n^2,) direct light of each projector pixel on the sensor according to the truth, and over a white board
         [W m^-2].
     purpose
         purpose of the light, which names its random streams.
-
-    Attributes
-    ----------
-    effects
-        names of the effects that the light has.
     """
 
     def __init__(self, light: SampledLight, exact: FloatArray, board: FloatArray, purpose: str = "scene") -> None:
@@ -153,12 +137,11 @@ class Ablation:
 
     @classmethod
     def of(cls, light: SampledLight) -> Ablation:
-        """Return the ablation of a scene's ``light``, with the light's own truth."""
         truth = light.apparent
         return cls(light, truth.reflectance.ravel() * truth.board_flux, truth.board_flux)
 
     def without(self, off: frozenset[str]) -> SampledLight:
-        """Return the light without the effects ``off``; an effect that the light does not have makes no difference."""
+        """Return the light without the effects ``off``; effects that the light does not have are ignored."""
         off &= frozenset(self.effects)
         if not off:
             return self.light
@@ -178,7 +161,6 @@ class Ablation:
         return AblatedLight(**own, whole=self.light, rest=self._rest(off))
 
     def _rest(self, off: frozenset[str]) -> SampledLight | None:
-        """Return all but direct light; None if there is none."""
         light, settings = self.light, self.light.simulation.settings
         effects = settings.effects - frozenset[str]().union(*(REGISTERED.get(name, frozenset()) for name in off))
         if not effects & _FURTHER:
@@ -219,26 +201,21 @@ class Ablation:
 
 @dataclass(frozen=True, eq=False)
 class AblatedLight(SampledLight):
-    """Direct light without some effects, and the ``rest`` of the light ``whole`` without them."""
-
     whole: SampledLight | None = None
     rest: SampledLight | None = None
 
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
-        """Return the frames of both lights together, as :meth:`Light.frames`, which describes ``lighting``, ``seed``
-        and ``leaking``."""
         parts = [(each.simulation, each.groups) for each in (self, self.rest) if each is not None]
         return expected_of(parts, self.rows_of(lighting), lighting, seed, leaking)
 
     @cached_property
     def apparent(self) -> Truth:
-        """Truth of the whole light."""
         assert self.whole is not None
         return self.whole.apparent
 
 
 class _AblationSimulation(Simulation):
-    """Direct light with its glare, or all other, accumulated where it would be seen without the effects ``off``."""
+    """Simulation that accumulates light where it would be seen without the effects ``off``."""
 
     def __init__(self, bench: Apparatus, settings: Settings, direct: bool, off: frozenset[str]) -> None:
         super().__init__(bench, settings)
@@ -269,8 +246,6 @@ class _AblationSimulation(Simulation):
 
 
 class _Place:
-    """Where light that a projector's pixel sends to one depth would be seen at another, or without its keystone."""
-
     def __init__(self, bench: Apparatus) -> None:
         loaded, grid = bench.loaded, bench.loaded.pixels
         turn, origin = turn_and_origin(loaded.camera.world_transform())
@@ -283,7 +258,6 @@ class _Place:
         )
 
     def move(self, path_samples: PathSamples, off: frozenset[str]) -> PathSamples:
-        """Return ``path_samples`` without depth and keystone, as far as these are ``off``."""
         if not off & {DEPTH, KEYSTONE}:
             return path_samples
         row, column, inverse = path_samples.row, path_samples.column, path_samples.inverse_depth
@@ -297,8 +271,9 @@ class _Place:
         return replace(path_samples, row=row, column=column)
 
     def whole(self, path_samples: PathSamples, side: int, straight: bool) -> PathSamples:
-        """Return the light of each projector pixel from ``side`` x ``side`` even points of the pixel on the plane;
-        ``straight`` means without the keystone."""
+        """Return the light of each projector pixel from ``side`` x ``side`` even points; ``straight`` omits the
+        keystone.
+        """
         n = self._n
         part = (np.arange(n * side) + 0.5) / side
         lines = [first + (last - first) * part / n for first, last in self._windows]
@@ -312,7 +287,7 @@ class _Place:
         return PathSamples(pixel, first, first, row, column, depth, value, kind).where(value > 0)
 
     def parallax(self, path_samples: PathSamples) -> FloatArray:
-        """Return the tan-angles (2, m) between ``path_samples`` and their places on the plane, rows and columns."""
+        """Return the tan-angles (2, m) between ``path_samples`` and their places on the plane."""
         inverse, row, column = path_samples.inverse_depth, path_samples.row, path_samples.column
         on_plane = self._on_plane(row, inverse, self._row), self._on_plane(column, inverse, self._column)
         return np.stack([row - on_plane[0], column - on_plane[1]])
@@ -324,13 +299,11 @@ class _Place:
 
 
 def _project(homography: FloatArray, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points ``row``, ``column`` (m,) under a ``homography`` (3, 3)."""
     first, second, scale = homography @ np.stack([row, column, np.ones_like(row)])
     return first / scale, second / scale
 
 
 def _present(light: SampledLight) -> dict[str, bool]:
-    """Which effects a light has."""
     bench, settings, physics = light.bench, light.simulation.settings, light.simulation.physics
     return {
         FALLOFF: True,
@@ -351,7 +324,7 @@ def _present(light: SampledLight) -> dict[str, bool]:
 
 
 def _off_plane(light: SampledLight) -> bool:
-    """Return True if light of some projector pixel is seen beside its place on the aligned plane, by one ray each."""
+    """Return True if light of some projector pixel is seen beside its place on the aligned plane."""
     bench, simulation = light.bench, light.simulation
     path_samples = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
     size = [(last - first) / bench.n for first, last in bench.windows]
@@ -360,7 +333,6 @@ def _off_plane(light: SampledLight) -> bool:
 
 
 def _form_settings(settings: Settings, off: frozenset[str], glossy: bool) -> Settings:
-    """What frames of direct light are formed with."""
     absent = _FURTHER.union(*(REGISTERED.get(name, frozenset()) for name in off))
     anchors = 1 if (GLOSS if glossy else FALLOFF) in off else settings.anchors
     occluded = () if OCCLUSION in off else settings.occluded
@@ -369,13 +341,12 @@ def _form_settings(settings: Settings, off: frozenset[str], glossy: bool) -> Set
 
 
 def _even(path_samples: PathSamples, pixels: int) -> PathSamples:
-    """Return ``path_samples`` of so many projector ``pixels``, with one value for all samples of a pixel."""
     count, total = (np.bincount(path_samples.pixel, weights, pixels) for weights in (None, path_samples.value))
     return replace(path_samples, value=(total / np.maximum(count, 1))[path_samples.pixel])
 
 
 def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_array:
-    """Return ``sharp`` light that every anchor of a ``simulation`` sees as in the mean over the sensor."""
+    """Return ``sharp`` light averaged over all anchors of the sensor."""
     if simulation.settings.sharp is None:
         return sharp
     bundle = simulation.grids["sharp"].bundle
@@ -395,7 +366,6 @@ def _scale(light: LightEstimate, by: FloatArray) -> LightEstimate:
 
 
 def _weigh(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
-    """Return ``rows`` times ``by``, one number each; rows of zero hold nothing."""
     scaled = sparse.csr_array(sparse.diags_array(by) @ rows)
     scaled.eliminate_zeros()
     return scaled
@@ -405,16 +375,16 @@ def _weigh(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
 
 
 def reform(light: SampledLight, absent: frozenset[str]) -> SampledLight:
-    """Return the same ``light``, whose frames are formed without the effects ``absent``, for which no light needs to be
-    traced again."""
+    """Return the ``light`` with frames formed without the effects ``absent``, which need no new tracing."""
     simulation = light.simulation
     settings = replace(simulation.settings, effects=simulation.settings.effects - absent)
     return replace(light, simulation=Simulation(simulation.bench, settings))
 
 
 def ablations(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str, Settings]]:
-    """Yield the name of each effect of those ``present`` that is in expected frames, and ``settings`` without it; then
-    each number that is above one, and ``settings`` with one in its place."""
+    """Yield the name of each present effect of expected frames with ``settings`` without it, then each number above one
+    with ``settings`` in which it is one.
+    """
     for name in sorted(present & names(lambda effect: effect.in_frames)):
         yield name, replace(settings, effects=settings.effects - {name})
     if settings.anchors > 1:
@@ -430,12 +400,12 @@ def ablations(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str
 # -------- Light over some numbers of surfaces
 
 MOST = ANY
-"""Order of light over any number of surfaces."""
 
 
 class OfOrders(Simulation):
-    """Followed light of the orders ``fewest`` to ``most`` alone (:class:`mitsim.transport.integrator.FollowingTracer`):
-    no direct light, no specular chains."""
+    """Followed light of the orders ``fewest`` to ``most`` (:class:`mitsim.transport.integrator.FollowingTracer`),
+    without direct light and specular chains.
+    """
 
     def __init__(self, bench: Apparatus, settings: Settings, fewest: int, most: int) -> None:
         super().__init__(bench, settings)
@@ -443,7 +413,6 @@ class OfOrders(Simulation):
 
     @cached_property
     def passes(self) -> Mapping[str, TracedPass]:
-        """Passes that follow light, by name."""
         found = {}
         for name, each in super().passes.items():
             if isinstance(each.tracer, FollowingTracer):
@@ -451,29 +420,19 @@ class OfOrders(Simulation):
         return found
 
     def specular_frames(self, labels: Labels) -> ClassFrames | None:
-        """Return None for all ``labels``: none of these tracers follows specular chains."""
         return None
 
 
 # -------- The image that is expected of changed frames
 
 Terms = Sequence[tuple[FloatArray, FloatArray]]
-"""Separable terms of a camera, left (m, n) and right (m', n') each."""
 Gains = Sequence[float | FloatArray]
-"""Root mean squares of gains that know nothing of each other: of a whole frame, or (m,) of its rows."""
+"""Root mean squares of independent gains: of a whole frame, or (m,) of its rows."""
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """One side of the camera by its singular vectors.
-
-    Attributes
-    ----------
-    slabs, singular, basis
-        (K, m, r) of U, (r,) of S and (n, r) of V.
-    patterns
-        (n, K).
-    """
+    """One side of the camera: (K, m, r) blocks of U, (r,) singular values, (n, r) V and (n, K) patterns."""
 
     slabs: FloatArray
     singular: FloatArray
@@ -482,14 +441,12 @@ class Axis:
 
     @classmethod
     def of(cls, factor: FloatArray, patterns: FloatArray) -> Axis:
-        """Return the side with a ``factor`` (m, n) and ``patterns`` (n, K)."""
         stacked = np.concatenate([factor * column for column in patterns.T])
         left, singular, right = np.linalg.svd(stacked, full_matrices=False)
         return cls(left.reshape(patterns.shape[1], *factor.shape[:1], -1), singular, right.T, patterns)
 
     @cached_property
     def total(self) -> FloatArray:
-        """(m, r) sum of the slabs."""
         return np.asarray(self.slabs.sum(axis=0))
 
     def terms_of(self, factor: FloatArray) -> FloatArray:
@@ -502,55 +459,44 @@ class Axis:
 
     @cached_property
     def noise(self) -> FloatArray:
-        """(r, n) variance of G where each number of the factor has variance 1."""
+        """Return the (r, n) variance of G for unit variance of each number of the factor."""
         mixed = np.einsum("nk,kmr->nmr", self.patterns, self.slabs, optimize=True)
         return np.asarray(np.square(mixed).sum(axis=1).T)
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What an image is expected to be: its mean, and the squared error about it.
-
-    Attributes
-    ----------
-    image
-        (n, n') mean.
-    variance
-        sum of the variances of all its numbers.
-    """
+    """Mean (n, n') of an image, and the sum of the variances of all its numbers."""
 
     image: FloatArray
     variance: float = 0.0
 
     def psnr_db(self, truth: FloatArray) -> float:
-        """Of the mean squared error against a ``truth`` (n, n'), peak 1; infinite without any."""
+        """Return the PSNR of the mean squared error against a ``truth`` (n, n'), peak 1."""
         square = (float(np.square(self.image - truth).sum()) + self.variance) / truth.size
         return float("inf") if square == 0 else float(-10 * np.log10(square))
 
 
 @dataclass(frozen=True, eq=False)
 class Changed:
-    """Differences of a scene's frames from those of the solver's factors; nothing is changed by default.
+    """Differences of a scene's frames from those of the solver's factors; by default none.
 
     Attributes
     ----------
     terms
-        what is added to the camera's own separable operator.
+        added to the camera's own separable operator.
     gain, gain_apart
-        (K, K') gains of the frames on average; of a pattern that is a difference of two, their mean, and half of what
-        the first has more than the second.
+        (K, K') mean gains of the frames; for a difference of two frames, their mean gain and half their difference.
     flicker
-        rms of further gains of each frame, all independent: a number each, or (m,) numbers, by row.
+        rms of independent gains of each frame: a number each, or (m,) numbers, by row.
     response
-        (m, m') what each pixel's response differs by from what the factors know, as a part of it; the same in every
-        frame.
+        (m, m') relative error of each pixel's response in the factors; the same in every frame.
     leak
-        part of the light of all pixels that is in every frame beside the pattern's.
+        part of the light of all pixels that is in every frame.
     added
         (m, m') frame that is added to all frames.
     added_gain, added_flicker, added_common
-        what it is multiplied by: on average; and rms of further gains, as ``flicker``, from frame to frame and for all
-        frames alike.
+        mean gain of ``added``; and rms of its further gains from frame to frame and for all frames alike.
     """
 
     terms: Terms = ()
@@ -567,20 +513,20 @@ class Changed:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise that is independent in every number, as variances.
+    """Independent noise, as variances.
 
     Attributes
     ----------
     datum
-        of each datum of a frame; of a pattern that is a difference of two, of each of these.
+        of each datum of a frame; for a difference of two frames, of each of them.
     ambient
-        of each datum of a frame that is taken off all others.
+        of each datum of a frame that is subtracted from all others.
     left, right
-        of each number of the factors, as far as frames do not share it.
+        of each number of the factors that frames do not share.
     light
-        of each scene pixel's light, as parts of a white board's, in all frames alike.
+        of each scene pixel's light, relative to a white board's, in all frames alike.
     left_light, right_light
-        of what each column of a factor is multiplied by.
+        of the gain of each column of a factor.
     """
 
     datum: float = 0.0
@@ -592,29 +538,15 @@ class Noise:
     right_light: float = 0.0
 
     def __add__(self, other: Noise) -> Noise:
-        """Return the noise of two independent sources."""
         return Noise(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
 
     def __sub__(self, other: Noise) -> Noise:
-        """Return this noise without an ``other`` that is part of it."""
         return Noise(*(getattr(self, each.name) - getattr(other, each.name) for each in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class LinearImage:
-    """A solver with its lambda fixed.
-
-    Attributes
-    ----------
-    left, right
-        Phi_L (m, n), Phi_R (m', n').
-    family
-        the patterns.
-    lam
-        lambda, above 0.
-    centre
-        whether means of rows and columns are taken off factors and frames.
-    """
+    """Solver with its lambda fixed: Phi_L (m, n), Phi_R (m', n'), and whether row and column means are removed."""
 
     left: FloatArray
     right: FloatArray
@@ -623,15 +555,7 @@ class LinearImage:
     centre: bool = False
 
     def expected_image(self, scene: FloatArray, changed: Changed | None = None, noise: Noise | None = None) -> Expected:
-        """Return the expected image of a scene.
-
-        Parameters
-        ----------
-        scene
-            X (n, n').
-        changed, noise
-            differences of its frames from those of the factors, and noise; None: none.
-        """
+        """Return the expected image of a ``scene`` (n, n') with differences and noise of its frames."""
         changed, noise = changed or Changed(), noise or Noise()
         left, right = self.axes
         cameras = [(self.left, self.right), *changed.terms]  # U has no means where frames are to lose theirs
@@ -657,11 +581,10 @@ class LinearImage:
         return Expected(left.basis @ (self.filter * weights) @ right.basis.T, variance)
 
     def scatter(self, scene: FloatArray, changed: Changed, error: FloatArray) -> float:
-        """Return the variance that drawn gains bring into the squared error, sum over the image.
+        """Return the variance of the summed squared error that independent normal gains cause.
 
-        Of independent normal gains that add e_g each to the image, beside an error b: sum_g 4 (b . e_g)^2 + 2 |e_g|^4.
-
-        ``scene`` and ``changed`` are as of :meth:`expected_image`; ``error`` (n, n') is the image's without gains.
+        With gains that add e_g each to the image, beside an error b (``error``, n x n'): sum_g 4 (b . e_g)^2 + 2
+        |e_g|^4.
         """
         left, right = self.axes
         off = self.filter * (left.basis.T @ error @ right.basis)
@@ -669,7 +592,7 @@ class LinearImage:
         return sum(4 * float((off * term).sum()) ** 2 + 2 * self._energy(np.square(term)) ** 2 for term in terms)
 
     def _by_gains(self, scene: FloatArray, changed: Changed) -> Iterator[FloatArray]:
-        """Yield what each gain that varies adds to W (r, r'), by its rms."""
+        """Yield the contribution of each varying gain to W (r, r'), by its rms."""
         left, right = self.axes
         cameras = [(self.left, self.right), *changed.terms]
         lit = 1 + 2 * changed.leak
@@ -696,7 +619,6 @@ class LinearImage:
                 yield left.total.T @ (_by_row(rms) * changed.added) @ right.total
 
     def _by_response(self, response: FloatArray, cameras: Terms, scene: FloatArray, gain: FloatArray) -> FloatArray:
-        """Return what pixels' ``response`` adds to W, in frames of a ``scene`` behind ``cameras`` with a ``gain``."""
         left, right = self.axes
         weights = np.zeros_like(self.filter)
         for row, column in np.ndindex(self._count):
@@ -706,12 +628,12 @@ class LinearImage:
         return weights
 
     def variance(self, scene: FloatArray, noise: Noise) -> float:
-        """Return the sum of the variances of all numbers of the image of a ``scene`` (n, n') by ``noise``."""
+        """Return the sum of the variances of all numbers of the image of a ``scene`` (n, n')."""
         units = self.units(scene)
         return self._energy(sum((getattr(noise, name) * unit for name, unit in units.items()), np.zeros((1, 1))))
 
     def units(self, scene: FloatArray) -> dict[str, FloatArray]:
-        """Return the variance (r, r') of the numbers of W by 1 of each :class:`Noise`, of frames of a ``scene``."""
+        """Return the variance (r, r') of the numbers of W by unit variance of each :class:`Noise`."""
         left, right = self.axes
         of_left, of_right = np.square(left.basis * left.singular).T, np.square(right.basis * right.singular)
         seen_right = np.square(scene @ (right.basis * right.singular))
@@ -731,19 +653,16 @@ class LinearImage:
         return len(self.axes[0].slabs), len(self.axes[1].slabs)
 
     def _energy(self, variance: FloatArray) -> float:
-        """Return the sum over the image of what has this ``variance``, or squares, in W."""
         return float((np.square(self.filter) * variance).sum())
 
     @cached_property
     def axes(self) -> tuple[Axis, Axis]:
-        """Left and right side of the camera."""
         left = Axis.of(self._centre(self.left), self.family.left.astype(np.float64))
         right = Axis.of(self._centre(self.right), self.family.right.astype(np.float64))
         return left, right
 
     @cached_property
     def filter(self) -> FloatArray:
-        """F (r, r')."""
         sigma = np.outer(self.axes[0].singular, self.axes[1].singular)
         return np.asarray(sigma / (np.square(sigma) + self.lam))
 
@@ -756,35 +675,30 @@ def _by_row(rms: float | FloatArray) -> FloatArray:
 
 
 def _together(seen: Terms, row: int, column: int, scene: FloatArray) -> FloatArray:
-    """Return the part of W (r, r') of one frame; ``seen`` are terms of G, (K, r, n) and (K', r', n')."""
+    """Return the part of W (r, r') of one frame from terms of G, (K, r, n) and (K', r', n')."""
     return np.asarray(sum(first[row] @ scene @ second[column].T for first, second in seen))
 
 
 _KINDS = tuple(each.name for each in fields(Noise))
-"""In the order of all arrays by kind."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Scatter about its mean of the squared error, sum over the image, of a ``scene`` (n, n') that a ``solver`` images.
-
-    Errors that are no noise are (n, n') each.
-    """
+    """Scatter of the summed squared error of a ``scene`` (n, n') about its mean; errors are (n, n')."""
 
     solver: LinearImage
     scene: FloatArray
 
     def deviation(self, noise: Noise, error: FloatArray) -> float:
-        """Return the standard deviation with so much ``noise`` beside an ``error`` that is no noise."""
+        """Return the standard deviation of the squared error with ``noise`` and an ``error`` that is not noise."""
         return math.sqrt(self._variance(noise, error))
 
     def share(self, noise: Noise, among: Noise, error: FloatArray) -> float:
-        """Return the standard deviation of what a source of ``noise`` adds to that ``among`` which it is, beside an
-        ``error`` that is no noise."""
+        """Return the standard deviation due to one source of ``noise`` ``among`` all."""
         return math.sqrt(max(self._variance(among, error) - self._variance(among - noise, error), 0.0))
 
     def common(self, noise: Noise, error: FloatArray) -> float:
-        """Return the standard deviation of what ``noise`` has in common with an ``error`` that is none, 2 b . e."""
+        """Return the standard deviation of the cross term 2 b . e of ``noise`` and ``error``."""
         return math.sqrt(float(self._beside(error) @ _amounts(noise)))
 
     def _variance(self, noise: Noise, error: FloatArray) -> float:
@@ -792,7 +706,7 @@ class Scatter:
         return float(amounts @ self._own @ amounts + self._beside(error) @ amounts)
 
     def _beside(self, error: FloatArray) -> FloatArray:
-        """(kinds,) variance of 2 b . e by a variance."""
+        """Return the (kinds,) variance of 2 b . e per unit variance."""
         (left, right), gain = self.solver.axes, self.solver.filter
         off = left.basis.T @ error @ right.basis
         found = 4 * self._energies @ np.square(off).ravel()
@@ -805,7 +719,6 @@ class Scatter:
 
     @cached_property
     def _own(self) -> FloatArray:
-        """(kinds, kinds) variance of |e|^2 by the product of two variances."""
         found, gain = 2 * self._energies @ self._energies.T, self.solver.filter
         for (side, axis, seen), weights in zip(self._sides, (gain, gain.T), strict=True):
             for name, square in zip((side, f"{side}_light"), _squares(axis, seen, weights), strict=True):
@@ -814,13 +727,12 @@ class Scatter:
 
     @cached_property
     def _energies(self) -> FloatArray:
-        """(kinds, r r') variance of the image's coefficients by a variance."""
+        """Return the (kinds, r r') variance of the image's coefficients per unit variance."""
         units = self.solver.units(self.scene)
         return np.stack([(np.square(self.solver.filter) * units[name]).ravel() for name in _KINDS])
 
     @property
     def _sides(self) -> tuple[tuple[str, Axis, FloatArray], tuple[str, Axis, FloatArray]]:
-        """Each factor, and (n, r') a_x through the other one."""
         left, right = self.solver.axes
         through_right = self.scene @ (right.basis * right.singular)
         return ("left", left, through_right), ("right", right, self.scene.T @ (left.basis * left.singular))
@@ -831,10 +743,7 @@ def _amounts(noise: Noise) -> FloatArray:
 
 
 def _squares(axis: Axis, seen: FloatArray, gain: FloatArray) -> tuple[float, float]:
-    """Return tr(C^2) of noise of variance 1 in the numbers of a factor, and in what its columns are multiplied by.
-
-    ``axis`` is the factor's side, ``seen`` (n, r') a_x through the other one, and ``gain`` F (r, r').
-    """
+    """Return tr(C^2) of unit noise in the numbers of a factor and in its columns' gains; ``seen`` (n, r') is a_x."""
     square, light = 0.0, axis.basis * axis.singular
     together = np.zeros((len(seen), len(seen)))
     for row, weights in enumerate(gain):

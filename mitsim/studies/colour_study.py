@@ -3,13 +3,11 @@
 The *floor* needs no camera: it is the error of the matrix from reflectances at the projector's lines to XYZ. Frames are
 rendered, with the sensor's noise, a calibration and a solve for each line. *One calibration for all*: the middle line's
 factors serve all lines. *D65*: a lamp of daylight shines on the chart, and its frame is subtracted. *Mosaic*: all lines
-are shown at once, behind colour filters, and images are solved with the best lambda of each way
-(:mod:`mitsim.report.reconstruct_run`).
+are shown at once, behind colour filters, and images are solved with the best lambda.
 
-Each line has a bench of its own, with the line's power, diffraction, photons and factors; the light of all lines is
-traced on the same paths (:mod:`mitsim.acquire.spectral`). Beside daylight, the brightest pixel fills the well in every
-frame, by daylight too. The noise of the frame that is subtracted is common to all frames, so that it adds up in the
-mean over a region; it is therefore the mean of as many shots as there are patterns. Signed patterns need none.
+Each line has its own bench; the light of all lines is traced on the same paths. The brightest pixel fills the well in
+every frame. The noise of the subtracted daylight frame is common to all frames, so that it adds up in the mean over a
+region; it is therefore the mean of as many shots as there are patterns.
 """
 
 from __future__ import annotations
@@ -58,7 +56,6 @@ from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 # -------- A scene in the light of each line
 
 _SPECTRUM = re.compile(r'value="(\s*[\d.]+\s*:[^"]*)"')
-"""Wavelengths and values, nm:value, as Mitsuba reads them."""
 _LAMP = """
     <shape type="rectangle" id="daylight">
         <transform name="to_world">
@@ -68,22 +65,21 @@ _LAMP = """
         <bsdf type="diffuse"> <spectrum name="reflectance" value="0"/> </bsdf>
     </shape>
 </scene>"""
-"""Lamp of scenes/lamp_bench."""
 DAYLIGHT_RADIANCE = 117.0
-"""Radiance of the lamp [W m^-2 sr^-1], with which it lights the sheet as the projector's white does."""
+"""Radiance of the lamp [W m^-2 sr^-1] that lights the sheet as the projector's white does."""
 FULL_LX = 2.97 * 205.0
 """Illuminance of that light: 2.97 W/m^2 at the chart's middle, and 205 lm/W of D65 from 380 to 780 nm."""
 FILTERS, ARRAY = "ov5647", "RGGB"
-"""Camera file whose measured curves the filters have, and their array."""
+"""Camera file with the measured curves of the filters, and their array."""
 _COARSE = tuple(float(relative) for relative in np.logspace(-9, -3, 7))
-"""Lambdas of the joint solve, of its largest eigenvalue; the best of them is refined by half a decade."""
+"""Lambdas of the joint solve, relative to its largest eigenvalue; the best is refined by half a decade."""
 Shots = Sequence[tuple[FloatArray, int, int]]
-"""Measured frames (m, m') [electrons/s], with the row and the column of their pattern."""
+"""Measured frames (m, m') [electrons/s], with the row and column of their pattern."""
 
 
 @dataclass(frozen=True, eq=False)
 class LitLine:
-    """A scene in the light of the line ``name``, ``lit``, and the camera's ``factors`` at this wavelength [nm]."""
+    """Scene in the light of the line ``name``, and the camera's ``factors`` at this wavelength [nm]."""
 
     name: str
     wavelength_nm: float
@@ -91,15 +87,11 @@ class LitLine:
     factors: Factors
 
     def seed(self, seed: int) -> int:
-        """Return a seed of this line's own, from the ``seed`` of all lines."""
         return integer(seed, "line", self.name)
 
 
 def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
-    """Light a scene with each line of its projector, and calibrate its camera in each.
-
-    MitsimError as :meth:`mitsim.bench.apparatus.Bench.capture_lines`.
-    """
+    """Light a scene with each line of its projector, and calibrate its camera in each."""
     colours = SpectralBench.of(_open(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
     request = Request.of(accuracy=setup.accuracy, seed=seed)
     plan = plan_request(colours.whole, request)
@@ -113,11 +105,10 @@ def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
 
 
 def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
-    """Return the irradiance (m, m') [W m^-2] of a scene in a lamp's daylight (D65), and the wavelength [nm] of photons
-    that carry as much energy as its own.
+    """Return the irradiance (m, m') [W m^-2] of a scene in a lamp's daylight (D65), and its photons' mean wavelength
+    [nm].
 
-    The scene's spectra count as D65's photons do, 380 to 780 nm, in a camera of equal efficiency for all of them; scene
-    files are written to a ``folder``.
+    The scene's spectra are averaged over D65's photons, 380 to 780 nm, for a camera of constant efficiency.
     """
 
     def weigh(at: FloatArray, values: FloatArray) -> float:
@@ -137,7 +128,7 @@ def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
 
 
 def replace_spectra(scene: str, folder: Path, weigh: Callable[[FloatArray, FloatArray], float]) -> Path:
-    """Copy a scene to a new ``folder``, each spectrum replaced by one number, and return the copy's XML.
+    """Copy a scene to a new ``folder`` with each spectrum replaced by one number, and return the copy's XML.
 
     ``weigh`` returns the number from wavelengths [nm] and values. MitsimError for a scene without spectra.
     """
@@ -161,7 +152,7 @@ def replace_spectra(scene: str, folder: Path, weigh: Callable[[FloatArray, Float
 
 
 def serving(line: LitLine, other: LitLine) -> Factors:
-    """Return the factors of an ``other`` line as those of a ``line``, with the gain that is nearest to its own."""
+    """Return the factors of an ``other`` line for a ``line``, with the gain nearest to its own."""
     own, model = line.factors, other.factors
     gain = 1.0
     for mine, theirs in ((own.left, model.left), (own.right, model.right)):
@@ -181,9 +172,9 @@ def _open(setup: Setup, scene: Path) -> Bench:
 
 
 def mosaic_shots(lines: Sequence[LitLine], family: PatternFamily, seed: int) -> Shots:
-    """Expose all lines at once, at equal peak, behind filters; ``seed`` is of the noise.
+    """Expose all lines at once, at equal peak, behind filters.
 
-    MitsimError for a line that the filters' curves do not cover.
+    MitsimError for a line outside the filters' curves.
     """
     devices, weights = lines[0].lit.bench.devices, filter_weights(lines)
     # Light and noise of a shot are in electrons, so that any time and wavelength may lie between them.
@@ -199,8 +190,10 @@ def mosaic_shots(lines: Sequence[LitLine], family: PatternFamily, seed: int) -> 
 
 
 def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, shots: Shots, way: str) -> LineImages:
-    """Solve the images of all lines by one of :data:`mitsim.core.manifests.WAYS`, with the lambda that is best for the
-    truth. MitsimError for demosaicing without colour-demosaicing."""
+    """Solve the images of all lines by one of :data:`mitsim.core.manifests.WAYS`, with the best lambda for the truth.
+
+    MitsimError for demosaicing without colour-demosaicing.
+    """
     factors = [(line.factors.left, line.factors.right) for line in lines]
     camera = MosaicCamera.of(factors, filter_weights(lines), ARRAY)
     flat = np.stack([line.lit.truth for line in lines]).reshape(len(lines), -1)
@@ -222,7 +215,7 @@ def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, shots: Shots,
 
 
 def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
-    """Return (4, lines) electrons behind each filter of :data:`ARRAY` over those of the camera without filters."""
+    """Return (4, lines) electrons behind each filter of :data:`ARRAY` relative to the camera without filters."""
     curves = load_model(locate(FILTERS, "calibration", ".toml", CAMERA), SensorModel)
     sensor = lines[0].lit.bench.sensor
     return np.array(
@@ -237,14 +230,9 @@ def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
 def daylit_images(
     line: LitLine, light: tuple[FloatArray, float], lux: float, patterns: str, seed: int
 ) -> list[Solution]:
-    """Solve one exposure of a line beside daylight of so many ``lux``, by Tikhonov's and by Markov's regularisation.
+    """Solve one exposure of a line beside daylight of ``lux``, by Tikhonov's and by Markov's regularisation.
 
-    Parameters
-    ----------
-    line, patterns, seed
-        Scene and camera, pattern family, and seed of the noise.
-    light
-        Irradiance of the lamp and its photons' wavelength, of :func:`daylight_frame`.
+    ``light`` is the irradiance and wavelength of :func:`daylight_frame`.
     """
     bench, family = line.lit.bench, line.lit.bench.family(patterns, seed)
     lamp = lux / FULL_LX * electrons_from_irradiance(light[0], 1.0, bench.sensor, light[1])
@@ -264,8 +252,7 @@ def daylit_images(
 
 
 def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
-    """Return the exposure time [s] at which the brightest pixel of expected ``rates`` [electrons/s], with its dark
-    current, fills the default part of the full well."""
+    """Return the exposure time [s] at which the brightest pixel fills the default part of the full well."""
     brightest = max(float(rate.max()) for rate in rates) + sensor.superpixel_dark_current_e_per_s
     return float(Exposure().fraction * sensor.superpixel_full_well_e / brightest)
 
@@ -273,7 +260,6 @@ def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
 def _measured(
     exposer: Exposer, family: PatternFamily, rates: Sequence[FloatArray]
 ) -> Iterator[tuple[FloatArray, int, int]]:
-    """Expose expected ``rates``, and yield the measurement of each pattern, of a signed one the difference of two."""
     positive: FloatArray | None = None
     for shot, rate in zip(family.shots, rates, strict=True):
         noisy = exposer.rate(exposer.digital(rate * exposer.exposure_s, *shot.names))
@@ -327,9 +313,9 @@ def _stacked(solved: Sequence[Solution]) -> FloatArray:
 def judge_colours(
     point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray, named: Mapping[str, Any]
 ) -> Found:
-    """Return a row for each patch of the point's chart, with ``named`` columns, and the colours of both images.
+    """Return a row for each patch of the point's chart, and the colours of both images.
 
-    ``images`` and ``truth`` (n, n, lines) are reflectances at lines of some ``wavelengths`` [nm].
+    ``images`` and ``truth`` (n, n, lines) are reflectances at the ``wavelengths`` [nm].
     """
     path = Path(point.setup.scene)
     place = load_chart(path.with_name("chart.json") if path.suffix == ".xml" else point.setup.scene)

@@ -1,35 +1,30 @@
 """Studies of light: the patterns, their exposure, ambient light, and what gloss and light over several surfaces do.
 
-*patterns*, section IV-B and figure 4 of the paper: uniform, random, shifting dots and repeated Hadamard, 1 to 64 of
-them, by three ways to expose them.
+*patterns*, section IV-B and figure 4 of the paper: 1 to 64 uniform, random, dots or Hadamard patterns, by three ways to
+expose them.
 
-*exposure*, section V-B, figure 9, and the error analysis of the supplement: one uniform frame, 49 uniform frames, and
-49 dots in the same time. For a least-squares image x' of a scene x, ||x|| / ||x - x'|| = ||x|| / (s rho), with rho^2 =
-Tr (A^T A)^-1 = sum 1 / s_i^2 over the singular values of the model A of all frames, and s the noise of a datum. (The
-paper writes SER = sqrt(T) SNR / rho for T equal frames.)
+*exposure*, section V-B, figure 9, and the supplement's error analysis: for a least-squares image x' of a scene x, ||x||
+/ ||x - x'|| = ||x|| / (s rho), with rho^2 = Tr (A^T A)^-1 = sum 1 / s_i^2 over the singular values of the model A of
+all frames, and s the noise of a datum. (The paper writes SER = sqrt(T) SNR / rho for T equal frames.)
 
-*ambient*, supplement: one uniform pattern, 64 dots and 64 Hadamard patterns under a lamp from a hundredth of the
-projector's light to a hundred times, whose reference frame is subtracted.
+*ambient*, supplement: three families under a lamp from a hundredth of the projector's light to a hundred times.
 
-*reflectivity*, supplement, has two parts. *Gloss*: gift card, metal blade and compact disc, then roughness from 1 to a
-mirror on a plate, to 0.03 on a ball. Every scene has a twin of matt paint (``finish=matt``), whose reflectance is the
-truth, and the image's error against it is split by cause. At one lambda an image R(Y) is linear in the frames Y, so
-that its error is a sum of differences. With L the reflectance of the twin and t the apparent reflectance of the glossy
-scene, its mean over the sensor,
+*reflectivity*, supplement. *Gloss*: every scene has a matt twin (``finish=matt``), whose reflectance L is the truth. At
+one lambda an image R(Y) is linear in the frames Y. Therefore its error is a sum of differences, with t the apparent
+reflectance of the glossy scene, its mean over the sensor:
 
     pixels           = t - L                         brightness that differs from the matt one
     sensor           = R(Y_direct) - R(Y_even)       light of a projector pixel that changes over the sensor
     interreflection  = R(Y_all) - R(Y_direct)
     saturation       = R(mean reading of Y_all) - R(Y_all)
-    rest             = R(Y_even) - t and noise       what a matt scene of the same brightness has as well
+    rest             = R(Y_even) - t and noise       error that a matt scene of the same brightness has as well
 
 where Y_even is the twin's light, with that of each projector pixel times t / L.
 
-*Global light*: dots separate direct from global light. Nayar, Krishnan, Grossberg and Raskar (2006) need a camera with
-a lens for this; here :func:`mitsim.reconstruct.focus.separate` does it in scenes whose light over several surfaces is
-known. Depth hides most of the gain, so every scene is shown as it is, and with direct light as the calibrated factors
-have it at any depth. A scene of the user is measured for gloss if it has a parameter ``finish``, otherwise for global
-light.
+*Global light*: dots separate direct from global light (Nayar, Krishnan, Grossberg and Raskar 2006, with a lens), here
+by :func:`mitsim.reconstruct.focus.separate`. Depth hides most of the gain, so that every scene is also shown with
+direct light as the calibrated factors have it. A user's scene is measured for gloss if it has a parameter ``finish``,
+otherwise for global light.
 """
 
 from __future__ import annotations
@@ -72,9 +67,8 @@ FAMILIES = (
 _FEW = "uniform", "random:7", "dots:2", "dots:4", "dots:7", "dots:8", "hadamard:4", "hadamard:8"
 _SHOWN = "uniform", "random:7", "dots:4", "dots:7", "hadamard:8"
 _STATED = "uniform", "dots:7"
-"""Families that the paper's figures 4 to 6 give decibels of, mask at 2000 um."""
+"""Families whose PSNR the paper's figures 4 to 6 state, mask at 2000 um."""
 _SPECTRUM = "spectrum"
-"""Squares of the left factor's singular values, of the calibrated camera with the family's patterns."""
 
 
 def _patterns_measure(studio: Studio, point: Point) -> Found:
@@ -124,11 +118,11 @@ PATTERNS = Study(
 FRAMES = 49
 ONE, MANY, DOTS = SHARED = ("1 uniform", "49 uniform", "49 dots")
 _LAW_WITHIN = 0.1
-"""Relative difference of law and measurement: one draw of 16384 unknowns scatters by 1 %, dots' noise is not white."""
+"""Relative difference of law and measurement: one draw scatters by 1 %, and the noise of dots is not white."""
 
 
 def _exposure_measure(studio: Studio, point: Point) -> Found:
-    """All frames have the time in which one of uniform light fills the full well as far as it may."""
+    """Expose all frames for the time in which a uniform one fills the well to its default part."""
     bench, name = studio.bench(point.setup), str(point["patterns"])
     ones, count = np.ones((bench.n, 1), np.int8), 1 if name == ONE else FRAMES
     family = bench.family("dots:7") if name == DOTS else PatternFamily(name, ones.repeat(count, axis=1), ones)
@@ -173,16 +167,14 @@ EXPOSURE = Study(
 # -------- Ambient light
 
 RADIANCES = WEAK, _, AS_BRIGHT, BRIGHTER, STRONG = ("1.17", "11.7", "117", "1170", "11700")
-"""Radiance of the scene's lamp [W m^-2 sr^-1]; that of lamp_bench lights its sheet a hundredth as the projector does,
-to a hundred times."""
+"""Radiance of the scene's lamp [W m^-2 sr^-1], from a hundredth to a hundred times the projector's light."""
 _PERCENTILES = (1.0, 99.0)
-"""Bounds of a dynamic range, because the noise of single pixels is no signal."""
+"""Percentiles of a dynamic range, because the noise of single pixels is no signal."""
 _BETTER, _OTHER = "hadamard:8", "dots:8"
 _by_lamp = partial(Lines, "lamp", "radiance of the lamp [W m$^{-2}$ sr$^{-1}$]", facet="", log=True)
 
 
 def _ambient_measure(studio: Studio, point: Point) -> Found:
-    """Measure the image, the lamp's light over the projector's, and the part of the full well without the lamp."""
     setup, patterns, seed = point.setup, str(point["patterns"]), int(point["seed"])
     image, frames = studio.image(setup, RENDERED, patterns, seed), studio.frames(setup, RENDERED, patterns, seed)
     exposer = frames.exposer(frames.seconds(EQUAL_PEAK))
@@ -250,27 +242,15 @@ PIXELS, SENSOR, INTERREFLECTION, SATURATION, REST = ERROR_SOURCES = (
     "pixels", "sensor", "interreflection", "saturation", "rest",
 )  # fmt: skip
 _ADDED = SENSOR, INTERREFLECTION, SATURATION
-"""Causes of artefacts."""
 _DARK = 1e-3
-"""Reflectance below which a pixel of the twin has no light to be scaled: shadows, beyond which sampling decides."""
+"""Reflectance below which a pixel of the twin is a shadow, whose scale is only sampling noise."""
 
 
 @single_threaded_blas()
 def split(frames: Unexposed, twin: LitScene, seconds: float) -> tuple[Solution, dict[str, FloatArray]]:
-    """Solve one noisy exposure, and split its error against the twin's reflectance by :data:`ERROR_SOURCES`.
+    """Solve one noisy exposure of ``seconds`` a frame, and split its error against the matt ``twin``.
 
-    Parameters
-    ----------
-    frames
-        Rendered frames of a family whose every pattern is one shot.
-    twin
-        The same scene of matt paint, in its light.
-    seconds
-        Exposure time of each frame.
-
-    Returns
-    -------
-    The solution, and (n, n) errors by cause, whose sum is the image less the twin's reflectance.
+    Return the solution, and (n, n) errors by :data:`ERROR_SOURCES`, whose sum is the image less the twin's reflectance.
     """
     model, sums = frames.data(seconds)
     solution, exposer, lit = model.solve(sums), frames.exposer(seconds), frames.lit
@@ -298,17 +278,16 @@ def split(frames: Unexposed, twin: LitScene, seconds: float) -> tuple[Solution, 
 
 
 def direct_of(light: SampledLight) -> SampledLight:
-    """Return a ``light`` without what was followed over several surfaces."""
+    """Return a ``light`` without light over several surfaces."""
     names = "indirect", "indirect_residual"
     groups = (each.with_light({name: sparse.csr_array(each[name].shape) for name in names}) for each in light.groups)
     return replace(light, groups=tuple(groups))
 
 
 def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
-    """Return direct light of a matt scene, scaled projector pixel by pixel to the brightness of a glossy one.
+    """Return direct light of a matt scene, scaled pixel by pixel to the brightness of a glossy one.
 
-    The scale comes from the traced light and not from the truth, so that sampling noise of a pixel's brightness does
-    not count as gloss.
+    The scale comes from the traced light, so that sampling noise does not count as gloss.
     """
     lit = matt.flux > _DARK * matt.apparent.board_flux
     ratio = np.divide(glossy.flux, matt.flux, out=np.zeros_like(glossy.flux), where=lit)
@@ -321,25 +300,21 @@ def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
 
 CARD, BLADE, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
 SHAPES = {"plate": {"shape": "rectangle", "z": "400"}, "ball": {"shape": "sphere", "z": "440"}}
-"""Shapes in the scene `highlight`."""
 ROUGHNESSES = {"plate": (1.0, 0.3, 0.1, 0.03, 0.003, 0.001), "ball": (1.0, 0.3, 0.1, 0.03)}
-"""Roughness of GGX lobes: from all directions to 0.8 mm at the sensor, which is 6 mm wide. At 0.01 lobes are neither
-wide enough for a few anchors nor sharp enough to be aimed at, so light takes minutes; as on a sharper ball."""
+"""Roughness of GGX lobes. At 0.01 lobes are neither wide enough for a few anchors nor sharp enough to be aimed at, so
+that light takes minutes."""
 GLOSS_FAMILIES = ("uniform", "dots:7")
 AS_MATT = "as the matt scene"
-"""The exposure time of the twin, with which highlights saturate."""
+"""Exposure time of the twin, with which highlights saturate."""
 EXPOSURES = (EQUAL_PEAK, AS_MATT)
 _TRUTHS = ("matt paint", "apparent")
 _KEPT_AS = "{patterns}, {exposure}"
-"""Names of the images."""
 _GREY = 0.5
-"""Grey of an error of 0, as images of errors are kept."""
 _ROUNDING = 1e-12
-"""Mean square of an error that is rounding: factors of a condition of 1e7 leave 1e-28 to 1e-14 of the image's."""
+"""Mean square of an error that is rounding."""
 _PLAIN_DB = 20.0
-"""Artefacts of a tenth of white are plainly seen."""
 _ACCURACY = 3e-3
-"""Accuracy of the light: a tenth of the artefacts that matter, and of global light, in a third of the time of 1e-3."""
+"""Accuracy of the light: a tenth of the artefacts that matter."""
 
 
 def _measure_gloss(studio: Studio, point: Point) -> Found:
@@ -380,10 +355,8 @@ SCENES = ("corner", "cookie_bag")
 GLOBAL_FAMILIES = ("dots:4", "dots:7", "dots:10")
 AS_IT_IS, MENDED = DEPTHS = ("as it is", "depth mended")
 _ALL, SEPARATED, ALONE, GLOBAL = IMAGES = ("all light", "separated", "direct alone", "global")
-"""Images of all light taken for direct, of what is left once global light is subtracted, of direct light without any
-other, and of global light."""
 _MARGIN = 2
-"""Periods of the dots beyond the window that light comes from: in the corner four give no more."""
+"""Periods of the dots beyond the window from which light comes."""
 
 
 def _measure_global(studio: Studio, point: Point) -> Found:
@@ -401,7 +374,6 @@ def _measure_global(studio: Studio, point: Point) -> Found:
     exposer, (left, right) = frames.exposer(seconds), frames.sides
 
     def measure(rates: list[FloatArray]) -> list[tuple[Shot, FloatArray]]:
-        """Expose frames of these rates [electrons/s] once."""
         return [
             (shot, exposer.rate(exposer.digital(np.maximum(rate, 0.0) * seconds, *shot.names)))
             for shot, rate in zip(family.shots, rates, strict=True)
@@ -433,7 +405,6 @@ def _measure_global(studio: Studio, point: Point) -> Found:
 
 
 def global_truth(light: SampledLight) -> FloatArray:
-    """Return (n, n) the image of global light under uniform light, over the board's light in each direction."""
     bench, grid = light.bench, light.simulation.grids["indirect"].bundle
     cells = np.asarray(sum(group["indirect"].sum(axis=0) for group in light.groups)) / len(light.groups)
     shape = len(grid.rows.centres), len(grid.columns.centres)

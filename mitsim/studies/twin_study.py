@@ -1,17 +1,15 @@
 """Real captures of two lensless cameras, compared with simulations of these cameras.
 
-*FlatCam*. Captures become frames as `mitsim import --list flatcam` makes them (:mod:`mitsim.core.prepare`). The codes
-of the mask are learned from the other captures and their authors' images, as `mitsim calibrate --known` learns them
-(:mod:`mitsim.reconstruct.shifted_codes`) with one code a side, so every frame is a prediction. The authors' image of
-the scene is put on an evenly lit sheet, and a camera with a drawn mask of the transmission (1 + c_r(row) c_c(column)) /
-2 captures it, without diffraction, because the learned codes contain it. Noise is estimated from a capture's own fine
-structure. What the simulation does not explain is divided by cause.
+*FlatCam*. The codes of the mask are learned from the other captures and their authors' images
+(:mod:`mitsim.reconstruct.shifted_codes`), so that every frame is a prediction. The authors' image of the scene is put
+on an evenly lit sheet, and a camera with a mask of the transmission (1 + c_r(row) c_c(column)) / 2 captures it, without
+diffraction, because the learned codes contain it. Noise is estimated from a capture's own fine structure. The
+unexplained part is divided by cause.
 
-*DiffuserCam*. A diffuser is a random relief, whose caustics lie elsewhere in every draw, so statistics are compared.
-The slopes of a normal relief move light by d (n - 1) grad h (:mod:`mitsim.transport.plugins.diffuser`), which two
-numbers determine: the relief's correlation length and the rms distance that light is moved by. A blur (point source,
-pixels and diffraction) and an even part of the light (haze) are fitted with them, by landing rays of small slopes on a
-grid; what is compared is traced by Mitsuba.
+*DiffuserCam*. Caustics of a random relief differ in every draw, so that statistics are compared. The slopes of a normal
+relief move light by d (n - 1) grad h (:mod:`mitsim.transport.plugins.diffuser`). The relief's correlation length and
+rms move of light are fitted, with a blur (point source, pixels and diffraction) and an even part of the light (haze),
+by landing rays of small slopes on a grid; the compared light is traced by Mitsuba.
 """
 
 from __future__ import annotations
@@ -58,11 +56,10 @@ if TYPE_CHECKING:
 # -------- Captures of a FlatCam: frames, their noise, and the codes of the mask
 
 _RAW = 1024, 1280
-"""Rows and columns of a capture."""
 PITCH_MM = 0.0106
-"""Width of a plane's pixels, twice 5.3 um as of sensors of 1024 x 1280 pixels. Frames do not depend on it."""
+"""Width of a plane's pixels: twice 5.3 um. Frames do not depend on it."""
 EXPOSURE_S = 0.01
-"""Any exposure: frames before noise are compared, and scaled."""
+"""Arbitrary exposure time, because frames before noise are compared after scaling."""
 _BLOCK, _SMOOTH = 48, 31
 """Side of the blocks whose noise and mean are compared, and of the square that gives a pixel's mean light [pixels]."""
 
@@ -73,18 +70,16 @@ class Measured:
 
     Attributes
     ----------
-    capture, plane
-        names of the capture and of the plane.
     offset
         place of the plane's pixels, down and to the right [pixels].
     level
         (m, m') the plane, turned and cut [DN].
     noise
-        (m, m') noise drawn as the plane's, turned and cut, without row and column means [DN].
+        (m, m') drawn noise of the plane, without row and column means [DN].
     scene
         (n, n') the authors' image, 0 to 1.
     gain, read_variance
-        DN an electron, and variance without light [DN^2], of the raw plane.
+        gain [DN per electron], and variance without light [DN^2], of the raw plane.
     """
 
     capture: str
@@ -98,23 +93,22 @@ class Measured:
 
     @property
     def name(self) -> str:
-        """Name of the frame."""
         return f"{self.capture} {self.plane}"
 
     @cached_property
     def frame(self) -> FloatArray:
-        """(m, m') the plane without row and column means [DN]."""
         return centre_frame(self.level)
 
     def exposure(self, frame: FloatArray | None = None, group: int = 0) -> Exposure:
-        """Return what a fit of codes takes: this frame, or another ``frame`` of the plane, of the picture ``group``."""
+        """Return this frame, or another ``frame`` of the plane, as input for a fit of codes."""
         return Exposure(self.scene, self.frame if frame is None else frame, group, self.plane, self.offset)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Contents of `calibration/flatcam.toml`: ``how`` files become frames, the kind of their numbers (``digital``) and
-    of how many ``bits``, and ``n`` scene pixels a side."""
+    """Contents of `calibration/flatcam.toml`: ``how`` files become frames, kind and number of bits, and ``n`` scene
+    pixels a side.
+    """
 
     how: Preparation
     digital: Digital
@@ -123,7 +117,6 @@ class Recipe:
 
     @classmethod
     def load(cls) -> Recipe:
-        """Return the shipped recipe."""
         path = shipped_path("calibration", "flatcam.toml")
         listed = read_toml(path)
         how = validate(Preparation, listed["prepare"], f"list {path}")
@@ -146,12 +139,12 @@ class Recipe:
         return {name: np.asarray(numbers[places[name][0] :: 2, places[name][1] :: 2] / factor) for name in PLANES}
 
     def place(self, plane: FloatArray) -> FloatArray:
-        """Return a whole ``plane``, or noise alone, turned and cut as a frame."""
+        """Return a whole ``plane`` turned and cut as a frame."""
         how = self.how.model_copy(update={"channel": None, "mosaic": None, "divide_by": 1})
         return Preparer.of(how, self.digital, Wanted()).frame(Path(), plane).astype(np.float64)
 
     def scene(self, path: Path) -> FloatArray:
-        """Return the authors' image (n, n, 3) in the file ``path``, 0 to 1; MitsimError for another size."""
+        """Return the authors' image (n, n, 3), 0 to 1; MitsimError for another size."""
         image = read_image(path, Wanted("image", bits=(8,), colour=True))
         if image.shape != (self.n, self.n, 3):
             raise MitsimError(
@@ -167,12 +160,7 @@ def _size(values: Numbers) -> str:
 def read_captures(files: Mapping[str, tuple[Path, Path]], seed: int) -> list[Measured]:
     """Return every plane of all captures; MitsimError for files that are no captures.
 
-    Parameters
-    ----------
-    files
-        raw frame and its authors' image, by the capture's name.
-    seed
-        seed of the drawn noise.
+    ``files`` are raw frame and authors' image, by the capture's name.
     """
     recipe, found = Recipe.load(), []
     raw = {name: recipe.planes(frame) for name, (frame, _) in files.items()}
@@ -188,11 +176,10 @@ def read_captures(files: Mapping[str, tuple[Path, Path]], seed: int) -> list[Mea
 
 
 def noise_of(planes: Sequence[FloatArray]) -> tuple[float, float]:
-    """Return gain [DN an electron] and variance without light [DN^2] from the ``planes`` of several captures.
+    """Return gain [DN per electron] and variance without light [DN^2] from the ``planes`` of several captures.
 
-    Second differences along both axes leave nothing of the light: between the two green planes of a capture, which see
-    the light half a pixel apart, they correlate by less than 0.01. Their mean squares in blocks are a line over the
-    means.
+    Second differences along both axes remove the light: between the two green planes of a capture they correlate by
+    less than 0.01. Their mean squares in blocks are a line over the means.
     """
     means, squares = [], []
     for plane in planes:
@@ -210,8 +197,7 @@ def noise_of(planes: Sequence[FloatArray]) -> tuple[float, float]:
 
 
 def draw_noise(plane: FloatArray, gain: float, read_variance: float, seed: int, name: str) -> FloatArray:
-    """Return the noise (rows, columns) of a simulated sensor in the light of a ``plane`` [DN], from a stream ``name``;
-    ``gain`` and ``read_variance`` are as of :func:`noise_of`."""
+    """Return noise (rows, columns) of a simulated sensor in the light of a ``plane`` [DN]."""
     sensor = SensorModel(
         name="twin", pixel_pitch_um=PITCH_MM * 1e3, full_well_e=float("inf"), gain_dn_per_e=gain,
         read_noise_e=float(np.sqrt(read_variance)) / gain, source="mitsim study twin",
@@ -223,8 +209,6 @@ def draw_noise(plane: FloatArray, gain: float, read_variance: float, seed: int, 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """Codes of a mask, and the ``pose`` of pictures before it."""
-
     pose: Pose
     codes: Codes
 
@@ -238,19 +222,17 @@ class Learned:
         return cls(pose, fit_codes(turned, Shape(pose.scales, 1, True)))
 
     def see(self, measured: Measured) -> Measured:
-        """Return the ``measured`` plane with its scene in the orientation that the mask sees."""
         return replace(measured, scene=measured.exposure().turn_scene(self.pose.orientation).scene)
 
 
 # -------- The simulated camera
 
 _MASK_MM, _SHEET_MM = 10.0, 1000.0
-"""Sensor to mask and to sheet. No frame determines more than the product of the mask's distance and an angle. At these
-distances the scene ends at 4 degrees, where light falls by 1 % by its angle."""
+"""Sensor to mask and to sheet. Frames determine only the product of the mask's distance and an angle. At these
+distances the scene ends at 4 degrees, where light falls by 1 %."""
 _ACCURACY = 1e-3
-"""Of frames, whose coded part is a thirtieth: it is then good to 2 to 5 %, where 22 to 58 % are not explained."""
+"""Accuracy of frames, whose coded part (a thirtieth) is then good to 2 to 5 %."""
 _WIDER = 1.05
-"""Projector's window over the sheet."""
 _SCENE = Template("""<scene version="3.0.0">
 <integrator type="path"><integer name="max_depth" value="2"/></integrator>
 <sensor type="mitsim_lensless" id="camera">
@@ -279,23 +261,14 @@ _SCENE = Template("""<scene version="3.0.0">
 </shape>
 </scene>
 """)
-"""As the shipped photograph's scene, which explains each line."""
 
 
 @single_threaded_blas()
 def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> FloatArray:
-    """Return the expected electrons (m, m') of a simulated camera that sees a frame's scene through a mask.
+    """Return the expected electrons (m, m') of a simulated camera that sees a frame's scene through a mask of
+    ``codes``.
 
-    Parameters
-    ----------
-    measured
-        frame with its scene in the orientation that the mask sees.
-    codes
-        codes of the mask, one a side.
-    folder
-        existing folder that gets the bench's files, which any verb takes.
-    variant
-        variant of Mitsuba.
+    ``folder`` gets the bench's files, which any verb accepts.
     """
     lines = [code[0] for code in codes.codes]
     feature = PITCH_MM * (1 - _MASK_MM / _SHEET_MM)
@@ -331,30 +304,22 @@ def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> Floa
 # -------- What a simulated frame explains of a measured one
 
 CAUSES = ("row and column means", "explained", "scale", "smooth field", "mask's code", "scene's image", "noise", "rest")
-"""Parts of a measured frame's energy, in the order in which each is removed from what the ones before leave."""
+"""Parts of a measured frame's energy, in the order of their removal."""
 _DEGREE = 3
-"""Degree of the polynomials of a smooth field: what changes over a third of the frame."""
+"""Degree of the polynomials of a smooth field."""
 _LAMBDAS = np.geomspace(1e-6, 1e2, 49)
-"""Weights of the scene's correction that are tried, relative to the square of its largest singular value."""
+"""Weights of the scene's correction, relative to the square of its largest singular value."""
 
 
 def column_of(cause: str) -> str:
-    """Return the column of the table that has the part of a ``cause``."""
     return f"part_{cause.replace(' ', '_')}"
 
 
 @single_threaded_blas()
 def compare(measured: Measured, codes: Codes, electrons: FloatArray, other: FloatArray) -> dict[str, Value]:
-    """Return the columns of a measured frame beside a simulated one, whose scale is the only number that is fitted.
+    """Return the columns of a measured frame beside simulated ``electrons`` (m, m'), of which only the scale is fitted.
 
-    Parameters
-    ----------
-    measured
-        frame with its scene in the orientation that the mask sees.
-    codes, electrons
-        codes of the mask, and expected electrons (m, m') of the simulated camera behind it.
-    other
-        scene of another capture.
+    ``other`` is the scene of another capture.
     """
     frame, expected = measured.frame, fitted(measured, electrons)
     simulated, left = centre_frame(electrons), frame - expected
@@ -405,8 +370,9 @@ def _parts(measured: Measured, codes: Codes, expected: FloatArray, gain: float) 
 
 
 def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, float]:
-    """Return the part of a ``rest`` that is smooth light, or a smooth gain of the ``expected`` frame, and the number of
-    its parameters."""
+    """Return the part of a ``rest`` that is smooth light or a smooth gain of the ``expected`` frame, and its number of
+    parameters.
+    """
     sides = [legvander(np.linspace(-1, 1, count), _DEGREE).astype(np.float64) for count in rest.shape]
     degrees = [each for each in product(range(_DEGREE + 1), repeat=2) if 0 < sum(each) <= _DEGREE]
     shapes: list[FloatArray] = [np.outer(sides[0][:, row], sides[1][:, column]) for row, column in degrees]
@@ -422,7 +388,8 @@ def _scene_correction(
     rest: FloatArray, factors: tuple[FloatArray, FloatArray], level: float
 ) -> tuple[FloatArray, float]:
     """Return the frame of a correction of the scene, by Tikhonov with the weight of least risk, and the number of
-    parameters that it fits to noise of variance ``level``."""
+    parameters that it fits to noise of variance ``level``.
+    """
     (left, first, _), (right, second, _) = (np.linalg.svd(each, full_matrices=False) for each in factors)
     seen, strength = left.T @ rest @ right, np.square(np.outer(first, second))
     largest = strength.max()
@@ -442,41 +409,38 @@ def _energy(values: FloatArray) -> float:
 
 
 def correlation(first: FloatArray, second: FloatArray) -> float:
-    """Return the correlation of all numbers of the ``first`` array and the ``second``."""
     return float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
 
 
 # -------- A DiffuserCam's point spread function, and diffusers with its statistics
 
 _REDUCE = 4
-"""Pixels a side of the picture that become one."""
+"""Binning of the picture."""
 SPREAD_MM = _REDUCE * 5.86e-3
-"""Width of these, of pixels of the shipped sensor's size: lengths are proportional to it, and nothing else."""
+"""Width of binned pixels of the shipped sensor; all lengths are proportional to it."""
 CORRELATIONS_MM, MOVES_MM = np.geomspace(0.15, 0.45, 8), np.geomspace(0.05, 0.25, 8)
-"""Correlation lengths and rms moves of light that are tried: steps of a sixth and a fourth, as wide as fits to single
-diffusers scatter."""
+"""Trial correlation lengths and rms moves of light, in steps as wide as fits to single diffusers scatter."""
 BLURS, HAZES = np.linspace(0.0, 2.0, 11), np.linspace(0.0, 0.5, 11)
-"""Standard deviations of the blur [pixels], and even parts of the light, that are tried."""
+"""Trial standard deviations of the blur [pixels], and even parts of the light."""
 _SEEDS, TRACED = 2, 6
-"""Diffusers at each point of the grid, and diffusers that are traced, whose scatter is known to a third."""
+"""Diffusers at each point of the grid, and traced diffusers."""
 _RAYS = 1280, 2048
-"""Rays a side of their square, of the fit and of what is traced: 20 and 50 a pixel."""
+"""Rays per side, of the fit and of the traced light: 20 and 50 a pixel."""
 _LOWEST, _HIGHEST, _BANDS = 1 / 70, 0.4, 14
-"""Bands of the radial spectrum, from a few caustic cells to where noise of rays would show [cycles / pixel]."""
+"""Bands of the radial spectrum, from a few caustic cells to the noise of rays [cycles / pixel]."""
 _EDGES = np.geomspace(_LOWEST, _HIGHEST, _BANDS + 1)
 FREQUENCIES = np.sqrt(_EDGES[1:] * _EDGES[:-1])
-"""(bands,) middles of the radial bands [cycles / pixel]."""
 _LIT, _SURE = 0.2, 12.0
-"""Part of the brightest smoothed light that counts as lit, and the width of that smoothing [pixels], a cell's."""
+"""Part of the brightest smoothed light that counts as lit, and the width of the smoothing [pixels]."""
 _MARGIN_MM = 1.2
-"""Margin of the relief around the compared square: light is moved by less."""
 _SLOPE = 0.1
-"""Slope of the reliefs that rays are landed from; their moves are scaled."""
+"""Slope of the reliefs from which rays are landed; their moves are scaled."""
 
 
 class Spread(NamedTuple):
-    """Statistics of a square of light: mean power of each radial band, of light over its mean; standard deviation over
-    mean; share of the light in the brightest twentieth of the pixels."""
+    """Statistics of a square of light over its mean: power of each radial band, standard deviation, and share of the
+    light in the brightest twentieth of the pixels.
+    """
 
     spectrum: FloatArray
     contrast: float
@@ -484,7 +448,7 @@ class Spread(NamedTuple):
 
 
 def radial_power(values: FloatArray) -> FloatArray:
-    """Return the mean power (bands,) a pixel of ``values`` (rows, columns), windowed and without their mean."""
+    """Return the mean power (bands,) per pixel of ``values`` (rows, columns), windowed and without their mean."""
     window = np.outer(*(np.hanning(side) for side in values.shape))
     window /= np.sqrt(np.square(window).mean())
     power = np.square(np.abs(np.fft.fft2((values - (values * window**2).mean()) * window))) / values.size
@@ -495,7 +459,6 @@ def radial_power(values: FloatArray) -> FloatArray:
 
 
 def spread_of(light: FloatArray) -> Spread:
-    """Return the statistics of a square of ``light``."""
     even = light / light.mean()
     ordered = np.sort(even.ravel())
     count = max(1, round(0.05 * even.size))
@@ -503,15 +466,16 @@ def spread_of(light: FloatArray) -> Spread:
 
 
 def read_spread(path: Path) -> FloatArray:
-    """Return the lit square of the point spread function in the picture ``path``; MitsimError for one in colour, and
-    for one whose lit part is too small."""
+    """Return the lit square of the point spread function in a picture; MitsimError for a picture in colour or too small
+    a lit part.
+    """
     if read_image(path, Wanted("point spread function", colour=True)).ndim != 2:
         raise MitsimError(f"point spread function {path}: is in colour; give the sensor's own grey picture")
     return lit_square(load_psf(path, _REDUCE))
 
 
 def lit_square(light: FloatArray) -> FloatArray:
-    """Return the largest centred square of a point spread function's ``light`` that is lit."""
+    """Return the largest centred lit square of a point spread function."""
     smooth = ndimage.gaussian_filter(light, _SURE)
     lit = smooth > _LIT * smooth.max()
     ends = [np.flatnonzero(lit.any(axis=axis))[[0, -1]] for axis in (1, 0)]
@@ -526,7 +490,7 @@ def lit_square(light: FloatArray) -> FloatArray:
 
 
 def land(relief: Relief, move_mm: float, count: int, seed: int) -> FloatArray:
-    """Return light over its mean (count, count) of rays that a ``relief`` moves by ``move_mm`` rms, by small slopes."""
+    """Return light over its mean (count, count) of rays that a ``relief`` moves by ``move_mm`` rms."""
     rays, side = _RAYS[0], relief.side_mm
     jitter = stream(seed, "twin's rays").random((2, rays, rays))
     places = (np.stack(np.meshgrid(np.arange(rays), np.arange(rays), indexing="ij")) + jitter).reshape(2, -1) / rays
@@ -543,7 +507,8 @@ def land(relief: Relief, move_mm: float, count: int, seed: int) -> FloatArray:
 
 def fit(measured: FloatArray, grid: FloatArray) -> tuple[int, int, float, float]:
     """Return indices on the ``grid`` (correlations, moves, bands), blur and haze of the spectrum most like the
-    ``measured`` one (bands,), by logarithms, because each band of a diffuser scatters by some tenths of itself."""
+    ``measured`` one (bands,), by logarithms, because each band scatters by some tenths of itself.
+    """
     damped = np.exp(-np.square(2 * np.pi * FREQUENCIES * BLURS[:, None]))  # of power
     best = (np.inf, 0, 0, 0.0, 0.0)
     for first, second in product(range(grid.shape[0]), range(grid.shape[1])):
@@ -556,8 +521,7 @@ def fit(measured: FloatArray, grid: FloatArray) -> tuple[int, int, float, float]
 
 
 def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[FloatArray], FloatArray]:
-    """Return squares of light of traced diffusers whose statistics are fitted to a measured ``square``, and the grid of
-    spectra (correlations, moves, bands) of the fit."""
+    """Return squares of light of traced diffusers fitted to a measured ``square``, and the grid of spectra of the fit."""
     count = len(square)
     side = count * SPREAD_MM + 2 * _MARGIN_MM
     grids = np.empty((_SEEDS, len(CORRELATIONS_MM), len(MOVES_MM), _BANDS))
@@ -583,10 +547,10 @@ def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[Fl
 # -------- The study
 
 _DIFFUSER, _SHOWN, _BRIGHT = "diffuser", 160, 3.0
-"""Value of the column capture; middle of a frame that is shown [pixels]; standard deviations from grey to white."""
+"""Value of the column capture; shown part of a frame [pixels]; standard deviations from grey to white."""
 _RENDERED = 0.1
-"""Relative error of a simulated frame from which a twin is not to be trusted: its energy is then a hundredth, as small
-as the parts of some causes."""
+"""Relative error of a simulated frame from which a twin is not reliable, because its energy (a hundredth) equals the
+parts of some causes."""
 
 
 def _points(scope: Scope) -> list[Point]:

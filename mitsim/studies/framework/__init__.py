@@ -1,1 +1,1 @@
-"""How studies of many points run: experiment, workers, table, verdicts, page."""
+"""Framework of studies of many points: experiment, workers, table, verdicts, page."""

@@ -1,7 +1,7 @@
-"""Studies from name and scope to a folder with points, table, claims, figures and page.
+"""Runner of studies, from name and scope to a folder with points, table, claims, figures and page.
 
-Points of a study are measured in processes of their own, which keep their studio from batch to batch. A process that
-dies loses the point that it was measuring, and another process tries it again.
+Points are measured in processes, which keep their studio from batch to batch. If a process dies, another one tries its
+point again.
 """
 
 from __future__ import annotations
@@ -68,8 +68,6 @@ class StudyResult:
 
     Attributes
     ----------
-    study, output
-        name, and the folder that holds the study.
     rows
         rows of its table.
     warnings
@@ -92,12 +90,10 @@ class StudyResult:
     section: Section | None = field(default=None, repr=False)
 
     def payload(self) -> dict[str, Any]:
-        """Return the result as JSON has it."""
         names = ("study", "output", "points", "missing", "seconds", "rows", "claims", "figures", "warnings")
         return {name: getattr(self, name) for name in names} | {"claims": [asdict(claim) for claim in self.claims]}
 
     def lines(self) -> list[str]:
-        """Return the result as text."""
         if self.missing:
             return [
                 f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
@@ -108,14 +104,12 @@ class StudyResult:
         return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
 
     def to_pandas(self) -> Any:
-        """Return the rows as a ``pandas.DataFrame``."""
         import pandas
 
         return pandas.DataFrame([*self.rows])
 
     @property
     def pictures(self) -> dict[str, Path]:
-        """Files of the figures, by name."""
         return {path.name: path for path in sorted(Path(self.output).glob("*.png"))}
 
     def _repr_html_(self) -> str:
@@ -126,10 +120,7 @@ class StudyResult:
 
 
 def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figure]:
-    """Write the ``figures``, by file name, that show anything to a ``folder``, and return these.
-
-    MitsimError when one cannot be written.
-    """
+    """Write the ``figures`` that show anything to a ``folder``, and return them; MitsimError on failure."""
     from mitsim.report.plots import tells  # not in processes that measure
 
     drawn = {file: figure for file, figure in figures.items() if tells(figure)}
@@ -140,7 +131,7 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figu
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write ``rows`` to the CSV file ``path``, all or nothing; MitsimError when it cannot be written."""
+    """Write ``rows`` to the CSV file ``path``, all or nothing; MitsimError on failure."""
     from pandas import DataFrame
 
     write_text(path, DataFrame([dict(row) for row in rows], dtype=object).to_csv(index=False))
@@ -151,11 +142,10 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 POINTS, KEPT = "points", "kept"
 """Folders of measured points, and of objects that points share."""
 DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
-"""Contents of a folder of `mitsim demo`."""
 
 
 def check_study_folder(output: Path | str, name: str) -> None:
-    """Refuse an ``output`` that :func:`study_folder` of the study ``name`` would refuse, before slow imports."""
+    """Refuse an ``output`` that :func:`study_folder` would refuse, before slow imports."""
     check_output(output, overwrite=_is_earlier(Path(output), name))
 
 
@@ -163,15 +153,14 @@ def check_study_folder(output: Path | str, name: str) -> None:
 def study_folder(output: Path | str, name: str) -> Iterator[Path]:
     """Hold the folder ``output`` of the study ``name`` while the context lasts.
 
-    It is new or empty, or holds an earlier study of that name alone, of which nothing is removed. MitsimError when it
-    holds anything else, or cannot be written.
+    The folder is new or empty, or holds an earlier study of that name, of which nothing is removed. MitsimError
+    otherwise.
     """
     with output_folder(output, overwrite=_is_earlier(Path(output), name)) as folder:
         yield folder
 
 
 def _is_earlier(place: Path, name: str) -> bool:
-    """Return True if a ``place`` holds an earlier study of a ``name``, whose NAME.json states it, and nothing else."""
     head = place / f"{name}.json"
     found = read_json(head) if head.is_file() else None
     if not isinstance(found, dict) or found.get("kind") != name:
@@ -189,16 +178,15 @@ def _is_earlier(place: Path, name: str) -> bool:
 
 @dataclass(frozen=True)
 class Store:
-    """Findings of points in a ``folder``, which exists."""
+    """Findings of points in an existing ``folder``."""
 
     folder: Path
 
     def has(self, point: Point) -> bool:
-        """Return True if a ``point`` is measured."""
         return self._file(point).is_file()
 
     def save(self, point: Point, found: Found) -> None:
-        """Keep what was ``found`` at a ``point``; MitsimError when it cannot be written."""
+        """Save the findings of a ``point``; MitsimError on failure."""
         import numpy as np
 
         rows = np.frombuffer(json.dumps([dict(row) for row in found.rows]).encode(), dtype=np.uint8)
@@ -206,7 +194,7 @@ class Store:
             np.savez_compressed(file, allow_pickle=False, **{"rows": rows, **found.arrays})  # type: ignore[arg-type]
 
     def load(self, point: Point) -> Found:
-        """Return what was found at a ``point``; MitsimError when the file is damaged."""
+        """Return the findings of a ``point``; MitsimError when the file is damaged."""
         from mitsim.core.arrays import read_npz
 
         path = self._file(point)
@@ -233,7 +221,6 @@ class Store:
                     shutil.copyfile(file, part)
 
     def results(self, points: Iterable[Point]) -> Results:
-        """Return everything found at ``points``, in their order."""
         found = {point.key: self.load(point) for point in points}
         rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
         return Results(rows, {(key, name): array for key, each in found.items() for name, array in each.arrays.items()})
@@ -246,8 +233,7 @@ Batch = tuple[Point, ...]
 
 
 def batches(points: Sequence[Point], kept: bool = False) -> list[Batch]:
-    """Return the ``points`` in their order, those of one setup together, because they share its light; each alone if
-    what they share is ``kept`` in files."""
+    """Return batches of ``points`` that share light; single points if the shared objects are ``kept`` in files."""
     if kept:
         return [(point,) for point in points]
     return [tuple(group) for _, group in groupby(points, key=lambda point: point.setup)]
@@ -255,21 +241,21 @@ def batches(points: Sequence[Point], kept: bool = False) -> list[Batch]:
 
 @dataclass(frozen=True)
 class Shard:
-    """Part ``number`` of ``count``, from 1 on, of a study that several jobs of a cluster share."""
+    """Part ``number`` of ``count``, from 1, of a study that several jobs of a cluster share."""
 
     number: int = 1
     count: int = 1
 
     @classmethod
     def of(cls, text: str) -> Shard:
-        """Read a ``text`` such as 2/8; MitsimError for anything else."""
+        """Parse a text such as 2/8; MitsimError for anything else."""
         number, slash, count = text.partition("/")
         if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
             raise MitsimError(f"--shard {text!r}: give I/N with I from 1 to N, such as 1/4")
         return cls(int(number), int(count))
 
     def part(self, points: Sequence[Point], kept: bool = False) -> list[Point]:
-        """Return the points of every ``count``-th of the :func:`batches`, because a batch's light is traced once."""
+        """Return the points of every ``count``-th batch, because a batch's light is traced once."""
         return [point for batch in batches(points, kept)[self.number - 1 :: self.count] for point in batch]
 
 
@@ -278,8 +264,9 @@ class Shard:
 
 @dataclass(frozen=True)
 class Where:
-    """Where points are measured: which part of them, by how many processes here, or by a Dask scheduler; ``shared`` is
-    a folder of plans and calibrations that studies share."""
+    """Part of the points, and local processes or the Dask scheduler that measure it; ``shared`` is a folder of plans
+    and calibrations that studies share.
+    """
 
     shard: Shard = field(default_factory=Shard)
     jobs: int | None = None
@@ -294,18 +281,16 @@ class Where:
 def run_experiment(
     study: str, scope: Scope, output: Path | str, job: Job | None = None, where: Where | None = None
 ) -> StudyResult:
-    """Measure the points that are not measured yet, and put everything together.
+    """Measure the points that are not measured yet, and write table, claims, figures and page.
 
     Parameters
     ----------
     study
-        name of an experiment; ``all`` for those of the paper, each in a folder of its own, on one page.
+        name of an experiment; ``all`` for those of the paper, each in its own folder, on one page.
     scope, where
-        scene and amount, and where the points are measured; None: all of them here.
+        scene and size, and where the points are measured; None: all of them here.
     output
         new or empty folder, or that of an earlier run of the same study, which is resumed.
-    job
-        progress.
 
     Raises
     ------
@@ -346,10 +331,7 @@ def run_experiment(
 
 
 def _check_data(points: Sequence[Point]) -> None:
-    """Raise MitsimError for a point whose frames hold no more numbers than its image, so that no lambda can be chosen.
-
-    A bench is opened once for all points that differ in their prints or accuracies alone.
-    """
+    """Raise MitsimError for a point with fewer data than unknowns, so that no lambda can be chosen."""
     from mitsim.bench.layout import shortage  # here: it needs the renderer
 
     asked = {(replace(each.setup, picture=None, accuracy=Setup.accuracy), each["patterns"]) for each in points}
@@ -364,15 +346,14 @@ def _check_data(points: Sequence[Point]) -> None:
 
 
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> StudyResult:
-    """Join several ``parts``, folders of the same study, to one study in the folder ``output``.
+    """Join ``parts``, folders of the same study, in the folder ``output``.
 
-    ``experiment`` is the module of a study of the user's own; no module is imported because a file names it.
+    ``experiment`` is the module of a user's own study, because no module is imported only since a file names it.
 
     Raises
     ------
     MitsimError
-        for parts of different studies, of one that neither ships nor is ``experiment``, parts that hold none, and an
-        output that holds something else.
+        for parts of different or unknown studies, parts that hold none, and an output that holds something else.
     """
     started, heads = time.perf_counter(), [_head(Path(part)) for part in parts]
     if not heads:
@@ -411,7 +392,7 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
 
 
 def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResult]) -> StudyResult:
-    """Make every experiment of the paper by ``each`` in a folder of its own, and one page of all claims."""
+    """Run every experiment of the paper in its own folder, and write one page of all claims."""
     with study_folder(output, ALL) as folder:
         _write_head(folder, ALL, ALL, scope, status="incomplete")
         found = [each(name, folder / name) for name in PAPER]
@@ -453,7 +434,7 @@ def _campaign(study: str, experiment: Study, scope: Scope, output: Path | str) -
 def _finish(
     study: str, experiment: Study, scope: Scope, points: Sequence[Point], store: Store, seconds: float
 ) -> StudyResult:
-    """Write table, claims, figures and page, where all points are there; measuring took so many ``seconds``."""
+    """Write table, claims, figures and page if no point is missing; ``seconds`` is the time of measuring."""
     from mitsim.studies.framework.panels import Section, build_page
 
     folder, there, name = store.folder.parent, sum(map(store.has, points)), experiment.name
@@ -479,7 +460,6 @@ def _write_head(folder: Path, name: str, study: str, scope: Scope, /, **more: An
 
 
 def _head(folder: Path) -> dict[str, Any]:
-    """Return the study's JSON in a ``folder``."""
     for file in sorted(folder.glob("*.json")):
         head = read_json(file)
         whole = isinstance(head, dict) and {"study", "scope", "versions"} <= head.keys()
@@ -489,7 +469,7 @@ def _head(folder: Path) -> dict[str, Any]:
 
 
 def read_scope(folder: Path) -> tuple[str, Scope]:
-    """Return name and scope of the study of many points in a ``folder``; MitsimError for one that holds none."""
+    """Return name and scope of the study in a ``folder``; MitsimError if there is none."""
     for file in sorted(folder.glob("*.json")) if folder.is_dir() else ():
         head = read_json(file)
         if isinstance(head, dict) and isinstance(head.get("study"), str) and "scope" in head:
@@ -510,7 +490,7 @@ def _scope(found: Any, part: Path | str) -> Scope:
 # -------- Batches of points in, measured in processes of their own; findings out as they come
 
 _TRIES = 2
-"""Times that a point is begun: what ended two processes would end the third."""
+"""Times that a point is tried: a point that ended two processes would end the third."""
 
 
 @cache
@@ -531,9 +511,8 @@ class _LazyStudio:
 
 
 def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
-    """Measure a ``point`` of the experiment ``name`` in this process's studio.
-
-    ``shared`` is a folder of plans and calibrations that processes share; None: this process keeps its own.
+    """Measure a ``point`` of the experiment ``name`` in this process's studio; ``shared`` is a folder of common
+    objects.
     """
     return find_experiment(name).measure(cast("Studio", _LazyStudio(shared)), point)
 
@@ -541,11 +520,9 @@ def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
 def in_processes(
     name: str, batches: Sequence[Batch], jobs: int, shared: str | None = None
 ) -> Iterator[tuple[Point, Found]]:
-    """Yield the findings of all points of the experiment ``name``, in any order, from so many processes (``jobs``).
+    """Yield the findings of all points of the experiment ``name``, in any order, from ``jobs`` processes.
 
-    A process measures the points of a batch one after the other. ``shared`` is a folder of plans and calibrations that
-    the processes share with others; None: with each other alone. MitsimError for anything that a point refuses, and
-    for a point that ended two processes.
+    MitsimError for anything that a point refuses, and for a point that ended two processes.
     """
     waiting, tries = deque(batches), dict[Point, int]()
     # Processes are ended, not asked to end: the files in their temporary folder go with it.
@@ -606,10 +583,7 @@ class _Worker:
 
 
 def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
-    """Measure every batch that comes, point by point, until the parent is gone.
-
-    ``folders`` are for temporary files and for calibrations that are shared.
-    """
+    """Measure every batch point by point, until the parent is gone; ``folders`` are temporary and shared."""
     tempfile.tempdir, shared = folders
     warnings.showwarning = lambda message, *_: say_note(str(message))
     with suppress(EOFError, OSError, KeyboardInterrupt):
@@ -623,9 +597,9 @@ def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
 
 
 def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tuple[Point, Found]]:
-    """Yield the findings of all points, measured by workers of the Dask cluster at an ``address``, a batch a task.
+    """Yield the findings of all points from the Dask cluster at an ``address``, a batch a task.
 
-    MitsimError without the package ``distributed``, without a scheduler there, and as :func:`in_processes`.
+    MitsimError without the package ``distributed``, without a scheduler, and as :func:`in_processes`.
     """
     try:
         from distributed import Client, as_completed

@@ -1,13 +1,11 @@
-"""Claims of a study: declared with thresholds, and judged from the table of results by one function.
+"""Claims of a study: declared with thresholds, and judged from the table of results.
 
 A claim states that a quantity, such as the difference of two mean PSNR, lies in a range. It is confirmed if the
-quantity's confidence interval lies in the range, not confirmed if the interval lies outside, and not decided if the
-interval contains a border of the range: more prints or more seeds would decide it. Two sets of images are compared by
-the differences of each print (of each seed of the noise where there is one print), because prints differ by decibels,
-and the sets often by tenths.
+quantity's confidence interval lies in the range, not confirmed if the interval lies outside, and otherwise not decided:
+more prints or seeds would decide it. Sets of images are compared print by print (seed by seed where there is one
+print), because prints differ by decibels, and sets often by tenths.
 
-A claim is judged for each model and exposure that were measured. It is confirmed only if it holds for all of them;
-otherwise the verdict names the exposures, or the model, for which it holds.
+A claim is judged for each model and exposure that were measured, and confirmed only if it holds for all of them.
 """
 
 from __future__ import annotations
@@ -29,16 +27,16 @@ if TYPE_CHECKING:
 CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"
 _CONFIDENCE = 0.95
 Holds = bool | None
-"""True, False, or None for a claim that is not decided."""
+"""None for a claim that is not decided."""
 Where = Mapping[str, Any] | str
-"""Values by column that choose rows: a value, a sequence of allowed values, or a function that accepts a value; a text
-is the value of the column patterns."""
+"""Values by column that choose rows: a value, a sequence of values, or a predicate; a text is the value of the column
+patterns."""
 
 # -------- Rows in, means with their standard errors out
 
 
 def choose_rows(rows: DataFrame, where: Where) -> DataFrame:
-    """Return the rows that have the values ``where`` names; a column that the table lacks has the value None."""
+    """Return the rows that match ``where``; a column that the table lacks has the value None."""
     for name, value in _chosen(where).items():
         column: Any = rows[name] if name in rows else rows.index.to_series().map(lambda _: None)
         if callable(value):
@@ -57,7 +55,6 @@ def _chosen(where: Where) -> Mapping[str, Any]:
 
 
 def measured(value: Any) -> bool:
-    """Return True for a number, which chooses rows whose column was measured."""
     return isinstance(value, (int, float)) and not math.isnan(value)
 
 
@@ -77,18 +74,15 @@ def mean_of(
 
     Parameters
     ----------
-    rows, column
-        table, and the column that is averaged.
     minus, minus_column
-        rows of the same prints and seeds, whose values are subtracted print by print, and their column if it has
-        another name.
+        rows of the same prints and seeds, whose values are subtracted, and their column if its name differs.
     error_column
-        column of an error that all rows share, which is added to that of the mean in quadrature.
+        column of an error that all rows share, added in quadrature.
 
     Raises
     ------
     MitsimError
-        if the rows, or the rows of both tables together, have no print (or seed) with a number.
+        if no print (or seed) that the rows, or both tables, share has a number.
     """
     from pandas import Series, to_numeric
 
@@ -117,9 +111,9 @@ def mean_of(
 
 
 def within(quantity: Mean, low: float = -math.inf, high: float = math.inf) -> Holds:
-    """Return whether a quantity lies in a range from ``low`` to ``high``, by Student's interval.
+    """Return whether a quantity lies in a range, by Student's interval with one degree of freedom less than values.
 
-    The degrees of freedom are the number of values less one; a single value decides nothing.
+    A single value decides nothing.
     """
     if quantity.of < 2:
         return None
@@ -139,12 +133,11 @@ def every(*holds: Holds) -> Holds:
 
 
 def verdict(holds: Holds) -> str:
-    """Return the words for a claim that ``holds``, does not hold, or is not decided."""
     return UNDECIDED if holds is None else CONFIRMED if holds else NOT_CONFIRMED
 
 
 def verdict_at(places: Mapping[str, Holds]) -> str:
-    """Return the verdict on a claim that was judged at several ``places``, such as exposures, by their names."""
+    """Return the verdict on a claim that was judged at several ``places``, such as exposures."""
     holding = [name for name, holds in places.items() if holds]
     if len(holding) in (0, len(places)):
         # Undecided at one place and failing at another: the claim may still hold at the first.
@@ -162,7 +155,6 @@ def value_name(column: str, value: Any) -> str:
 
 
 def with_unit(mean: Mean, unit: str, sign: str = "") -> str:
-    """Return a mean with its error and ``unit``: other units than decibels to two digits of the error."""
     if unit == "dB":
         return f"{mean:{sign}} dB"
     error = "" if math.isnan(mean.error) else f" \N{PLUS-MINUS SIGN} {round_to_error(mean.error, mean.error)}"
@@ -172,7 +164,6 @@ def with_unit(mean: Mean, unit: str, sign: str = "") -> str:
 # -------- Declared claims
 
 _SHOWN = 4
-"""Number of values that the figures of a claim list; of more values they state the one that decides."""
 
 
 @dataclass(frozen=True)
@@ -184,15 +175,15 @@ class Statement:
     claim, paper
         the sentence, in which {column} is the value of ``each``, and the paper's figure.
     where
-        rows that the claim is about.
+        rows of the claim.
     each
-        column: there is a claim for each of its values.
+        column with a claim for each of its values.
     every
-        column: the claim must hold for each of its values.
+        column for each of whose values the claim must hold.
     models
-        column of the models, and its two values, whose figures take the places of the idealised and rendered ones.
+        column of the models, and the two values that replace the idealised and rendered one.
     optional
-        True to leave the claim out where no row of it was measured, for example on a user's own scene.
+        True to omit the claim where no row of it was measured, for example on a user's own scene.
     """
 
     claim: str
@@ -205,11 +196,11 @@ class Statement:
     models: tuple[str, str, str] = ("model", IDEALISED, RENDERED)
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        """Return figures, whether the claim holds for some ``rows``, and the margin inside the range's nearest end."""
+        """Return figures, whether the claim holds for some ``rows``, and the margin to the range's nearest end."""
         raise NotImplementedError
 
     def judge(self, results: Results) -> list[Claim]:
-        """Return the claim, or one for each value of the column ``each``, with figures and verdict."""
+        """Return the claim, or one for each value of ``each``, with figures and verdict."""
         rows = choose_rows(results.frame, self.where)
         if rows.empty:
             if self.optional:
@@ -226,7 +217,7 @@ class Statement:
 
     @property
     def _compared(self) -> frozenset[str]:
-        """Columns that choose what is compared, so that the claim isn't judged for each of their values."""
+        """Columns that choose the compared rows, so that the claim is not judged for each of their values."""
         return frozenset()
 
     def _judge(self, rows: DataFrame, claim: str) -> Claim:
@@ -268,7 +259,7 @@ class Statement:
 
 @dataclass(frozen=True)
 class _Range(Statement):
-    """A claim that a quantity of a ``column`` lies in a range ``at_least`` to ``at_most``, in a ``unit``."""
+    """Claim that a quantity of a ``column`` lies in a range [``unit``]."""
 
     _: KW_ONLY
     column: str = "psnr_db"
@@ -283,29 +274,28 @@ class _Range(Statement):
 
 @dataclass(frozen=True)
 class Level(_Range):
-    """A claim that the mean of a ``column`` lies in a range from ``at_least`` to ``at_most`` [``unit``]."""
+    """Claim that the mean of a ``column`` lies in a range from ``at_least`` to ``at_most`` [``unit``]."""
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        """Return the mean, whether it lies in the range, and its margin."""
         mean = mean_of(rows, self.column)
         return self._decide(with_unit(mean, self.unit), mean)
 
 
 @dataclass(frozen=True)
 class Gain(_Range):
-    """A claim that some images exceed others by an amount in a range, compared print by print.
+    """Claim that some images exceed others by an amount in a range, compared print by print.
 
     Attributes
     ----------
     one, other
-        values that choose the rows of both among those of the claim.
+        values that choose the rows of each side.
     column, other_column, unit
-        what is compared, its column in ``other`` if it has another name, and its unit.
+        compared column, its name in ``other`` if it differs, and its unit.
     at_least, at_most
-        range of the gain of ``one`` over ``other``; by default it is above 0.
+        range of the gain of ``one`` over ``other``; by default above 0.
     apart, other_error
-        True to state ``other`` under the first head and ``one`` under the second; and the column of an error of
-        ``other`` beside that of its mean.
+        True to state ``other`` under the first head and ``one`` under the second; column of a further error of
+        ``other``.
     """
 
     one: Where
@@ -321,7 +311,6 @@ class Gain(_Range):
         return frozenset({*_chosen(self.one), *_chosen(self.other)})
 
     def judge(self, results: Results) -> list[Claim]:
-        """Return the claim as other claims do; an optional one is left out where either side was not measured."""
         one, other, _ = self._parts(choose_rows(results.frame, self.where))
         return [] if self.optional and (one.empty or other.empty) else super().judge(results)
 
@@ -338,7 +327,6 @@ class Gain(_Range):
         return replace(judged, idealised=with_unit(before, self.unit), rendered=after)
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        """Return both means and the gain, whether it lies in the range, and its margin."""
         one, other, other_column = self._parts(rows)
         gain = mean_of(one, self.column, other, other_column)
         means = with_unit(mean_of(one, self.column), self.unit), with_unit(mean_of(other, other_column), self.unit)
@@ -347,22 +335,19 @@ class Gain(_Range):
 
 @dataclass(frozen=True)
 class Judged(Statement):
-    """A claim that a function decides: from the rows of one model and exposure to figures and whether it holds, or the
-    words of its verdict."""
+    """Claim that a function decides from the rows of one model and exposure."""
 
     decide: Callable[[DataFrame], tuple[str, Any]]
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        """Return what the function returns; there is no margin."""
         return (*self.decide(rows), 0.0)
 
 
 TOLERANCE_DB = 2.0
-"""Allowed distance from the paper's figures: it states neither its images nor how bright they are."""
+"""Allowed distance from the paper's figures, which state neither images nor brightness."""
 
 
 def stated(claim: str, low: float, high: float, **where: Any) -> Level:
-    """Return the claim of a mean PSNR in a range of the paper, from ``low`` to ``high`` [dB], within
-    :data:`TOLERANCE_DB`; ``where`` chooses its rows."""
+    """Return the claim of a mean PSNR in the paper's range [dB], within :data:`TOLERANCE_DB`."""
     paper = f"{low:g} to {high:g} dB"
     return Level(claim, paper=paper, where=where, at_least=low - TOLERANCE_DB, at_most=high + TOLERANCE_DB)

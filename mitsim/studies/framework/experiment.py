@@ -1,4 +1,4 @@
-"""The declaration of a study: axes, the measurement of one point, claims with thresholds, panels; and its results.
+"""Declaration of a study (axes, measurement of one point, claims, panels), and its results.
 
 The paper's means are over eight images, which it does not name. Those here come with scikit-image, which states their
 licences.
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 # -------- Where a study measures: setups, points, axes
 
 _KEY_DIGITS = 16
-"""Digits of a point's name: two of 10^4 points have the same name with a probability of 10^-11."""
+"""Digits of a point's name: two of 10^4 points collide with a probability of 10^-11."""
 
 
 @dataclass(frozen=True)
@@ -89,19 +89,12 @@ class Point:
 
     @classmethod
     def of(cls, setup: Setup, **values: Value) -> Point:
-        """Return the point of a ``setup`` with these ``values``."""
         return cls(setup, tuple(values.items()))
 
     @classmethod
     def grid(cls, setups: Iterable[Setup], columns: str, **varied: Sequence[Value]) -> list[Point]:
-        """Return all combinations of the ``varied`` values at each setup, the last value fastest.
-
-        Parameters
-        ----------
-        setups, columns
-            setups, and the names of the values in the order in which the table has them.
-        **varied
-            values by name; a fixed one is a sequence of one.
+        """Return all combinations of the ``varied`` values at each setup, the last value fastest; ``columns`` orders
+        the names.
         """
         names = columns.split()
         chosen = [dict(zip(varied, values, strict=True)) for values in product(*varied.values())]
@@ -116,27 +109,26 @@ class Point:
 
     @property
     def key(self) -> str:
-        """Name of the file that keeps the point's findings."""
         text = json.dumps(asdict(self), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:_KEY_DIGITS]
 
 
 @dataclass(frozen=True)
 class Scope:
-    """The part of a study that is measured, and the scene that it is measured on.
+    """The measured part of a study, and its scene.
 
     Attributes
     ----------
     setup
         scene and devices where nothing varies.
     pictures
-        prints that means are taken over; (None,) where the scene keeps its own.
+        prints to average over; (None,) where the scene keeps its own.
     seeds
-        seeds of the noise that means are taken over.
+        seeds of the noise to average over.
     quick
         True for a few points, as a first look.
     sweep, measures
-        knobs of `mitsim study sweep` with their values, and the measures that it shows; empty for other studies.
+        knobs of `mitsim study sweep` with their values, and the shown measures; empty for other studies.
     patterns
         patterns of a sweep that does not vary them, and of a drift.
     recipe
@@ -157,7 +149,7 @@ class Scope:
 
     @property
     def repeats(self) -> tuple[int, ...]:
-        """Seeds of a study without prints to take means over: three of a whole study, so that means have errors."""
+        """Seeds of a study without prints: three of a whole study, so that means have errors."""
         three = (self.seeds[0] + more for more in range(3))
         return self.choose(tuple(dict.fromkeys((*self.seeds, *three))), self.seeds)
 
@@ -183,11 +175,11 @@ class Axes:
     quick_prints
         number of prints of a quick study; None: all of the scope's.
     repeats
-        True to take three seeds (:attr:`Scope.repeats`), for studies whose means are over seeds.
+        True for three seeds (:attr:`Scope.repeats`), for studies whose means are over seeds.
     default
-        shipped scene that is measured where the user names none; None: that of the scope.
+        shipped scene of a study whose user names none; None: that of the scope.
     kept
-        decides which combinations are points, from their values by name; None: all.
+        chooses the combinations that are points, from their values by name; None: all.
     """
 
     values: Mapping[str, Sequence[Value]]
@@ -200,7 +192,6 @@ class Axes:
     kept: Callable[[Mapping[str, Value]], bool] | None = None
 
     def __call__(self, scope: Scope) -> list[Point]:
-        """Return the points of a ``scope``, those of one setup together."""
         scene, values = ({name: self._values(name, all_, scope) for name, all_ in axis.items()} for axis in
                          (self.scene, self.values))  # fmt: skip
         prints = self._values("picture", self.prints, scope) if self.prints else scope.pictures
@@ -220,9 +211,8 @@ class Axes:
 # -------- Results
 
 IMAGE = "image"
-"""Name of the (n, n) reflectance of a point, where it is kept."""
 TRUTH = "truth"
-"""Name of the error-free image that is kept with it."""
+"""Name of the error-free image of a point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,8 +233,6 @@ class Results:
         rows of all points as JSON has them; the column ``point`` holds the points' keys.
     arrays
         arrays by key of the point and name.
-    scope
-        scope of the study.
     """
 
     rows: Sequence[Mapping[str, Value]]
@@ -253,34 +241,32 @@ class Results:
 
     @cached_property
     def frame(self) -> DataFrame:
-        """The rows as a table, one measurement a row; the values keep the types that they have in JSON."""
+        """Table with one measurement a row; values keep their types in JSON."""
         from pandas import DataFrame  # here, because it takes half a second and processes that measure do without
 
         return DataFrame([dict(row) for row in self.rows], dtype=object)
 
     def with_columns(self, **columns: Any) -> Results:
-        """Return results with more ``columns`` of the table, each a pandas Series."""
         return replace(self, rows=tuple(self.frame.assign(**columns).to_dict("records")))
 
     def array(self, row: Mapping[str, Value], name: str = IMAGE) -> FloatArray | None:
-        """Return the array ``name`` that was kept with a ``row``."""
+        """Return the array ``name`` of a ``row``."""
         return self.arrays.get((str(row.get("point")), name))
 
 
 # -------- What a study declares
 
 KNOBS = "{knobs}"
-"""In the title of a study that sweeps: the names of its knobs."""
+"""Names of a sweep's knobs in its title."""
 HEADS = "Paper", "Idealised", "Rendered"
-"""Heads of the columns of a page's table of claims."""
 
 
 @dataclass(frozen=True)
 class Claim:
     """A judged claim: its sentence, the paper's figure, the figures of both models, and the verdict.
 
-    ``verdict`` is "confirmed", "confirmed only ...", "not confirmed", or "not decided at this size"
-    (:mod:`mitsim.studies.framework.claims`); a figure that the paper or a model does not have is empty.
+    ``verdict`` is "confirmed", "confirmed only ...", "not confirmed", or "not decided at this size"; a missing figure
+    is empty.
     """
 
     claim: str
@@ -290,7 +276,6 @@ class Claim:
     verdict: str
 
     def figures_text(self, heads: tuple[str, str, str]) -> str:
-        """Return all figures on a line, each under its own of the ``heads``."""
         figures = zip((self.paper, self.idealised, self.rendered), heads, strict=True)
         return ", ".join(f"{head.lower()} {figure}" for figure, head in figures if figure)
 
@@ -304,33 +289,33 @@ class Study:
     name, title, question
         name on the command line, head of the page, and the question that the study answers.
     points
-        from a scope to all points, such as :class:`Axes`; points of one setup should follow each other.
+        function from a scope to all points, such as :class:`Axes`; points of one setup should follow each other.
     measure
-        measures one point, in a :class:`mitsim.studies.framework.studio.Studio`, which keeps what neighbours share.
+        measures one point, in a :class:`mitsim.studies.framework.studio.Studio`.
     claims
         claims with thresholds (:mod:`mitsim.studies.framework.claims`), or functions from all results to judged claims.
     panels
         figures (:mod:`mitsim.studies.framework.panels`), or functions from all results to figures by file name.
     derive
-        from all results to results with more columns, for columns that need more than one point; None adds none.
+        adds columns that need more than one point; None adds none.
     tables
         tables of the page (:class:`mitsim.studies.framework.panels.Pivot`), or functions from all results to its parts.
     message
-        from all results to the page's first sentence; an empty one is replaced by the number of claims that hold.
+        function from all results to the page's first sentence; by default the number of claims that hold.
     about
-        how the study was measured; empty for claims of the paper, which the page explains.
+        method of measurement; empty for claims of the paper, which the page explains.
     heads
         heads of a claim's three figures; a figure without a head has no column.
     note
-        remarks on the figures beside their titles and axes.
+        remarks on the figures.
     traced
         True if light is traced, to an accuracy that the page states.
     kept
-        True to keep plans, calibrations and other shared objects in the study's folder. Any process can then measure
-        any point, and an interrupted study loses none of them.
+        True to keep plans, calibrations and other shared objects in the study's folder, so that any process can measure
+        any point.
     solved
-        True if all points have patterns whose frames are solved with an automatic lambda, which needs more data than
-        unknowns: points without are refused before any is measured.
+        True if all points need more data than unknowns, for an automatic lambda; other points are refused before
+        measuring.
     """
 
     name: str
@@ -351,18 +336,15 @@ class Study:
     solved: bool = False
 
     def judge(self, results: Results) -> list[Claim]:
-        """Return all claims with their figures and verdicts."""
         results = self._derived(results)
         return [claim for each in self.claims for claim in (each(results) if callable(each) else each.judge(results))]
 
     def draw(self, results: Results) -> dict[str, Figure]:
-        """Return all figures by file name."""
         results = self._derived(results)
         drawn = [each(results) if callable(each) else each.draw(results) for each in self.panels]
         return {file: figure for figures in drawn for file, figure in figures.items()}
 
     def parts(self, results: Results) -> list[Any]:
-        """Return the tables of the page."""
         results = self._derived(results)
         return [part for each in self.tables for part in (each(results) if callable(each) else each.parts_of(results))]
 
@@ -371,15 +353,15 @@ class Study:
 
 
 def group_by_setup(points: Sequence[Point]) -> list[Point]:
-    """Return the ``points`` in an order in which those of one setup follow each other, because they share its light."""
+    """Return ``points`` with those of one setup together, because they share its light."""
     order = {setup: index for index, setup in enumerate(dict.fromkeys(point.setup for point in points))}
     return sorted(points, key=lambda point: order[point.setup])
 
 
 def find_experiment(name: str) -> Study:
-    """Return the study ``name``: a shipped one, or one of the user's, a file or a module with a dot in its name.
+    """Return the study ``name``: a shipped one, or a user's file or dotted module.
 
-    MitsimError for another name, with the names of all studies, and for a module without a ``STUDY``.
+    MitsimError for another name, and for a module without a ``STUDY``.
     """
     check_study(name)
     module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
@@ -395,7 +377,7 @@ def find_experiment(name: str) -> Study:
 
 
 def check_study(name: str) -> None:
-    """Raise MitsimError for a ``name`` of no study, with the replacement of one that there was."""
+    """Raise MitsimError for an unknown study ``name``, with the replacement of a former one."""
     if name in GONE:
         raise MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
     if name not in (*EXPERIMENTS, ALL) and "." not in name:
@@ -404,7 +386,7 @@ def check_study(name: str) -> None:
 
 @cache
 def _load_file(path: str) -> Any:
-    """Return the module in a file, which is executed once."""
+    """Execute a file once, and return its module."""
     found = importlib.util.spec_from_file_location(f"mitsim_study_{Path(path).stem}", path)
     assert found is not None and found.loader is not None, "a file of Python has a loader"
     module = importlib.util.module_from_spec(found)
@@ -428,15 +410,14 @@ MEASURES = {
 NO_SCENE = ("patterns", "exposure", "seed", "accuracy", "method")
 """Knobs of a sweep that are no parameters of the scene."""
 OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason", *(c for c, _ in MEASURES.values())}
-"""Columns of every study's table, which are no knob."""
+"""Columns of every study's table that are no knob."""
 _MOST = 10_000
-"""Points of one sweep: more are a typing error."""
+"""Most points of one sweep: more are a typing error."""
 Sweep = Sequence[tuple[str, Sequence[str]]]
-"""Knobs and their values."""
 
 
 def values_of(text: str) -> tuple[str, tuple[str, ...]]:
-    """Return name and values of a knob in ``text``: NAME=FIRST:LAST:COUNT, evenly spaced, or NAME=VALUE,VALUE,...
+    """Return name and values of a knob: NAME=FIRST:LAST:COUNT, evenly spaced, or NAME=VALUE,VALUE,...
 
     MitsimError for anything else.
     """
@@ -456,7 +437,7 @@ def values_of(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def measures_of(text: str) -> tuple[str, ...]:
-    """Return the measures named in ``text``, separated by commas; MitsimError for an unknown one."""
+    """Return the comma-separated measures in ``text``; MitsimError for an unknown one."""
     names = tuple(text.split(","))
     if unknown := [name for name in names if name not in MEASURES]:
         raise MitsimError(f"--measure {unknown[0]!r}: use {', '.join(MEASURES)}")
@@ -464,7 +445,7 @@ def measures_of(text: str) -> tuple[str, ...]:
 
 
 def check_sweep(sweep: Sweep, pictures: int) -> None:
-    """Raise MitsimError for a ``sweep`` over so many ``pictures`` that varies nothing, or what cannot be varied."""
+    """Raise MitsimError for a ``sweep`` that varies nothing, or an impossible knob."""
     knobs, allowed = dict(sweep), {"exposure": CONVENTIONS, "method": METHODS}
     if not knobs:
         raise MitsimError(
@@ -494,7 +475,7 @@ def check_drifts(sweep: Sweep) -> None:
 
 
 def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> float:
-    """Return the value of a ``knob`` in a ``text`` as a number of a ``kind``; MitsimError for anything else."""
+    """Return the value of a ``knob`` as a number of a ``kind``; MitsimError for anything else."""
     try:
         return kind(text)
     except ValueError:
@@ -505,20 +486,18 @@ def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> fl
 
 
 TEST_IMAGES = ("astronaut", "camera", "chelsea", "coffee", "coins", "rocket", "page", "brick")
-"""Portraits, an animal, things, a page of text and a texture."""
 QUICK_IMAGES = ("chelsea", "page")
-"""For a first look: fur and letters."""
 PRINT_MM = 128.0
-"""Width of the photograph's sheet, which they are printed on."""
+"""Width of the photograph's sheet, which carries the print."""
 SIDE = 512
-"""Pixels a side: four of each of 128 projector pixels."""
+"""Pixels a side: four per projector pixel."""
 
 
 def picture(name: str) -> npt.NDArray[np.uint8]:
     """Return the (512, 512) eight-bit reflectance of the test image ``name``: its middle square, grey.
 
-    ``bars 0.26`` are bars of so many line pairs a mm of the print, upright on the left, lying on the right, and
-    ``edge`` is one edge 5 degrees off the upright, as in ISO 12233. MitsimError for another name.
+    ``bars 0.26`` has bars of 0.26 line pairs per mm of the print, vertical on the left, horizontal on the right;
+    ``edge`` is an edge 5 degrees off the vertical, as in ISO 12233. MitsimError for another name.
     """
     import numpy as np
     from skimage import data

@@ -1,7 +1,7 @@
-"""Figures and tables of a study, declared over columns of its table and drawn by one plotter; and the study's page.
+"""Figures and tables of a study, declared over columns of its table, and the study's page.
 
-A panel names the columns along its axes; every other column that varies is averaged over. All means and standard errors
-come from :func:`mitsim.studies.framework.claims.mean_of`.
+A panel names the columns along its axes and averages over every other column that varies, by
+:func:`mitsim.studies.framework.claims.mean_of`.
 """
 
 from __future__ import annotations
@@ -52,8 +52,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 Columns = str | Sequence[str] | Mapping[str, str]
-"""A column whose values are told apart, several whose combinations are, or names by column whose numbers are shown
-beside each other."""
+"""A column, several columns whose combinations are shown, or names by column whose numbers are shown side by side."""
 Names = Mapping[Any, str] | str
 """Names by value, or by (column, value); or a template for numbers such as "{} mm"."""
 PSNR = "PSNR [dB]"
@@ -69,15 +68,15 @@ class Panel:
     Attributes
     ----------
     file, title
-        name of the file without its ending, by default that of the measure or images, and what stands above.
+        name of the file without its ending (by default that of the measure or images), and heading.
     where
         rows that are shown.
     each
-        column: there is a figure for each of its values, which file and title end with.
+        column with a figure for each of its values, which file and title end with.
     names
         names of values in the legend, beside rows and above columns.
     errors
-        columns of errors that all rows share, by the column of numbers that they belong to.
+        columns of errors that all rows share, by the column of their numbers.
     """
 
     _: KW_ONLY
@@ -102,16 +101,13 @@ class Panel:
 
     @property
     def _file(self) -> str:
-        """Name of the file of a panel that states none: the column that is shown."""
         shown = getattr(self, "y", getattr(self, "x", ""))
         return str(shown).removesuffix("_db") or "images"
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
-        """Return one figure of some ``rows``; None if they have nothing to show."""
         raise NotImplementedError
 
     def name(self, column: str, value: Any) -> str:
-        """Return the name of a ``value`` of a ``column``."""
         if isinstance(self.names, str) and is_number(value):
             return self.names.format(f"{float(value):g}")
         for key in ((column, value), value):
@@ -124,7 +120,7 @@ class Panel:
         return value_name(column, value)
 
     def combinations(self, rows: DataFrame, by: Columns) -> list[dict[str, Any]]:
-        """Return the combinations of the values of some columns that ``rows`` have, in the order of the table."""
+        """Return the combinations of the values of some columns of ``rows``, in the order of the table."""
         columns = [by] if isinstance(by, str) else list(by)
         lacking = [each not in rows or bool(rows[each].isna().any()) for each in columns]
         values = [[*distinct(rows, each), *([None] if no else [])] for each, no in zip(columns, lacking, strict=True)]
@@ -132,14 +128,13 @@ class Panel:
         return [each for each in found if len(choose_rows(rows, each))]
 
     def parts(self, rows: DataFrame, by: Columns) -> dict[str, tuple[DataFrame, str]]:
-        """Return rows, and the column that is shown instead of the panel's own, by the name of each part of ``by``."""
+        """Return rows, and the column shown instead of the panel's own, by the name of each part of ``by``."""
         if isinstance(by, Mapping):
             return {name: (rows, column) for column, name in by.items() if column in rows}
         chosen = self.combinations(rows, by) if by else [{}]
         return {self.joined(each): (choose_rows(rows, each), "") for each in chosen}
 
     def joined(self, values: Mapping[str, Any]) -> str:
-        """Return the names of some ``values`` by column, separated by commas."""
         return ", ".join(filter(None, (self.name(*item) for item in values.items())))
 
 
@@ -162,11 +157,11 @@ class Lines(Panel):
     colour, facet
         columns of the curves and of the facets; a mapping shows several columns of numbers instead of ``y``.
     shared
-        rows that begin every curve, such as the one uniform frame of several kinds of patterns.
+        rows that begin every curve, such as one uniform frame.
     log
         True for a logarithmic x axis; an axis over decades is logarithmic anyway.
     ticks
-        True for a tick at every x that was measured, as far as there is room.
+        True for a tick at every measured x, as far as there is room.
     """
 
     x: str
@@ -181,7 +176,6 @@ class Lines(Panel):
     ticks: bool = True
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
-        """Return the figure; None without rows."""
         from mitsim.report.plots import curves
 
         if rows.empty:
@@ -230,7 +224,6 @@ class Bars(Panel):
     ordered: bool = False
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
-        """Return the figure; None without rows."""
         from mitsim.report.plots import grouped_bars
 
         if rows.empty:
@@ -269,7 +262,6 @@ class Pivot(Panel):
     value: str = "psnr_db"
 
     def parts_of(self, results: Results) -> list[Part]:
-        """Return the tables of the page, one for each value of ``each``."""
         chosen, found = choose_rows(results.frame, self.where), []
         for value in distinct(chosen, self.each) if self.each else [None]:
             own = choose_rows(chosen, {} if value is None else {self.each: value})
@@ -291,7 +283,7 @@ def _mean_text(rows: DataFrame, column: str) -> str:
 
 
 _MOST_SHOWN = 6
-"""Images along either side of a grid: more would be too small to compare on a page."""
+"""Images along either side of a grid: more would be too small on a page."""
 
 
 @dataclass(frozen=True)
@@ -302,13 +294,13 @@ class Images(Panel):
     ----------
     across
         columns whose combinations are the grid's columns; or (title, caption) by the name of an array, for several
-        arrays of one point side by side.
+        arrays of one point.
     columns
         values of ``across`` in their order; None: all of the table.
     down
         columns whose combinations are the grid's rows.
     array, before
-        template of the arrays' names, filled from their row, and titles by name of arrays that stand before the others.
+        template of the arrays' names, filled from their row; titles of leading arrays by name.
     caption
         template of the text below an image, filled from its row.
     """
@@ -322,7 +314,6 @@ class Images(Panel):
     caption: str = "{psnr_db:.1f} dB"
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
-        """Return the grid; None if no row of it has all images."""
         kept = {key for key, _ in results.arrays}
         rows = rows[rows["point"].isin(kept)] if "point" in rows else rows[:0]
         shown: list[tuple[dict[str, Any], str, str]] = [({}, name, "") for name in self.before]
@@ -350,7 +341,6 @@ class Images(Panel):
 
 
 Cell = tuple[FloatArray, FloatArray | None, str]
-"""Image, truth where it was kept, and caption."""
 
 
 def _cells(results: Results, rows: DataFrame, where: Where, array: str, caption: str) -> list[Cell]:
@@ -366,21 +356,13 @@ def _cells(results: Results, rows: DataFrame, where: Where, array: str, caption:
 
 
 def _few(items: Sequence[Any]) -> list[Any]:
-    """Return at most :data:`_MOST_SHOWN` of some ``items``, evenly spread, with both ends."""
+    """Return at most :data:`_MOST_SHOWN` of the ``items``, evenly spread, with both ends."""
     count = min(len(items), _MOST_SHOWN)
     return [items[int(place)] for place in np.linspace(0, len(items) - 1, count).round()]
 
 
 def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], title: str) -> Figure:
-    """Draw images with their truths: in a first column where each row has one truth, else in rows above the images.
-
-    Parameters
-    ----------
-    grid
-        cells by the rows' names.
-    titles, title
-        titles of the columns, and of the figure.
-    """
+    """Draw images with their truths: in a first column where each row has one truth, else in rows above the images."""
     from mitsim.report.plots import image_grid
 
     truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
@@ -405,8 +387,7 @@ def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a page: a ``title``, a ``lead``, ``figures`` by file name, a table of ``rows`` of words under its
-    ``head``, and ``notes`` on how to read them."""
+    """A part of a page: ``figures`` by file name, a table of ``rows`` of words, and ``notes`` on how to read them."""
 
     title: str
     lead: str = ""
@@ -417,14 +398,12 @@ class Part:
 
     @property
     def numeric(self) -> tuple[bool, ...]:
-        """True for each column whose cells all begin with a number, which are set to the right."""
         columns = zip(*self.rows, strict=True)
         begins = re.compile(r"[+-]?\d|nothing$")
         return tuple(any(cells) and all(not cell or begins.match(cell) for cell in cells) for cells in columns)
 
 
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table of ``rows`` under their ``head``; none without rows."""
     table = [head, *rows] if rows else []
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     sides = [">" if right else "<" for right in Part("", rows=tuple(map(tuple, rows))).numeric]
@@ -439,17 +418,17 @@ class Section:
     Attributes
     ----------
     name, title, message, detail
-        study, heading, first sentence, and the question or the scene that it is about.
+        study, heading, first sentence, and the study's question or scene.
     pictures
-        figures by file name: the data URI of each, and its width [pixels].
+        data URI and width [pixels] of the figures by file name.
     parts, claims, heads
         tables with their figures; judged claims and the heads of their figures.
     warnings
         reasons why the findings may not be trusted.
     note, about, count, command
-        remarks on the figures; how the study was measured; the number of measurements; the command that repeats them.
+        remarks on the figures; method; number of measurements; command that repeats them.
     quick, prints
-        True for a few points alone; number of test images that means are taken over.
+        True for a few points; number of test images in means.
     """
 
     name: str
@@ -472,15 +451,6 @@ class Section:
     def of(
         cls, study: Study, name: str, claims: Sequence[Claim], figures: Mapping[str, Figure], results: Results
     ) -> Section:
-        """Return the section of a study of many points.
-
-        Parameters
-        ----------
-        study, name
-            study, and its name on the command line.
-        claims, figures, results
-            judged claims, figures by file name, and all results.
-        """
         scope = results.scope
         prints = sorted({str(row.get("picture")) for row in results.rows} & set(TEST_IMAGES))
         of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
@@ -509,7 +479,7 @@ class Section:
 
 
 def tally(claims: Sequence[Claim]) -> str:
-    """Return how many ``claims`` hold; an empty text without claims."""
+    """Return the number of ``claims`` that hold; an empty text without claims."""
     part, open_ = "confirmed in part", "not decided"
     counts = Counter(
         each if each in (CONFIRMED, NOT_CONFIRMED) else part if each.startswith(CONFIRMED) else open_
@@ -520,11 +490,11 @@ def tally(claims: Sequence[Claim]) -> str:
 
 
 _IMAGE = "point", "psnr_db", "exposure", "model", "picture", "condition", "method", "weight"
-"""Columns whose values together are of one image."""
+"""Columns that identify one image."""
 
 
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
-    """Return a warning of how many images of the study ``name`` are flagged, and why; nothing if none is."""
+    """Return a warning with the number of flagged images of the study ``name``, and the reasons."""
     # An image may have many rows, such as a transfer function's.
     rows = {tuple(map(row.get, _IMAGE)): row for row in results.rows if row.get("flagged") is not None}
     found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]
@@ -539,16 +509,12 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
 
 
 def page_of(sections: Sequence[Section], title: str) -> str:
-    """Return the page of some ``sections`` under a ``title`` as HTML."""
     message = sections[0].message if len(sections) == 1 else tally([claim for one in sections for claim in one.claims])
     return render_page("study.html", title=title, message=message or title, sections=sections, versions=versions())
 
 
 def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
-    """Write the page of some ``sections`` under a ``title`` to ``path``, all or nothing, and return the path.
-
-    MitsimError when it cannot be written.
-    """
+    """Write the page of some ``sections`` to ``path``, all or nothing, and return the path; MitsimError on failure."""
     write_text(path, page_of(sections, title))
     return path
 
@@ -557,15 +523,7 @@ def build_findings(
     name: str, titles: tuple[str, str], where: str, parts: Sequence[Part], pictures: Mapping[str, tuple[str, int]],
     warnings: Sequence[str] = (),
 ) -> str:  # fmt: skip
-    """Return the page of findings that are no table of points as HTML.
-
-    Parameters
-    ----------
-    name, titles
-        study, and the page's title and message, which may be empty.
-    where, parts, pictures, warnings
-        scene and patterns, and attributes of :class:`Section`.
-    """
+    """Return the page of findings that are no table of points as HTML; ``titles`` are title and message."""
     return page_of([Section(name, *titles, where, pictures, tuple(parts), warnings=tuple(warnings))], titles[0])
 
 

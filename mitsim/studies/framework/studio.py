@@ -1,4 +1,4 @@
-"""Where points of a study are measured: setups in; light, factors and images out, kept while neighbours share them."""
+"""Measurement of points of a study: light, factors and images of setups, kept while neighbouring points share them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Kept = TypeVar("Kept")
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One reconstruction and how good it is.
+    """One reconstruction and its quality.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Image:
     flags
         columns of :func:`flags_of`.
     trust
-        where it is known: the unexplained part of the measurements, their chi-square, the image's standard uncertainty.
+        unexplained part of the measurements, their chi-square, and the image's standard uncertainty, where known.
     seconds
         time of the solution of rendered frames.
     """
@@ -66,13 +66,12 @@ class Image:
     def of(
         cls, frames: Unexposed, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1
     ) -> Image:
-        """Return the image of one exposure; arguments as for :meth:`mitsim.report.lit_scene.Unexposed.solve`."""
+        """Return the image of one exposure; arguments as of :meth:`mitsim.report.lit_scene.Unexposed.solve`."""
         solution = frames.solve(seconds, lam, binning)
         quality, shots = frames.lit.quality(solution.image), len(frames.family.shots)
         return cls(solution.image, quality, solution.lam, shots, seconds, flags_of(solution.status))
 
     def row(self) -> dict[str, Value]:
-        """Return the columns of a table."""
         return {
             "psnr_db": self.quality.psnr_db,
             "ssim": self.quality.ssim,
@@ -85,15 +84,7 @@ class Image:
 
 
 def flags_of(*statuses: Status, misfit: Misfit | None = None, others: Iterable[str] = ()) -> dict[str, Value]:
-    """Return the columns `flagged` and `reason` of an image, which every study's table has.
-
-    Parameters
-    ----------
-    statuses, misfit
-        status and misfit of the solution, or statuses of the solutions of all lines.
-    others
-        warnings of the objects that the image was made of.
-    """
+    """Return the columns `flagged` and `reason` of an image; ``others`` are warnings of the objects it was made of."""
     cause = f", {misfit.reason}" if misfit and misfit.flagged and misfit.cause else ""
     reasons = [f"{each.verdict.value}{cause}" for each in statuses if not each.verdict.good]
     flags = [text for each in statuses for text in each.flags]
@@ -102,14 +93,9 @@ def flags_of(*statuses: Status, misfit: Misfit | None = None, others: Iterable[s
 
 
 class Studio:
-    """Benches, their light and their factors, the last few of each; a temporary folder holds scenes with other prints.
+    """Benches, their light and their factors, the last few of each; a context that removes its temporary folder.
 
-    To be used as a context, which removes that folder.
-
-    Parameters
-    ----------
-    shared
-        folder of plans and calibrations that several studios share; None: this one's are its own.
+    ``shared`` is a folder of plans and calibrations that several studios share; with None they are kept privately.
     """
 
     def __init__(self, shared: str | None = None) -> None:
@@ -125,28 +111,19 @@ class Studio:
         self._folder.cleanup()
 
     def folder(self, name: str) -> Path:
-        """Return a new folder of this studio's own, which ends with it; an earlier one of that ``name`` is removed."""
+        """Return a new temporary folder, replacing an earlier one of that ``name``."""
         place = Path(self._folder.name) / "own" / name
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir(parents=True)
         return place
 
     def shared_folder(self, kind: str) -> Path:
-        """Return the folder of objects of a ``kind`` that studios share."""
         place = self._shared / kind
         place.mkdir(parents=True, exist_ok=True)
         return place
 
     def made_once(self, kind: str, name: str, make: Callable[[Path], object]) -> Path:
-        """Return a file or folder that studios share, which the first of them makes: whole or not at all.
-
-        Parameters
-        ----------
-        kind, name
-            folder that it is in, and its name there.
-        make
-            makes it at a path that does not exist.
-        """
+        """Return a shared file or folder, which ``make`` creates at a new path, whole or not at all."""
         place = self.shared_folder(kind) / name
         with FileLock(place.with_suffix(".lock")):
             if not place.exists():  # a studio may have been ended while it made it
@@ -182,7 +159,6 @@ class Studio:
         return self.once("bench", 3, setup, make)
 
     def lit_scene(self, setup: Setup) -> LitScene:
-        """Return the scene of a ``setup`` in its light."""
 
         def make() -> LitScene:
             bench, key = self.bench(setup), Point.of(setup).key
@@ -192,7 +168,7 @@ class Studio:
         return self.once("light", 1, setup, make)
 
     def factors(self, setup: Setup, seed: int) -> Factors:
-        """Return the factors that a session with the devices of a ``setup`` estimates, its noise from ``seed``."""
+        """Return the factors that a session with the devices of a ``setup`` estimates, with noise from ``seed``."""
         bench = self.bench(setup)
         name = f"{bench.devices_digest[:16]}-{seed}"
 
@@ -203,7 +179,7 @@ class Studio:
         return self.once("factors", 4, name, make)
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
-        """Return frames of a family, or of its name, before any exposure; the rest as for :meth:`image`."""
+        """Return frames of a pattern family before any exposure; arguments as of :meth:`image`."""
         factors = self.factors(setup, seed) if model == RENDERED else None  # first: a mask may have none
         lit = self.lit_scene(setup)
         family = lit.bench.family(patterns, seed) if isinstance(patterns, str) else patterns
@@ -223,14 +199,14 @@ class Studio:
 
         Parameters
         ----------
-        setup, patterns, seed
-            scene, pattern family, and seed of the frames' and the calibration's noise.
+        seed
+            seed of the frames' and the calibration's noise.
         model
             one of :data:`mitsim.report.MODELS`.
         exposure
             one of :data:`mitsim.report.CONVENTIONS`, or ``DIM``.
         focus, method
-            of rendered frames, as for :func:`mitsim.reconstruct`.
+            of rendered frames, as of :func:`mitsim.reconstruct`.
         """
         frames = self.frames(setup, model, patterns, seed)
         if model != RENDERED:
@@ -251,15 +227,7 @@ class Studio:
         )
 
     def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """Return an object that is made once while neighbouring points share it.
-
-        Parameters
-        ----------
-        kind, most, key
-            kind of the object, how many of its kind are kept, and which of them it is.
-        make
-            makes it.
-        """
+        """Return an object of a ``kind``, of which the ``most`` recent are kept because neighbouring points share them."""
         kept = self._kept.setdefault(kind, OrderedDict())
         if key not in kept:
             while len(kept) >= most:
@@ -274,16 +242,9 @@ class Studio:
 
 
 def finding(studio: Studio, point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
-    """Return the findings of a point in one row.
+    """Return the findings of a point in one row of the ``measured`` columns.
 
-    Parameters
-    ----------
-    studio, point
-        studio that measured it, and the point.
-    image
-        image of the point, if figures show it; kept for a few prints, with the truth.
-    **measured
-        columns of the row.
+    The ``image`` is kept for a few prints, with the truth.
     """
     kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
     arrays = image_arrays(image, studio.lit_scene(point.setup).truth) if kept and image is not None else {}
@@ -291,7 +252,6 @@ def finding(studio: Studio, point: Point, image: FloatArray | None = None, **mea
 
 
 def image_arrays(image: FloatArray, truth: FloatArray) -> dict[str, FloatArray]:
-    """Return an ``image`` and its ``truth`` as findings keep them."""
     return single_precision({IMAGE: image, TRUTH: truth})
 
 
@@ -301,14 +261,9 @@ def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
 
 
 def measure_image(studio: Studio, point: Point, shown: Collection[str] | None = None) -> Found:
-    """Return the quality of the image that a user gets at a point with model, patterns, exposure and seed.
+    """Return the quality of the image at a point with model, patterns, exposure and seed.
 
-    Parameters
-    ----------
-    studio, point
-        studio that measures, and the point.
-    shown
-        patterns whose images are kept; None: all.
+    Images are kept of the patterns ``shown``, or of all if it is None.
     """
     values = dict(point.values)
     patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
