@@ -221,7 +221,7 @@ def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, Floa
 
 
 def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) -> dict[tuple[str, str], Share]:
-    """Return the shares of a scene's light by cause, and of lambda; ``sampled`` is the rendering noise of all images."""
+    """Return the shares of a scene's light by cause, and of lambda; ``sampled`` is the rendering noise."""
     exact, scene, found = scatter.solver, scatter.scene, {(SCENE, ERROR_SOURCES[causes.DETAIL]): Share(0.0)}
     (_, last), *others = seen.items()
     for name, image in others:

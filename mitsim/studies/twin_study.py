@@ -521,7 +521,7 @@ def fit(measured: FloatArray, grid: FloatArray) -> tuple[int, int, float, float]
 
 
 def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[FloatArray], FloatArray]:
-    """Return squares of light of traced diffusers fitted to a measured ``square``, and the grid of spectra of the fit."""
+    """Return squares of light of traced diffusers fitted to a measured ``square``, and the spectra of the grid."""
     count = len(square)
     side = count * SPREAD_MM + 2 * _MARGIN_MM
     grids = np.empty((_SEEDS, len(CORRELATIONS_MM), len(MOVES_MM), _BANDS))

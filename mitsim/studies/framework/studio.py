@@ -227,7 +227,7 @@ class Studio:
         )
 
     def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """Return an object of a ``kind``, of which the ``most`` recent are kept because neighbouring points share them."""
+        """Return an object of a ``kind``, keeping the ``most`` recent for neighbouring points."""
         kept = self._kept.setdefault(kind, OrderedDict())
         if key not in kept:
             while len(kept) >= most:
