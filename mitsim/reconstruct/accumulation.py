@@ -44,44 +44,31 @@ t) / 2 with a mean square of 1/120, and the slopes around it bring 1/346."""
 PRINT = (1 + EDGES) / 2
 """Mean of :data:`EDGES` and 1, for print that may have hard edges or none."""
 _ALIKE = 0.5
-"""Correlation with the moved neighbour above which responses are one moving shadow."""
 _LEAST_EIGENVALUE = 0.01
-"""Least energy of the halves' disagreement over that of the image's error."""
 _SIGNIFICANT = 3.0
-"""Standard deviations of the known errors' energy above which halves disagree by more than chance."""
 _NEAR = 2.0
-"""Standard deviation [scene pixels] of the neighbourhood that an error is averaged over."""
 _BLOCKS = 4
-"""Blocks a side of the scene, each of which may have a depth of its own."""
 _EDGE = 0.5
-"""Scene pixels from the centre of a pixel to its edge."""
 _PLACES = (0.1, 0.3), (0.4, 0.8), (0.7, 0.1), (0.9, 0.6)
-"""Examined groups of lit rows and columns, as parts of their number."""
 _RANK = 1e-6
-"""Relative eigenvalue below which the depth of a block is undetermined."""
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Factorised model with factors (centred where it is) and patterns, and its response to light beside centres."""
-
     prepared: Prepared
     factors: tuple[FloatArray, FloatArray]
     patterns: tuple[FloatArray, FloatArray]
 
     @property
     def sides(self) -> tuple[Side, Side]:
-        """Factorised sides."""
         return self.prepared.left, self.prepared.right
 
     @cached_property
     def slopes(self) -> tuple[FloatArray, FloatArray]:
-        """Slopes Phi_L' and Phi_R', see :func:`factor_slope`."""
         return factor_slope(self.factors[0]), factor_slope(self.factors[1])
 
     @cached_property
     def moved(self) -> tuple[FloatArray, FloatArray]:
-        """:func:`offset_responses` of both sides."""
         left, right = zip(self.sides, self.slopes, self.patterns, strict=True)
         return offset_responses(*left), offset_responses(*right)
 
@@ -105,17 +92,7 @@ def print_energy(model: Model, image: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class LitFrame:
-    """Frame of few lit pixels.
-
-    Attributes
-    ----------
-    frame, variance
-        Frame (m, m'), and the noise variance of each number.
-    factors, slopes
-        Columns of both factors at the lit pixels, (m, c) and (m', c'), and their slopes.
-    blocks
-        Block of the scene of each lit pixel, (c,) and (c',).
-    """
+    """Frame (m, m') of few lit pixels, with the (m, c), (m', c') factors, slopes and blocks of the scene at these."""
 
     frame: FloatArray
     variance: float
@@ -124,7 +101,6 @@ class LitFrame:
     blocks: tuple[IndexArray, IndexArray]
 
     def beyond(self, left: FloatArray, right: FloatArray) -> float:
-        """Return the energy beyond the noise outside the orthonormal ranges ``left`` (m, r) and ``right`` (m', r')."""
         seen = left.T @ self.frame @ right
         beyond = np.square(self.frame).sum() - np.square(seen).sum() - (self.frame.size - seen.size) * self.variance
         return float(beyond)
@@ -151,8 +127,6 @@ class LitFrame:
 
 
 class LitFrames:
-    """Sums of measurements that show a few groups of scene pixels alone."""
-
     def __init__(self, factors: tuple[FloatArray, FloatArray], patterns: tuple[FloatArray, FloatArray]) -> None:
         self._factors, sides = factors, list[list[tuple[IndexArray, FloatArray]]]()
         for side in patterns:
@@ -168,7 +142,6 @@ class LitFrames:
         self._variances = [0.0] * len(self._groups)
 
     def collect(self, measurement: Measurement, frame: FloatArray, variance: float) -> None:
-        """Add a ``measurement`` as the centred ``frame`` (m, m') with its mean noise ``variance``."""
         for k, ((_, rows), (_, columns)) in enumerate(self._groups):
             weight = rows[measurement.row] * columns[measurement.column]
             if weight:
@@ -176,7 +149,6 @@ class LitFrames:
                 self._variances[k] += weight**2 * variance
 
     def print_part(self) -> float:
-        """Return :func:`print_part` of these frames; NaN where pixels of patterns overlap."""
         if not self._apart:
             return float("nan")
         slopes, (left, right) = [factor_slope(side, spline=True) for side in self._factors], self._factors
@@ -191,10 +163,9 @@ class LitFrames:
 def print_part(frames: Sequence[LitFrame]) -> float:
     """Return the part of the misfit of ``frames`` that is light beside pixels' centres, but not because of depth.
 
-    Print has its light on either side of the centres. A surface beside the calibrated distance has all of it on one
-    side, by the same part of a pixel nearby. So the energy that depths explain, for the scene or block by block, is no
-    print. The depths are estimated from the other frames, because dipoles of print may add up to any depth in one.
-    Light beyond a pixel's edge has another cause.
+    Print has its light on either side of the centres, a surface beside the calibrated distance on one side. Therefore
+    the energy that depths explain, of the scene or block by block, is no print. Depths are estimated from the other
+    frames, because dipoles of print may add up to any depth in one.
     """
     moments, own, left_over, depths = np.zeros(3), 0.0, 0.0, list[tuple[FloatArray, FloatArray]]()
     for each in frames:
@@ -233,13 +204,11 @@ def _predicted_energy(problems: Sequence[tuple[FloatArray, FloatArray]]) -> floa
 
 
 def orthonormal(matrix: FloatArray) -> FloatArray:
-    """Return orthonormal columns that span those of ``matrix``, without directions that are rounding."""
     left, singular, _ = np.linalg.svd(matrix, full_matrices=False)
     return np.asarray(left[:, singular > singular[0] * max(matrix.shape) * np.finfo(np.float64).eps])
 
 
 def offset_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> FloatArray:
-    """Return sum_j diag(p_j) Phi'^T U_j (2, n, r) over each half of the sensor, for light beside centres."""
     total = np.zeros((2, slope.shape[1], len(side.singular)))
     for half, strips in zip(total, side.halves, strict=True):
         own = np.concatenate([slope[strip] for strip in strips]).T if strips else np.zeros((slope.shape[1], 0))
@@ -292,7 +261,6 @@ def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[Fl
 
 
 def _shift(factor: FloatArray) -> float:
-    """Return the sensor pixels that a shadow moves by from one scene pixel to the next; 0 if it is no moving shadow."""
     rows = len(factor)
     shadows = np.ascontiguousarray((factor - factor.mean(axis=0)).T)  # transforms are faster along lines of memory
     spectra = np.fft.rfft(shadows, 2 * rows)
@@ -314,20 +282,14 @@ class FrameNoise:
 
     Attributes
     ----------
-    ambient
-        Mean noise variance of the ambient frame by sensor row (m,) and column (m',) [(electrons/s)^2], or None.
-    variance : (K, K') array, (electrons/s)^2
-        Mean noise variance of a datum of each pattern, without the ambient frame.
-    rows, columns : (K, K', m) and (K, K', m') arrays, (electrons/s)^2
-        Likewise of each sensor row and column.
+    ambient, variance, rows, columns
+        Mean noise variances [(electrons/s)^2]. That of the ambient frame is by sensor row (m,) and column (m',), or
+        None. Those of each pattern (K, K'), its rows (K, K', m) and its columns (K, K', m') do not include it.
     light_error
-        Standard error of single projector pixels' light in simulated frames, relative to the board's; 0: not stated.
-    power, light
-        Sum of the squares of all shots [(electrons/s)^2], and sum (m, m') of all shots [electrons/s].
-    means : (K, K') array, electrons/s
-        Mean light of each pattern's shots.
-    shots, saturated, readings
-        Shots of a pattern, saturated readings, and all readings.
+        Relative standard error of single projector pixels' light in simulated frames; 0: not stated.
+    power, light, means
+        Sum of the squares of all shots [(electrons/s)^2], sum (m, m') of all shots, and mean (K, K') of each pattern's
+        [electrons/s].
     factor
         Largest whole number that divides all digital numbers; 1 where they are not whole.
     """
@@ -351,27 +313,22 @@ class FrameNoise:
 
     @property
     def stated(self) -> bool:
-        """Whether all of the sensor's noise is known, and not only that of its light."""
         return self._digital.noise_is_stated
 
     @property
     def rendering(self) -> float:
-        """Energy of the Monte Carlo error and discretisation of simulated frames, as they state it."""
         return float((self._sampling**2 + self._systematic**2) * self.power)
 
     @property
     def discretisation(self) -> float:
-        """Part of :attr:`rendering` without :attr:`light_error`."""
         return float(self._systematic**2 * self.power) if self.light_error else self.rendering
 
     def of(self, light: FloatArray | float, shots: int) -> FloatArray:
-        """Return the noise variance of a measurement of ``light`` [electrons/s], with that of the ambient frame."""
         # The difference of a pair has no ambient frame.
         ambient = float(self.ambient[0].mean()) if self.ambient and shots == 1 else 0.0
         return self._own(light, shots) + ambient
 
     def add(self, measurement: Measurement) -> None:
-        """Add a ``measurement``."""
         pattern, light, shots = (measurement.row, measurement.column), measurement.light, measurement.shots
         if not self.rows.size:
             self.rows, self.columns = (np.zeros((*self.variance.shape, size)) for size in light.shape)
@@ -414,15 +371,12 @@ def factor_energy(
 
 @dataclass(frozen=True, eq=False)
 class Lack:
-    """Effect of separable ``terms`` that a ``model``'s factors lack, for an ``image`` (n, n')."""
-
     model: Model
     terms: tuple[SeparableTerm, ...]
     image: FloatArray
 
     @property
     def energy(self) -> float:
-        """Energy of the terms in all frames outside of the model's range."""
         left, right = (lit @ lit.T for lit in self.model.patterns)
         total = 0.0
         for a, b in self.terms:
@@ -432,7 +386,6 @@ class Lack:
 
     @cached_property
     def struck(self) -> FloatArray:
-        """Contribution (r, r') of the terms to the coefficients W."""
         sides, patterns = self.model.sides, self.model.patterns
         return np.asarray(
             sum(
@@ -454,19 +407,7 @@ def _term_response(side: Side, term: FloatArray, patterns: FloatArray) -> FloatA
 
 @dataclass(frozen=True, eq=False)
 class Accumulation:
-    """Sums of a run's frames.
-
-    Attributes
-    ----------
-    frames, noise
-        Sums of all frames, and of their noise.
-    kept
-        The frames themselves while they are few, else none.
-    coefficients
-        Contribution (c, c') of each kept frame to W, by pattern.
-    iterative
-        Options of the solver (:attr:`mitsim.reconstruct.request.ImageRequest.iterative`).
-    """
+    """Sums of a run's frames; ``kept`` are few frames themselves, ``coefficients`` (c, c') their contributions to W."""
 
     shots: Capture
     factors: Factors
@@ -480,40 +421,32 @@ class Accumulation:
 
     @property
     def prepared(self) -> Prepared:
-        """Factorised model."""
         return self.model.prepared
 
     @property
     def digital(self) -> Digital:
-        """Reading of the sensor's numbers."""
         return self.shots.manifest.digital
 
     @property
     def weights(self) -> FloatArray:
-        """W (r, r') of all frames."""
         problem = self.prepared.problem(self.frames)
         return np.where(problem.sigma > 0, problem.projected, 0.0)
 
     @property
     def lit_everywhere(self) -> tuple[int, int] | None:
-        """A pattern that lights all scene pixels, or None."""
         lit = [np.flatnonzero((side > 0).all(axis=0)) for side in self.shots.patterns]
         return (int(lit[0][0]), int(lit[1][0])) if all(map(len, lit)) else None
 
     def measurements_again(self) -> Iterable[Measurement]:
-        """Return the kept measurements, or read them again."""
         return self.kept or self.shots.pattern_measurements()
 
     def solution(self, lam: float | Literal["auto"]) -> Solution:
-        """Return the image at ``lam``."""
         return self.solver.compute(self.prepared, self.frames, lam, **self.iterative)
 
     def lack(self, image: FloatArray) -> Lack | None:
-        """Return the effect of the terms that the factors are known to lack, or None."""
         return Lack(self.model, self.factors.lacking, image) if self.factors.lacking else None
 
     def factor_energy(self, image: FloatArray) -> float | None:
-        """Return the energy of the factors' stated noise in all frames of an ``image`` (n, n'), or None."""
         stated = self.factors.manifest.noise
         return factor_energy(self.prepared, self.shots.patterns, stated, image) if stated else None
 
@@ -544,6 +477,5 @@ def accumulate(shots: Capture, factors: Factors, solver: Solver = SOLVERS[TIKHON
 
 
 def check_factorising(shots: Capture, factors: Factors, solver: Solver) -> None:
-    """Raise MitsimError if factorising the model takes more memory than is free."""
     cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=solver.whole))
     cost.check(f"{shots.name}: factorising its patterns", Limits())

@@ -42,15 +42,12 @@ from mitsim.reconstruct.factors import Factors, ResponseFit, StripeSums, stripe_
 from mitsim.reconstruct.session_check import SessionConditions, check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
-"""Fields of a list's `digital` that a camera's file may supply."""
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
-"""Fields that list and camera must agree on, with relative and absolute tolerance."""
 _UNLIKE, _MATTERS = 4.0, 0.02
 """Squared difference of repeated frames over the session's median, and difference over their light, above which one is
 wrong.
 """
 _LIT = 0.01
-"""Light of a dark frame beyond the others', over the uniform frame's, above which it is wrong."""
 
 
 # ---- From the frames of a real session to factors ----
@@ -104,7 +101,6 @@ def calibrate_frames(
 def calibrate_planes(
     session: SessionFrames, output: Path, job: Job | None = None, camera: Path | str | None = None
 ) -> dict[str, Factors]:
-    """Calibrate every plane of a mosaic by a session with prepare.channel = "all", and write a coloured CAL folder."""
     job, colours = job or Job(), lines_of_planes(CALIBRATION, session.listed.prepare.wavelengths_nm)
     with output_folder(output) as place:
         found = {
@@ -220,7 +216,6 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...]) -> Fac
 
 
 def _checked(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
-    """Return a session whose frames have one size, without a common factor of their numbers, and doubts about it."""
     first, *others = session.files
     size = image_size(session.folder / first, session.wanted)
     for name in session.files:
@@ -267,8 +262,6 @@ class _Reading:
 
 
 class _Compared(NamedTuple):
-    """Two frames that should be alike: squared difference, light, and the first one's light over the other's."""
-
     names: tuple[str, str]
     kind: int
     squared: float
@@ -367,7 +360,6 @@ class _Readings:
         }
 
     def _alike(self, frames: list[DarkFile]) -> list[DarkFile]:
-        """Return the dark ``frames`` of one exposure without those that contain light, which are noted in ``odd``."""
         levels = np.array([float(self._read([frame], True).rate.mean()) for frame in frames])
         uniform = self._read(self.session.repeats_of((SIDES[0], 0, UNIFORM)), True).rate.mean()
         parts = (levels - np.median(levels)) / uniform
@@ -465,11 +457,8 @@ def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, 
 # ---- One frame at several exposure times ----
 
 Chosen = npt.NDArray[np.bool_] | bool
-"""Chosen pixels (rows, columns), or all or none."""
 _ROOM = 5.0
-"""Standard deviations that a uniform frame's pixel must stay below saturation."""
 _STRIPES_LIGHT = 0.5
-"""Light of stripes over that of the uniform frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -481,19 +470,7 @@ class Ladder:
 
     @classmethod
     def of(cls, digitals: Sequence[Digital], uniform: FloatArray, shots: int, merge: Merge) -> Ladder:
-        """Return the weights of several exposures.
-
-        Parameters
-        ----------
-        digitals
-            Reading of each exposure, the shortest first.
-        uniform : (rows, columns) array, electrons/s
-            Rate of the uniform frame at the shortest exposure.
-        shots
-            Number of shots of that frame.
-        merge
-            ``weighted`` by variance, or ``longest`` exposure that does not saturate a pixel.
-        """
+        """Return the weights of exposures by the ``uniform`` rate [electrons/s] at the first, the shortest one."""
         first = digitals[0]
         light = np.maximum(uniform, 0.0)
         error = first.variance(light) / shots
@@ -514,7 +491,6 @@ class Ladder:
         return cls(tuple(digitals), weights)
 
     def merge(self, rates: Iterable[FloatArray], rows: slice = slice(None)) -> FloatArray:
-        """Return the merged ``rates`` of one frame; ``rows`` are those of the sensor that they show."""
         each = iter(rates)
         if self.weights is None:
             return next(each)
@@ -524,14 +500,10 @@ class Ladder:
         return total
 
     def used_pixels(self, exposure: int) -> Chosen:
-        """Return the pixels (rows, columns) that are read at an ``exposure``."""
         return True if self.weights is None else np.asarray(self.weights[exposure] > 0)
 
     def variance(self, light: FloatArray | float, shots: int = 1) -> float:
-        """Return the mean noise variance [(electrons/s)^2] of a merged sum or difference of ``shots`` frames.
-
-        ``light`` is the sum of their rates; a single number is enough for one exposure.
-        """
+        """Return the mean noise variance [(electrons/s)^2] of a merged sum or difference of ``shots`` frames."""
         if self.weights is None:
             return float(self.digitals[0].variance(float(np.mean(light)), shots))
         parts = zip(self.weights, self.digitals, strict=True)

@@ -47,9 +47,7 @@ from mitsim.reconstruct.solution import Solution
 PLANES = ((0, 0), (0, 1), (1, 0), (1, 1))
 """First row and column of each plane of 2 x 2 filters."""
 _TOLERANCE = 1e-7
-"""Relative residual of the normal equations at which the last visible digit of an image is stable."""
 _MOST_STEPS = 1000
-"""Largest number of steps of conjugate gradients, which take some hundred at the best lambda."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +60,6 @@ class JointMosaic:
         (lines, m, n) and (lines, m', n') factors of each line; m and m' are even.
     weights
         (4, lines) responses of the pixels of each plane of :data:`PLANES` to each line.
-    P_L, P_R
-        (n, K) and (n', K') pattern columns.
     """
 
     lefts: FloatArray
@@ -87,7 +83,6 @@ class JointMosaic:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape (lines, n, n') of the images."""
         return len(self.lefts), self.lefts.shape[2], self.rights.shape[2]
 
     def frame(self, images: FloatArray, row: int, column: int) -> FloatArray:
@@ -107,7 +102,6 @@ class JointMosaic:
         return images
 
     def normal(self, images: FloatArray) -> FloatArray:
-        """Return A^T A ``images`` (lines, n, n'), for all patterns together."""
         left, right = self._grams
         found = np.zeros(self.shape)
         for other in range(self.shape[0]):
@@ -119,21 +113,12 @@ class JointMosaic:
 
     @property
     def scale(self) -> float:
-        """Largest eigenvalue of the preconditioner, which relative lambdas refer to."""
         (rows, _), (columns, _), (lines, _) = self._spectra
         return float(rows.max() * columns.max() * lines.max())
 
     @single_threaded_blas()
     def solve(self, gathered: FloatArray, lam: float) -> Solution:
-        """Solve for the images (lines, n, n') by regularised least squares.
-
-        Parameters
-        ----------
-        gathered
-            (lines, n, n') sum of :meth:`gather` over all frames.
-        lam
-            Lambda above 0, in the unit of (Phi_L Phi_R)^2; MitsimError for another.
-        """
+        """Solve for the images (lines, n, n') by least squares; MitsimError unless lambda is above 0."""
         if not 0 < lam < np.inf:
             raise MitsimError(f"lambda is {lam}; give a finite number above 0")
         # Imported here because a capture behind filters needs no linear algebra of SciPy.
@@ -150,7 +135,6 @@ class JointMosaic:
 
     @cached_property
     def _grams(self) -> list[FloatArray]:
-        """(2, lines, lines, n, n) for rows and for columns: Gram matrices of pairs of lines by parity."""
         found = []
         for sides, patterns in ((self.lefts, self.P_L), (self.rights, self.P_R)):
             halves, shared = (sides[:, parity::2] for parity in (0, 1)), patterns @ patterns.T
@@ -159,17 +143,13 @@ class JointMosaic:
 
     @cached_property
     def _spectra(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """Eigenvalues and eigenvectors of the preconditioner's three parts: rows, columns and lines."""
         rows, columns = (np.einsum("plljk->jk", grams) / (2 * self.shape[0]) for grams in self._grams)
         spectra = [np.linalg.eigh(part) for part in (rows, columns, self.weights.T @ self.weights)]
         return tuple((np.maximum(values, 0), vectors) for values, vectors in spectra)
 
 
 def behind(weights: FloatArray, shape: Sequence[int]) -> FloatArray:
-    """Return the response (lines, m, m') of each pixel of a sensor of an even ``shape`` (m, m') to each line.
-
-    ``weights`` (4, lines) are the responses of each plane of :data:`PLANES`.
-    """
+    """Return the response (lines, m, m') of each pixel of a sensor of an even ``shape`` (m, m') to each line."""
     return np.tile(weights.T.reshape(-1, 2, 2), (1, shape[0] // 2, shape[1] // 2))
 
 
@@ -184,17 +164,7 @@ _OBSERVER, _WHITE = "CIE 1931 2 Degree Standard Observer", "D65"
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Patches of known spectra.
-
-    Attributes
-    ----------
-    names
-        Names of the patches.
-    wavelengths_nm, spectra
-        (w,) wavelengths [nm], and (patches, w) reflectances.
-    xyz
-        (patches, 3) CIE XYZ under D65; a perfect reflector has Y = 1.
-    """
+    """Patches of known reflectance (patches, w), with CIE XYZ (patches, 3) under D65."""
 
     names: tuple[str, ...]
     wavelengths_nm: FloatArray
@@ -218,7 +188,6 @@ class Chart:
 
 @cache
 def chart() -> Chart:
-    """Return the chart :data:`CHART`."""
     colour = _colour()
     spectra = colour.SDS_COLOURCHECKERS[CHART]
     names = tuple(name.split(" (")[0] for name in spectra)
@@ -240,7 +209,6 @@ def _white_xy() -> tuple[float, float]:
 
 
 def white_xyz() -> FloatArray:
-    """Return (3,) XYZ of the white board in D65, Y = 1."""
     return np.asarray(_colour().xy_to_XYZ(_white_xy()), dtype=np.float64)
 
 
@@ -252,17 +220,7 @@ def daylight(wavelengths_nm: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class ColourModel:
-    """Conversion of reflectances at spectral lines to colours.
-
-    Attributes
-    ----------
-    wavelengths_nm
-        Wavelengths of the lines.
-    matrix
-        (3, lines) matrix to XYZ under D65, which gives a white board Y = 1 and D65's chromaticity.
-    fitted_on
-        The chart, and the source of its patches' reflectances.
-    """
+    """Conversion of reflectances at lines to XYZ under D65 by ``matrix`` (3, lines), which keeps white boards white."""
 
     wavelengths_nm: tuple[float, ...]
     matrix: FloatArray
@@ -278,17 +236,7 @@ class ColourModel:
 
     @classmethod
     def fit(cls, wavelengths_nm: Sequence[float], patches: npt.ArrayLike, fitted_on: str) -> ColourModel:
-        """Fit the model to the patches in a picture of the chart, by least squares in XYZ.
-
-        Parameters
-        ----------
-        wavelengths_nm
-            Wavelengths of the lines.
-        patches
-            (24, lines) finite reflectances of the chart's patches; MitsimError for others.
-        fitted_on
-            Source of the reflectances.
-        """
+        """Fit the model to (24, lines) finite reflectances of the chart's patches, by least squares in XYZ."""
         values = np.asarray(patches, dtype=np.float64)
         expected = len(chart().names), len(wavelengths_nm)
         if values.shape != expected or not np.isfinite(values).all():
@@ -309,7 +257,6 @@ class ColourModel:
         return np.asarray(np.asarray(reflectances, dtype=np.float64) @ self.matrix.T)
 
     def summary(self) -> dict[str, Any]:
-        """Return the entries of colour.json and of the command line's JSON."""
         return {"matrix": self.matrix, "matrix_fitted_on": self.fitted_on, "illuminant": _WHITE}
 
 

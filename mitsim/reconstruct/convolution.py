@@ -39,9 +39,7 @@ from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import check_lambda
 
 Operator = Callable[[FloatArray], FloatArray]
-"""From an image (n, n) to another."""
 Watch = Callable[[FloatArray], bool]
-"""Return True for an image (n, n) during the iterations that is good enough."""
 
 
 def solve_iteratively(
@@ -52,17 +50,7 @@ def solve_iteratively(
     iterations: int = 500,
     watch: Watch | None = None,
 ) -> Solution:
-    """Solve the normal equations of all frames by conjugate gradients.
-
-    Parameters
-    ----------
-    camera
-        Camera with the patterns that the frames were taken under.
-    frames : (patterns, rows, columns) array
-        Sensor frames in the order of the patterns.
-    lam, tolerance, iterations, watch
-        See :func:`conjugate_gradients`.
-    """
+    """Solve the normal equations of all ``frames`` (patterns, rows, columns) by conjugate gradients."""
     camera.check_frames(frames)
     target = camera.correlate(frames)
     return conjugate_gradients(
@@ -81,18 +69,8 @@ def conjugate_gradients(
 ) -> Solution:
     """Solve (``normal`` + lambda) X = ``target`` (Hestenes and Stiefel 1952).
 
-    Parameters
-    ----------
-    normal
-        Symmetric operator without negative eigenvalues.
-    target
-        Right-hand side, of the shape of X.
-    lam
-        Lambda >= 0.
-    inverse
-        Preconditioner: symmetric, positive, and near the inverse of normal + lambda.
-    tolerance, most, watch
-        Relative residual and number of steps that end the iterations, and a function that may end them before.
+    The preconditioner ``inverse`` is symmetric, positive, and near the inverse of normal + lambda. The iterations end
+    at the relative residual ``tolerance``, after ``most`` steps, or when ``watch`` returns True.
     """
     lam = check_lambda(lam)
     image, left = np.zeros_like(target), target
@@ -128,17 +106,7 @@ MOST_FACTORISED = 2048
 
 
 class Classes:
-    """A ``camera`` under shifting dots of period ``k``; 1 is uniform light.
-
-    Attributes
-    ----------
-    cropped
-        Whether light misses the sensor.
-    factorised
-        Whether normal matrices are formed and factorised.
-    largest
-        Largest number of S, which lambda is relative to.
-    """
+    """A ``camera`` under shifting dots of period ``k``; 1 is uniform light."""
 
     def __init__(self, camera: ShiftedLight, k: int) -> None:
         self.camera, self.k, self._n = camera, k, camera.scene[0]
@@ -154,7 +122,6 @@ class Classes:
         self.largest = float(self._power.max())
 
     def project(self, frames: FloatArray) -> FloatArray:
-        """Return the (n, n) sum of all ``frames``, each correlated with the light of the pixels of its class."""
         self._lit.check_frames(frames)
         weight = self._spectrum.conj()
         (row, column), (rows, columns) = self.camera.origin, self.camera.sensor
@@ -169,10 +136,7 @@ class Classes:
         return self._join(classes)
 
     def factorise(self, lam: float) -> FactorisedClasses:
-        """Return all classes at ``lam``, ready for any number of scenes.
-
-        Raises MitsimError where a class is too ill-conditioned.
-        """
+        """Return all classes at ``lam``, ready for any number of scenes."""
         lam = check_lambda(lam)
         if not self.factorised:
             return FactorisedClasses(self, lam, None)
@@ -193,7 +157,6 @@ class Classes:
         return FactorisedClasses(self, lam, in_threads(factor, range(self.k**2)))
 
     def normal(self, image: FloatArray) -> FloatArray:
-        """Return the normal matrix of all classes times an ``image`` (n, n)."""
         if self.cropped:
             return self._lit.correlate(self._lit.image_of(image))
         size, kernel = self._section
@@ -201,7 +164,6 @@ class Classes:
         return self._join(whole[..., : self._side, : self._side])
 
     def inverse(self, lam: float) -> Operator:
-        """Return the division of an image by S + ``lam``, symmetric, positive and near the normal matrix's inverse."""
         least = max(lam, float(np.finfo(np.float64).eps) * self.largest)
         weight = 1 / (self._power[:, : self._grid[1] // 2 + 1] + least)
 
@@ -226,7 +188,6 @@ class Classes:
 
     @cached_property
     def _section(self) -> tuple[tuple[int, int], npt.NDArray[np.complex128]]:
-        """Size of the grid, and spectrum, of the section of h's autocorrelation at every k-th place."""
         size = fft.next_fast_len(2 * self._side - 1, real=True)
         steps = (np.arange(size) + size // 2) % size - size // 2
         near = np.abs(steps) < self._side
@@ -236,7 +197,6 @@ class Classes:
 
     @cached_property
     def _grams(self) -> FloatArray:
-        """G (k, k, side, side, side, side) of each class, entry by entry from sums over the sensor."""
         k, side, psf = self.k, self._side, self.camera.psf
         grams = np.zeros((k, k, side, side, side, side))
 
@@ -274,7 +234,6 @@ class FactorisedClasses:
     factors: list[FloatArray] | None
 
     def solve(self, projected: FloatArray, tolerance: float = 1e-6) -> Solution:
-        """Return the Tikhonov image of ``projected`` frames (:meth:`Classes.project`)."""
         classes = self.classes
         if self.factors is None:
             # On a section's small grids the division would take longer than the steps that it saves.

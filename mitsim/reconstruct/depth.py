@@ -3,15 +3,14 @@
 *One depth.* The energy ||Y||^2 - sum_ij ||U_Li^T Y_ij U_Rj||^2, which no lambda changes, has a narrow valley at the
 true depth, and others where dots of period k see their neighbours' light. So depths are tried in steps of a pixel of
 parallax, every valley that may be the lowest is followed to its bottom, and valleys that chance or the model's own
-misfit may have raised are named beside the lowest. Columns of neighbouring depths are much alike: a few hundred vectors
-span them, so that frames are read once and kept small.
+misfit may have raised are reported as alternatives. A few hundred vectors span the columns of all depths.
 
-*A depth for each pixel.* Every frame is first reconstructed at the calibrated depth as if all pixels along the baseline
-were lit, which shows where each dot's light arrives. Then each pixel has columns of both factors at its own depth, and
-the model is linear in (X, X o d), d a change of 1/z. So each Gauss-Newton step, with the d of neighbours pooled, is one
-closed-form solve for each frame, whose normal matrix is (L^T L) o (R^T R). Last, single pixels beside an edge take the
-depth on its other side where that explains more. Depths whose parallax spans more than a period of the dots are
-ambiguous."""
+*A depth for each pixel.* Every frame is first reconstructed at the calibrated depth as if all pixels along the
+baseline were lit, which shows where each dot's light arrives. Then the model is linear in (X, X o d), d a change of
+1/z, and each Gauss-Newton step, with the d of neighbours pooled, is one closed-form solve for each frame, whose normal
+matrix is (L^T L) o (R^T R). Last, single pixels beside an edge take the depth on its other side where that explains
+more. Depths whose parallax spans more than a period of the dots are ambiguous.
+"""
 
 from __future__ import annotations
 
@@ -40,19 +39,12 @@ from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare, pro
 RANGE = 0.25
 """Searched part of 1/z on either side: 320 to 533 mm for 400."""
 _FEWEST = 32
-"""Least number of steps of one projector pixel of parallax, for devices without a baseline."""
 _RESOLUTION = 0.01
-"""Projector pixels of parallax to which valleys are refined: 0.06 mm at 400 mm and a baseline of 60 mm."""
 _LEAST_RISE = 2e-5
-"""Part of the measurements' energy that a pixel of parallax must add, or depth is undetermined. Uniform light stays
-below."""
 _SIMILAR = 2.0
-"""Largest ratio of a valley's depth to that of the lowest valley."""
 _OPPOSED = 4.0
-"""Times the unexplained energy S by which two depths must differ. With r the light of the right depth that the wrong
-one does not explain, the wrong one leaves less only if 2 r.d > |r|^2 for the misfit d of energy S, so |r|^2 < 4 S."""
+"""Times the unexplained energy S by which depths must differ: the wrong one wins if 2 r.d > |r|^2, so |r|^2 < 4 S."""
 _LAMBDA = 1e-3
-"""Lambda over the largest sigma^2 of the image that weighs the noise of factors."""
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -68,21 +60,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Depth:
-    """Depth whose factors are used.
-
-    Attributes
-    ----------
-    error_mm
-        Standard error, or the distance to an alternative; None for a given depth.
-    doubt
-        Reason for not trusting the depth, or nothing.
-    range_mm
-        Nearest and farthest tried depth.
-    alternatives
-        Depths that explain the measurements as well.
-    at_end
-        Whether the depth is an end of the tried range.
-    """
+    """Depth whose factors are used; ``error_mm`` is its standard error or the distance to an alternative."""
 
     mm: float
     error_mm: float | None = None
@@ -102,24 +80,10 @@ class Depth:
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """Depths by projector pixel, and their image.
+    """Depths [mm] by projector pixel, and their ``image`` (n, n').
 
-    Attributes
-    ----------
-    image, mm, confidence : (n, n') arrays
-        Reflectance; depth; and 1 less the light at the second place over that at the first.
-    lam
-        Lambda of the image.
-    left_over, energy, data
-        Residual energy, energy and number of the measurements.
-    part
-        Part of the sensor of these measurements.
-    doubt
-        Reason for not trusting the depths, or nothing.
-    range_mm
-        Nearest and farthest searched depth.
-    smoothing
-        Variance of the factors' noise at these depths, over that of the calibrated ones.
+    ``confidence`` is 1 less the light at the second place over that at the first. ``part`` is that of the sensor whose
+    measurements count, and ``smoothing`` the variance of the factors' noise over that of the calibrated ones.
     """
 
     image: FloatArray
@@ -144,22 +108,16 @@ class DepthMap:
 
     @property
     def solution(self) -> Solution:
-        """Image as a solution; dots leave fewer unknowns in a frame than the sensor has data."""
         residual = float(np.sqrt(self.left_over / self.energy))
         status = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
         return Solution(self.image, self.lam, residual, status)
 
     @property
     def reliable(self) -> npt.NDArray[np.bool_]:
-        """Whether each depth (n, n') is reliable."""
         return np.asarray(self.confidence >= _RELIABLE)
 
     def misfit(self, noise: FrameNoise, factor_energy: float | None, print_energy: float) -> Misfit:
-        """Return the misfit of the measurements at these depths, over the sensor as a whole.
-
-        ``factor_energy`` and ``print_energy`` are the energies that noise of the calibrated factors and print within a
-        pixel may add to all frames.
-        """
+        """Return the misfit of the measurements at these depths, over the sensor as a whole."""
         spare = 1 - 2 * self.image.size / self.data  # a reflectance and a depth for each pixel
         variance = float(noise.variance.mean()) * self.data * spare
         expected = variance + self.part * (noise.rendering + self.smoothing * (factor_energy or 0.0))
@@ -168,11 +126,9 @@ class DepthMap:
         return weigh(energies, factor_energy is not None, noise, self.part * print_energy)[0]
 
     def channels(self) -> dict[str, npt.NDArray[np.float32]]:
-        """Return the channels of depth.exr: depth [mm] and confidence."""
         return {"depth_mm": self.mm.astype(np.float32), "confidence": self.confidence.astype(np.float32)}
 
     def summary(self) -> dict[str, float]:
-        """Return the entries of result.json."""
         reliable = self.mm[self.reliable] if self.reliable.any() else self.mm
         low, middle, high = (float(value) for value in np.percentile(reliable, (1, 50, 99)))
         return {"least_mm": low, "median_mm": middle, "most_mm": high, "told_part": float(self.reliable.mean())}
@@ -181,24 +137,13 @@ class DepthMap:
 # ---- A basis that factors of all depths share ------------------------------------------------------------------------
 
 _LEFT_OUT = 1e-6
-"""Part of the factors' energy that the common basis may omit."""
 
 
 class CommonBasis:
     """Frames of a capture, and factors of any depth within a range, on a basis that depths share.
 
-    Attributes
-    ----------
-    sides
-        Both factors as they move with depth.
-    noise
-        Noise of the measurements on the whole sensor.
-    frames, stack
-        Measurements on the bases, one by one and in one array (K, r, K', r').
-    energy, outside
-        Squared norm of the measurements where all depths are known, and the part that no depth explains.
-    data, part
-        Number of these measurements, and their part of the sensor.
+    ``frames`` are single measurements on the bases, and ``stack`` (K, r, K', r') is all in one array. ``energy``
+    counts where all depths are known; no depth explains its part ``outside``.
     """
 
     def __init__(self, shots: Capture, factors: Factors, shifts: tuple[float, float]) -> None:
@@ -243,7 +188,6 @@ class CommonBasis:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Scene pixels along both axes."""
         return len(self.patterns[0]), len(self.patterns[1])
 
     def side(self, axis: int, shift: float | FloatArray, margin: int = 0) -> FloatArray:
@@ -258,7 +202,6 @@ class CommonBasis:
         return np.asarray(self._bases[axis].T @ self._centred(columns))
 
     def smoothing(self, shift: float) -> float:
-        """Return the variance of noise in the factors at 1/z changed by ``shift``, over that of the calibrated ones."""
         return float(np.mean([side.noise(shift) ** 2 for side in self.sides]))
 
     def _columns(self, axis: int, shift: float | FloatArray) -> FloatArray:
@@ -271,7 +214,6 @@ class CommonBasis:
 # ---- Parallax, dots and chance ---------------------------------------------------------------------------------------
 
 _STEP = 0.5
-"""Projector pixels of parallax between tried displacements; a dot's image is about two wide."""
 
 
 def chance_difference(difference: float, variance: float, unknowns: int) -> float:
@@ -284,7 +226,6 @@ def chance_difference(difference: float, variance: float, unknowns: int) -> floa
 
 
 def _shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the least and largest change of 1/z [1/mm] of the searched depths."""
     parallax = parallax_of(factors)
     if depth_range is None:
         return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
@@ -297,7 +238,6 @@ def _shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) 
 
 
 def _moves(factors: Factors) -> FloatArray:
-    """Return the projector pixels (2,) that a change of 1/z by 1/mm moves light along rows and along columns."""
     counts = factors.left.shape[1], factors.right.shape[1]
     ends = [pixels_of_parallax(parallax_of(factors), axis, count)[:2] for axis, count in enumerate(counts)]
     return np.array([max(map(abs, each)) for each in ends])
@@ -309,10 +249,7 @@ def _are_dots(patterns: FloatArray) -> bool:
 
 
 def _period(moves: FloatArray, patterns: Sequence[FloatArray]) -> float:
-    """Return the change of 1/z [1/mm] that moves the light of dots onto another dot of the same frame.
-
-    ``moves`` are the projector pixels along both axes for a change by 1/mm.
-    """
+    """Return the change of 1/z [1/mm] that moves the light of dots onto another dot of the same frame."""
     periods, pixel = [lit.shape[1] for lit in patterns], 1 / moves.max()
     for parallax in np.arange(1.0, np.prod(periods) + 1, _STEP / 4):
         turns = moves * pixel * parallax / periods
@@ -326,10 +263,9 @@ def _period(moves: FloatArray, patterns: Sequence[FloatArray]) -> float:
 
 @single_threaded_blas()
 def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float] | None = None) -> Depth:
-    """Return the depth whose factors explain most of the measurements.
+    """Return the depth, between two given ones [mm] or a quarter of 1/z either way, whose factors explain most.
 
-    ``depth_range`` are the nearest and farthest tried depth [mm], by default a quarter of 1/z either way. Raises
-    MitsimError without a stated parallax, and ArgumentError for a range that too little of the sensor knows.
+    Raises MitsimError without a stated parallax, and ArgumentError for a range that too little of the sensor knows.
     """
     search = _Search(shots, factors, depth_range)
     basis, ends, pixel, inverse = search.basis, search.ends, search.pixel, 1 / parallax_of(factors).depth_mm
@@ -344,7 +280,6 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
     rise = min(near, far) - least
 
     def indifferent(difference: float) -> float:
-        """Return the energy by which two depths may differ of which either is the right one."""
         return max(chance_difference(difference, variance, unknowns), _OPPOSED * misfit)
 
     def ties() -> list[tuple[float, float]]:
@@ -384,8 +319,6 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
 
 
 class _Search:
-    """Energy that factors of one depth leave, by the change of 1/z."""
-
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         self.ends, self._period, beyond = _shifts_searched(factors, depth_range), np.inf, 0.0
         if depth_range is None:
@@ -409,7 +342,6 @@ class _Search:
         return self.basis.energy - float(np.square(project_frames(left, right, self.basis.stack)[measured]).sum())
 
     def valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
-        """Yield energy and place of the bottom of each valley that may be the lowest."""
         steps = max(int(np.ceil((last - first) / self.pixel)), _FEWEST)
         shifts = np.linspace(first, last, steps + 1)
         scores = np.array([self.left_over(shift) for shift in shifts])
@@ -441,7 +373,6 @@ class _Search:
                     yield self._bottom(away - self.pixel, away + self.pixel)
 
     def misfit(self, shift: float, least: float) -> float:
-        """Return the energy beyond noise, rendering and errors of the factors; 0 where these are not stated."""
         basis, noise = self.basis, self.basis.noise
         if not (noise.stated and self._stated):
             return 0.0
@@ -463,20 +394,13 @@ class _Search:
 # ---- The search for a depth of each projector pixel ------------------------------------------------------------------
 
 _STEPS, _STEP_POOLED = 4, 3.0
-"""Largest number of Gauss-Newton steps, and the standard deviation [pixels] over which changes of depth are pooled."""
 _ROUNDS, _BESIDE = 4, 5
-"""Largest number of rounds in which single pixels take another depth of the 5 x 5 around them."""
 _SURE = 25.0
-"""Variances of a datum that a pixel must explain more to take another depth: 5 standard deviations."""
 _RIVAL, _ASTRAY = 2.0, 0.05
-"""Starts that leave less than twice as much as the best one may place at most this part of the reliable pixels half a
-period beside it."""
+"""Starts that leave less than twice the best one's energy may place at most this part half a period beside it."""
 _RELIABLE = 0.5
-"""Least confidence of a reliable depth: twice as much light arrives there as anywhere else."""
 SPARE = 2.0
-"""Projector pixels of the period that reliable depths must leave free, as many as a dot's image is wide."""
 _MEDIAN = 5
-"""Width of the median of places [projector pixels]."""
 
 
 @single_threaded_blas()
@@ -488,8 +412,7 @@ def depth_map(
 ) -> DepthMap:
     """Return the depth of each projector pixel under shifting dots, and the image with all of them in focus.
 
-    ``depth_range`` are the nearest and farthest searched depth [mm], by default a quarter of 1/z either way. Raises
-    MitsimError for other patterns, and without parallax.
+    Raises MitsimError for other patterns, and without parallax.
     """
     # Dots of any period determine the depth of a flat scene, however far from the calibrated one.
     ends, inverse = _shifts_searched(factors, depth_range), 1 / parallax_of(factors).depth_mm
@@ -556,7 +479,6 @@ def depth_map(
 
 
 def _refine(pixels: PixelDepths, shift: FloatArray, offset: float, width: float, pixel: float) -> FloatArray:
-    """Take Gauss-Newton steps, with the change of neighbours pooled, while these explain more."""
     left_over = pixels.solve(shift).left_over
     for _ in range(_STEPS):
         image, moved = pixels.step(shift, pixel)
@@ -589,29 +511,19 @@ def _sharpen(pixels: PixelDepths, shift: FloatArray) -> FloatArray:
 # -------- The image at a depth for each pixel
 
 _SMALL = 1e-3
-"""Lambda over the mean diagonal of the normal matrix while depths are searched."""
 _LARGEST = 1e-2
-"""Largest such lambda of the final image."""
 _MOST_LIT = 4096
-"""Pixels of one frame whose normal matrix has 128 MiB."""
 _CUBIC = np.array([[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]]) / 6
-"""Lagrange cubic through -1, 0, 1, 2: weight of each by power of the place."""
 
 
 class Solved(NamedTuple):
-    """Image (n, n') at given depths, its lambda, and the residual energy."""
-
     image: FloatArray
     lam: float
     left_over: float
 
 
 class PixelDepths:
-    """Model with a depth for each projector pixel.
-
-    ``limit`` and ``step`` are the largest change of 1/z [1/mm], and the distance between those that columns are
-    computed at.
-    """
+    """Model with a depth for each projector pixel."""
 
     def __init__(self, basis: CommonBasis, limit: float, step: float) -> None:
         self._basis = basis
@@ -628,7 +540,6 @@ class PixelDepths:
         self._scale = left * right
 
     def solve(self, shift: FloatArray, lam: float | None = None) -> Solved:
-        """Return the image with 1/z of each pixel changed by ``shift`` (n, n') [1/mm]; ``lam`` None: a small one."""
         lam = _SMALL * self._scale if lam is None else lam
         image, left_over = np.zeros(shift.shape), self._basis.outside
         for frame, lit, left, right in self._columns_of_frames(shift):
@@ -639,7 +550,6 @@ class PixelDepths:
         return Solved(image, lam, left_over)
 
     def variance(self, solved: Solved) -> float:
-        """Return the variance of a datum from the residual of a ``solved`` image."""
         return float(solved.left_over / max(self._basis.data - 2 * solved.image.size, 1))
 
     def final(self, shift: FloatArray, solved: Solved) -> Solved:
@@ -665,7 +575,7 @@ class PixelDepths:
     def gains(self, shift: FloatArray, image: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
         """Return the energy (others, n, n') that each pixel alone explains more at other changes of 1/z.
 
-        Pixels of a frame are a period apart and hardly share measurements, so that each is judged with all else fixed.
+        Pixels of a frame hardly share measurements, so that each is judged with all else fixed.
         """
         explained = np.zeros((1 + len(others), *shift.shape))
         for frame, lit, left, right in self._columns_of_frames(shift):
@@ -680,7 +590,6 @@ class PixelDepths:
     def _columns_of_frames(
         self, shift: FloatArray
     ) -> Iterator[tuple[FloatArray, tuple[npt.NDArray[np.intp], ...], FloatArray, FloatArray]]:
-        """Yield each frame, the places of its lit pixels, and their columns (k, r) of both factors."""
         for each in self._basis.frames:
             grid = np.meshgrid(self._lit[0][each.row], self._lit[1][each.column], indexing="ij")
             lit = tuple(place.ravel() for place in grid)
@@ -688,7 +597,6 @@ class PixelDepths:
             yield each.frame, lit, left, right
 
     def _columns(self, axis: int, pixels: npt.NDArray[np.intp], shift: FloatArray, slope: bool = False) -> FloatArray:
-        """Return columns (k, r) of the ``pixels`` of an axis at changes ``shift`` (k,) of 1/z, or their derivatives."""
         step, table = self._shifts[1] - self._shifts[0], self._tables[axis]
         place = (shift - self._shifts[0]) / step
         start = np.clip(np.floor(place).astype(np.intp), 1, len(self._shifts) - 3)
@@ -702,37 +610,18 @@ class PixelDepths:
 # ---- Where most light of each projector pixel arrives ----------------------------------------------------------------
 
 _SHARP = 1e-6
-"""Lambda over the largest sigma^2 where light arrives: smaller ones add noise, larger ones blur dots."""
 _OFFSETS = -1.0, -0.5, 0.5, 1.0
-"""Projector pixels by which the range of displacements may be moved, because a surface at its end is ambiguous."""
 _POOLED = 1.0
-"""Standard deviation over which light is pooled [projector pixels]."""
 _BESIDE_LARGEST = 2
-"""Projector pixels beyond the largest displacement, so that a dot's image is not cut."""
 _LEAST_PARALLAX = 0.5
-"""Least parallax of an axis over the range of depths [projector pixels]."""
 _NEIGHBOURHOOD = 2.0
-"""Projector pixels beside the largest light that belong to it."""
 
 
 class Arrivals:
-    """Places where light arrives, by pixel and change of 1/z.
+    """Places where light arrives, by pixel and change of 1/z [1/mm] between two ``ends``.
 
-    Parameters
-    ----------
-    ends
-        Least and largest change of 1/z [1/mm] of the searched depths.
-    beside
-        Largest change of 1/z [1/mm] of the middle of the distinguishable depths.
-
-    Attributes
-    ----------
-    pixel
-        Change of 1/z [1/mm] that moves light by one projector pixel.
-    width, reach
-        Distinguishable changes of 1/z, and the largest tried one, either way.
-    limited
-        Whether the dots' period limits the range of depths.
+    ``pixel`` is the change that moves light by one projector pixel, ``width`` the distinguishable changes, and
+    ``reach`` the largest tried one. The dots' period may limit the range.
     """
 
     def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
@@ -759,7 +648,6 @@ class Arrivals:
         self._images = self._class_images()
 
     def _class_images(self) -> FloatArray:
-        """Return the images (K or 1, K' or 1, n, n') of all frames of a class."""
         basis = self.basis
         sides = [basis.side(axis, 0.0, self._margin if opened else 0) for axis, opened in enumerate(self._open)]
         patterns, counts = list[FloatArray](), list[int]()
@@ -795,7 +683,6 @@ class Arrivals:
         return found, np.where(dark, 0.0, np.maximum(1 - elsewhere / np.where(dark, 1.0, peak), 0.0))
 
     def _arriving(self, shift: float) -> FloatArray:
-        """Return the light (n, n') where each pixel's would be at 1/z changed by ``shift``, linear between pixels."""
         places, parts = list[npt.NDArray[np.intp]](), list[FloatArray]()
         for side, classes, opened in zip(self.basis.sides, self._classes, self._open, strict=True):
             place = np.arange(classes.size) + (side.edges * shift + self._margin if opened else 0.0)

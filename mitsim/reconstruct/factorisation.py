@@ -23,23 +23,17 @@ IndexArray = npt.NDArray[np.intp]
 Strips = tuple[slice, ...]
 StripHalves = tuple[Strips, Strips]
 _STRIPS = 8
-"""Strips of sensor rows that alternate between the two halves, each wider than a feature of the mask."""
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Scene pixels factorised together.
-
-    ``pixels`` (c,), ``patterns`` (c, K); ``shared`` is (weights (c,), psi (K,)) if the patterns are weights psi^T, or
-    None.
-    """
+    """Scene pixels (c,) factorised together; ``shared`` is (weights (c,), psi (K,)) if patterns are weights psi^T."""
 
     pixels: IndexArray
     patterns: FloatArray
     shared: tuple[FloatArray, FloatArray] | None
 
     def lights(self, index: int) -> bool:
-        """Return True if pattern ``index`` lights any of these pixels."""
         return bool(self.patterns[:, index].any() if self.shared is None else self.shared[1][index])
 
 
@@ -57,14 +51,10 @@ class Side:
 
     Attributes
     ----------
-    basis : (n, r) array
-        Right singular vectors V of B.
-    singular : (r,) array
-        Singular values of B, numerically zero ones exactly 0; r = min(n, rows of B) over the blocks.
-    slabs
-        One for each pattern index.
-    pattern_count, sensor_size, scene_size, data_rows
-        K, m, n, and the independent data rows: m K, less K once frames are centred.
+    basis, singular
+        Right singular vectors V (n, r) of B, and its singular values (r,), numerically zero ones exactly 0.
+    data_rows
+        Independent data rows: m K, less K once frames are centred.
     dual : (n, r) array
         V' with B = U S V'^T; None if V' is the basis, which is then orthonormal.
     spread
@@ -88,24 +78,20 @@ class Side:
 
     @property
     def duals(self) -> FloatArray:
-        """V' (n, r) of B = U S V'^T."""
         return self.basis if self.dual is None else self.dual
 
     @property
     def common(self) -> FloatArray:
-        """Sum of all slabs (m, r), the response of the coefficients to light that all frames share."""
         total = np.zeros((self.sensor_size, len(self.singular)))
         for slab in self.slabs:
             total[:, slab.columns] += slab.matrix
         return total
 
     def columns(self, index: int) -> IndexArray:
-        """Return the places in W that pattern ``index`` contributes to."""
         return np.arange(len(self.singular))[self.slabs[index].columns]
 
     @property
     def rank(self) -> int:
-        """Number of singular values above the rank cut."""
         return int(np.count_nonzero(self.singular))
 
     @property
@@ -152,7 +138,6 @@ def pattern_blocks(patterns: FloatArray) -> tuple[IndexArray, ...]:
 
 
 def group_pixels(patterns: FloatArray) -> tuple[Group, ...]:
-    """Return the groups of scene pixels that ``patterns`` (n, K) allow to be factorised alone."""
     groups = []
     for block in pattern_blocks(patterns):
         lit, own = np.flatnonzero(patterns[block].any(axis=1)), patterns[block]
@@ -166,19 +151,7 @@ def group_pixels(patterns: FloatArray) -> tuple[Group, ...]:
 
 
 def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], centred: bool = False) -> Side:
-    """Factorise one side by an SVD of the stacked matrix B, block by block.
-
-    Parameters
-    ----------
-    phi : (m, n) array
-        Factor, checked.
-    patterns : (n, K) array
-        Pattern columns, checked.
-    groups
-        Groups of scene pixels of the patterns.
-    centred
-        True if frames lose their row and column means.
-    """
+    """Factorise one side, ``phi`` (m, n) under ``patterns`` (n, K), by an SVD of B, block by block."""
     sensor, scene = phi.shape
     parts = [_block_svd(phi[:, group.pixels], group) for group in groups]
     singular = np.concatenate([part[1] for part in parts])
@@ -213,8 +186,7 @@ def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], 
 def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray]:
     """Return the slabs, singular values and right vectors of a group's stacked matrix.
 
-    The SVD is numpy's. scipy's wheel has a thread pool of its own, and two pools wait for each other on a busy machine
-    (2.5 s instead of 15 ms).
+    The SVD is numpy's, because scipy's wheel has a second thread pool (2.5 s instead of 15 ms on a busy machine).
     """
     patterns = group.patterns
     if group.shared is not None:

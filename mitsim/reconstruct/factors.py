@@ -34,24 +34,17 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 SEPARABLE_RESIDUAL = 0.01
-"""Unexplained residual above which the status warns: a keystone that leaves 1.5 % costs the image 16 % under uniform
-light, while falloff and diffraction leave less than 1e-3.
-"""
+"""Residual above which the status warns: a keystone of 1.5 % costs 16 %; falloff and diffraction leave below 1e-3."""
 
 UNKNOWN_NOISE = 0.05
-"""Limit of the unexplained residual where the sensor's noise is not stated."""
 
 NOISE_MODEL = 0.2
 """Part of the stated noise that may be left unexplained: an error of 4 % in its variance."""
 
 LARGEST_ERROR = 0.1
-"""Relative error of a factor above which the status warns."""
 _NUMBERS_AT_ONCE = 2**15
-"""Numbers of a response whose misfit is summed at a time, so that they stay in the cache."""
 _NEGATIVE = 0.1
-"""Sum over the sum of absolute values below which a uniform response counts as negative."""
 _TURNS, _TURNED = 30, 1e-13
-"""Steps of the power iteration that splits a uniform response, and the change at which it has converged."""
 
 
 # ---- Estimated factors ----
@@ -65,18 +58,12 @@ class Estimate:
     ----------
     left, right
         Phi_L (m, n), Phi_R (m', n), in the square root of the frames' unit.
-    separability_residual
-        sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses.
-    unexplained
-        Part of that residual beyond the stated noise of the sensor.
+    separability_residual, unexplained
+        sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses, and its part beyond the stated noise.
     condition
         Larger cond(Phi)^2 of the two; inf when rank deficient.
-    noise
-        Root mean square of Y_i - u_i v^T, corrected for the fitted numbers [frame unit].
-    predicted_error
-        Relative error (Frobenius norm) of both factors by independent noise of that size.
-    rank
-        Number of singular values of both factors above rounding and noise.
+    noise, predicted_error
+        Root mean square of Y_i - u_i v^T [frame unit], and the relative error (Frobenius) of factors by such noise.
     """
 
     left: FloatArray
@@ -91,7 +78,6 @@ class Estimate:
 
     @property
     def ok(self) -> bool:
-        """Whether the factors can be used without a correction."""
         return self.status.ok
 
 
@@ -100,19 +86,10 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class ResponseFit:
-    """Contribution of one response to :class:`StripeSums`.
+    """Contribution of one response to :class:`StripeSums`: least-squares u_i or w_i in Y_i = u_i common^T.
 
-    Attributes
-    ----------
-    vector : (m,) array
-        Least-squares u_i or w_i in Y_i = u_i common^T.
-    misfit, energy
-        ||Y_i - u_i common^T||^2 and ||Y_i||^2.
-    ambient : (3,) array
-        Light that the mask does not cast: even, tilted along the response's vector, and tilted along the common one.
-        Zeros where responses are centred.
-    light : (m,) array
-        Sum of the response's two frames, projected likewise, or None.
+    ``ambient`` (3,) is light that the mask does not cast: even, tilted along the response's vector, and tilted along
+    the common one. ``light`` (m,) is the projected sum of the response's two frames, or None.
     """
 
     vector: FloatArray
@@ -126,24 +103,8 @@ class ResponseFit:
 class StripeSums:
     """Running sums over the responses of one side, which continue to the same bits after being saved.
 
-    Attributes
-    ----------
-    side
-        ``horizontal`` or ``vertical`` stripes.
-    centre
-        Whether row and column means are removed from every response.
-    common
-        v (k,) of Y_i = u_i v^T; for vertical stripes a of Y_i^T = w_i a^T.
-    vectors : (m, N) array
-        u_i or w_i as columns.
-    misfit, energy
-        Sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
-    done
-        Number of added responses.
-    misfits, energies, ambient
-        (N,), (N,) and (N, 3) of each response.
-    lights
-        (m, N) projected sums of the two frames of each response; (m, 0) where they are unknown.
+    ``common`` is v (k,) of Y_i = u_i v^T or, for vertical stripes, a of Y_i^T = w_i a^T. ``vectors`` (m, N) are u_i or
+    w_i, and ``lights`` (m, N) the projected sums of each response's two frames, (m, 0) where they are unknown.
     """
 
     side: str
@@ -164,14 +125,9 @@ class StripeSums:
         self.lights = np.zeros((len(self.vectors), 0))
 
     def add(self, response: npt.ArrayLike) -> None:
-        """Add the next ``response`` (rows, columns)."""
         self.put(self.fit_response(response, self.done))
 
     def fit_response(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
-        """Return the contribution of response ``number`` without adding it, so that several threads may call this.
-
-        ``light`` (rows, columns) is the sum of the two frames whose difference the response is.
-        """
         across, shape, given = self.side == "horizontal", (len(self.vectors), len(self.common)), np.asarray(response)
         response = _response(given, f"{self.side} response {number}", shape if across else shape[::-1], self.centre)
         common = self.common / np.dot(self.common, self.common)
@@ -192,7 +148,6 @@ class StripeSums:
         return ResponseFit(vector, misfit, energy, shown * (not self.centre), light)
 
     def put(self, seen: ResponseFit) -> None:
-        """Add a fitted response."""
         self.vectors[:, self.done] = seen.vector
         self.misfit += seen.misfit
         self.energy += seen.energy
@@ -212,7 +167,6 @@ def stripe_sums(
     uniform: npt.ArrayLike | None = None,
     lights: Sequence[FloatArray | None] = (None, None),
 ) -> tuple[StripeSums, StripeSums]:
-    """Return sums of horizontal and of vertical stripes of ``count`` responses each, with the first of each."""
     first = _response(horizontal, "horizontal response 0", None, centre)
     second = _response(vertical, "vertical response 0", first.shape, centre)
     mean = (upright(first, horizontal) + upright(second, vertical)) / 2
@@ -245,24 +199,10 @@ def estimate_factors(
 ) -> Estimate:
     """Estimate the factors of a separable camera from its responses to striped light.
 
-    Parameters
-    ----------
-    horizontal, vertical
-        Responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T, in order, each the difference of a pattern's positive and
-        negative capture. Generators keep memory small.
-    H : (n, N) array
-        +1 and -1 with orthogonal rows; column 0 is all +1 unless ``uniform`` is given.
-    centre
-        True removes row and column means, for a FlatCam mask.
-    uniform : (m, m') array
-        Response under all light, by default the mean of the first horizontal and vertical responses.
-    noise
-        Root mean square sensor noise of a response [frame unit]; None if unknown.
-
-    Raises
-    ------
-    MitsimError
-        For a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
+    ``horizontal`` and ``vertical`` are the responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T, each the difference of
+    two captures; ``H`` (n, N) has orthogonal rows of +-1, and a column 0 of +1 unless ``uniform`` (m, m'), the
+    response under all light, is given. ``noise`` is the rms of a response's noise, None if unknown. Raises MitsimError
+    for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
     """
     signs = np.asarray(H, dtype=np.float64)
     if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
@@ -367,15 +307,7 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
 
 
 class AmbientLight:
-    """Even light and light tilted along either side in responses u v^T, measured across the ``common`` vector v.
-
-    Attributes
-    ----------
-    effects : (3, m) array
-        Vectors that light of size 1 adds to u: even, tilted along u, tilted along v.
-    variances : (3,) array
-        Variances of the measured sizes for noise of variance 1.
-    """
+    """Even light and light tilted along either side in responses u v^T, measured across the ``common`` vector v."""
 
     def __init__(self, common: FloatArray, length: int) -> None:
         self._places, even = np.linspace(-1, 1, length), np.ones(length)
@@ -390,12 +322,10 @@ class AmbientLight:
         self.variances = np.diag(self._inverse)
 
     def measure(self, response: FloatArray) -> FloatArray:
-        """Return the sizes (3,) of the light in a ``response`` (m, k)."""
         seen = response @ self._across
         return np.asarray(self._inverse @ [seen[:, 0].sum(), self._places @ seen[:, 0], seen[:, 1].sum()])
 
     def energies(self, sizes: FloatArray) -> FloatArray:
-        """Return the squares (N,) that light of ``sizes`` (N, 3) adds to the misfits of responses."""
         return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
 
 
@@ -403,7 +333,6 @@ class AmbientLight:
 
 
 def decibels(part: float) -> float:
-    """Return an rms ``part`` of a signal in dB, -20 for a tenth."""
     return float(20 * np.log10(part))
 
 
@@ -417,8 +346,7 @@ def squared_condition(phi: FloatArray, values: FloatArray | None = None) -> floa
 def rank_above_noise(phi: FloatArray, error: float, values: FloatArray | None = None) -> int:
     """Return the number of singular ``values`` of ``phi`` (m, n) above rounding and noise of a relative ``error``.
 
-    Along a direction that the sensor does not see the factor has m independent numbers of noise. Their squared norm
-    is chi-square with m degrees of freedom, of which the limit is three standard deviations above the mean.
+    The squared norm of m numbers of noise is chi-square; the limit is three standard deviations above its mean.
     """
     if not phi.any():
         return 0
@@ -438,8 +366,7 @@ def _rounding(phi: FloatArray, values: FloatArray) -> float:
 def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return a (m,) and v (n,) whose product is the largest part of rank one of a uniform response ``mean`` (m, n).
 
-    A uniform response is nearly of rank one, and its SVD takes half a minute at 2048 x 2048, so that power iteration is
-    used unless it does not converge.
+    Power iteration is used unless it does not converge, because an SVD takes half a minute at 2048 x 2048.
     """
 
     def unit(vector: FloatArray) -> FloatArray:
@@ -478,9 +405,7 @@ def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None,
 # ---- Factors of a calibrated camera ----
 
 _LACKING = "lacking"
-"""Prefix of channels with terms that a factor lacks."""
 _LIGHT = ("projector.lines_nm", "projector.radiant_shares")
-"""Parts of an identity that manifests of 0.4.0 do not state."""
 
 
 @checked_fields
@@ -520,7 +445,6 @@ class Factors:
     @classmethod
     @check_arguments
     def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[SeparableTerm] = ()) -> Factors:
-        """Return the factors of an ``estimate`` with the ``manifest`` of its camera, and the terms that they lack."""
         left, right = _single(estimate.left), _single(estimate.right)
         own, other = (
             float(error * float(np.linalg.norm(side)) / np.sqrt(side.size))
@@ -550,19 +474,16 @@ class Factors:
 
     @property
     def sides(self) -> tuple[FloatArray, FloatArray]:
-        """Both factors, centred if frames are."""
         if not self.manifest.centre:
             return self.left, self.right
         return centre_columns(self.left), centre_columns(self.right)
 
     @property
     def ok(self) -> bool:
-        """Whether the status is good and there are no warnings."""
         return self.status.ok and not self.warnings
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings of the calibration."""
         return self.manifest.warnings
 
     @cached_property
@@ -579,7 +500,6 @@ class Factors:
 
     @check_arguments
     def write(self, folder: Path | str) -> Path:
-        """Write the files to a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         folder = Path(folder)
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
         if self.manifest.board_reflectance is not None:
@@ -716,7 +636,6 @@ def load_calibration(folder: Path | str) -> Factors:
 def factors_of(
     manifest: CalibrationManifest, read: Callable[[str], tuple[Channels, Metadata]], name: str = "in memory"
 ) -> Factors:
-    """Return the factors of a calibration's manifest and files, which ``read`` returns by name."""
     files = [(Path(name) / f"{side}.exr", read(f"{side}.exr")[0]) for side in SIDES]
     left, right = (finite_channel(channels, "factor", path) for path, channels in files)
     terms = max(sum(channel.startswith(_LACKING) for channel in channels) for _, channels in files)

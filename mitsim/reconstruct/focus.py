@@ -49,23 +49,17 @@ from mitsim.reconstruct.request import check_parallax
 from mitsim.reconstruct.solver import Prepared
 
 _NEIGHBOURS = 4
-"""Columns of a cubic; fewer leave more of a sheet at 360 mm, more add noise."""
 _DEGREE = 4
 """Degree of the polynomial of brightness over columns: cos^4 of 8.5 degrees is a parabola to 1e-4."""
 _PAIRS = 32
-"""Distances along the sensor, at most twice as many, at which columns of the same shadow are compared."""
 _HIDDEN = 0.5
-"""Part of a pixel's light that must be missing for a hidden pixel."""
 LEAST_PART = 0.5
-"""Least part of the sensor's rows that must remain."""
 
 
 # ---- Captures of which something is changed --------------------------------------------------------------------------
 
 
 class DerivedCapture(Capture):
-    """The ``whole`` capture with other ``patterns``, or on a ``part`` of a ``sensor`` of that many rows and columns."""
-
     def __init__(
         self,
         whole: Capture,
@@ -78,28 +72,21 @@ class DerivedCapture(Capture):
 
     @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
-        """P_L (n, K) and P_R (n', K')."""
         return self._patterns or self.whole.patterns
 
     @cached_property
     def ambient(self) -> Ambient | None:
-        """Ambient frame that is subtracted from every frame."""
         whole = self.whole.ambient
         return whole and Ambient(whole.rate[self._part], whole.variance[self._part], whole.shots)
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """Yield the measurements of the whole capture on this part of the sensor."""
         for each in self.whole.pattern_measurements(self._sensor or shape):
             yield replace(each, frame=each.frame[self._part], light=each.light[self._part])
 
 
 @dataclass(frozen=True, eq=False)
 class MovedFactors:
-    """Factors of a depth or of a wider window, on the sensor's ``rows`` and ``columns`` where they are known.
-
-    ``sensor`` is the shape of the whole sensor, and ``hidden`` the part of scene pixels whose light the field stop
-    blocks.
-    """
+    """Factors of a depth or of a wider window, on the sensor's ``rows`` and ``columns`` where they are known."""
 
     factors: Factors
     rows: slice
@@ -108,7 +95,6 @@ class MovedFactors:
     hidden: float = 0.0
 
     def of(self, shots: Capture) -> Capture:
-        """Return the part of ``shots`` on these rows and columns."""
         return DerivedCapture(shots, part=(self.rows, self.columns), sensor=self.sensor)
 
 
@@ -116,10 +102,7 @@ class MovedFactors:
 
 
 def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
-    """Return the factors of a surface at ``depth_mm`` from the sensor.
-
-    Raises ArgumentError for a depth where too little of them is known, and MitsimError without a stated parallax.
-    """
+    """Return the factors of a surface at ``depth_mm``; ArgumentError where too little of them is known."""
     parallax, sensor = parallax_of(factors), (len(factors.left), len(factors.right))
     if not (np.isfinite(depth_mm) and depth_mm > parallax.mask_distance_mm):
         raise ArgumentError(
@@ -148,10 +131,7 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
 
 
 def widen_factors(factors: Factors, cells: int) -> MovedFactors:
-    """Return ``factors`` with ``cells`` more columns a side, on the part of the sensor where these are known.
-
-    Raises MitsimError without a stated parallax, and for more cells than the window or the sensor covers.
-    """
+    """Return ``factors`` with ``cells`` more columns a side, on the part of the sensor where these are known."""
     parallax, sides = parallax_of(factors), (factors.left, factors.right)
     if cells > (most := min(factor.shape[1] for factor in sides)):
         raise ArgumentError("margin", f"{cells}: give at most {most}, the projector's pixels a side")
@@ -174,10 +154,7 @@ def widen_factors(factors: Factors, cells: int) -> MovedFactors:
 
 
 def light_margin(shots: Capture, cells: int) -> Capture:
-    """Return ``shots`` with patterns that always light a margin of ``cells``.
-
-    Raises MitsimError for patterns of -1.
-    """
+    """Return ``shots`` with patterns that always light a margin of ``cells``."""
     if any(shot.sign for shot in shots.manifest.patterns.captures):
         raise MitsimError(
             f"margin {cells}: {shots.name} shows patterns of -1, as differences of two frames, in which what is lit "
@@ -189,7 +166,6 @@ def light_margin(shots: Capture, cells: int) -> Capture:
 
 
 def parallax_of(factors: Factors) -> Parallax:
-    """Return the parallax of ``factors``, or raise MitsimError if their calibration does not state it."""
     parallax = check_parallax(factors.manifest.parallax, factors.name)
     if min(factors.left.shape[1], factors.right.shape[1]) < _NEIGHBOURS:
         raise MitsimError(
@@ -216,12 +192,8 @@ def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float
 class FactorOfDepths:
     """A calibrated ``factor`` (m, n) of the left (``axis`` 0) or right side (1), and how it moves with depth.
 
-    Attributes
-    ----------
-    edges
-        Projector pixels (n,) that a change of 1/z by 1/mm moves the light of each pixel.
-    reach
-        Largest number of projector pixels that a change of 1/z by 1/mm moves what a sensor pixel sees.
+    A change of 1/z by 1/mm moves the light of each pixel by ``edges`` (n,), and what a sensor pixel sees by at most
+    ``reach`` projector pixels.
     """
 
     def __init__(self, factor: FloatArray, parallax: Parallax, axis: int) -> None:
@@ -259,17 +231,15 @@ class FactorOfDepths:
         return shadows, _whole(known)
 
     def hidden_part(self, shift: float) -> FloatArray:
-        """Return the part (n,) of each column's light that the field stop blocks at 1/z changed by ``shift`` [1/mm]."""
+        """Return the part (n,) of each column's light that the field stop blocks."""
         return np.asarray(1 - self._transmission(self._source_columns(shift)).mean(axis=0))
 
     def noise(self, shift: float) -> float:
-        """Return the noise of columns at 1/z changed by ``shift`` [1/mm], relative to that of the calibrated ones."""
         white = np.random.default_rng(0).standard_normal(self.factor.shape)
         row, within, _ = self._sources(self._source_columns(shift))
         return float(np.sqrt(np.mean(np.square(ColumnSpline(white, self._step).at(row, within)))))
 
     def brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        """Return the brightness at each ``column`` without the mask's shadow; 1 in the window's middle."""
         return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
 
     def _source_columns(self, shift: float | FloatArray) -> FloatArray:
@@ -278,7 +248,6 @@ class FactorOfDepths:
     def _sources(
         self, column: npt.NDArray[np.floating | np.integer]
     ) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.bool_]]:
-        """Return rows, columns within the window and whether these are known, for sources at any ``column``."""
         rows, count = self.factor.shape
         within, row = np.array(column, dtype=np.float64), np.repeat(np.arange(rows)[:, None], column.shape[1], axis=1)
         known = np.ones(within.shape, dtype=np.bool_)
@@ -310,7 +279,6 @@ class FactorOfDepths:
 
     @cached_property
     def _falloff(self) -> FloatArray:
-        """Coefficients of the logarithm of brightness, by columns that see the same part of the mask."""
         rows, count = self.factor.shape
         unlike, changes = [np.zeros(1)], [np.zeros((1, _DEGREE + 1))]
         apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
@@ -343,14 +311,10 @@ def _whole(known: npt.NDArray[np.bool_]) -> slice:
 # ---- A factor as a smooth function of the place between its columns --------------------------------------------------
 
 _SPLINE_ROWS = 5
-"""Sensor rows to either side that a row's spline is fitted to: of 2, 3 and 5 the most leave least (1.9e-3, 1.7e-3,
-1.5e-3)."""
+"""Rows to either side that a row's spline is fitted to: 2, 3 and 5 leave 1.9e-3, 1.7e-3 and 1.5e-3."""
 _SPLINE_KNOTS = 4
-"""Knots for each column."""
 _STIFFNESS = 1e-2
-"""Weight of squared third differences of coefficients over that of a number's error."""
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
-"""Third difference of four neighbours."""
 
 
 class ColumnSpline:
@@ -384,7 +348,6 @@ class ColumnSpline:
             self._coefficients[own] = solveh_banded(normal, data, lower=True).T
 
     def at(self, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
-        """Return numbers of each ``row`` at each ``column``, from 0 to n - 1; the two broadcast."""
         start, weights = self._weights(column * _SPLINE_KNOTS)
         first, numbers = row * self._coefficients.shape[1] + start, self._coefficients.ravel()
         return np.asarray(sum(weight * numbers.take(first + k) for k, weight in enumerate(weights)))
@@ -402,21 +365,13 @@ class ColumnSpline:
 # ---- Global light, the same in all frames ----------------------------------------------------------------------------
 
 _LEAST_EIGENVALUE = 1e-3
-"""Least part of a mode that must remain; noise in the mode is magnified by the root of its inverse."""
 
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Light that all frames share.
+    """Light ``common`` (m, m') of all frames, and the ``image`` (n, n') that it looks like under uniform light.
 
-    Attributes
-    ----------
-    common : (m, m') array
-        Light of each frame, in the frames' unit.
-    image : (n, n') array
-        Reflectance that it looks like under uniform light.
-    eigenvalues
-        Part of each mode that lit pixels do not explain, smallest first.
+    ``eigenvalues`` are the part of each mode that lit pixels do not explain, smallest first.
     """
 
     common: FloatArray
@@ -434,21 +389,9 @@ def separate(
 ) -> Separation:
     """Return the global light of frames under shifting dots.
 
-    Parameters
-    ----------
-    model
-        Factorised model of these patterns.
-    seen : (m, n + 2 w) and (m', n' + 2 w') arrays
-        Factors with w columns beside the window on either side (:meth:`FactorOfDepths.beyond`), or w = 0.
-    patterns
-        P_L (n, K) and P_R (n', K').
-    weights, total
-        W (r, r'), and the sum (m, m') of all frames.
-
-    Raises
-    ------
-    MitsimError
-        For uniform light, +-1 patterns or centred factors, under which global light looks like an image.
+    ``seen`` are the factors (m, n + 2 w), (m', n' + 2 w') with w columns beside the window, ``patterns`` P_L (n, K)
+    and P_R (n', K'), ``weights`` W (r, r') and ``total`` the sum (m, m') of all frames. Raises MitsimError for uniform
+    light, +-1 patterns or centred factors, under which global light looks like an image.
     """
     if model.centre or any((side < 0).any() for side in patterns):
         raise MitsimError("separation: takes dots before a mask that is not centred; use dots:K")

@@ -1,23 +1,20 @@
 """Checks of single frames: each is compared with the prediction from all other frames of the run.
 
-Where patterns overlap, the other frames predict a frame by the model: e^T (I - H_kk)^-1 e is the energy of the frame's
-difference from the prediction, in closed form. Signed patterns have a second redundancy, because the halves of every
-pair add up to the same light. Under shifting dots no scene pixel is in two frames, and the picture of the other frames
-predicts a frame. A closing frame repeats the first pattern, or all pixels lit, at the end of the session and is
-compared with the frames before it.
+Where patterns overlap, the other frames predict a frame by the model: e^T (I - H_kk)^-1 e is the energy of the
+difference, in closed form. The halves of every signed pattern add up to the same light. A closing frame repeats the
+first pattern, or all pixels lit, at the end of the session.
 
 *Picture.* Under shifting dots every scene pixel is in one frame only, so that a frame of another scene, of another
-lamp power or of a moved camera fits the model as well as a right one. The only redundancy is the picture: neighbouring
-scene pixels are in different frames. A symmetric stencil of neighbours, fitted to the run itself, predicts each pixel
-from other frames. Three measurements follow from the differences r between pixels and predictions:
+lamp power or of a moved camera fits the model as well as a right one. The only redundancy is the picture: a symmetric
+stencil of neighbours, fitted to the run itself, predicts each pixel from other frames. Three measurements follow from
+the differences r between pixels and predictions:
 
-1. the mean of log(1 + u^2) over a frame, u being r over its robust scale: a foreign frame stands out;
+1. the mean of log(1 + u^2) over a frame, u being r over its robust scale, detects a foreign frame;
 2. least squares of the power and then of the shift of all frames, because a frame of power 1 + a adds a X at its own
    pixels and changes the predictions of its neighbours;
-3. the same mean as in 1 over windows of a few dots and one to four consecutive shots: a hand in a few frames stands
-out.
+3. the mean of 1 over windows of a few dots and one to four consecutive shots detects a hand in a few frames.
 
-What the picture leaves undecided is stated as a standard error of the power and of the place of single frames.
+The undecided rest is stated as a standard error of the power and of the place of single frames.
 """
 
 from __future__ import annotations
@@ -42,53 +39,23 @@ from mitsim.reconstruct.uncertainty import Propagation
 # ---- The picture of shifting dots -----------------------------------------------------------------------------------
 
 _PRIOR_POWER, _PRIOR_SHIFT = 0.1, 0.5
-"""Standard deviations of the power of a frame and of its place [scene pixels] before the frames are seen."""
 _SCALES = 8.0, 3.0, 1.0, 1.0
-"""Scales of the rounds of reweighted least squares, because small ones at once end in another minimum."""
 _PIXELS, _FEWEST = 2500, 4
-"""Pixels to which the stencil is fitted at most, to save time; and pixels for each number that is fitted, below which
-the picture decides nothing."""
 _WINDOWS, _LONGEST = (3, 5), 4
-"""Dots along each side of the windows, and most consecutive shots, in which a disturbance is looked for."""
 _FEW, _OF_NORMAL = 0.2, 0.253
-"""Part of the frames that no disturbance reaches, and the quantile of the size of normal numbers there."""
 _BLACK, _DARKER = 6.0, 1.5
-"""Deviations of noise up to which a frame has no light, and weight of its deviation, because no good frame lacks all of
-what the picture predicts."""
 _MOST, _FIXED = 3.0, 1e12
-"""Scales at which a single pixel's difference counts in full, because edges of a print reach more; and weight with
-which the mean change of all frames is held at zero."""
 _UNDERSTATED = 2.0
-"""Scatter of powers and places in good runs over their standard errors, at most, because neighbours share errors."""
 _UNMOVED, _SHARED = 0.3, 0.25
-"""Part of the frames that a wrong one leaves as they are, and part of the differences that pixels along a line share
-from which the picture varies in one direction only, and decides nothing."""
 
 
 class PictureCheck:
     """Comparison of each of the K frames of a run of shifting dots with the picture that the others show.
 
-    Parameters
-    ----------
-    image
-        (n, n') the image, reflectance.
-    frame_of
-        (n, n') number of the shot that lights each pixel.
-    periods
-        scene pixels from one dot to the next along rows and columns.
-    noise
-        (n, n') variance of the image by the frames' noise.
-
-    Attributes
-    ----------
-    decides
-        whether the picture is large enough to decide anything; without it there are no other attributes.
-    power, power_error
-        (K,) relative power of each frame beyond the mean, and its standard error.
-    predicted
-        standard error with which the other frames predict a pixel, reflectance.
-    foreign, disturbed
-        (K,) robust deviations of the whole frame, and of its most deviating window, from those of other frames.
+    ``frame_of`` (n, n') is the number of the shot that lights each pixel, ``periods`` are the pixels between dots, and
+    ``noise`` (n, n') is the image's variance by the frames' noise. ``power`` (K,) is relative to the mean;
+    ``predicted`` is the standard error of predicted pixels; ``foreign`` and ``disturbed`` (K,) are robust deviations
+    of the whole frame, and of its worst window. They exist only if the picture is large enough (``decides``).
     """
 
     def __init__(self, image: FloatArray, frame_of: IndexArray, periods: Sequence[int], noise: FloatArray) -> None:
@@ -139,7 +106,6 @@ class PictureCheck:
 
     @cached_property
     def place(self) -> tuple[FloatArray, FloatArray]:
-        """The place (2, K) of each frame along rows and columns [scene pixels], and its standard error."""
         # Looked for in the picture without the powers, because in even parts these look like a slope.
         place, error = self._fit(self._even, [*np.gradient(self._even)], _PRIOR_SHIFT)
         return place.reshape(2, -1), error.reshape(2, -1)
@@ -147,10 +113,8 @@ class PictureCheck:
     def uncertainty(self, image: FloatArray) -> FloatArray:
         """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames.
 
-        Of the scatter of the powers and places over the frames, the part that their own errors explain is no change of
-        lamp, camera or scene. The variance that remains is stated, and at least its standard error, because a flicker
-        as small as the errors is not seen. A regular print makes a part of the scatter, which cannot be told from a
-        flicker.
+        The scatter over the frames beyond its own error is stated, and at least its standard error, because a flicker
+        as small as the errors is not seen.
         """
         found, errors = (
             np.stack([own, *others]) for own, others in zip((self.power, self.power_error), self.place, strict=True)
@@ -164,17 +128,7 @@ class PictureCheck:
         return np.asarray(np.sqrt(variance))
 
     def _disturbance(self, moved: FloatArray, periods: Sequence[int], common: float) -> FloatArray:
-        """Return the largest deviation (K,) of the mean of a window of each frame, alone and with up to three later.
-
-        Parameters
-        ----------
-        moved
-            differences of pixels from their predictions in units of their scale, limited.
-        periods
-            as of the class.
-        common
-            part of the differences' energy that pixels along a line share.
-        """
+        """Return the largest deviation (K,) of the mean of a window of each frame, alone and with up to three later."""
         cells = [
             place // each for place, each in zip(np.unravel_index(self._pixels, self._shape), periods, strict=True)
         ]
@@ -204,13 +158,10 @@ class PictureCheck:
     ) -> tuple[FloatArray, FloatArray]:
         """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n').
 
-        Returns the parameters, change by change, and their standard errors by the sandwich estimator (Huber 1967),
-        which does not take differences for normal numbers. Parameters have a normal ``prior``. Least squares are
-        reweighted by Cauchy's weights, because edges of the print are outliers; with scales ``learned`` for these, the
-        stencil is fitted, too.
-
-        The stencil has no negative weights, because these imitate a lamp that flickers in the period of the dots. A
-        stencil along the other direction may still do so, and the errors of the powers then show it.
+        Returns the parameters and their standard errors by the sandwich estimator (Huber 1967), because differences
+        are not normal. Least squares are reweighted by Cauchy's weights, because edges of the print are outliers; with
+        ``learned`` scales the stencil is fitted, too. It has no negative weights, because these imitate a lamp that
+        flickers in the period of the dots.
         """
         own, target = self._pairs(image, self._some), image.ravel()[self._some]
         # The same change of all frames is a change of the picture, and is held at zero.
@@ -237,21 +188,17 @@ class PictureCheck:
         return found, np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare)
 
     def _differences(self, image: FloatArray) -> FloatArray:
-        """Return the pixels inside of an ``image`` (n, n') less what the stencil predicts of them."""
         return np.asarray(image.ravel()[self._pixels] - self._pairs(image, self._pixels) @ self._weights)
 
     def _scale(self, left_over: FloatArray, pixels: IndexArray) -> FloatArray:
-        """Return the scale of the differences ``left_over`` of ``pixels``."""
         return np.maximum(np.sqrt(robust_scatter(left_over) ** 2 + self._noise[pixels]), self._floor)
 
     def _pairs(self, image: FloatArray, pixels: IndexArray) -> FloatArray:
-        """Return the means of opposite neighbours (pixels, pairs), and a constant of either sign."""
         values, ones = image.ravel(), np.ones(len(pixels))
         pairs = [(values[pixels + each] + values[pixels - each]) / 2 for each in self._offsets]
         return np.stack([*pairs, ones, -ones], axis=1)
 
     def _sensitivity(self, changes: Sequence[FloatArray]) -> csr_matrix:
-        """Return the change of pixels less their predictions (pixels, len(changes) K) by one frame alone."""
         place, near = np.arange(len(self._some)), zip(self._offsets, self._weights, strict=False)
         terms = [(0, 1.0), *((sign * offset, -weight / 2) for offset, weight in near for sign in (1, -1) if weight)]
         parts = [
@@ -267,39 +214,23 @@ class PictureCheck:
 OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
 _CLOSING = 4e-3
-"""Part of a closing frame, rms, by which it may be off: no calibration and no print is between it and other frames."""
 _TURNED, _SIDE = 0.5, 0.3
-"""Part of its energy by which a pattern of exchanged halves differs at least, because they leave twice its light; and
-correlation of a pair's sum with its difference from which one of its halves is at fault."""
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
-"""Times the median excess, and part of the largest, from which a frame is named; part of all frames above which the run
-does not fit as a whole, and no single frames are named."""
 _FOREIGN, _DISTURBED = 6.5, 7.5
-"""Robust deviations from which a frame, and a window of frames, contradict the picture: no good run does."""
 _FLICKERS, _POWER = 15.0, 0.01
-"""Scatter of the powers of frames over its error, and least scatter, from which a flicker is reported. The picture of a
-print of a regular texture imitates smaller ones; all are part of the uncertainty."""
+"""Scatter of powers over its error, and least scatter, reported as flicker; regular textures imitate smaller ones."""
 _FEWEST_PAIRS, _FEWEST_FRAMES, _MOST_NUMBERS = 4, 3, 3e7
-"""Pairs, and frames that overlap, from which powers are told, and numbers that their fit may keep in memory."""
 _DOTS = "under dots each scene pixel is in one frame, so that only the picture shows a change of lamp, camera or scene."
 _LEAKING = "Light of the room cancels. A projector that leaks it since it was calibrated darkens the image as much."
 _REMEDY = "A closing frame (--closing-frame uniform) decides it."
-"""Sentences on questions that the frames leave undecided."""
 _LEAK = 5e-3
-"""Light of a dark pattern, over that of the bright one, from which a leaking projector is reported."""
 _RESTORED, _SCATTERS = 0.9, 4.0
-"""Part of the unexplained energy that frames at fault must explain; and scatters of the power up to which the
-difference of a single frame is that of a flicker."""
 _OUTLIER, _DIMMED = 6.5, 0.02
-"""Robust deviations, and change, from which the power of a single frame is reported."""
 
 
 @dataclass(frozen=True)
 class FrameFault:
-    """Shots that do not fit the others, and the part of their light, rms, by which they differ.
-
-    ``kind`` is the test, ``numbers`` count from 0 in the manifest's order, and ``words`` are for people.
-    """
+    """Shots (numbered from 0) that do not fit the others, and the part of their light, rms, by which they differ."""
 
     kind: str
     numbers: tuple[int, ...]
@@ -311,24 +242,11 @@ class FrameFault:
         return self.words
 
     def summary(self) -> dict[str, Any]:
-        """Return the entry of result.json."""
         return {"fault": self.kind, "frames": list(self.numbers), "files": list(self.files), "words": self.words}
 
 
 class FrameCheck:
-    """Tests the frames of accumulated ``data``.
-
-    Parameters
-    ----------
-    data, sums
-        the run, and its residuals.
-    lam
-        lambda of the image that shows the picture.
-    ratio
-        measured over stated variance of the noise.
-    beside
-        energy that rendering, the factors' noise and print add to all residuals.
-    """
+    """Tests the frames of accumulated ``data``; ``beside`` is the energy of rendering, the factors' noise and print."""
 
     def __init__(self, data: Accumulation, sums: Residuals, lam: float, ratio: float, beside: float) -> None:
         self._data, self._sums, self._beside = data, sums, beside
@@ -344,7 +262,6 @@ class FrameCheck:
         self.picture = self._check_picture(lam) if self._exclusive else None
 
     def faults(self) -> tuple[FrameFault, ...]:
-        """Return all frames that do not fit the others."""
         found, by_others = [*self._alone()], [*self._unlike_model()]
         powers = [*self._unlike_picture(), *self._flicker()]
         # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
@@ -429,9 +346,9 @@ class FrameCheck:
     def _flicker(self) -> Iterator[FrameFault]:
         """Report shots of another power.
 
-        The halves of all signed patterns add up to the same light. Where other patterns overlap, a frame of power 1 + a
-        adds a (I - H) Y to all residuals, so that the powers follow from normal equations with the matrix |Y_k|^2
-        delta_kl - C_k . C_l, C being the coefficients of frames in the model's range.
+        Where patterns overlap, a frame of power 1 + a adds a (I - H) Y to all residuals, so that the powers follow
+        from normal equations with the matrix |Y_k|^2 delta_kl - C_k . C_l, C being the coefficients of frames in the
+        model's range.
         """
         powers, weights, count = self._sums.powers, self._sums.weights, self._variance.size
         if len(powers) >= _FEWEST_PAIRS and self._data.noise.stated:
@@ -454,15 +371,7 @@ class FrameCheck:
         yield from self._powers(power, error, [self._number[(*pattern, 0)] for pattern in patterns], CHANCE)
 
     def _powers(self, power: FloatArray, error: FloatArray, of: Sequence[int], errors: float) -> Iterator[FrameFault]:
-        """Name shots of another power than the rest, or all of them if the powers of most differ.
-
-        Parameters
-        ----------
-        power, error, of
-            (shots,) relative powers, their standard errors, and the numbers of the shots.
-        errors
-            standard errors from which the scatter of all powers is a flicker.
-        """
+        """Name shots of another power than the rest, or all of them if the powers of most differ."""
         scatter, middle = robust_scatter(power), float(np.median(power))
         single = np.abs(power - middle) > np.maximum(_OUTLIER * np.maximum(error, scatter), _DIMMED)
         if single.any() and single.sum() <= max(1, _MOST_BAD * len(power)):
@@ -476,7 +385,6 @@ class FrameCheck:
     # ---- A closing frame
 
     def _closing(self) -> Iterator[FrameFault]:
-        """Compare the closing frame with the frames before it."""
         closing, noise, sides = self._data.shots.closing, self._data.noise, self._data.shots.patterns
         if closing is None:
             return
@@ -509,7 +417,6 @@ class FrameCheck:
     # ---- What no test decides
 
     def limits(self) -> tuple[dict[str, Any], ...]:
-        """Return entries of result.json on what the frames of a real camera leave undecided without a closing frame."""
         shots = self._data.shots
         if shots.manifest.plan is not None or (shots.closing and shots.closing.kind == "uniform"):
             return ()
@@ -531,7 +438,6 @@ class FrameCheck:
     # ---- Words
 
     def _fault(self, kind: str, numbers: Iterable[int], words: str, part: float = 0.0) -> FrameFault:
-        """Make a fault of some shots, of which the words name the first few with their files."""
         numbers = tuple(sorted(int(number) for number in numbers))
         files = tuple(self._shots[number].file for number in numbers)
         if len(numbers) == 1:

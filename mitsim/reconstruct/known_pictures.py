@@ -65,7 +65,6 @@ from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.reconstruct.solver import centre_columns, centre_frame
 
 _MOST_TRIED = 3
-"""Largest number of codes of a side that is tried."""
 
 
 # ---- The calibration -------------------------------------------------------------------------------------------------
@@ -118,7 +117,6 @@ def calibrate_known(
 
 
 def _fit_codes(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
-    """Return factors of the pictures alone, by plane."""
     listed = captures.listed
     with job.clock.stage("read"):
         read = KnownFrames(captures)
@@ -236,10 +234,6 @@ def _finish(
     found: tuple[tuple[float, float, float], Mapping[str, Any], tuple[str, ...]],
     job: Job,
 ) -> Factors:
-    """Return factors of a plane, with the manifest entries that both ways of calibrating share.
-
-    ``found`` are the results of :meth:`KnownFrames.misfit`, more results, and the warnings.
-    """
     (explained, unexplained, chi_square), more, warnings = found
     digital, (left, right) = captures.manifests[line].digital, sides
     result: dict[str, Any] = {
@@ -282,34 +276,14 @@ def _finish(
 _COLOURS = {"red": 0, "green": 1, "blue": 2}
 _PICTURE = Wanted("picture", colour=True)
 _REFLECTANCE = "reflectance"
-"""Channel of an image, or of a truth, in OpenEXR."""
 _OF_DIFFERENCES = 6
-"""Variance of second differences of white noise over that of the noise."""
 _COPIES = 4
-"""Copies of all frames that are in memory at a time."""
 
 
 class KnownFrames:
-    """Frames, scenes and noise of a list of captures.
-
-    Attributes
-    ----------
-    noises
-        Noise variance of a number of each frame, NaN where the run does not state its sensor.
-    saturated
-        Names of runs with saturated readings.
-    frames
-        Number of shots.
-    sums
-        SHA-256 of pictures and of the runs' manifests.
-    prepared
-        Preparation of the files at import.
-    places
-        Offsets of the planes of a colour sensor [pixels of a plane].
-    """
+    """Frames, scenes and noise of a list of captures; ``noises`` are NaN where the run does not state its sensor."""
 
     def __init__(self, captures: KnownCaptures, aged: Mapping[str, Factors] | None = None) -> None:
-        """Read all ``captures``, which must be of the camera of ``aged`` factors where these are given."""
         self.exposures, self.noises, self.saturated, self.frames = list[Exposure](), list[float](), list[str](), 0
         self.sums: dict[str, str] = {}
         self.prepared = preparation_of(next(iter(captures.manifests.values())), captures.path)
@@ -356,11 +330,7 @@ class KnownFrames:
         return guess / _differences_of_turned(misfit.shape, self.prepared)
 
     def misfit(self, models: Iterable[tuple[FloatArray, float]]) -> tuple[float, float, float]:
-        """Return explained part, rms part that neither models nor noise explain, and mean of misfit over noise.
-
-        ``models`` are the frames of a model, each with the variance of its known errors. Both are centred before
-        comparison.
-        """
+        """Return explained part, rms part that neither models nor noise explain, and mean of misfit over noise."""
         excess = energy = total = 0.0
         ratios = []
         for number, (each, (model, error)) in enumerate(zip(self.exposures, models, strict=True)):
@@ -374,7 +344,6 @@ class KnownFrames:
         return 1 - total / energy, float(np.sqrt(max(excess, 0.0) / energy)), float(np.mean(ratios))
 
     def warnings(self) -> Iterator[str]:
-        """Return a warning if runs are saturated."""
         if self.saturated:
             yield (
                 f"saturation: {len(self.saturated)} runs have readings at the full well or the ADC's end, first "
@@ -415,7 +384,6 @@ def _picture(captures: KnownCaptures, capture: KnownCapture) -> FloatArray:
 
 
 def _plane(captures: KnownCaptures, capture: KnownCapture, picture: FloatArray, line: str) -> FloatArray:
-    """Return the light of a ``picture`` that a plane of the sensor sees."""
     problem = ""
     if captures.lines is not None and line not in PLANES:
         problem = (
@@ -439,27 +407,17 @@ def _plane(captures: KnownCaptures, capture: KnownCapture, picture: FloatArray, 
 # ---- An aged calibration ---------------------------------------------------------------------------------------------
 
 _KNOTS = 4
-"""Knots of the spline for each sensor pixel."""
 _STIFFNESS = 1e-3
-"""Weight of squared third differences of the spline's coefficients over that of a number of the factor."""
 _WAY_ERROR = 0.02
-"""Tolerance of the shadow's way s n over the whole scene [pixels]."""
 _PASSES, _MOVED = 20, 0.05
-"""Largest number of Gauss-Newton steps, and the last step's largest size in standard errors."""
 _HALVINGS = 8
-"""Largest number of halvings of a step that increases the misfit."""
 _REACH = 8
-"""The shadow is sought within one part in so many of the sensor."""
 _STARTED = 4
-"""Largest number of frames that start the search."""
 _CLEARER = 1.5
-"""Ratio of residuals above which another orientation of the pictures is certain."""
 _MASK = "mask_rows_um", "mask_columns_um", "mask_axis_um"
-"""Names of the mask's displacements in results [um]."""
 
 
 def _move_factors(captures: KnownCaptures, folder: Path, job: Job) -> dict[str, Factors]:
-    """Return the factors of an aged calibration in a ``folder``, moved until frames of known pictures fit, by plane."""
     listed = captures.listed
     for name in ("orientation", "scale", "terms"):
         if getattr(listed, name) is not None:
@@ -537,7 +495,6 @@ def _move_factors(captures: KnownCaptures, folder: Path, job: Job) -> dict[str, 
 
 
 def moved_in_words(numbers: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the ``numbers`` of a mended calibration in a line."""
     return ", ".join(
         f"{name.replace('_um', '').replace('_', ' ')} {each['value']:.4g} +-{each['standard_error']:.2g}"
         + (f" {each['unit']}" if each["unit"] != "1" else "")
@@ -546,8 +503,6 @@ def moved_in_words(numbers: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 class _Shadow:
-    """A ``factor`` as the shadow of one mask, which moves by ``scale`` sensor pixels from column to column."""
-
     def __init__(self, factor: FloatArray, scale: float) -> None:
         self.factor, self.scale = factor, scale
         rows, count = factor.shape
@@ -570,7 +525,6 @@ class _Shadow:
 
     @classmethod
     def find_scale(cls, factor: FloatArray, name: str) -> float:
-        """Return the scale at which a ``factor`` is a shadow; MitsimError if it is none."""
         count, first = factor.shape[1], -shadow_step(factor)
         if abs(first) * count < 1:
             raise MitsimError(
@@ -593,8 +547,6 @@ class _Shadow:
 
 
 class _MovedSide(NamedTuple):
-    """Factor (m, n) of a side, as frames show it, its slopes (3, m, n) by the move, and where the shadow is known."""
-
     factor: FloatArray
     seen: FloatArray
     slopes: FloatArray
@@ -622,7 +574,6 @@ class _AgedCamera:
             self._ratio = parallax.mask_distance_mm / (parallax.depth_mm - parallax.mask_distance_mm)
 
     def moved(self, line: str, move: FloatArray) -> list[_MovedSide]:
-        """Return both sides of a plane after a ``move``."""
         found = []
         for axis, shadow in enumerate(self._shadows[line]):
             rows, count = shadow.factor.shape
@@ -637,10 +588,7 @@ class _AgedCamera:
         return found
 
     def first_guess(self, name: str) -> FloatArray:
-        """Return the move, in whole pixels, and the gains that make frames most alike.
-
-        Raises MitsimError for a list (``name``) whose pictures lie otherwise than images by the calibration.
-        """
+        """Return the move, in whole pixels, and the gains that make frames most alike."""
         some = self._read.exposures[:: -(-len(self._read.exposures) // _STARTED)]
         still = {line: self.moved(line, np.zeros(3)) for line in self._factors}
         shape = some[0].frame.shape
@@ -671,7 +619,6 @@ class _AgedCamera:
 
     @single_threaded_blas()
     def fit(self, start: FloatArray) -> tuple[FloatArray, FloatArray, bool, float]:
-        """Return the fitted numbers, their covariance, whether the steps converged, and the unknown part of shadows."""
         exposures = self._read.exposures
         models = zip(exposures, self._models(start), strict=True)
         found = [self._read.noise(number, each.frame - model) for number, (each, (model, _)) in enumerate(models)]
@@ -699,11 +646,9 @@ class _AgedCamera:
         return at, covariance, converged and within, unknown
 
     def misfit(self, move: FloatArray) -> tuple[float, float, float]:
-        """Return :meth:`KnownFrames.misfit` after a ``move``, at the best gains."""
         return self._read.misfit(self._models(np.append(move, self._gains(move))))
 
     def numbers(self, at: FloatArray, covariance: FloatArray) -> dict[str, dict[str, Any]]:
-        """Return value, standard error and unit of each fitted number, and of the mask's displacements if known."""
         lights = [f"light {line}".strip() for line in self._factors]
         names = ["shadow_rows", "shadow_columns", "mask_distance", *lights]
         units, values, errors = ["pixels", "pixels", *["1"] * (1 + len(lights))], at, np.sqrt(np.diag(covariance))
@@ -725,7 +670,6 @@ class _AgedCamera:
         return [*fit_gains(exposures, models, [*self._factors]).values()]
 
     def _models(self, at: FloatArray) -> Iterator[tuple[FloatArray, float]]:
-        """Yield the frame of each exposure, and the variance of the factors' noise in it."""
         sides = {line: self.moved(line, at[:3]) for line in self._factors}
         gains = dict(zip(self._factors, at[3:].tolist(), strict=True))
         for each in self._read.exposures:
@@ -738,7 +682,6 @@ class _AgedCamera:
             yield gain * (left @ lit), error
 
     def _normal(self, at: FloatArray, variances: Sequence[float]) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Return normal matrix, right-hand side, covariance of the sides' errors, and the weighted misfit."""
         size, right, misfit = len(at), np.zeros(len(at)), 0.0
         matrix, systematic = np.zeros((size, size)), np.zeros((size, size))
         for number, (line, factors) in enumerate(self._factors.items()):

@@ -53,26 +53,17 @@ from mitsim.reconstruct.uncertainty import Propagation
 # ---- Defective pixels -----------------------------------------------------------------------------------------------
 
 _SPREADS = 7.0
-"""Standard deviations of noise, 1e-12 for a pixel, beyond which its residual's energy is no chance."""
 _AROUND, _CROWD = 3, 0.35
-"""Pixels to each side whose median energy is what a pixel's is compared with, and part of these 7 x 7 that are off at
-most: two dead lines side by side, or two that cross, are less than a third of them."""
+"""Pixels to each side that a pixel is compared with, and the largest part of these 7 x 7 that may be off."""
 _MOST, _LEAKS = 0.02, 0.1
-"""Part of the sensor that may be defective, because the scene does not fit where more is off; and part of the largest
-energy of a pixel that others may have by it: the square of what the fit takes from one reading for the next, 0.03 where
-the scene has 0.4 of the sensor's pixels a side."""
+"""Largest defective part of a sensor, and limit of a pixel's energy by a neighbour's reading: 0.03 at 0.4 of its side.
+"""
 _LEAST_VARIANCE, _MOST_VARIANCE = 1e-3, 4.0
-"""Part of the mean variance that a pixel's counts as at least, as one that reads nothing has none of light; and times
-the mean at most, as that of a hot one is not light's: frames are four times as bright at their brightest."""
 _ROUNDS, _PLACES_SHOWN = 8, 5
-"""Rounds in which defective readings are replaced: leverages are below 1/4 where the sensor has twice the scene's
-pixels a side, and 4^-8 of a reading is below noise. And places that a sentence names."""
 
 
 @dataclass(frozen=True, eq=False)
 class Defects:
-    """Defective pixels of a sensor, in ``rows`` and ``columns``, 1 or more."""
-
     rows: IndexArray
     columns: IndexArray
 
@@ -83,21 +74,16 @@ class Defects:
 
     @property
     def places(self) -> list[tuple[int, int]]:
-        """Row and column of each."""
         return list(zip(self.rows.tolist(), self.columns.tolist(), strict=True))
 
     def summary(self) -> dict[str, object]:
-        """Return the entry of result.json."""
         return {"count": len(self.rows), "first": self.places[:_PLACES_SHOWN]}
 
     def with_others(self, others: Defects | None) -> Defects:
-        """Return these defects and ``others``."""
         return Defects(*np.array(sorted({*self.places, *(others.places if others else ())}), dtype=np.intp).T)
 
 
 class LeftOut(DerivedCapture):
-    """The capture of ``data`` with other readings at ``defects``: those that all other readings predict."""
-
     def __init__(self, data: Accumulation, defects: Defects) -> None:
         super().__init__(data.shots)
         self._data, self._places = data, (defects.rows, defects.columns)
@@ -121,7 +107,6 @@ class LeftOut(DerivedCapture):
         self._total = prepared.frame(weights, whole)[self._places] if whole else np.zeros(len(defects.rows))
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """Yield the measurements of the capture, whose ``shape`` is known, with other readings at these places."""
         for each in self._data.measurements_again():
             frame, light = each.frame.copy(), each.light.copy()
             frame[self._places] += self._moved[each.row, each.column]
@@ -130,17 +115,7 @@ class LeftOut(DerivedCapture):
 
 
 def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defects | None:
-    """Return pixels that are off in all measurements of ``data``; None where there are none.
-
-    Parameters
-    ----------
-    data
-        the run.
-    squares
-        (m, m') sum of the squares of the residuals of each pixel.
-    ratio
-        measured over stated variance of the noise.
-    """
+    """Return pixels that are off in all measurements of ``data``, by their residuals ``squares`` (m, m'), or None."""
     noise, prepared, count = data.noise, data.prepared, data.noise.variance.size
     mean = noise.light / count
     variance = ratio * noise.of(mean, noise.shots)
@@ -153,15 +128,7 @@ def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defec
 
 
 def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects | None:
-    """Return pixels whose residual exceeds noise and that of their neighbours, or None where there are none.
-
-    Parameters
-    ----------
-    squares, variance
-        (rows, columns) energy that the model leaves of all measurements at each pixel, and that of their noise.
-    count
-        of the measurements.
-    """
+    """Return pixels whose residual exceeds noise and that of their neighbours, or None where there are none."""
     mean = float(variance.mean()) or 1.0
     ratio = squares / np.clip(variance, _LEAST_VARIANCE * mean, _MOST_VARIANCE * mean)
     limit, typical, most, width = _limit(count), (1 - 2 / (9 * count)) ** 3, float(ratio.max()), 2 * _AROUND + 1
@@ -187,20 +154,12 @@ def _limit(count: int) -> float:
 
 
 UNEXPLAINED = 3.5e-3
-"""Part of the measurements, rms, that a fitting scene may leave unexplained: prints leave up to 6e-4 (the shipped ones)
-and 3e-3 (edges under pixels of 7.5 mm); a sheet 2 mm off 400 leaves 4.2e-3 (16 dots) to 1.0e-2 (49)."""
+"""Part of the measurements, rms, that may be unexplained: prints leave up to 3e-3; 2 mm off 400 leaves 4.2e-3 or more.
+"""
 GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
-"""Unexplained part and chi-square of shot noise alone from which an image is flagged where no other noise is stated:
-read noise of as many electrons makes 2."""
 _LAMBDA_BESIDE = 1e-3
-"""Lambda, over the largest sigma^2, of the image that frames are compared with if the method has no lambda of its
-own."""
 _SHOWN, _MOSTLY = 4, 0.5
-"""Faults that a sentence names, because result.json has all of them; and part of the unexplained energy in one place
-from which nothing else is blamed."""
 _IN_RANGE, _COMMON_IMAGE = 1e-6, 0.01
-"""Part of the energy of a common light below which it counts as lying in the model's range; and change of the image,
-rms, from which such a light is reported."""
 
 
 class Cause(Enum):
@@ -228,38 +187,22 @@ class Misfit:
 
     Attributes
     ----------
-    chi_square
-        energy of the residual over the expected energy; 1 where the model fits.
-    unexplained
-        square root of the energy beyond that and beyond what print within a pixel may add, relative to the
-        measurements; 0 where nothing is.
-    tiles
-        (rows, columns) the chi-square of each tile of the sensor.
-    worst_tile
-        largest unexplained part of a tile.
+    chi_square, unexplained
+        Energy of the residual over the expected energy; root of the excess beyond print, relative to the measurements.
+    tiles, worst_tile
+        (rows, columns) chi-square of each tile of the sensor, and the largest unexplained part of a tile.
     stated
-        whether the noise of sensor and calibration were stated; otherwise only gross misfit is flagged.
-    flagged, cause
-        whether something is off, and the measurement that found it.
-    noise
-        measured over stated noise; None of frames that are too small.
-    gain
-        gain that the camera file states [DN per electron].
+        Whether the noise of sensor and calibration were stated; otherwise only gross misfit is flagged.
+    noise, gain
+        Measured over stated noise, None of frames that are too small; and the stated gain [DN per electron].
     predicted
-        part that the calibration predicts of ``unexplained``, because its factors lack it; None where it does not know.
-    faults, places, readings
-        frames and places that do not fit, and readings of the data that restore the fit, the best first.
-    defects
-        pixels of the sensor whose readings were left out, or are to be; None: there are none.
+        Part that the calibration predicts of ``unexplained``, because its factors lack it; None if unknown.
     detail
-        part of the measurements, rms, that the frames show to be print finer than a scene pixel; no part of
-        ``unexplained``.
-    picture
-        result of the picture's check under shifting dots; None under other patterns.
+        Part of the measurements, rms, by print finer than a scene pixel; no part of ``unexplained``.
     common
-        relative change of the image, rms, by light that is the same in all frames.
+        Relative change of the image, rms, by light that is the same in all frames.
     limits
-        questions that the frames leave undecided.
+        Questions that the frames leave undecided.
     """
 
     chi_square: float
@@ -283,7 +226,6 @@ class Misfit:
 
     @property
     def gist(self) -> str:
-        """The misfit in a few words."""
         return f"chi-square {chi_square_text(self.chi_square)} a datum"
 
     def __str__(self) -> str:
@@ -294,7 +236,6 @@ class Misfit:
 
     @property
     def reason(self) -> str:
-        """The finding in words; empty where nothing is off."""
         words = self.cause.value[0] if self.cause else ""
         if self.cause is Cause.READING:
             words = f"the frames fit if {'; or if '.join(each.words for each in self.readings[:_SHOWN])}"
@@ -314,7 +255,6 @@ class Misfit:
         return words
 
     def summary(self) -> dict[str, Any]:
-        """Return the entry of result.json and of the command line's JSON."""
         measured = self.gain * self.noise.gain if self.gain and self.noise and self.noise.gain > 0 else None
         return {
             **{name: getattr(self, name) for name in ("chi_square", "unexplained", "worst_tile", "flagged", "detail")},
@@ -336,7 +276,6 @@ class Misfit:
         }
 
     def judge(self, status: Status) -> Status:
-        """Return the ``status`` of a solution with this misfit."""
         if self.cause is None:
             return status
         times = f", {chi_square_text(self.chi_square)} times what its noise makes" if self.stated else ""
@@ -353,7 +292,6 @@ class Misfit:
 
 
 def chi_square_text(chi_square: float) -> str:
-    """Format a ``chi_square``: fitting images differ in the third decimal, others by orders of magnitude."""
     return f"{chi_square:.3f}" if chi_square < 10 else f"{chi_square:.3g}"
 
 
@@ -361,17 +299,7 @@ def chi_square_text(chi_square: float) -> str:
 
 
 def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = True) -> Misfit | None:
-    """Compare all measurements of accumulated ``data`` with the model; None where there are no more data than unknowns.
-
-    Parameters
-    ----------
-    data
-        whose frames are read again if they were not kept.
-    solution
-        the image, for the energy that print and the factors' noise add to the frames.
-    with_defects
-        whether defective pixels are looked for.
-    """
+    """Compare all measurements with the model; return None where there are no more data than unknowns."""
     prepared, noise, image = data.prepared, data.noise, solution.image
     if prepared.spare <= 0:
         return None
@@ -421,15 +349,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
 
 
 def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:
-    """Return frames at fault of a scene of several depths, of which the model fits a part.
-
-    Parameters
-    ----------
-    data
-        added up at the depth of most of the scene.
-    image, lam
-        (n, n') with a depth for each pixel, and its lambda.
-    """
+    """Return frames at fault of a scene of several depths, of which the model fits a part."""
     beside = data.noise.rendering + (data.factor_energy(image) or 0.0) + print_energy(data.model, image)
     return FrameCheck(data, Residuals(data), lam, 1.0, beside).faults()
 
@@ -437,11 +357,9 @@ def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[Fr
 def _common_light(data: Accumulation, sums: Residuals, stated: float, beside: float) -> FloatArray | None:
     """Return the light (m, m') that is the same in all measurements; None if chance or factor errors explain it.
 
-    It must have more energy than the factors' errors (``beside``), which are common to all frames, and most of the
-    residual beyond that of the ``stated`` noise and of these errors.
-
-    The light is even, as of a black level that is wrong, or that of an even scene, as of a lamp in the room. The sum of
-    all residuals has it times the energy K |F|^2 less that in the model's range.
+    It must have more energy than the factors' errors, which are common to all frames, and most of the residual beyond
+    them and the ``stated`` noise. The light is even (a wrong black level), or that of an even scene (a lamp in the
+    room).
     """
     prepared, count = data.prepared, data.noise.variance.size
     if data.noise.shots == 2 or count < 2:
@@ -464,7 +382,6 @@ def _common_light(data: Accumulation, sums: Residuals, stated: float, beside: fl
 
 
 def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -> float:
-    """Return the energy of print finer than a scene pixel, as the frames show it."""
     lit = LitFrames(data.factors.sides, data.shots.patterns)
     for each in data.measurements_again():
         variance = float(data.noise.of(float(data.noise.means[each.row, each.column]), each.shots))
@@ -478,20 +395,7 @@ def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -
 def weigh(
     energies: tuple[FloatArray, ...], factors_stated: bool, noise: FrameNoise, print_energy: float
 ) -> tuple[Misfit, float]:
-    """Return the misfit, without its cause, and the energy that is unexplained.
-
-    Parameters
-    ----------
-    energies
-        four arrays (rows, columns) by tile of the sensor, or of all of it: energy that a model leaves, of the
-        measurements, and that is expected to be left, and the pixels.
-    factors_stated
-        whether the noise of the factors was stated.
-    noise
-        of the measurements.
-    print_energy
-        energy that print within a pixel may add.
-    """
+    """Return the misfit, without its cause, and the energy that is unexplained."""
     residual, energy, expected, pixels = energies
     beyond = residual - expected - print_energy * pixels / pixels.sum()
     excess = float(beyond.sum())

@@ -63,22 +63,15 @@ Array = npt.NDArray[Any]
 _MU = 10.0
 """mu over the mean of |H|^2."""
 _COARSE_STEPS, _LEAST_SIDE = 60, 32
-"""Steps at each of the smaller sizes, and least side of these."""
 _SMOOTH = 1e-3
-"""Slope below which TV is quadratic, over the image's largest number."""
 _FIRST_SMOOTH, _SHARPENED = 10.0, 0.3
-"""Smoothing slope of the first pass over the final one, and ratio between passes: without it large weights take five
-times as many steps."""
+"""Smoothing slope of the first pass, and its ratio between passes; large weights otherwise need five times the steps.
+"""
 _PASS, _PASS_UNBOUND = 6, 12
-"""Steps of a pass, with bounds and without."""
 _TIGHTENED = 2
-"""Steps of conjugate gradients for the d of the gap."""
 _NOTHING = 1e-300
-"""Divisor in place of a zero."""
 _FEWEST = 1e-12
-"""Shortest part of a pass."""
 _HUGE = 1e30
-"""Inverse of the least distance to a bound."""
 
 
 # ---- The camera ------------------------------------------------------------------------------------------------------
@@ -86,28 +79,12 @@ _HUGE = 1e30
 
 @dataclass(eq=False)
 class ShiftedLight:
-    """Camera whose scene points all cast one pattern of light.
+    """Camera whose scene points all cast one pattern of light ``psf`` (k, k').
 
-    Attributes
-    ----------
-    psf : (k, k') array
-        Light of one scene pixel, in sensor pixels.
-    sensor
-        Rows and columns (m, m') of the sensor.
-    patterns
-        P_L (n, K) and P_R (n', K'); None: uniform light of all that reaches the sensor.
-    precision
-        Type of all numbers.
-    seen : (m, m') array
-        1 for pixels that count, 0 for those that are held out; None: all count.
-    scene, whole, origin
-        Rows and columns of the scene, those that light reaches, and the first of these on the sensor.
-    window
-        Part of the scene that is the image.
-    count
-        Number of frames.
-    grid
-        Rows and columns of transforms; light that wraps round lands beside the sensor.
+    ``patterns`` are P_L (n, K) and P_R (n', K'), or None for uniform light of all that reaches the sensor. ``seen``
+    (m, m') is 1 for pixels that count, 0 for held-out ones. ``scene``, ``whole`` and ``origin`` are the scene's size,
+    that of its light, and the first lit pixel on the sensor; ``window`` is the part of the scene that is the image.
+    ``grid`` is the size of transforms, such that light that wraps round lands beside the sensor.
     """
 
     psf: FloatArray
@@ -158,7 +135,6 @@ class ShiftedLight:
         return cls(psf, sensor or (rows, columns), (np.ones((n, 1)), np.ones((n, 1))))
 
     def under(self, family: PatternFamily) -> ShiftedLight:
-        """Return the same camera under the patterns of a ``family``."""
         if (family.n, family.n) != self.scene:
             raise MitsimError(
                 f"patterns of {family.n} pixels a side for a scene of {self.scene[0]}; both need the same"
@@ -166,7 +142,6 @@ class ShiftedLight:
         return replace(self, patterns=(family.left.astype(np.float64), family.right.astype(np.float64)))
 
     def check_frames(self, frames: Array) -> None:
-        """Raise MitsimError unless ``frames`` fit the patterns and the sensor and are finite."""
         if frames.shape != (self.count, *self.sensor) or not np.isfinite(frames).all():
             raise MitsimError(
                 f"frames of shape {frames.shape}: give {self.count} of {self.sensor[0]} x {self.sensor[1]} finite "
@@ -203,7 +178,6 @@ class ShiftedLight:
         return None if small or self.patterns is not None or self.seen is not None else self.reduce(2)
 
     def reduce(self, factor: int) -> ShiftedLight:
-        """Return the camera with pixels ``factor`` times as large."""
         rows, columns = (size // factor for size in self.sensor)
         return replace(self, psf=factor**2 * reduce_frame(self.psf, factor), sensor=(rows, columns))
 
@@ -224,7 +198,6 @@ class ShiftedLight:
 
     @property
     def column_power(self) -> float:
-        """Mean square of the light of one scene pixel in all frames, without the crop."""
         power = float(np.square(self.psf).sum())
         if self.patterns is None:
             return power
@@ -233,7 +206,6 @@ class ShiftedLight:
 
     @cached_property
     def spectrum(self) -> Array:
-        """Spectrum of h on the grid."""
         return np.asarray(fft.rfft2(self.psf.astype(self.precision), self.grid))
 
     @property
@@ -245,7 +217,6 @@ class ShiftedLight:
 
 
 def reduce_frame(frame: Array, reduce: int) -> Array:
-    """Return means of ``reduce`` x ``reduce`` numbers of a ``frame``, without the remaining rows and columns."""
     rows, columns = (size // reduce for size in frame.shape)
     blocks = frame[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce)
     return np.asarray(blocks.mean(axis=(1, 3)), frame.dtype)
@@ -275,7 +246,6 @@ class _State:
 
     @cached_property
     def smoothed(self) -> float:
-        """Objective whose TV is quadratic where slopes are small."""
         if not self.prior.weight:
             return self.objective
         low = np.minimum(self._slopes, self.smooth)
@@ -291,7 +261,6 @@ class _State:
         return self.light.correlate(self.residual) + self.bend(self.image)
 
     def bend(self, direction: Array) -> Array:
-        """Return the second derivative of ridge and the quadratic TV at X, times a ``direction``."""
         bent = self.prior.ridge * direction
         if self.prior.weight:
             bent += slopes_adjoint(slopes_of(direction) * self._stiffness)
@@ -324,7 +293,6 @@ class _State:
         return np.asarray(1 / total, light.precision)
 
     def divide(self, image: Array) -> Array:
-        """Return the approximate inverse of the second derivative times an ``image``, by a Fourier transform."""
         if self.light.patterns is not None:
             return image
         rows, columns = image.shape
@@ -398,20 +366,10 @@ def _dot(first: Array, second: Array) -> float:
 
 
 class Minimum(NamedTuple):
-    """Image near the minimum.
+    """Image near the minimum: the whole scene (n, n'), and the steps at full size.
 
-    Attributes
-    ----------
-    image : (n, n') array
-        The whole scene.
-    iterations
-        Steps at full size.
-    objective
-        P of the image.
-    fall
-        Relative fall of the objective in the last half of the steps, or promised by the last pass if that is more.
-    gap
-        Bound of the objective's excess over its minimum, over the objective.
+    ``fall`` is the relative fall of the objective in the last half of the steps, or the promise of the last pass if
+    larger; ``gap`` bounds the objective's excess over its minimum, over the objective.
     """
 
     image: Array
@@ -500,33 +458,21 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
 # ---- The weight of the prior, and the misfit -------------------------------------------------------------------------
 
 RIDGE, _WEIGHT = 50.0, 1.2
-"""Automatic lambda over the mean square of a scene pixel's light, by a frame's relative error; and automatic weight of
-TV in units of the error of the data term's gradient. Chosen on photographs."""
+"""Lambda over the mean square of a pixel's light, by relative error; TV's weight in units of the gradient's error."""
 _CLEARLY = 2.0
-"""Ratio of the error by held-out pixels to the measured noise above which the model is wrong."""
 _SIDE, _STEPS = 128, 60
-"""Least side of reduced frames, and steps for held-out pixels."""
 _BLOCKS, _KEPT = 12, 8
-"""Blocks along the shorter side, of which one in eight is held out."""
 _HALVES = range(-16, 7)
-"""Tried weights in half decades."""
 _TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
 _MODEL_ERROR, _ROUGH, _LEFT = 0.01, (3.0, 0.3), 4.0
-"""Least relative error of a model; TV's two weights in a comparison; and the chi-square above which the second one is
-used.
-"""
+"""Least relative error of a model; TV's two weights; chi-square above which the second one is used."""
 _ALIKE = 0.9
-"""Correlation above which light equals its turned copy."""
 _BETTER, _EQUAL = 0.85, 0.98
-"""Cost ratio of the best turned copy to the light as given: below the first the copy is recommended, below the second
-the light is wrong even if noise explains the frames."""
+"""Cost ratios of the best turned copy below which it is recommended, and below which the light is wrong."""
 _LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
-"""Least cost ratio of right light: the first times chi-square to the power of the second. Below the last chi-square
-noise explains the frames."""
+"""Least cost ratio of right light: the first times chi-square to the second; noise explains frames below the last."""
 _OFF = 1 / 8
-"""Flagged distance of the light's mean from the middle of the picture, over its side."""
 _GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
-"""Part of the frames, rms, and chi-square, above which a fit is flagged without a comparison."""
 
 
 def frame_noise(frame: Array) -> float:
@@ -552,7 +498,7 @@ def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, in
 def frame_error(light: ShiftedLight, frames: Array) -> float:
     """Return the deviation of ``frames`` (K K', m, m') from the light that a model explains.
 
-    This is their noise or, under uniform light, the noise whose ridge predicts held-out pixels best, if clearly more.
+    It is their noise or, under uniform light, the noise whose ridge predicts held-out pixels best, if clearly more.
     """
     mean = float(frames.mean())
     if mean <= 0:
@@ -600,20 +546,10 @@ def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Lite
 class PointSpreadFit:
     """Fit of frames to a point spread function.
 
-    Attributes
-    ----------
-    chi_square, unexplained
-        Residual energy over that of noise, and residual beyond noise, rms, over the frames.
-    stated
-        Whether the sensor states its noise; otherwise it is measured from the frames.
-    gain
-        Cost of the best turned or mirrored copy over the cost of the light as given; None where all copies are alike.
-    reading
-        Orientation of that copy.
-    off
-        Rows and columns from the middle of the picture to the light's centre.
-    size
-        Rows and columns of the picture.
+    ``unexplained`` is the residual beyond noise, rms, over the frames. ``gain`` is the cost of the best turned or
+    mirrored copy (``reading``) over that of the light as given, None where all are alike. ``off`` is the distance
+    [rows, columns] from the middle of the picture to the light's centre. Noise that is not ``stated`` was measured
+    from the frames.
     """
 
     chi_square: float
@@ -626,7 +562,6 @@ class PointSpreadFit:
 
     @property
     def fault(self) -> tuple[str, str]:
-        """Sentence and remedy; empty for a good fit."""
         left = (
             f"{self.unexplained:.1%} of the frames is left unexplained, {self.chi_square:.3g} times the noise's energy"
         )
@@ -649,7 +584,6 @@ class PointSpreadFit:
 
     @property
     def gist(self) -> str:
-        """Misfit in a few words."""
         return f"{self.unexplained:.1%} unexplained"
 
     def __str__(self) -> str:
@@ -658,7 +592,6 @@ class PointSpreadFit:
         return f"misfit: {self.unexplained:.1e} unexplained, chi-square {self.chi_square:.3g} against {noise}{cost}"
 
     def summary(self) -> dict[str, Any]:
-        """Return the misfit's entries of result.json."""
         sentence, _ = self.fault
         return {
             "chi_square": self.chi_square,
@@ -671,7 +604,6 @@ class PointSpreadFit:
         }
 
     def judge(self, status: Status) -> Status:
-        """Return the ``status`` of a solution with this misfit."""
         sentence, remedy = self.fault
         if not sentence:
             return status

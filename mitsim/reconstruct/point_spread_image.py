@@ -24,7 +24,6 @@ from mitsim.reconstruct.solver import check_lambda
 from mitsim.reconstruct.solvers import Prior
 
 _NUMBERS = 24
-"""Single-precision numbers in memory for each of a grid and of all frames."""
 
 
 # ---- The image -------------------------------------------------------------------------------------------------------
@@ -39,19 +38,7 @@ def solve_point_spread(
     iterations: int = 300,
     tolerance: float = 0.02,
 ) -> Solution:
-    """Return the image of all frames (K K', m, m').
-
-    Parameters
-    ----------
-    method
-        ``tikhonov``, ``nonnegative`` or ``tv``.
-    lam
-        Lambda, or the weight of ``tv``; "auto": :func:`mitsim.reconstruct.point_spread.automatic_prior`.
-    bounds
-        Least and largest number; None: any for ``tikhonov``, otherwise 0 and inf.
-    iterations, tolerance
-        See :func:`mitsim.reconstruct.point_spread.minimise`.
-    """
+    """Return the image of all frames (K K', m, m')."""
     light.check_frames(frames)
     if iterations < 1:
         raise MitsimError(f"iterations are {iterations}; give at least 1")
@@ -134,7 +121,6 @@ def reconstruct_psf(
 def reconstruct_psf_request(
     shots: Capture, psf: Path | str | FloatArray, reduce: int, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
-    """Recover the image of a request, see :func:`reconstruct_psf`."""
     request.check_point_spread(reduce)
     clock = (job or Job()).apart("").clock
     with clock.stage("read"):
@@ -170,7 +156,6 @@ def reconstruct_psf_request(
 
 
 def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:
-    """Return the inputs of an image: fingerprints of the ``shots`` and of the ``psf``, and the request."""
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
     asked = {
         "run": shots.fingerprint,

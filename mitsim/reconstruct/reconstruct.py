@@ -50,11 +50,8 @@ if TYPE_CHECKING:
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
 _INCOMPLETE = "incomplete"
-"""Status in result.json while files are being written."""
 MADE_OF = "made_of"
-"""Key of the folders that an image was made of."""
 POINT_SPREAD = "psf"
-"""Key of the fingerprint of a point spread function among an image's inputs."""
 
 
 @checked_fields
@@ -184,7 +181,6 @@ class Reconstruction(Solution):
 
     @check_arguments
     def write(self, folder: Path | str, more: Mapping[str, Any] | None = None) -> Path:
-        """Write the files to a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         _check_stored(more)
         folder = Path(folder)
         remove_page(folder)
@@ -271,7 +267,6 @@ def read_result(folder: Path) -> dict[str, Any]:
 
 
 def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | float]) -> None:
-    """Raise MitsimError if the image in a ``folder``, whose JSON is ``head``, is of other inputs than ``asked``."""
     earlier = head.get("inputs") if isinstance(head, dict) else None
     earlier = earlier if isinstance(earlier, dict) else {}
     changed = [name for name in {**asked, **earlier} if earlier.get(name) != asked.get(name)]
@@ -285,9 +280,7 @@ def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | floa
 # ---- From shots and factors to an image ------------------------------------------------------------------------------
 
 _DEFECT_ROUNDS = 6
-"""Largest number of searches for defective pixels, because dim ones show when bright ones are left out."""
 _BETTER = 0.5
-"""Part of the unexplained residual that frames without defective pixels may leave."""
 
 
 @takes(ImageRequest)
@@ -327,7 +320,6 @@ def reconstruct(
 def reconstruct_request(
     shots: Capture, factors: Factors, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
-    """Recover the image of a request, see :func:`reconstruct`; the ``job`` gives clock and progress."""
     asked, lam, doubts = request.inputs(shots, factors), request.lam, list[str]()
     shots, factors, solver = check_image(shots, factors, request)
     # Depths that are looked for, and total variation, take as long as the data ask for.
@@ -397,7 +389,6 @@ def reconstruct_request(
 
 
 def check_image(shots: Capture, factors: Factors, request: ImageRequest) -> tuple[Capture, Factors, Solver]:
-    """Return shots, factors and solver of a request, or refuse it before a frame is read."""
     solver = SOLVERS[request.method] if isinstance(request.method, str) else request.method
     factors.check_fit(shots)
     if request.focus is not None:

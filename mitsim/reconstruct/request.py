@@ -17,26 +17,18 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
 TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
-"""Names of the methods in :data:`mitsim.reconstruct.solvers.SOLVERS`."""
 MODEL = ".pt"
-"""Ending of a trained network's file, which may replace the name of a method."""
 MOST_REDUCED = 1024
-"""Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
 _MOST = 1e100
-"""Largest number of a request: far beyond any lambda, depth or reflectance, and its square is finite."""
 Bounds = tuple[float, float]
-"""Least and largest number of an image; -inf and inf: any."""
 IMAGE_FILE, PICTURE_FILE, RESULT_FILE = "image.exr", "image.png", "result.json"
-"""Files of an image: its numbers, a picture for display, and its results."""
 
 
 def holds_image(folder: Path) -> bool:
-    """Return True if a ``folder`` contains an image, finished or not."""
     return (folder / IMAGE_FILE).is_file() or (folder / RESULT_FILE).is_file()
 
 
 def method_names() -> str:
-    """Return the methods of solving, as the help lists them."""
     notes = {MARKOV: f"{MARKOV} (neighbouring pixels alike: for noisy frames)"}
     return ", ".join([*(notes.get(name, name) for name in METHODS), f"or MODEL{MODEL}, a file of mitsim train"])
 
@@ -57,7 +49,6 @@ def _two(name: str, rule: str, low: float | None = None, high: float | None = No
 
 
 def _two_numbers(ends: Any) -> tuple[float, float] | None:
-    """Return two ``ends`` as a pair; MitsimError for anything but two numbers."""
     if ends is None:
         return None
     real = isinstance(ends, (tuple, list)) and [type(end) in (int, float) for end in ends] == [True, True]
@@ -106,7 +97,6 @@ class ImageRequest(Options):
     )
 
     def model_post_init(self, context: object) -> None:
-        """Refuse combinations of options by which no image is made."""
         lam: Any = self.lam
         focus: Any = self.focus
         if not isinstance(self.method, str) and not hasattr(self.method, "name"):
@@ -146,23 +136,19 @@ class ImageRequest(Options):
 
     @property
     def iterative(self) -> dict[str, Any]:
-        """Those of ``bounds`` and ``iterations`` that are given."""
         given = {"bounds": self.bounds, "iterations": self.iterations}
         return {name: value for name, value in given.items() if value is not None}
 
     @property
     def plain(self) -> dict[str, Any]:
-        """The iterative options as JSON holds them."""
         return {**self.iterative, **({} if self.bounds is None else {"bounds": plain_bounds(self.bounds)})}
 
     @property
     def name(self) -> str:
-        """Name of the method."""
         return str(self.method if isinstance(self.method, str) else self.method.name)
 
     @property
     def looks_for_depth(self) -> bool:
-        """True if depths are found from the frames."""
         return self.focus in ("auto", "map")
 
     def check_point_spread(self, reduce: int) -> None:
@@ -205,12 +191,10 @@ class ImageKeys(TypedDict, total=False):
 
 
 def plain_bounds(bounds: Bounds) -> list[float | None]:
-    """Return ``bounds`` for JSON, with None for an infinite end."""
     return [end if math.isfinite(end) else None for end in bounds]
 
 
 def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
-    """Return the ``parallax`` of a ``calibration``; MitsimError if it states none."""
     if parallax is None:
         raise MitsimError(
             f"calibration {calibration}: does not state its parallax, which focus and margin need; calibrate again, or "
@@ -220,7 +204,6 @@ def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
 
 
 def check_joint(lam: float | str) -> None:
-    """Refuse a lambda ``lam`` by which runs behind colour filters are not solved."""
     if lam != "auto" and (isinstance(lam, str) or not 0 < lam <= _MOST):
         raise ArgumentError("lam", f"{short_text(lam)}: behind colour filters give a finite number above 0, or auto")
 
@@ -230,20 +213,16 @@ def check_joint(lam: float | str) -> None:
 KEPT_NUMBERS = 1 << 24
 """Pixels of all measurements up to which they are kept for a second look: 64 of 512 x 512, at most 256 MiB."""
 BYTES_A_NUMBER = 32.0
-"""Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
+"""Memory for each number of the factors' slabs, with the copies that factorising makes."""
 _FRAMES, _KEPT = 16.0, 2.0
-"""Frames in double precision that are held at once: one as it is read (its file, channels, numbers, rates), its
-residual and squares, and sums that tell causes; and of each measurement that is kept."""
+"""Frames in double precision that are held at once, and of each measurement that is kept."""
 _BASE_BYTES = 1e8
-"""Memory of the solver's libraries, and of the tables of uncertainty."""
 _READ_S, _ADD_S, _JUDGE_S = 3.5e-8, 1.5e-8, 2e-8
-"""A pixel of a frame, on one processor: read and checked, added up, and held against the model."""
+"""Seconds for a pixel of a frame, on one processor: read, added up, and compared with the model."""
 _SHOT_S = 4e-3
-"""A shot of any size."""
 _PRODUCT_S = 6e-10
-"""A multiplication of an SVD, of which one of (m, c) takes m c^2: dozens."""
+"""Seconds for a multiplication of an SVD, of which one of (m, c) takes dozens times m c^2."""
 _PLAIN_S = 0.05
-"""Of any image of few pixels."""
 
 
 @dataclass(frozen=True)
@@ -281,15 +260,7 @@ def keeps_frames(shots: Capture, factors: Factors) -> bool:
 
 
 def slab_numbers(shots: Capture, factors: Factors, whole: bool = False) -> float:
-    """Return the count of numbers in the factors and in all slabs that they are factorised into.
-
-    Parameters
-    ----------
-    shots, factors
-        the patterns, and the camera.
-    whole
-        whether every pattern's slab has all coefficients, not those of the pixels that it lights alone.
-    """
+    """Return the count of numbers in the factors and in all slabs that they are factorised into."""
     sides = zip((factors.left, factors.right), shots.patterns, strict=True)
     return float(
         sum(

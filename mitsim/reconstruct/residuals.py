@@ -1,27 +1,23 @@
 """Residuals of all measurements against the factorised model, and the tests that need nothing else.
 
-Of data Y the model explains what lies in its range, H Y = U_L U_L^T Y U_R U_R^T, whatever the image. The residual e =
-Y - H Y therefore depends on no lambda. With noise of variance v in all data, its mean square at a datum is v (1 - h),
-h being the diagonal of H, which is a product of the two sides.
+The model explains the part H Y = U_L U_L^T Y U_R U_R^T of data Y, whatever the image, so that the residual e = Y - H Y
+depends on no lambda. With noise of variance v in all data, its mean square at a datum is v (1 - h), h being the
+diagonal of H.
 
-*Noise.* Second differences along rows and along columns hardly see what is smooth, such as light that the model lacks.
-Their mean square over 36 v, less the part that H takes, is the ratio of measured to stated noise. It is taken by tiles
-of single frames, of which the median is not moved by a few frames or places that are wrong. Numbers that were divided
-by a gain that is wrong by the factor rho have the noise rho (y + dark) + rho^2 read^2 at the light y, so that the
-slope of the noise over the light is rho times the stated one, whatever the read noise is.
+*Noise.* Second differences along rows and along columns hardly see smooth light that the model lacks. Their mean
+square over 36 v, less the part that H takes, is the ratio of measured to stated noise. The median over tiles of single
+frames ignores a few wrong frames or places. Numbers that were divided by a gain that is wrong by the factor rho have
+the noise rho (y + dark) + rho^2 read^2 at the light y, so that the slope of the noise over the light is rho times the
+stated one.
 
-*Map.* Energies by tile, row, column and pixel, of the first half of the shots less the second, and the sum of
-residuals of each pixel. Each is divided by its own robust scatter, so that a fault that is everywhere does not hide
-behind one that is in one place, and sensors of uneven response raise no alarm.
+*Map.* Energies by tile, row, column and pixel are each divided by their own robust scatter, so that a general fault
+does not hide a local one, and sensors of uneven response raise no alarm.
 
 *Other readings* of a run's frames are turned frames, shots in another order, numbers with a tone curve, and lag. Each
-reading is fitted by the same factorised model, on a part of the sensor that is large enough to decide. Its misfit is
-the energy of numbers that the model leaves, in the numbers as they were read: for light g(y) of numbers y, the model H
-g(y) is mapped back by the inverse of g. All misfits are therefore compared with the same noise.
-
-A reading is offered if it explains nearly all that the frames as they are leave unexplained. All readings that fit as
-well as the best one within noise are offered, because a symmetric camera cannot decide between them: with equal masks
-on both sides, transposed frames and shots of a loop over columns leave the same misfit.
+is fitted by the same model on a part of the sensor that is large enough to decide. Its misfit is the energy that the
+model leaves in the numbers as they were read: for light g(y) of numbers y, the model H g(y) is mapped back by the
+inverse of g, so that all misfits are compared with the same noise. All readings that fit as well as the best one
+within noise are offered, because a symmetric camera cannot decide between them.
 """
 
 from __future__ import annotations
@@ -45,19 +41,10 @@ from mitsim.reconstruct.solver import Prepared, prepare, robust_scatter
 # ---- Other readings of the data -------------------------------------------------------------------------------------
 
 _FITS, _AT_MOST = 0.05, 2e-2
-"""Part of the unexplained energy, and of the measurements, rms, that a reading may leave."""
 _FIT_ALIKE, _ROWS = 0.02, 4.0
-"""Relative difference of misfits up to which two readings fit alike; and sensor rows for each scene row, at least, of
-the part of the sensor that decides."""
 _EXPONENTS, _LAGS, _LINEAR, _NO_LAG = (0.3, 3.0), (0.0, 0.5), 0.05, 2e-3
-"""Ranges of the tone curve's exponent, and of the part of a frame that is left of the one before; and difference of an
-exponent's logarithm from zero, and lag, that are no readings of their own."""
 _LAMBDA, _NEGATIVE = 1e-3, 0.5
-"""Lambda, over the largest sigma^2, of the image whose mean is looked at; and the part of its largest mean by which an
-image is negative: noise of no picture that shows anything is as large."""
 _MULTIPLIED, _LEAST_MULTIPLIED = 0.15, 1.5
-"""Chi-square of multiplied numbers over their factor, and at least: their shot noise is that many times too large, and
-0.3 of it if the black level was multiplied, too."""
 
 _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "as they are": lambda frame: frame,
@@ -69,7 +56,6 @@ _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "turned by 90 degrees clockwise": lambda frame: np.rot90(frame),
     "transposed about the other diagonal": lambda frame: frame[::-1, ::-1].T,
 }
-"""States of frames, and the turns that bring them back."""
 _KEPT, _TAKEN = "as they are", ""
 _STEPS = {
     "late": "the frames are one step late: each shot shows the pattern of the shot before",
@@ -79,17 +65,13 @@ _STEPS = {
 
 @dataclass(frozen=True)
 class Reading:
-    """A reading of the data that restores the fit, and the part of the measurements, rms, that it ``left``.
-
-    ``order`` is an argument of `mitsim import --order`.
-    """
+    """A reading of the data that restores the fit, and the part of the measurements, rms, that it ``left``."""
 
     words: str
     left: float = 0.0
     order: str | None = None
 
     def summary(self) -> dict[str, object]:
-        """Return the entry of result.json."""
         return {"words": self.words, "order": self.order, "unexplained": self.left}
 
 
@@ -107,15 +89,7 @@ def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[IndexArra
 
 
 def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatArray) -> bool:
-    """Return True if pixels that are lit alike have a negative reflectance in the mean, where noise is averaged.
-
-    Parameters
-    ----------
-    prepared, weights
-        the model, and W (r, r') of all frames.
-    groups
-        of :func:`pixel_groups`.
-    """
+    """Return True if pixels that are lit alike have a negative reflectance in the mean, where noise is averaged."""
     sigma = prepared.sigma
     image = prepared.image(weights * sigma / (np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2 + TINY))
     means = np.array([[image[np.ix_(rows, columns)].mean() for columns in groups[1]] for rows in groups[0]])
@@ -125,14 +99,7 @@ def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatA
 def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Reading, ...]:
     """Return the readings that restore the fit of a run, the best first; empty if none does.
 
-    Parameters
-    ----------
-    data
-        the run.
-    ratio
-        measured over stated variance of the noise.
-    beside
-        energy of all measurements that rendering, calibration and print add.
+    ``beside`` is the energy of all measurements that rendering, calibration and print add.
     """
     run = _Part(data)
     if run.prepared.spare <= 0:
@@ -156,8 +123,6 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
 
 
 class _Part:
-    """A run's shots on a part of the sensor, with the model of this part."""
-
     def __init__(self, data: Accumulation) -> None:
         manifest = data.shots.manifest
         sides, patterns = (data.factors.left, data.factors.right), data.shots.patterns
@@ -183,7 +148,6 @@ class _Part:
         self.energy = self._weights(self.shots())[1]
 
     def moved(self, change: tuple[str, str]) -> Reading:
-        """Return the reading of a turn of the frames and an order of the shots, with the energy that it leaves."""
         turn, order = change
         parts = [] if turn == _KEPT else [f"the frames are {turn}"]
         parts += [] if order == _TAKEN else [_STEPS.get(order, f"the shots were taken in the order {order}")]
@@ -191,7 +155,6 @@ class _Part:
         return Reading(" and ".join(parts), self.misfit(self.shots(turn, order)), known)
 
     def curves(self) -> Iterator[Reading]:
-        """Yield the best tone curve and the best lag, each with the energy that it leaves."""
         shots = self.shots()
 
         def misfit_of_lag(part: float) -> float:
@@ -210,7 +173,6 @@ class _Part:
                 yield Reading(f"the sensor lags: each frame holds {best.x:.1%} of the frame before", float(best.fun))
 
     def shots(self, turn: str = _KEPT, order: str = _TAKEN) -> list[FloatArray]:
-        """Return this part of all shots, their frames brought back by a ``turn`` and taken in another ``order``."""
         frames = (_TURNS[turn](self._frames[index])[self._part] for index in self._orders[order])
         return [np.ascontiguousarray(frame, dtype=np.float64) for frame in frames]
 
@@ -255,26 +217,16 @@ class _Part:
 CHANCE = 6.0
 """Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
 TINY = 1e-300
-"""Replaces 0 in a denominator."""
 _TILES = 8
-"""Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
 _NOISE_TILE, _NOISE_TILES = 16, 1500
-"""Least pixels a side of a tile whose noise is measured, and tiles of all frames that are enough, to save time."""
 _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
-"""Relative differences of measured from stated noise, and of its slope where read noise is not stated, from which they
-are flagged, because published gains are good to some per cent; and the error up to which a slope counts as known."""
+"""Relative differences of noise, and of its slope, that are flagged, and the error up to which a slope is known."""
 _STRUCTURE, _CORRELATED = 0.5, (70 / 36) ** 2
-"""Energy of structure over that of noise up to which residuals count as white; and sum of the squared correlations of
-second differences, because they have so many times fewer degrees of freedom."""
+"""Energy of structure over noise up to which residuals are white; sum of squared correlations of second differences."""
 _PAIR_ROWS, _SAMPLE = 96, 20_000
-"""Sensor rows and columns, at least, by which the sums of pairs are compared, and numbers whose median and scatter
-stand for those of more, to save time."""
 _BRIGHT, _ALIKE = 50.0, 1e-3
-"""Energy of a half over that of its noise from which it is no black one, because it would be fitted to its own noise;
-and determinant of the products of a pair's halves, over the square of the larger, below which they are alike."""
+"""Energy of a half over its noise from which it is not black; relative determinant below which halves are alike."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
-"""Robust deviations from which a place stands out, and the part of the expected energy that its residual must
-exceed."""
 
 
 # ---- Findings ----
@@ -282,16 +234,7 @@ exceed."""
 
 @dataclass(frozen=True)
 class NoiseTest:
-    """Measured noise of the frames over the stated noise.
-
-    Attributes
-    ----------
-    ratio, error
-        measured variance over the stated one, and its standard error.
-    gain, gain_error
-        gain that the noise shows over the stated one: by its slope over the light where brightness differs enough, and
-        otherwise by the stated read noise.
-    """
+    """Measured noise of the frames over the stated noise, and the gain that it shows over the stated one."""
 
     ratio: float
     error: float
@@ -303,13 +246,6 @@ class NoiseTest:
 
         Energy and second differences must agree, because structure adds to the energy, and the error of rendering may
         be stated too large. Where read noise is not stated, only the slope over the light is compared.
-
-        Parameters
-        ----------
-        noise
-            as it is stated.
-        whole, stated, beside
-            energy of all residuals, of their stated noise, and of what calibration and rendering add.
         """
         if not noise.stated:
             return self.gain_error < _SLOPE_KNOWN and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error
@@ -325,8 +261,6 @@ class NoiseTest:
 
 
 class Place(NamedTuple):
-    """Part of the sensor or of the session where frames do not fit: its ``words``, and its unexplained ``energy``."""
-
     words: str
     energy: float
 
@@ -339,37 +273,28 @@ class Residuals:
 
     Attributes
     ----------
-    energy, residual
-        (tiles, tiles) sums of the squares of measurements and of residuals.
-    pixels
-        (tiles, tiles) pixels of each tile.
+    energy, residual, pixels
+        (tiles, tiles) sums of the squares of measurements and of residuals, and numbers of pixels.
     squares, total
         (m, m') sums of the squares of residuals of each sensor pixel, and of the residuals.
     leave_out
-        (K, K') e^T (I - H_kk)^-1 e of a pattern's residual e, the energy of its difference from the prediction of all
-        other patterns.
-    shots
-        (K, K') energy of a pattern's shots.
-    free
-        (K, K') data of a pattern that others predict too.
-    fitted
-        (K, K') product of a pattern's residual and of what the model has of it.
+        (K, K') e^T (I - H_kk)^-1 e of a pattern's residual e, its difference from the prediction of all others.
+    shots, free, fitted
+        (K, K') energy of shots, data that other patterns predict too, and product of residual and model.
     powers
-        by signed pattern, (2,) relative power of its first and second half beyond that of the other pairs, whose halves
-        add up to the same light, and the standard errors; infinite where a half is as good as black, or as the other.
+        By signed pattern, (2,) relative power of its halves beyond that of the other pairs, and the standard errors;
+        infinite where a half is as good as black, or as the other.
     rest, compared
-        (K, K') energy of the differences of these sums that no power of the halves explains, and number of its data.
+        (K, K') energy of the differences of these sums that no power explains, and number of its data.
     side
-        (K, K') correlation of that rest with the residual of the halves' difference: 1 if the first half is wrong, -1
-        if the second is.
+        (K, K') correlation of that rest with the residual: 1 if the first half is wrong, -1 if the second is.
     contrast
         (K, K') difference of the halves' light over their sum.
     same, clipped
-        row, column and sign of shots by a number that equal frames share, and readings at a shot's largest number.
+        Shots by a number that equal frames share, and readings at a shot's largest number.
     """
 
     def __init__(self, data: Accumulation, light: FloatArray | None = None) -> None:
-        """Read all measurements of ``data``, less a ``light`` (m, m') that was in every one of them."""
         prepared, self.noise = data.prepared, data.noise
         self._prepared, self._light = prepared, light
         self._sides = sides = prepared.left, prepared.right
@@ -444,7 +369,6 @@ class Residuals:
             self.contrast[pattern] = difference.sum() / max(float(total.sum()), TINY)
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
-        """Return (2, tiles) mean squares of second differences, and mean light, of tiles of one residual."""
         tiles = -(-_NOISE_TILES * _NOISE_TILE // (residual.shape[1] * self.noise.variance.size))
         first = max(len(residual) - tiles * _NOISE_TILE - 2, 0) // 2
         rows = slice(first, first + tiles * _NOISE_TILE + 2)
@@ -460,7 +384,6 @@ class Residuals:
 
     @cached_property
     def noise_test(self) -> NoiseTest | None:
-        """The measured noise; None of frames that are too small."""
         found, light = np.concatenate(self._noises, axis=1)
         if not found.any():
             return None
@@ -484,15 +407,6 @@ class Residuals:
         return NoiseTest(ratio, error, gain, error if self.noise.stated else float("inf"))
 
     def expected_energy(self, ratio: float, beside: float) -> FloatArray:
-        """Return (tiles, tiles) the energy that residuals should have.
-
-        Parameters
-        ----------
-        ratio
-            measured over stated variance of the noise.
-        beside
-            energy that the factors' noise adds, evenly.
-        """
         rendering = self.noise.rendering * self.energy / max(float(self.energy.sum()), TINY)
         # The variance is linear in the light, so that the mean light of a tile has the mean variance of the tile.
         count = self.noise.variance.size
@@ -501,10 +415,7 @@ class Residuals:
         return np.asarray(noise + rendering + beside * self.pixels / self.pixels.sum())
 
     def places(self, ratio: float) -> list[Place]:
-        """Return tiles, rows, columns and pixels that fit worse than the rest of the sensor, the worst first.
-
-        ``ratio`` is that of measured to stated noise.
-        """
+        """Return tiles, rows, columns and pixels that fit worse than the rest of the sensor, the worst first."""
         count = self.noise.variance.size
         taken = [sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in self._sides]
         freedom = np.maximum(count - np.outer(*taken), 1e-3)
@@ -542,13 +453,11 @@ def noise_chance(noise: FrameNoise, pixels: float) -> float:
 
 
 def _deviations(values: FloatArray) -> FloatArray:
-    """Return the ``values`` less their median over their robust scatter, which counts as one at least."""
     some = values.ravel()[:: max(values.size // _SAMPLE, 1)]
     return np.asarray((values - np.median(some)) / max(robust_scatter(some), 1.0))
 
 
 def _words(name: str, beyond: FloatArray) -> str:
-    """Return where the energy ``beyond`` is: by rows and columns of the sensor, or tiles of it."""
     spans = [" to ".join(dict.fromkeys((str(each.min()), str(each.max())))) for each in np.nonzero(beyond)]
     if beyond.ndim == 1:
         return f"sensor {name} {spans[0]}"

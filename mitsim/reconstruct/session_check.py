@@ -1,26 +1,22 @@
 """Check of a calibration session by measurement, and the error that its faults leave in the factors.
 
 Three redundancies hold for every good session. The two frames of a pair add up to one frame for all patterns. The
-responses of one side are the shadow of one mask that moves (below). Both sides share the lamp and the time.
-
-Therefore the sum s_k of each pair, projected on the common vector as its response u_k is, is fitted over the sensor's
-rows (or columns) y and in time::
+responses of one side are the shadow of one moving mask. Both sides share the lamp and the time. Therefore the sum s_k
+of each pair, projected on the common vector as its response u_k is, is fitted over the sensor's rows (or columns) y
+and in time::
 
     s_k = s + c_k u + d_k u_k + l u_(k-1) + m_k u' + a_k + b_k y
 
 with s the side's usual sum and u the response to uniform light. c is the lamp's power, d the unequal power of the two
-frames, l the lag, m the camera's motion in pixels, and a, b the ambient light. Light that this projection does not
-show changes no factor. The change of ambient light within a pair is measured in the response, across the common
-vector. Only three acts change the factors: the sign of a response is turned, one frame of a pair replaces both, and
-responses are divided by the lamp's power. Each is accepted if the moving shadow, estimated afterwards, agrees. Every
-other fault is refused or counts in the stated error.
+frames, l the lag, m the camera's motion in pixels, and a, b the ambient light. Only three repairs change the factors:
+the sign of a response is turned, one frame of a pair replaces both, and responses are divided by the lamp's power.
+Each is accepted if the moving shadow, estimated afterwards, agrees. Every other fault is refused or counts in the
+stated error.
 
-*The moving shadow.* Column j of a factor is the mask's shadow from scene line j, and column j + 1 is column j moved by
-``step`` pixels. At each spatial frequency the columns are therefore a phase that grows with j, times an amplitude that
-varies slowly from line to line (falloff, obliquity): a polynomial of j. Detail finer than the pixels appears at
-another frequency, and moves at the step of its own. The part of the columns outside these modes is zero but for noise,
-so that each pattern's vector u_i = Phi h_i can be compared with the vectors of all others. The comparison needs the
-motion, because the sine and the cosine of one period are as alike if the shadow moves the other way.
+*The moving shadow.* Column j + 1 of a factor is column j moved by ``step`` pixels. At each spatial frequency the
+columns are therefore a phase that grows with j, times an amplitude that varies slowly (falloff, obliquity): a
+polynomial of j. Detail finer than the pixels is aliased and moves at a step of its own. The part of the columns
+outside these modes is zero but for noise, so that each pattern's vector u_i = Phi h_i can be compared with all others.
 """
 
 from __future__ import annotations
@@ -40,29 +36,19 @@ from mitsim.reconstruct.solver import robust_scatter
 # ---- The moving shadow ----------------------------------------------------------------------------------------------
 
 _MOVES = (0, -1), (1, -1), (-1, -1), (2, -1)
-"""Turns and sign of the frequencies that pixels show as k in [0, pi]: itself, 2 pi - k, whose phase is mirrored,
-2 pi + k and 4 pi - k. Without them the finest stripes, of masks of two pixels a feature, seem to move the other way."""
+"""Turns and sign of the frequencies that pixels alias to k in [0, pi]; masks of two pixels a feature need them."""
 _DEGREE = 3
-"""Degree of the polynomial, where there are lines enough: falloff and obliquity of 120 mm at 400 mm are even and
-smooth."""
+"""Degree of the polynomial: falloff and obliquity are even and smooth."""
 _LINES = 8
-"""Scene lines for each number of a polynomial, at least: three polynomials leave most lines to predict with."""
 _FREQUENCIES = 64
-"""Spatial frequencies that are compared, evenly chosen: more show the same, and cost time."""
 _FARTHEST = 0.6
-"""Part of the sensor that the shadow moves by at most, from the first scene line to the last: more leaves little that
-both show."""
+"""Largest part of the sensor that the shadow may move by, from the first scene line to the last."""
 _ENOUGH = 16, 40
-"""Patterns, and sensor rows, from which their shadows are compared."""
 _PREDICTED = 0.15
-"""Squared deviation of a pattern, as a part of its own square, that a tenth of the patterns must not exceed: it is 0.03
-with three exchanged pairs of 32, and 0.3 where a shadow of 16 lines moves by two pixels a line and predicts nothing."""
+"""Limit of the relative squared deviation of a tenth of the patterns: 0.03 with three exchanged pairs of 32."""
 _KNOWN = 0.1
-"""Part of a column beyond the modes from which the others predict it: at the ends of few lines it is less."""
 _ROUNDING = 1e-12
-"""Squared deviation, as a part of the vectors' mean square, that vectors without noise have."""
 _FITS = 3
-"""Times that unknown patterns are fitted one after the other: they hardly depend on each other."""
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -72,29 +58,24 @@ class MovingShadow:
 
     Parameters
     ----------
-    vectors
-        (m, N) u_i.
-    signs
-        (n, N) H.
+    vectors, signs
+        (m, N) u_i, and (n, N) H.
     unknown
-        patterns whose vectors do not count: the vectors that fit the others best replace them.
+        Patterns whose vectors are replaced by those that fit the others best.
 
     Attributes
     ----------
-    deviations
-        (N,) mean squared deviation of a vector from the predicted one, in units of the median pattern's.
-    unlike
-        (N,) the same squared deviation as a part of the vector's own square.
+    deviations, unlike
+        (N,) mean squared deviation from the prediction, in units of the median pattern's, and over the vector's square.
     shares, sure
         (N,) part of its vector by which each pattern disagrees, and the same in standard errors: 0 if it is right, 2 if
-        its sign is wrong, 1 if it has nothing in common with the predicted vector.
+        its sign is wrong, 1 if it has nothing in common with the prediction.
     by_turning
-        (N,) decrease of all patterns' squared deviations if the sign of one is turned, in the same units.
+        (N,) decrease of all deviations if the sign of one pattern is turned.
     predicts
-        whether patterns are predicted: few lines, whose shadows have little in common, predict nothing.
+        Whether patterns are predicted; the shadows of few lines have little in common.
     lines
-        (n,) squared deviation of each column from what the others predict, in units of the mean square of columns: 1
-        for a column that is missing, 0 where the others predict nothing.
+        (n,) squared deviation of each column from the prediction, over the mean square of columns.
     """
 
     def __init__(self, vectors: FloatArray, signs: FloatArray, unknown: Sequence[int] = ()) -> None:
@@ -129,7 +110,6 @@ class MovingShadow:
         self.lines = lines * (kept.mean(axis=0) > _KNOWN)
 
     def along(self, shapes: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Return (N,) the sizes of the ``shapes`` (frequencies, N) in the deviations, and their variances."""
         size = np.maximum((np.square(np.abs(shapes)) * self._own).sum(axis=0), 1e-300)
         # The deviation at each frequency is complex: half of its noise is along the shape.
         return np.real(shapes.conj() * self._left).sum(axis=0) / size, self._unit / len(self._own) / 2 / size
@@ -139,20 +119,17 @@ class MovingShadow:
         return self.along(self._spectra + self._spectra[:, :1])
 
     def moves(self) -> tuple[FloatArray, FloatArray]:
-        """Return (N,) the pixels that each pattern's shadow has moved by against the others, and their variances."""
         return self.along(-1j * self._angles[:, None] * self._spectra)
 
 
 def shadow_step(factor: FloatArray) -> float:
-    """Return the sensor pixels that the shadow in a ``factor`` (m, n) moves by from one column to the next."""
     return _step(*_spectra(factor), len(factor))
 
 
 def _spectra(columns: FloatArray) -> tuple[ComplexArray, FloatArray]:
     """Return (frequencies, n) spectra of ``columns`` (m, n), and the frequencies' angles a pixel.
 
-    Columns fade out at the ends, where a moving shadow leaves and another comes in, and have no mean light, which does
-    not move. Without both, the deviations of good cameras are up to 400 times those by noise; with both, up to 5 times.
+    Columns fade out at the ends, where another shadow comes in, and have no mean light, because it does not move.
     """
     taper = np.square(np.sin(np.pi * (np.arange(len(columns)) + 0.5) / len(columns)))
     spectra = np.fft.rfft((columns - taper @ columns / taper.sum()) * taper[:, None], axis=0)[1:]
@@ -161,7 +138,6 @@ def _spectra(columns: FloatArray) -> tuple[ComplexArray, FloatArray]:
 
 
 def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
-    """Return (frequencies, n, modes) orthonormal modes of the columns' spectra at frequencies of so many ``angles``."""
     degree = max(min(_DEGREE, n // _LINES - 1), 0)
     slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree)
     moves = _MOVES[: max(1, 3 * n // _LINES // (degree + 1))]
@@ -170,7 +146,6 @@ def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
 
 
 def _step(columns: ComplexArray, angles: FloatArray, pixels: int) -> float:
-    """Return the pixels by which ``columns`` move from one to the next, whose reversal makes their sum largest."""
     n = columns.shape[1]
     length = 8 * n
     power = np.square(np.abs(np.fft.fft(columns, length, axis=1)))
@@ -181,59 +156,38 @@ def _step(columns: ComplexArray, angles: FloatArray, pixels: int) -> float:
 
 
 MOST_FAULTS = 0.1
-"""Part of the patterns that may be wrong before the session is refused: with more, the usual sum is in doubt."""
 _MATTERS = 0.5
-"""Error over that by noise from which it is reported: both in quadrature are 12 % more."""
 _DEVIATIONS = 8.0
-"""Robust deviations from the other pairs that make a fault: noise alone goes so far in one session of 10^12."""
+"""Robust deviations from the other pairs that make a fault; chance alone reaches them in one session of 10^12."""
 _STRAYS = 4.265
 """Standard deviations from which places move: one side in 1e5 by chance."""
 _SURE = 5.0
-"""Standard deviations at which a pooled number counts as measured."""
 _ALONE = 0.9
-"""Unequal power d / c from which only one frame of a pair has light."""
 _SLIGHT = 0.02
-"""Change of a single frame's power that is not reported by itself: a lamp's flicker makes as much."""
 _NEAR = 5
-"""Pairs next in time that give the sum which a wrong pair should have had."""
 _WRONG, _UNLIKE = 40.0, 0.03
-"""Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
-from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
+"""Two squared deviations from which a pattern is wrong: none of 860 good sides of 64 or 128 patterns exceeds 20 in
+both."""
 _FOREIGN = 0.5, 15.0, 15.0
-"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too: good
-ones have 0.25 at 6 (64 patterns), or 1 at 30 and a deviation of 11 (128); swapped patterns about 1 at 23 and 30."""
+"""Limits of a foreign pattern: good ones have 0.25 at 6 (64 patterns), swapped ones about 1 at 23 and 30."""
 _UNEXPLAINED = 0.05
-"""Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
-of its amplitude."""
+"""Part of a response's energy, beyond noise, that no separable camera explains."""
 _TURNED = 0.7
-"""Part of its deviation that turning a pattern's sign must remove from all patterns."""
 _LINE = 0.15
-"""Squared deviation of a line of the stripes from what its neighbours predict, over the mean square, from which it
-counts: good cameras of 32 lines reach 0.003."""
+"""Limit of a line's squared deviation over the mean square: good cameras of 32 lines reach 0.003."""
 _DARK, _LIT = (0.02, 0.3), 0.1
-"""Light of a dead sensor row over that of its neighbours at most, and in centred frames, where it has their mean with
-the sign turned; and theirs over the median row's at least. A row that has more
-than ten times the light of either neighbour is hot."""
+"""Light of a dead sensor row over its neighbours' at most, and their light over the median row's at least."""
 _NAMED = 12
-"""Frames that a message names; the others are counted."""
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
-"""Reason of errors by ambient light of unknown shape, bands, or pixels that change."""
 _LAMP = "the lamp's power changes; use a steadier one"
-"""Reason of errors that are left when responses are divided by the lamp's power."""
 _BENT = "numbers are not in proportion to light; switch gamma and other processing off, expose for less"
-"""Reason of errors by an exponent or by clipping."""
 _POWER = "frames are of different power; use a steadier lamp, or pairs"
-"""Reason of errors by a lamp that no sums show."""
 _OFFSET = "the uniform frame does not fit those of patterns; keep lamp and ambient light steady, or take pairs"
-"""Reason of light that all responses share, because it is in their uniform frame alone."""
 _REPLACED = "a frame of a pair is wrong; take it again"
-"""Reason of the noise that is larger where one frame replaces a pair."""
 _STEP = 5.0
-"""Variance of the lamp's step from one side to the other, in that of the power of one pair."""
 
 
 def frame_words(half: Half) -> str:
-    """Return which frame of a session a ``half`` is, in words."""
     return f"{half[0]} stripes {half[1]}" + f" of sign {half[2]:+d}" * (half[2] != UNIFORM)
 
 
@@ -242,21 +196,10 @@ def frame_words(half: Half) -> str:
 
 @dataclass(frozen=True)
 class SessionConditions:
-    """How a session was taken.
+    """Order, names and known defects of a session's frames.
 
-    Attributes
-    ----------
-    order
-        frames as they were taken.
-    name
-        of a frame.
-    saturated
-        whether frames have saturated pixels, which make pairs add up to less; those sessions are flagged for it,
-        and not refused.
-    unsteady
-        whether it is stated that the lamp is, so that its power is neither divided out nor reported.
-    wrong
-        frames that are known to be wrong, and why.
+    ``saturated`` sessions have pairs that add up to less and are flagged instead of refused. ``unsteady`` lamps are
+    neither divided out nor reported. ``wrong`` maps frames that are known to be wrong to the reason.
     """
 
     order: Sequence[Half]
@@ -268,26 +211,11 @@ class SessionConditions:
 
 @dataclass(frozen=True)
 class SessionFault:
-    """One pattern, or one of its frames, that was wrong and is mended; a manifest has it with these keys.
+    """One mended pattern or frame; a manifest has it with these keys.
 
-    Attributes
-    ----------
-    frames
-        names of its frames.
-    side, index
-        of the pattern.
-    sign
-        of the frame; None: both frames.
-    kind
-        ``exchanged``, ``power`` or ``replaced``.
-    detail
-        the same in words, after the frame's name.
-    repair
-        the repair in words.
-    cost
-        relative error of its factor that this leaves beyond the noise.
-    other
-        always None; older manifests have a frame here.
+    ``sign`` is None for both frames, ``kind`` is ``exchanged``, ``power`` or ``replaced``, and ``cost`` is the
+    relative error of the factor that remains beyond the noise. ``other`` is always None (older manifests have a frame
+    here).
     """
 
     frames: list[str]
@@ -312,17 +240,12 @@ class CheckedSession:
     Attributes
     ----------
     sums
-        of horizontal and vertical stripes, faults mended; the very ones that came in where nothing was mended.
-    faults
-        in the order of the sides and patterns.
+        Of horizontal and vertical stripes; the same objects that came in where nothing was mended.
     lamp
-        None if the projector is steady. ``drift`` from the session's begin to its end, ``flicker`` from frame to frame,
-        rms, both as a part of its power; ``drift_cost``, ``flicker_cost``: relative error of both factors of each
-        without correction; ``remaining``: with it; ``corrected``.
-    doubts
-        sentences on the lamp, and on errors that are not mended and count in the stated error.
-    extra
-        squared error of each side's vectors beyond their noise.
+        None if the projector is steady. ``drift`` over the session and ``flicker`` from frame to frame, as parts of its
+        power; ``drift_cost``, ``flicker_cost``, ``remaining``: relative errors of the factors without and with repair.
+    doubts, extra
+        Sentences on errors that are not mended, and the squared error of each side's vectors beyond their noise.
     """
 
     sums: tuple[StripeSums, StripeSums]
@@ -332,39 +255,17 @@ class CheckedSession:
     extra: tuple[float, float] = (0.0, 0.0)
 
     def estimate(self, signs: FloatArray, noise: float | None) -> Estimate:
-        """Return the factors.
-
-        Parameters
-        ----------
-        signs
-            (n, N) H.
-        noise
-            as ``stated_noise`` of :func:`mitsim.reconstruct.factors.factors_of_sums`.
-        """
         return factors_of_sums(*self.sums, signs, noise, self.extra)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence for each fault and doubt."""
         return (*map(str, self.faults), *self.doubts)
 
 
 def check_session(sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> CheckedSession:
     """Check a session, make repairs that a check afterwards confirms, and add remaining errors to the stated error.
 
-    Parameters
-    ----------
-    sums
-        of horizontal and of vertical stripes, all in.
-    signs
-        (n, N) H.
-    taken
-        how the session was taken.
-
-    Raises
-    ------
-    MitsimError
-        for faults that cannot be mended, with the frames that do not fit, or "all frames".
+    Raises MitsimError for faults that cannot be mended, with the frames that do not fit, or "all frames".
     """
     return _Check(sums, signs, taken).result()
 
@@ -377,8 +278,8 @@ def _shrunk(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return ``values`` shrunk to 0 by their ``variances``, the remaining squared errors, and the shared variance.
 
-    The variance that all ``good`` values have beyond their noise is the prior of each; where it cannot be told from 0,
-    no value is changed. A value that is sure by itself is kept. The prior's variance is at ``least`` so much.
+    The prior of each is the variance, at ``least`` so much, that all ``good`` values have beyond their noise. Nothing
+    is changed where that is insignificant, and values that are significant by themselves are kept.
     """
     beyond, pooled = np.square(values) - variances, 0.0
     middle = max(float(np.median((beyond / variances)[good])), 0.0)
@@ -397,11 +298,6 @@ def _shrunk(
 
 
 class _Side:
-    """One side of a session while it is checked, with corrected ``vectors`` (m, N).
-
-    ``extras`` are squared errors by their reason, and ``axis`` is 0 for horizontal stripes.
-    """
-
     def __init__(self, sums: StripeSums, other: StripeSums, axis: int) -> None:
         self.sums, self.uniform, self.axis = sums, other.common, axis
         self.side: Side = SIDES[axis]
@@ -421,7 +317,6 @@ class _Side:
         return max(float(np.square(self.vectors).sum()), 1e-300)
 
     def result(self) -> StripeSums:
-        """Return the sums with all repairs; those of a good session are unchanged."""
         if np.array_equal(self.vectors, self.sums.vectors):
             return self.sums
         return replace(self.sums, vectors=self.vectors, misfit=float(self.misfits.sum()))
@@ -430,10 +325,7 @@ class _Side:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
     def add_motion(self, places: FloatArray, variances: FloatArray, times: FloatArray) -> None:
-        """Count ``places`` (N,) [pixels] of patterns that differ from either end of the session beyond ``variances``.
-
-        The other side's uniform frames are as far on the other side of 0.
-        """
+        """Count ``places`` (N,) [pixels] that differ from either end of the session beyond ``variances``."""
         few, late = max(2, len(times) // 8), np.argsort(times)
         ends = np.array([np.median(places[late[:few]]), np.median(places[late[-few:]]), -self.place])
         away = np.square(np.append(places, ends[2]) - np.median(places)) / np.append(variances, 2 * variances.max())
@@ -446,11 +338,7 @@ class _Side:
             self.add(f"camera or mask move by {np.ptp(ends):.2g} pixels; fasten them", energy)
 
     def fit_sums(self) -> tuple[FloatArray, ...]:
-        """Fit the sums of all pairs.
-
-        Return (N,) arrays: whether pairs do not fit, squared errors beyond noise, power, place and unequal power of
-        both frames, and the variances of these three.
-        """
+        """Return misfit, squared errors, power, place and imbalance of pairs, and the variances of these three."""
         shapes = self.shapes
         if not self.sums.centre:
             shapes = np.stack([*shapes, np.ones_like(self.uniform), np.linspace(-1, 1, len(self.uniform))])
@@ -479,7 +367,6 @@ class _Side:
         return bad | self.odd() | (np.abs(ratios) > _ALONE), excess, *measured, *variances  # no division by power 0
 
     def odd(self) -> npt.NDArray[np.bool_]:
-        """Return (N,) whether responses show light that no stripes cast."""
         least = _UNEXPLAINED * np.maximum(self.sums.energies, np.median(self.sums.energies))
         middle = float(np.median(self.misfits))
         # Few misfits hardly show their scatter, which is that of squares of noise at least.
@@ -488,8 +375,6 @@ class _Side:
 
 
 class _Check:
-    """A session while it is checked. Numbers of pairs are arrays (2, N) of both sides."""
-
     def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
         self.signs, self.taken, self.count = signs, taken, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
@@ -528,7 +413,7 @@ class _Check:
     # ---- what the sums of pairs show of lamp, lag, bend, motion and ambient light ------------------------------------
 
     def _correct_pairs(self) -> bool:
-        """Fit the sums of pairs, correct the responses, and count the rest as errors; return False if saturated."""
+        """Fit the sums of pairs, correct responses, count the rest as errors; return False if saturated."""
         bad, excess, *measured = np.stack([own.fit_sums() for own in self.sides], axis=1)
         if self.taken.saturated and bad.any():
             return False
@@ -565,7 +450,6 @@ class _Check:
         return True
 
     def _subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
-        """Subtract the change of ambient light within pairs from the vectors."""
         for found, effect, scale in zip(own.sums.ambient.T, own.light.effects, own.light.variances, strict=True):
             variance = own.variance * scale
             # Without pairs, all responses share the uniform and dark frames, a third of their noise at most.
@@ -664,7 +548,6 @@ class _Check:
             self._refuse(own, index, reason)
 
     def _check_shadow(self, own: _Side) -> None:
-        """Turn the signs of patterns whose two frames are exchanged; refuse patterns that are foreign."""
         foreign = list[int]()
         turned = (np.arange(self.count) == 0) & (np.dot(own.vectors[:, 0], own.uniform) < 0)
         own.vectors[:, turned] *= -1
@@ -724,7 +607,7 @@ class _Check:
     # ---- the result --------------------------------------------------------------------------------------------------
 
     def _judge(self) -> None:
-        """Report significant errors, the largest first, and refuse the session for a tenth or for wrong frames."""
+        """Report significant errors, the largest first; refuse the session for a tenth or for wrong frames."""
         found, sides = self.found, self.sides
         energies = {
             why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for own in sides for why in own.extras

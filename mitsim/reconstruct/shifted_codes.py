@@ -47,25 +47,14 @@ TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "transposed, upside down": lambda scene: scene.T[::-1],
     "transposed, turned": lambda scene: scene.T[::-1, ::-1],
 }
-"""Orientations of a picture relative to the camera's code."""
 
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """Frame and the light that it shows.
+    """Frame (m, m') [electrons/s], and the light (n, n') that it shows: a picture times its pattern.
 
-    Attributes
-    ----------
-    scene : (n, n') array
-        Picture times its pattern.
-    frame : (m, m') array, electrons/s
-        Measurement, centred where the camera's factors are.
-    group
-        Picture number; frames of one picture are held out together.
-    plane
-        Name of the sensor's plane; planes have gains of their own.
-    offset
-        Offset of the plane's pixels, down and to the right, 0 to below 1 pixel.
+    Frames of one ``group`` are held out together. Each sensor ``plane`` has a gain, and its pixels an ``offset`` (down
+    and to the right, 0 to below 1 pixel).
     """
 
     scene: FloatArray
@@ -75,7 +64,6 @@ class Exposure:
     offset: tuple[float, float] = (0.0, 0.0)
 
     def turn_scene(self, orientation: str) -> Exposure:
-        """Return the exposure with its scene in another ``orientation``."""
         return replace(self, scene=TURNS[orientation](self.scene))
 
 
@@ -90,8 +78,6 @@ def plane_offsets(how: Preparation) -> dict[str, tuple[float, float]]:
 
 @dataclass(frozen=True)
 class Shape:
-    """Fixed quantities of a fit: ``scales`` s of both sides [sensor pixels / scene pixel], codes a side, centring."""
-
     scales: tuple[float, float]
     terms: int = 1
     centre: bool = False
@@ -99,15 +85,7 @@ class Shape:
 
 @dataclass(eq=False)
 class Side:
-    """Geometry of one side: ``sensor`` and ``scene`` pixels, ``scale``, ``terms``, and whether it is centred.
-
-    Attributes
-    ----------
-    width, length
-        Length of the window of the code that one sensor pixel sees, and of the code.
-    weights
-        Polynomials b_k (terms, n) of mean square 1.
-    """
+    """Geometry of one side: ``sensor`` and ``scene`` pixels, ``scale``, ``terms``, and whether it is centred."""
 
     sensor: int
     scene: int
@@ -123,7 +101,6 @@ class Side:
         self.weights: FloatArray = np.stack([basis(place) * np.sqrt(size) for basis, size in bases])
 
     def hats(self, offset: float) -> FloatArray:
-        """Return the linear interpolation (n, width) of each scene pixel in its window, at an ``offset``."""
         place, rows = offset + self.scale * np.arange(self.scene), np.arange(self.scene)
         first = np.floor(place).astype(int)
         found = np.zeros((self.scene, self.width))
@@ -132,11 +109,9 @@ class Side:
         return found
 
     def spread(self, offset: float) -> FloatArray:
-        """Return the part (n, terms, width) of each number of the codes in a window that a scene pixel sees."""
         return (self.weights[:, :, None] * self.hats(offset)[None]).transpose(1, 0, 2)
 
     def factor(self, codes: FloatArray, offset: float) -> FloatArray:
-        """Return Phi (m, n) of ``codes`` (terms, length) for pixels at an ``offset``."""
         hats, phi = self.hats(offset), np.zeros((self.sensor, self.scene))
         for code, weight in zip(codes, self.weights, strict=True):
             phi += (sliding_window_view(code, self.width) @ hats.T) * weight
@@ -167,31 +142,20 @@ class Side:
 # ---- The fit ---------------------------------------------------------------------------------------------------------
 
 _TURNS, _STILL = 20, 1e-5
-"""Largest number of turns, and the gain of the explained part that ends them."""
 _VAGUE, _SMALLEST, _LARGEST = 1e-3, 1e-9, 1e6
-"""First guess of alpha, over the mean of N's diagonal, and its limits."""
 
 
 @dataclass(frozen=True, eq=False)
 class Codes:
-    """Fitted codes.
+    """Fitted codes (terms, length) of both sides, with the gain of each plane.
 
     Attributes
     ----------
-    sides
-        Geometry of rows and of columns.
-    codes : (terms, length) arrays
-        Codes of either side.
-    gains
-        Gain of each plane.
-    variances
-        Mean square of the residual of each frame.
-    explained
-        Mean explained part of the frames' energy.
-    errors
-        Standard deviation of a number of each factor, rms, at gains of 1, undetermined numbers included.
-    seen_errors
-        Independent errors that change frames of these scenes as much as the factors' errors do.
+    variances, explained
+        Mean square of the residual of each frame, and mean explained part of the frames' energy.
+    errors, seen_errors
+        Standard deviation of a number of each factor, rms, undetermined numbers included; and independent errors that
+        change frames of these scenes as much.
     told
         Numbers of each side's codes that the frames determine.
     """
@@ -206,7 +170,6 @@ class Codes:
     told: tuple[float, float]
 
     def factors(self, offset: tuple[float, float] = (0.0, 0.0), plane: str = "") -> tuple[FloatArray, FloatArray]:
-        """Return Phi_L (m, n) and Phi_R (m', n') of a ``plane`` whose pixels are at an ``offset``."""
         gain = self.gains[plane]
         left, right = (
             side.factor(codes, place) * np.sqrt(abs(gain))
@@ -222,7 +185,6 @@ class Codes:
         return likelihood - 0.5 * sum(self.told) * float(np.log(size * len(self.variances)))
 
     def explains(self, exposures: Sequence[Exposure]) -> float:
-        """Return the mean part of the energy of other ``exposures`` that the codes explain."""
         parts = []
         for each in exposures:
             left, right = self.factors(each.offset, each.plane)
@@ -235,19 +197,9 @@ class Codes:
 def fit_codes(
     exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS
 ) -> Codes:
-    """Fit the codes of both sides to ``exposures`` whose scenes lie as the code runs.
+    """Fit the codes of both sides to ``exposures``, from the code ``start`` of columns or that of the spectra.
 
-    Parameters
-    ----------
-    start
-        Code of columns to begin with; None: that of the spectra.
-    turns
-        Largest number of turns of both sides.
-
-    Raises
-    ------
-    MitsimError
-        For frames or scenes without light.
+    Raises MitsimError for frames or scenes without light.
     """
     sizes = zip(exposures[0].frame.shape, exposures[0].scene.shape, shape.scales, strict=True)
     left, right = (Side(sensor, scene, scale, shape.terms, shape.centre) for sensor, scene, scale in sizes)
@@ -316,10 +268,7 @@ def fit_codes(
 def _solve_side(
     own: Side, sums: Mapping[float, Sequence[FloatArray]], before: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return the codes of a side, their alphas, the covariance, and the number of determined parameters.
-
-    ``sums`` are those of :meth:`Side.normal` by offset, and ``before`` the alphas of the turn before.
-    """
+    """Return the codes of a side, their alphas, the covariance, and the number of determined parameters."""
     matrix: FloatArray = np.zeros((own.terms * own.length,) * 2)
     right: FloatArray = np.zeros(len(matrix))
     for place, (gram, product) in sums.items():
@@ -342,10 +291,7 @@ def _solve_side(
 
 
 def fit_gains(exposures: Sequence[Exposure], models: Sequence[FloatArray], planes: Sequence[str]) -> dict[str, float]:
-    """Return the gain of each of the ``planes`` that brings ``models`` of the frames nearest to these.
-
-    Raises MitsimError where models have no light.
-    """
+    """Return the gain of each of the ``planes`` that brings ``models`` of the frames nearest to these."""
     above, below = dict.fromkeys(planes, 0.0), dict.fromkeys(planes, 0.0)
     for each, model in zip(exposures, models, strict=True):
         above[each.plane] += float(np.vdot(model, each.frame))
@@ -358,24 +304,15 @@ def fit_gains(exposures: Sequence[Exposure], models: Sequence[FloatArray], plane
 # ---- Orientation and scale, by spectra -------------------------------------------------------------------------------
 
 _FREQUENCIES = 20
-"""Frequencies of either sign, lowest first, whose spectra are compared."""
 _COMPARED = 2
-"""Frames whose spectra are compared."""
 _STEP, _FINE, _STEPS = 1.1, 1.03, 10
-"""Ratio of neighbouring tried scales, ratio by which a fit may change a scale at once, and number of changes."""
 _WIDEST, _NARROWEST = 1.0, 0.03
-"""Limits of the shadow's way over the whole scene, over the length of the sensor."""
 _FIRST_TURNS, _SCALE_TURNS = 2, 3
-"""Turns that decide the orientation, and the scale."""
 _CERTAIN = 1.2
-"""Least ratio of what another orientation and the right one leave of the frames."""
 _TOLERANCE = 0.05
-"""Tolerance of a search for a scale, relative to its reach."""
 
 
 class _Spectra:
-    """Spectra of ``exposures``, with periods that leave room for a shadow that moves by half the sensor."""
-
     def __init__(self, exposures: Sequence[Exposure]) -> None:
         rows, columns = exposures[0].frame.shape
         self._periods = 1.5 * rows, 1.5 * columns
@@ -407,18 +344,9 @@ def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
 
 @dataclass(frozen=True)
 class Pose:
-    """Orientation and scale of scenes before the camera.
+    """Orientation and scales [sensor pixels / scene pixel] of scenes before the camera.
 
-    Attributes
-    ----------
-    orientation
-        One of :data:`TURNS`.
-    scales
-        Scales of rows and of columns [sensor pixels / scene pixel].
-    margin
-        Explained part of the energy beyond that of the best other orientation; None: not compared.
-    certain
-        Whether that is clear.
+    ``margin`` is the explained part of the energy beyond that of the best other orientation; None: not compared.
     """
 
     orientation: str
@@ -431,7 +359,6 @@ class Pose:
 def find_pose(
     exposures: Sequence[Exposure], orientation: str | None = None, scales: tuple[float, float] | None = None
 ) -> Pose:
-    """Find the pose of scenes by spectra, and then by codes that are fitted to centred frames."""
     exposures = [replace(each, frame=centre_frame(each.frame)) for each in exposures]
     some = exposures[:: -(-len(exposures) // _COMPARED)]
     spectra, scenes = _Spectra(some), {name: [turn(each.scene) for each in some] for name, turn in TURNS.items()}
@@ -468,7 +395,6 @@ def find_pose(
 def _refine(
     misfit: Callable[[tuple[float, float]], float], start: tuple[float, float], reach: float
 ) -> tuple[float, float]:
-    """Return the scales of rows, and then of columns, within a ratio ``reach`` of which the ``misfit`` is least."""
     options, bounds = {"xatol": np.log(reach) * _TOLERANCE}, (-np.log(reach), np.log(reach))
     row = minimize_scalar(
         lambda x: misfit((start[0] * np.exp(x), start[1])), bounds=bounds, method="bounded", options=options
@@ -483,14 +409,10 @@ def _refine(
 # ---- How many codes: by frames that are held out ---------------------------------------------------------------------
 
 _GAIN = 0.02
-"""Part of the residual of held-out frames that more codes must explain."""
 
 
 def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> tuple[int, tuple[float, ...]]:
-    """Choose the number of codes, at most ``most``, by holding out half of the pictures, or of the frames.
-
-    Returns the number, and the explained part of held-out frames for each tried number, from one on.
-    """
+    """Choose the number of codes, at most ``most``, by holding out half of the pictures, or of the frames."""
     groups = sorted({each.group for each in exposures})
     numbers = [groups.index(each.group) for each in exposures] if len(groups) > 1 else range(len(exposures))
     folds = [[each for each, number in zip(exposures, numbers, strict=True) if number % 2 == own] for own in (0, 1)]

@@ -36,25 +36,12 @@ class Verdict(Enum):
 
     @property
     def good(self) -> bool:
-        """Whether the result can be used without a correction."""
         return self in (Verdict.SOLVED, Verdict.PARTLY_MEASURED, Verdict.CALIBRATED, Verdict.UNKNOWN)
 
 
 @dataclass(frozen=True)
 class Status:
-    """Verdict on a result, with the reason and the remedy; ``str`` gives all of it in sentences.
-
-    Attributes
-    ----------
-    sentence
-        Verdict in words, with its figures, without a full stop.
-    remedy
-        What to do; may be empty.
-    figures
-        Sentence with rank, condition and rounding.
-    flags
-        Sentences inherited from flagged captures and calibrations.
-    """
+    """Verdict on a result, with the reason and the remedy; ``str`` gives all of it in sentences."""
 
     verdict: Verdict
     sentence: str
@@ -64,7 +51,6 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        """Whether the verdict is good and nothing was flagged before."""
         return self.verdict.good and not self.flags
 
     def __str__(self) -> str:
@@ -105,5 +91,4 @@ class Solution:
 
     @property
     def ok(self) -> bool:
-        """Whether the image can be used without a correction."""
         return self.status.ok

@@ -8,24 +8,23 @@ factors are prepared once, and frames are added one by one:
 >>> frames.add(Y, i, j)                           # for each pattern P_L[:, i] P_R[:, j]^T
 >>> solution = prepared.solve(frames, "auto")
 
-With B = U S V^T on each side (:mod:`mitsim.reconstruct.factorisation`) and W = sum_ij U_Li^T Y_ij U_Rj, the solution is
-X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. The rounding error is about eps / sqrt(lambda_rel), where
-lambda_rel = lambda / (max s_L^2 max s_R^2). The paper's Q = sum (Phi_L^T Y Phi_R) o P in place of W would give
+With B = U S V^T on each side (:mod:`mitsim.reconstruct.factorisation`) and W = sum_ij U_Li^T Y_ij U_Rj, the solution
+is X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. The rounding error is about eps / sqrt(lambda_rel),
+where lambda_rel = lambda / (max s_L^2 max s_R^2). The paper's Q = sum (Phi_L^T Y Phi_R) o P in place of W would give
 eps / lambda_rel (docs/decisions.md).
 
 *Correlated neighbours.* The penalty lambda ||X||^2 darkens large even areas of noisy images. With the covariance
 rho^|p - p'| along rows and columns (a separable first-order Markov field; Jain, Fundamentals of Digital Image
-Processing, 1989, chapter 2), X = F_L Z F_R^T with independent Z, so that the penalty is Tikhonov's of the model B F.
-The SVD of S V^T F keeps the closed form.
+Processing, 1989, chapter 2), X = F_L Z F_R^T with independent Z, so that the SVD of S V^T F keeps the closed form.
 
-*Lambda.* Coefficient W_ij is kept by the share sigma_ij^2 / (sigma_ij^2 + lambda), so that trying a lambda costs n^2
-operations. Where the model explains the frames, lambda minimises an unbiased estimate of the image's error. Elsewhere
-the image must also be stable when lambda changes (docs/decisions.md).
+*Lambda.* Coefficient W_ij is kept by the share sigma_ij^2 / (sigma_ij^2 + lambda). Where the model explains the
+frames, lambda minimises an unbiased estimate of the image's error. Elsewhere the image must also be stable when lambda
+changes.
 
-*Noise by halves of the sensor.* With G = U_0^T U_0 of half of the sensor's rows, W_0 - G W contains no image, but
-noise: white noise of variance v gives its number i the variance v (G (I - G))_ii. An error of the left factor that is
-independent from sensor row to row adds to all numbers of a column of W. Halves of the columns show errors of the right
-factor."""
+*Noise by halves of the sensor.* With G = U_0^T U_0 of half of the sensor's rows, W_0 - G W contains no image: white
+noise of variance v gives its number i the variance v (G (I - G))_ii. An error of the left factor that is independent
+from sensor row to row adds to all numbers of a column of W; halves of the columns show errors of the right factor.
+"""
 
 from __future__ import annotations
 
@@ -47,27 +46,20 @@ from mitsim.reconstruct.solution import Solution, Status, Verdict
 
 
 def check_lambda(lam: float | str) -> float:
-    """Return ``lam`` as a float, or raise MitsimError unless it is a finite number of at least 0."""
     if isinstance(lam, str) or not (np.isfinite(lam) and lam >= 0):
         raise MitsimError(f"lambda is {lam}; give a finite number of at least 0")
     return float(lam)
 
 
 RISK_POWER = 0.5
-"""Power of sigma that weights errors: 0 is the image's error, 2 that of the frames
-(docs/decisions.md)."""
+"""Power of sigma that weights errors: 0 is the image's error, 2 that of the frames (docs/decisions.md)."""
 MISFIT_RATIO = 1.2
-"""Limit of noise outside the model's range over noise inside it. Flat prints have 0.92 to 1.02, and scenes with depth
-and gloss 1.4 and more."""
+"""Limit of noise outside the range over noise inside: prints have 0.92 to 1.02, depth and gloss 1.4 and more."""
 _TAKEN, _TAKEN_RISE = 30.0, 4
-"""Limit of the energy that lambda removes within the range, over the noise outside, and the power of the noise ratio
-that raises the limit (docs/decisions.md)."""
+"""Limit of the energy that lambda removes, over the noise outside, and the power of the noise ratio that raises it."""
 _EXPONENTS = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
-"""Powers of ten of the tried lambdas, relative to the largest sigma^2."""
 _FELT = 100.0
-"""Ratio of sigma^2 to lambda above which lambda changes a coefficient by less than one per cent."""
 _FAINT, _FEWEST = 2.0, 20
-"""An octave whose energy over its noise is lower is faint if it has at least the second number of coefficients."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,20 +68,14 @@ class DiagonalProblem:
 
     Attributes
     ----------
-    sigma : (r, r') array
-        Singular values of the whole model, exact zeros beyond its rank.
-    projected : (r, r') array
-        Data W projected on the left singular vectors.
-    energy
-        Squared norm of all data.
-    data_count
-        Number of independent data.
+    sigma, projected : (r, r') arrays
+        Singular values of the whole model, exact zeros beyond its rank, and data W on the left singular vectors.
+    energy, data_count
+        Squared norm and number of all independent data.
     halves
         ``projected`` by quarters of the sensor, which show its noise; None assumes white noise.
     struck : (r, r') array
         Part of ``projected`` that is known to be neither image nor noise, up to its sign.
-    least
-        Smallest automatic lambda, see :attr:`Prepared.least_lambda`.
     """
 
     sigma: FloatArray
@@ -101,26 +87,22 @@ class DiagonalProblem:
     least: float = 0.0
 
     def taken_energy(self, lam: float) -> float:
-        """Return the energy within the model's range that the Tikhonov solution at ``lam`` omits."""
         return float(np.sum(np.square((1 - self.kept_share(lam)) * self.projected)))
 
     def kept_share(self, lam: float) -> FloatArray:
-        """Return the share sigma^2 / (sigma^2 + ``lam``) of each coefficient (r, r'), 0 beyond the rank."""
         squared = np.square(self.sigma)
         return np.divide(squared, squared + lam, out=np.zeros_like(squared), where=squared > 0)
 
     @property
     def scale(self) -> float:
-        """Largest sigma^2, which lambda_rel refers to."""
         return float(np.square(self.sigma.max()))
 
 
 def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) -> float:
     """Return an unbiased estimate of the weighted squared error of the image at ``lam``, up to a constant.
 
-    ``noise`` is the variance of one datum, or (r, r') of each number of ``projected``. With kept shares k, coefficient
-    (k W / sigma) has the expected squared error (1 - k)^2 x^2 + k^2 noise / sigma^2, and (W^2 - noise) / sigma^2
-    estimates x^2 without bias. Terms that lambda does not change are omitted, so that small sigma do no harm.
+    With kept shares k, coefficient (k W / sigma) has the expected squared error (1 - k)^2 x^2 + k^2 noise / sigma^2,
+    and (W^2 - noise) / sigma^2 estimates x^2 without bias. Terms that lambda does not change are omitted.
     """
     measured = problem.sigma > 0
     sigma, data = problem.sigma[measured], np.square(problem.projected[measured])
@@ -131,10 +113,9 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) 
 
 
 def movement(problem: DiagonalProblem, lam: float) -> float:
-    """Return ||lambda dX / dlambda||^2 of the Tikhonov image X at ``lam``.
+    """Return ||lambda dX / dlambda||^2 of the Tikhonov image X (quasi-optimality, Tikhonov and Glasko 1965).
 
-    This quasi-optimality criterion of Tikhonov and Glasko (1965) needs no noise level and holds for errors of any
-    spectrum.
+    The criterion needs no noise level and holds for errors of any spectrum.
     """
     kept = problem.kept_share(lam)
     measured = kept > 0
@@ -142,10 +123,7 @@ def movement(problem: DiagonalProblem, lam: float) -> float:
 
 
 def noise_variance(problem: DiagonalProblem) -> float:
-    """Return the mean noise variance of one datum from the energy outside the model's range.
-
-    Raises MitsimError when there are no more data than unknowns.
-    """
+    """Return the mean noise variance of one datum from the energy outside the model's range."""
     spare = problem.data_count - np.count_nonzero(problem.sigma)
     if spare <= 0:
         raise MitsimError("there are no more data than unknowns, so noise cannot be told; give lambda as a number")
@@ -164,9 +142,8 @@ def is_misfit(problem: DiagonalProblem) -> bool:
 def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
     """Return the noise variance of each number (r, r') of ``problem.projected``, or of all.
 
-    Most numbers have the noise outside the model's range, or the noise that the halves of the sensor show where that is
-    larger, because noise of the factors is within the range alone. Where the model does not explain the frames, the
-    halves decide. Noise of single rows, columns and numbers is added.
+    It is the noise outside the model's range or, where larger, that of the sensor's halves, because noise of the
+    factors is within the range alone. Where the model does not explain the frames, the halves decide.
     """
     white, halves = noise_variance(problem), problem.halves
     if not halves:
@@ -176,10 +153,7 @@ def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
 
 
 def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
-    """Raise the ``noise`` of octaves of sigma whose signal would need a scene brighter than the octaves before.
-
-    All octaves beyond the first such octave count as noise, unless one of them is clearly above the noise.
-    """
+    """Raise the ``noise`` of octaves of sigma whose signal would need a scene brighter than the octaves before."""
     measured = problem.sigma > 0
     sigma, found = problem.sigma[measured], noise[measured]
     octave = np.log2(sigma.max() / sigma).astype(np.intp)
@@ -205,9 +179,8 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
 def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
     """Return the lambda in the unit of sigma^2 that minimises :func:`risk_score`, but at least ``problem.least``.
 
-    Where the model does not explain the frames, as the frames show or as is known before (``explained`` is False), that
-    lambda is a lower bound, and the image that :func:`movement` finds steadiest is used. Raises MitsimError without
-    more data than unknowns, or without a signal.
+    Where the model does not explain the frames, that lambda is a lower bound, and the image that :func:`movement`
+    finds steadiest is used. Raises MitsimError without more data than unknowns, or without a signal.
     """
     noise = coefficient_noise(problem)
     if problem.energy == 0:
@@ -236,8 +209,7 @@ def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:
 def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
     """Return the rising lambda at which the image moves least, as far as misfit explains what lambda removes.
 
-    Behind a mask whose constant term is centred away the image turns black, and movement then counts relative to the
-    image. The bound by the misfit prevents that a dark print loses its stars.
+    Where the constant term is centred away the image turns black, so that movement counts relative to the image.
     """
     moved = np.array([movement(problem, lam) for lam in lambdas])
     if len(moved) > 1 and moved[-1] < moved[-2]:
@@ -271,13 +243,9 @@ def _least(score: Callable[[float], float], scale: float, exponents: FloatArray)
 # -------- W by quarters of the sensor in
 
 _LEAST_SPREAD = 0.01
-"""Least G (I - G)_ii of a usable number: 1/4 where both halves see as much, 0 where a side has no spare rows."""
 _MEDIAN = 0.4549
-"""Median of the square of a standard normal number."""
 MEDIAN_SPREAD = 2.33
-"""Relative standard deviation of the median of n squared normal numbers, times the square root of n."""
 _SIGNIFICANT = 2.0
-"""Standard deviations above which a row or column is noisier than others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +258,6 @@ class Halves:
 
     @cached_property
     def differences(self) -> tuple[FloatArray, FloatArray]:
-        """W_0 - G W (r, r') of the halves of rows, and of the halves of columns."""
         total = self.quarters.sum(axis=(0, 1))
         by_row = self.quarters[0].sum(axis=0) - self.left.first_half @ total
         by_column = self.quarters[:, 0].sum(axis=0) - total @ self.right.first_half
@@ -305,12 +272,10 @@ class Halves:
 
     @cached_property
     def typical(self) -> float:
-        """Noise variance of most numbers by the median; NaN when unknown."""
         return float(_medians(np.concatenate([square[self._measured] for square in self._squares])[None])[0])
 
     @cached_property
     def excess(self) -> FloatArray:
-        """Noise variance (r, r') beyond :attr:`typical` where a row or column is significantly noisier."""
         row, column = (np.where(self._measured, square, np.nan) for square in self._squares)
         return _excess(row.T) + _excess(column)[:, None]
 
@@ -320,12 +285,10 @@ class Halves:
 
 
 def half_spread(half: FloatArray) -> FloatArray:
-    """Return the variance (r,) of W_0 - G W for white noise of variance 1: diag G (I - G) with G ``half``."""
     return np.asarray(np.diag(half) - np.einsum("ij,ji->i", half, half))
 
 
 def robust_scatter(values: FloatArray) -> float:
-    """Return 1.4826 times the median absolute deviation of ``values``, the standard deviation of normal numbers."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
@@ -338,7 +301,6 @@ def _medians(squares: FloatArray) -> FloatArray:
 
 
 def _excess(squares: FloatArray) -> FloatArray:
-    """Return the variance of each row of ``squares`` beyond that of the middle row, where it is significant."""
     level = _medians(squares)
     count = np.maximum((~np.isnan(squares)).sum(axis=1), 1)
     middle = np.nanmedian(level) if not np.isnan(level).all() else np.nan
@@ -347,30 +309,16 @@ def _excess(squares: FloatArray) -> FloatArray:
 
 
 ROUNDING_LIMIT = 0.01
-"""Rounding above this part of the image flags a solution."""
 _ROUNDING_UNITS = 110 * float(np.finfo(np.float64).eps)
-"""Rounding of a number before magnification. LAPACK's dbdsqr neglects what is below u^(-1/8) u = 49 eps (u = eps / 2)
-of its neighbour, on each of two sides, and a dozen units are left to reductions and products. 44 units were seen in
-5500 models, where singular values are nearly equal (tests/hard/test_solver_digits.py)."""
+"""Rounding before magnification: 2 x 49 eps neglected by LAPACK's dbdsqr and 12 of products; 44 in 5500 models."""
 _SMALLEST, _LARGEST = 1e-30, 1e30
-"""Limits of the largest number of a factor or pattern: sigma^2, a product of eight, stays far from 1e-308 and 1e308."""
+"""Limits of the largest number of a factor or pattern, so that a product of eight is a normal number."""
 _UNSEEN = 1e-60
-"""Largest singular value of a side below which it sees nothing: the square of ``_SMALLEST``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Factorised model, ready for any number of scenes; applying it changes nothing.
-
-    Attributes
-    ----------
-    stated
-        Directions of each factor above the calibration's noise; None if not stated.
-    noise
-        Standard deviation of each number of the left and of the right factor, as the calibration states it.
-    light
-        Mean over scene pixels of the sum of squared patterns, for each side.
-    """
+    """Factorised model for any number of scenes; ``light`` is the mean over pixels of summed squared patterns."""
 
     left: Side
     right: Side
@@ -383,9 +331,8 @@ class Prepared:
     def least_lambda(self) -> float:
         """Lambda at which the stated noise of the factors alone outweighs the image.
 
-        Independent errors of deviation s_L in Phi_L add noise of variance n s_L^2 x^2 sigma_R^2 to a datum whose column
-        has the singular value sigma_R, for n scene pixels of mean square x^2 (times ``light``). Its ratio to x^2 is the
-        weight that the datum deserves; the largest of all columns and rows counts.
+        Independent errors of deviation s_L in Phi_L add noise of variance n s_L^2 x^2 sigma_R^2 to a datum whose
+        column has the singular value sigma_R, for n scene pixels of mean square x^2 (times ``light``).
         """
         sides = zip((self.left, self.right), (self.right, self.left), self.noise, self.light, strict=True)
         return max(
@@ -394,17 +341,14 @@ class Prepared:
 
     @property
     def condition(self) -> float:
-        """Larger cond(A) of the two sides; inf when rank deficient."""
         return max(self.left.condition, self.right.condition)
 
     @property
     def condition_whole(self) -> float:
-        """cond(A) of the whole model; inf when rank deficient."""
         return self.left.condition * self.right.condition
 
     @property
     def rank(self) -> int:
-        """Numerical rank of the whole model."""
         return self.left.rank * self.right.rank
 
     @property
@@ -417,46 +361,37 @@ class Prepared:
 
     @property
     def spare(self) -> float:
-        """Part of the energy of white noise in all frames that neither centring nor an image takes up."""
         left, right = self.left, self.right
         numbers = left.sensor_size * left.pattern_count * right.sensor_size * right.pattern_count
         return (left.data_rows * right.data_rows - self.rank) / numbers
 
     @property
     def unknowns(self) -> int:
-        """Number of scene pixels."""
         return self.left.scene_size * self.right.scene_size
 
     @property
     def sigma(self) -> FloatArray:
-        """Singular values (r, r') of the whole model, exact zeros beyond its rank."""
         return np.outer(self.left.singular, self.right.singular)
 
     def as_solved(self, frame: FloatArray) -> FloatArray:
-        """Return a ``frame`` (m, m') centred if the model is."""
         return centre_frame(frame) if self.centre else frame
 
     def slabs(self, pattern: tuple[int, int]) -> tuple[Slab, Slab]:
-        """Return the slabs of the row and of the column of a ``pattern``."""
         return self.left.slabs[pattern[0]], self.right.slabs[pattern[1]]
 
     def places(self, pattern: tuple[int, int]) -> Any:
-        """Return the index of the coefficients of a ``pattern`` in W."""
         return np.ix_(self.left.columns(pattern[0]), self.right.columns(pattern[1]))
 
     def frame(self, weights: FloatArray, pattern: tuple[int, int]) -> FloatArray:
-        """Return the frame (m, m') of a ``pattern`` from the ``weights`` W."""
         left, right = self.slabs(pattern)
         return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
 
     def weights(self, frame: FloatArray, pattern: tuple[int, int]) -> FloatArray:
-        """Return the contribution of a centred ``frame`` (m, m') of a ``pattern`` to W at its :meth:`places`."""
         left, right = self.slabs(pattern)
         return np.asarray(left.matrix.T @ frame @ right.matrix)
 
     @property
     def extent(self) -> str:
-        """Rank and condition of the whole model and of its two sides in words."""
         left, right = self.left, self.right
         return (
             f"Rank {self.rank} of {self.unknowns} (rows {left.rank} of {left.scene_size}, columns {right.rank} of "
@@ -465,17 +400,14 @@ class Prepared:
         )
 
     def with_correlation(self) -> Prepared:
-        """Return the model for images whose neighbouring pixels are correlated; it has its own accumulator."""
         with single_threaded_blas():
             left = correlate_side(self.left)
             return replace(self, left=left, right=left if self.right is self.left else correlate_side(self.right))
 
     def accumulator(self) -> Accumulator:
-        """Return an empty sum of frames."""
         return Accumulator(self)
 
     def problem(self, frames: Accumulator) -> DiagonalProblem:
-        """Return the data of all ``frames`` in the diagonal basis; raises MitsimError when frames are missing."""
         if frames.prepared.left is not self.left or frames.prepared.right is not self.right:
             raise MitsimError("frames were added to an accumulator of other factors; use this one's accumulator()")
         missing = frames.missing
@@ -490,11 +422,9 @@ class Prepared:
         return DiagonalProblem(sigma, data, frames.energy, data_count, halves, least=self.least_lambda)
 
     def image(self, coefficients: npt.ArrayLike) -> FloatArray:
-        """Return the image (n, n') V_L C V_R^T of ``coefficients`` C (r, r')."""
         return np.asarray(self.left.basis @ np.asarray(coefficients) @ self.right.basis.T)
 
     def coefficients(self, image: npt.ArrayLike) -> FloatArray:
-        """Return the coefficients (r, r') V_L^T X V_R of an ``image`` X (n, n'), the adjoint of :meth:`image`."""
         return np.asarray(self.left.basis.T @ np.asarray(image) @ self.right.basis)
 
     def solve(
@@ -510,13 +440,12 @@ class Prepared:
         ----------
         lam
             Lambda >= 0 in the unit of (Phi_L Phi_R)^2, or "auto" (:func:`automatic_lambda`). 0 gives the
-            pseudo-inverse, in which singular values below max(rows, columns) eps of the largest of their side count as
-            zero.
-        explained
-            False if the factors are known not to explain the camera, which "auto" uses.
-        lack
-            Known part of the frames beside the image, (r, r') in the diagonal basis and as energy beyond it, which
-            "auto" treats as noise.
+            pseudo-inverse, in
+            which singular values below max(rows, columns) eps of the largest of their side count as zero.
+        explained, lack
+            Used by "auto": False if the factors are known not to explain the camera; known part of the frames beside
+            the
+            image, (r, r') in the diagonal basis and as energy beyond it.
         """
         problem, flags = self.problem(frames), tuple[str, ...]()
         if isinstance(lam, str):
@@ -584,23 +513,12 @@ class Prepared:
 def prepare(
     left: npt.ArrayLike, right: npt.ArrayLike, P_L: npt.ArrayLike, P_R: npt.ArrayLike, centre: bool = False
 ) -> Prepared:
-    """Factorise the model of a camera and a pattern family.
+    """Factorise the model of a camera (Phi_L, Phi_R) and a pattern family (P_L (n, K), P_R (n', K')).
 
-    Parameters
-    ----------
-    left, right : (m, n) and (m', n') arrays
-        Phi_L and Phi_R: scene rows to sensor rows, scene columns to sensor columns.
-    P_L, P_R : (n, K) and (n', K') arrays
-        Pattern columns; pattern (i, j) is P_L[:, i] P_R[:, j]^T.
-    centre
-        True removes row and column means of factors and frames: the constant term of a FlatCam mask (1 + m m^T)/2
-        vanishes if the mask covers all that the sensor sees. Elsewhere the leak is (C Phi_1) X (C Phi_1)^T / 2, with
-        Phi_1 the shadow of the mask's outline.
-
-    Raises
-    ------
-    MitsimError
-        If shapes do not fit, values are not finite or too large or too small to be squared, or no light is seen.
+    ``centre`` removes row and column means of factors and frames: the constant term of a FlatCam mask (1 + m m^T)/2
+    vanishes if the mask covers all that the sensor sees. Elsewhere the leak is (C Phi_1) X (C Phi_1)^T / 2, with Phi_1
+    the shadow of the mask's outline. Raises MitsimError if shapes do not fit, values cannot be squared, or no light is
+    seen.
     """
     factors = [_matrix("left factor", left), _matrix("right factor", right)]
     patterns = [_matrix("patterns P_L", P_L), _matrix("patterns P_R", P_R)]
@@ -649,7 +567,6 @@ def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
 # -------- Frames are added one at a time to W = sum_ij U_Li^T Y_ij U_Rj
 
 _LARGEST_SUM = 1e100
-"""Largest norm of a frame, and one over the smallest, so that its square is a normal number."""
 
 
 class Accumulator:
@@ -664,7 +581,6 @@ class Accumulator:
 
     @classmethod
     def of_sums(cls, prepared: Prepared, quarters: FloatArray, energy: float) -> Accumulator:
-        """Return an accumulator from the ``quarters`` and ``energy`` of an earlier one of the same model."""
         found = cls(prepared)
         found._quarters += quarters
         found._energy = energy
@@ -673,38 +589,25 @@ class Accumulator:
 
     @property
     def sum(self) -> FloatArray:
-        """Copy of W (r, r')."""
         return np.asarray(self._quarters.sum(axis=(0, 1)))
 
     @property
     def quarters(self) -> FloatArray:
-        """Copy of the parts (2, 2, r, r') of W by half of the sensor's rows and columns."""
         return self._quarters.copy()
 
     @property
     def energy(self) -> float:
-        """Sum of the squares of all added frames, after centring."""
         return self._energy
 
     @property
     def missing(self) -> list[tuple[int, int]]:
-        """Pattern indices (i, j) whose frame has not been added."""
         return [(int(i), int(j)) for i, j in np.argwhere(~self._seen)]
 
     def add(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
-        """Add one frame, and return its contribution (c, c') to W at its places.
+        """Add one ``frame`` (m, m'), and return its contribution (c, c') to W at its places.
 
-        Parameters
-        ----------
-        frame : (m, m') array
-            Real numbers; for a signed pattern the difference of its two shots.
-        row, column
-            Index of the pattern P_L[:, row] P_R[:, column]^T.
-
-        Raises
-        ------
-        MitsimError
-            If the shape, a value or the index is not allowed, or a pattern is added twice.
+        The frame of a signed pattern is the difference of its two shots. Raises MitsimError if the shape, a value or
+        the index is not allowed, or a pattern is added twice.
         """
         (rows, columns), name, given = self._seen.shape, f"frame of pattern ({row}, {column})", np.asarray(frame)
         whole = all(isinstance(k, (int, np.integer)) and not isinstance(k, bool) for k in (row, column))
@@ -751,12 +654,10 @@ def project_frames(left: Side, right: Side, frames: FloatArray) -> FloatArray:
 
 
 def centre_columns(matrix: FloatArray) -> FloatArray:
-    """Return ``matrix`` without the mean of each column."""
     return np.asarray(matrix - matrix.mean(axis=0, keepdims=True))
 
 
 def centre_frame(frame: FloatArray) -> FloatArray:
-    """Return C Y C of a ``frame`` Y, C = I - 1 1^T / m, without row and column means."""
     return centre_columns(frame - frame.mean(axis=1, keepdims=True))
 
 
@@ -781,8 +682,7 @@ def _product(first: FloatArray, second: FloatArray, strips: Strips) -> FloatArra
 # -------- One side of a factorised model in, whose scene pixels are taken for independent
 
 NEIGHBOURS = 0.9
-"""Correlation rho of neighbouring pixels; 0.8 to 0.98 are within 0.7 dB of each other
-(docs/decisions.md)."""
+"""Correlation rho of neighbouring pixels; 0.8 to 0.98 are within 0.7 dB of each other (docs/decisions.md)."""
 
 
 def covariance_root(size: int) -> FloatArray:
@@ -792,7 +692,6 @@ def covariance_root(size: int) -> FloatArray:
 
 
 def correlate_side(side: Side) -> Side:
-    """Return a ``side`` whose scene pixels are correlated with their neighbours."""
     root = covariance_root(side.scene_size)
     turned, singular, right = np.linalg.svd(side.response.T @ root, full_matrices=False)
     singular[singular <= singular.max() * side.scene_size * np.finfo(np.float64).eps] = 0.0

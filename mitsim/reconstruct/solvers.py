@@ -48,20 +48,13 @@ from mitsim.reconstruct.solver import (
 
 
 _BALANCE, _STEP = 3.0, 2.0
-"""Ratio of two residuals, or of two parts of the gap, beyond which a penalty changes, and the largest change."""
 _RELAXED = 1.7
-"""Over-relaxation (Boyd et al., section 3.4.3: 1.5 to 1.8)."""
 _BALANCED_EACH, _JUDGED_EACH = 5, 10
-"""Steps after which the penalty of X = Z is balanced, and steps after which the gap, which costs two steps, is
-computed."""
 _DAMPINGS = 10.0 ** np.arange(-20, 2.1, 0.5)
-"""mu over the largest sigma^2."""
 _NOTHING = 1e-300
-"""Divisor in place of a zero."""
 
 
 _SINGLE = float(np.finfo(np.float32).eps) ** 2 / 2
-"""Least objective over the data's energy that a gap refers to, because frames have single precision."""
 
 
 def automatic_weight(problem: DiagonalProblem) -> float:
@@ -83,11 +76,9 @@ class Prior:
 
     @property
     def bounded(self) -> bool:
-        """Whether any bound is finite."""
         return math.isfinite(self.bounds[0]) or math.isfinite(self.bounds[1])
 
     def slack(self, image: FloatArray, pressed: FloatArray) -> float:
-        """Return how far <``pressed``, X> may exceed <``pressed``, ``image``> within the bounds."""
         low, high = self.bounds
         down, up = np.minimum(pressed, 0.0), np.maximum(pressed, 0.0)
         total = 0.0
@@ -107,17 +98,7 @@ def solve_tv(
     tolerance: float = 1e-4,
     bounds: Bounds | None = None,
 ) -> Solution:
-    """Return the total-variation solution of the added frames.
-
-    Parameters
-    ----------
-    weight
-        Weight >= 0 [data^2 / image], or "auto" (:func:`automatic_weight`); 0 is least squares.
-    iterations, tolerance
-        The solver stops when the relative gap is at most ``tolerance``, or after ``iterations``.
-    bounds
-        Least and largest number of the image; None: any.
-    """
+    """Return the total-variation solution of the added frames."""
     problem = prepared.problem(frames)
     lam = automatic_weight(problem) if weight == "auto" else check_lambda(weight)
     return _Minimum(prepared, problem, Prior(weight=lam, bounds=bounds or Prior.bounds)).find(iterations, tolerance)
@@ -131,17 +112,7 @@ def solve_nonnegative(
     tolerance: float = 1e-4,
     bounds: Bounds | None = None,
 ) -> Solution:
-    """Return the Tikhonov solution of the added frames among images within bounds.
-
-    Parameters
-    ----------
-    lam
-        Lambda >= 0, or "auto" as for Tikhonov's solution.
-    iterations, tolerance
-        See :func:`solve_tv`.
-    bounds
-        Least and largest number of the image; None: 0 and inf.
-    """
+    """Return the Tikhonov solution of the added frames among images within bounds."""
     problem = prepared.problem(frames)
     ridge = automatic_lambda(problem) if lam == "auto" else check_lambda(lam)
     prior = Prior(ridge=ridge, bounds=bounds or (0.0, math.inf))
@@ -157,7 +128,6 @@ class _Minimum:
         self.prepared, self.problem, self.prior = prepared, problem, prior
 
     def find(self, iterations: int, tolerance: float) -> Solution:
-        """Return the image whose relative gap is at most ``tolerance``, or that after so many ``iterations``."""
         if iterations < 1:
             raise MitsimError(f"iterations are {iterations}; give at least 1")
         problem = self.problem
@@ -204,7 +174,6 @@ class _Minimum:
         )
 
     def _iterate(self, iterations: int, tolerance: float) -> tuple[FloatArray, int, float]:
-        """Return the image (n, n'), the number of steps and the relative gap."""
         problem, weight, ridge = self.problem, self.prior.weight, self.prior.ridge
         squared, data = np.square(problem.sigma) + ridge, problem.sigma * problem.projected
         # The penalty sets the speed alone: Tikhonov's lambda balances both of its steps.
@@ -280,7 +249,6 @@ class _Minimum:
         return 0.5 * float(np.square(misfit).sum() + self.prior.ridge * np.square(image).sum()) + variation
 
     def _gap(self, image: FloatArray, bounded: FloatArray, pressed: FloatArray) -> tuple[float, float]:
-        """Return the parts of the gap by variation and bounds, and by the quadratic."""
         problem = self.problem
         pull, variation = pressed, self.prior.slack(image, pressed)
         if self.prior.weight:
@@ -301,7 +269,6 @@ class _Minimum:
 
 
 def _towards(first: float, second: float, power: float) -> float:
-    """Return the factor, at most ``_STEP``, by which a penalty changes if ``first`` and ``second`` are not balanced."""
     ratio = max(first, _NOTHING) / max(second, _NOTHING)
     return 1.0 if 1 / _BALANCE <= ratio <= _BALANCE else float(np.clip(ratio**power, 1 / _STEP, _STEP))
 
@@ -332,44 +299,26 @@ def lengths(slopes: FloatArray) -> FloatArray:
 
 
 Patterns = tuple[FloatArray, FloatArray]
-"""P_L (n, K) and P_R (n', K')."""
 
 
 class Solver(Protocol):
     """Solver of images: prepared once for a camera and its patterns, and applied to any number of scenes.
 
-    Attributes
-    ----------
-    linear
-        Whether images at one lambda are linear in the frames, so that their noise is known for each pixel.
-    whole
-        Whether every pattern's slab has all coefficients.
+    Images of a ``linear`` one have an uncertainty for each pixel; ``whole`` slabs have all coefficients.
     """
 
     linear: bool
     whole: bool
 
     @property
-    def name(self) -> str:
-        """Method name."""
-        ...
+    def name(self) -> str: ...
 
-    def init(self, camera: Factors, patterns: Patterns) -> Prepared:
-        """Return the model of a ``camera`` under ``patterns``."""
-        ...
+    def init(self, camera: Factors, patterns: Patterns) -> Prepared: ...
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """Return the image of one scene from all its added ``frames``.
-
-        Parameters
-        ----------
-        lam
-            Lambda; each solver defines "auto".
-        **iterative
-            ``bounds`` and ``iterations`` as requested, for a solver that iterates.
-        """
+        """Return the image of one scene from all its added ``frames``."""
         ...
 
 
@@ -379,7 +328,6 @@ class Tikhonov(Solver):
     name, linear, whole = TIKHONOV, True, False
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
-        """Return the factorised model of a ``camera`` under ``patterns``."""
         prepared = prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
         stated = camera.manifest.noise
         left, right = (float(np.square(side).sum(axis=1).mean()) for side in patterns)
@@ -389,7 +337,6 @@ class Tikhonov(Solver):
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """See :meth:`Solver.compute`."""
         return prepared.solve(frames, lam)
 
 
@@ -399,7 +346,6 @@ class Markov(Tikhonov):
     name, whole = MARKOV, True
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
-        """Return the model factorised in the basis of correlated pixels."""
         return super().init(camera, patterns).with_correlation()
 
 
@@ -411,7 +357,6 @@ class Nonnegative(Tikhonov):
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """See :func:`solve_nonnegative`."""
         return solve_nonnegative(prepared, frames, lam, **iterative)
 
 
@@ -423,10 +368,8 @@ class TotalVariation(Tikhonov):
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """See :func:`solve_tv`."""
         return solve_tv(prepared, frames, lam, **iterative)
 
 
 _ALL = Tikhonov(), Markov(), Nonnegative(), TotalVariation()
 SOLVERS: dict[str, Solver] = {solver.name: solver for solver in _ALL}
-"""Solvers by method name."""

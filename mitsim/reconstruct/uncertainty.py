@@ -61,45 +61,27 @@ from mitsim.reconstruct.solver import DiagonalProblem, coefficient_noise
 
 
 _FALL = -2.0
-"""Power of frequency of the spectra of scenes (Field 1987)."""
 _CONTRAST = 0.4
-"""Prior standard deviation of a scene over its mean: 0.2 (gravel) to 0.6 (a portrait) in eight photographs."""
+"""Prior standard deviation of a scene over its mean: 0.2 to 0.6 in eight photographs."""
 _DEPARTURE, _MEMORY = 2.0, 4.0
 """Prior standard deviation of log S, and its correlation length in octaves (docs/physics.md, uncertainty)."""
 _ALIKE = 0.8
-"""Correlation of log S along rows and columns with log S between them."""
 _NARROW = 16
-"""Frequencies are along an axis where one is less than this part of the other."""
 _SINGLE, _BANDS = 8, 4
-"""Frequencies below which each is a band, and bands an octave above."""
 _CERTAIN = 100.0
-"""Largest effective number of signal data of a group, because scenes are not exactly stationary."""
 _NOISE_CERTAIN = 2000.0
-"""Largest effective number of noise data, because the noise is known to 2 or 3 %."""
 _GREY, _BRIGHT = 0.35, 1.0
-"""Mean reflectance before any data, and the standard deviation of means."""
 _STEPS, _STILL = 60, 1e-4
-"""Largest number of Newton steps, and the log-likelihood below which a step ends them."""
 _FARTHEST = 3.0
-"""Largest step of log S."""
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
     """Mean and power spectrum of a scene.
 
-    Attributes
-    ----------
-    mean, mean_variance
-        Mean of the image, and its variance.
-    even : (r, r') array
-        Coefficients of an image of ones.
-    log_power, covariance
-        log S (J,) at all nodes, and its covariance (J, J).
-    shares : (J, r, r') array
-        Mean square of each coefficient by a unit of S of each node.
-    departure
-        Mean square misfit of groups of data to S over chance; 1 at least.
+    ``even`` (r, r') are the coefficients of an image of ones, ``log_power`` (J,) log S at all nodes, ``shares`` (J, r,
+    r') mean squares of coefficients by a unit of S, and ``departure`` is the misfit of data to S over chance, at least
+    1.
     """
 
     mean: float
@@ -112,21 +94,16 @@ class Spectrum:
 
     @property
     def energy(self) -> FloatArray:
-        """Mean square (r, r') of each coefficient without the mean."""
         return np.asarray(np.tensordot(np.exp(self.log_power), self.shares, axes=1))
 
     def spread(self, weights: FloatArray) -> float:
-        """Return the variance of the logarithm of the sum of coefficients' mean squares times ``weights`` (r, r')."""
         parts = np.exp(self.log_power) * np.tensordot(self.shares, weights, axes=2)
         parts = parts / max(float(parts.sum()), 1e-300)
         return float(parts @ self.covariance @ parts)
 
 
 def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: float | FloatArray) -> Spectrum | None:
-    """Return the spectrum of a scene, or None without data.
-
-    ``noise`` is the variance of each number of ``problem.projected`` (r, r'), or of all.
-    """
+    """Return the spectrum of a scene, or None without data."""
     sigma, measured = problem.sigma, problem.sigma > 0
     if not problem.projected[measured].any():
         return None
@@ -176,11 +153,7 @@ def _bands(size: int) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.
 
 
 def _nodes(down: FloatArray, across: FloatArray) -> tuple[FloatArray, float]:
-    """Return weights (J, r, c) at all frequencies but the mean's, and the octaves between nodes.
-
-    J / 2 octaves are along rows and columns, then those between; ``down`` (r,) and ``across`` (c,) are frequencies in
-    parts of the finest, 0 the first.
-    """
+    """Return weights (J, r, c) at all frequencies but the mean's, and the octaves between nodes."""
     rows, columns = down[:, None], across
     least = min(down[1] if len(down) > 1 else 1.0, across[1] if len(across) > 1 else 1.0)
     octave = np.log2(np.maximum(np.hypot(rows, columns) / least, 1.0))
@@ -194,10 +167,7 @@ def _nodes(down: FloatArray, across: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _group(seen: FloatArray, shares: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return means (groups, J) of sigma^2 times shares over similar coefficients, counts, and their squared data.
-
-    ``seen`` and ``data`` (count,) are sigma^2 and squared data over the noise; ``shares`` is (J, count).
-    """
+    """Return means (groups, J) of sigma^2 times shares over similar coefficients, counts, and their squared data."""
     octaves = len(shares) // 2
     whole = np.maximum(shares.sum(axis=0), 1e-300)
     middle, along = (np.arange(len(shares)) % octaves) @ shares / whole, shares[:octaves].sum(axis=0) / whole
@@ -212,10 +182,7 @@ def _group(seen: FloatArray, shares: FloatArray, data: FloatArray) -> tuple[Floa
 def _likeliest(
     told: FloatArray, counts: FloatArray, found: FloatArray, usual: FloatArray, precision: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return log S (J,), its covariance and the departure from it, by Fisher scoring.
-
-    ``told, counts, found`` are those of :func:`_group`; ``usual`` (J,) and ``precision`` (J, J) are the prior.
-    """
+    """Return log S (J,), its covariance and the departure from it, by Fisher scoring."""
     signal = np.maximum(1 - 1 / np.maximum(found, 1.0), 0.0)
     weight = counts / (1 + counts * (np.square(signal) / _CERTAIN + 1 / _NOISE_CERTAIN))
 
@@ -251,26 +218,19 @@ def _likeliest(
 
 
 _LOST = 1e-5
-"""Part of the energy of G that its few products may omit."""
 _EXTRAPOLATED = 1.35
-"""Factor of its error from which a stated uncertainty is called extrapolated."""
 _AS_STATED = 1.5
-"""Factor that chi-square may be off from 1 before the residual replaces the stated noise."""
 _NEAR = 2.0
-"""Standard deviation [scene pixels] of the neighbourhood of lost detail."""
 _UNSURE = 0.1
-"""Prior detail near a place, in parts of its mean."""
 NO_UNCERTAINTY = {
     "uncertainty": None,
     "uncertainty_budget": None,
     "uncertainty_extrapolated": None,
     "regularisation_bias_factor": None,
 }
-"""Entries of result.json where the uncertainty is not known."""
 
 
 RANDOM = ("frame_noise", "ambient_frame", "rendering")
-"""Sources that another capture draws anew."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,27 +242,22 @@ class Uncertainty:
 
     @property
     def random(self) -> FloatArray:
-        """Part (n, n') that another capture draws anew."""
         return _together([values for name, values in self.sources.items() if name in RANDOM])
 
     @property
     def systematic(self) -> FloatArray:
-        """Part (n, n') that captures with these factors share."""
         return _together([values for name, values in self.sources.items() if name not in RANDOM])
 
     @property
     def total(self) -> FloatArray:
-        """Standard uncertainty (n, n')."""
         return _together(list(self.sources.values()))
 
     @property
     def budget(self) -> dict[str, float]:
-        """Root mean square over the image by source."""
         return {name: _rms(values) for name, values in self.sources.items()}
 
     @property
     def extrapolated(self) -> bool:
-        """Whether most of it is detail that lambda removes and that the data hardly determine."""
         lost = self.budget.get("regularisation_bias", 0.0)
         return self.bias_factor > _EXTRAPOLATED and 2 * lost**2 > _rms(self.total) ** 2
 
@@ -324,7 +279,6 @@ class Uncertainty:
 
     @property
     def gist(self) -> str:
-        """Uncertainty of the whole image in a few words."""
         return f"standard uncertainty {_rms(self.total):.1e} rms"
 
     def __str__(self) -> str:
@@ -334,12 +288,10 @@ class Uncertainty:
         return f"{self.gist}: {by_source or 'no noise is stated'}{known}"
 
     def channels(self) -> dict[str, Channel]:
-        """Return the channels (n, n') of uncertainty.exr."""
         parts = {"uncertainty": self.total, "random": self.random, "systematic": self.systematic}
         return {name: values.astype(np.float32) for name, values in parts.items()}
 
     def summary(self) -> dict[str, Any]:
-        """Return the entries of result.json."""
         return {
             "uncertainty": _rms(self.total),
             "uncertainty_budget": self.budget,
@@ -350,14 +302,11 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
-    """Propagation of noise of a ``model``'s data to its image at ``lam``."""
-
     model: Model
     lam: float
 
     @cached_property
     def gain(self) -> FloatArray:
-        """G (r, r'), 0 where nothing is measured."""
         return np.divide(
             self._sigma, np.square(self._sigma) + self.lam, out=np.zeros_like(self._sigma), where=self._sigma > 0
         )
@@ -378,14 +327,9 @@ class Propagation:
         return np.stack(rows, axis=1), np.stack(columns, axis=1)
 
     def of_white(self, variance: float) -> FloatArray:
-        """Return the variance (n, n') of the image by independent noise of this ``variance`` in all data."""
         return self._spread(np.full(self.gain.shape, variance))
 
     def of_frames(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """Return the variance (n, n') of the image by noise of the frames.
-
-        ``rows`` (K, K', m) and ``columns`` (K, K', m') are the mean variances of a datum by sensor row and column.
-        """
         left, right = self.model.sides
         squares = [np.square(slab.matrix) for slab in right.slabs]
         # Clipped at 0, rows and columns of frames that are darker than nothing have means of their own.
@@ -400,14 +344,12 @@ class Propagation:
         return self._spread(total)
 
     def of_ambient_frame(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """Return the variance (n, n') by a frame of mean variances ``rows`` and ``columns`` taken off all others."""
         sides = zip(self.model.sides, (rows, columns), strict=True)
         left, right = (side.common * np.sqrt(variance)[:, None] for side, variance in sides)
         mean = max(float(rows.mean()), float(columns.mean()))
         return np.asarray(self._image_variance(left, right) / (mean or 1.0))
 
     def of_light(self, variance: float) -> FloatArray:
-        """Return the variance (n, n') of the image by an independent error of every scene pixel's light."""
         left, right = self.model.sides
         if left.dual is None and right.dual is None:  # what coefficients get is then independent too
             return self._spread(variance * np.square(self._sigma))
@@ -423,9 +365,8 @@ class Propagation:
     def of_regularisation(self, problem: DiagonalProblem, variance: float) -> tuple[FloatArray, float]:
         """Return the mean square (n, n') of what lambda removes from the image, and the factor of its error.
 
-        ``variance`` of the data replaces the measured one if there are no more data than unknowns. A coefficient's mean
-        square follows from its datum and from the scene's spectrum, weighted by their errors. The mean is lost as an
-        image of ones is, and detail where lambda would remove more of the image.
+        A coefficient's mean square follows from its datum and from the scene's spectrum, weighted by their errors.
+        ``variance`` replaces the measured one if there are no more data than unknowns.
         """
         told_by_data = problem.data_count > np.count_nonzero(problem.sigma)
         noise = coefficient_noise(problem) if told_by_data else variance
@@ -454,19 +395,16 @@ class Propagation:
         return of_mean + placed, float(np.exp(np.sqrt(spread * spectrum.departure) / 2))
 
     def of_factors(self, noise: FactorNoise, image: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the variances (n, n') of an ``image`` by ``noise`` of the left factor, and of the right one."""
         left, right = self.model.sides
         rows = _of_factor(left, right, self.model.patterns[0], self.terms, image)
         columns = _of_factor(right, left, self.model.patterns[1], self.terms[::-1], image.T).T
         return noise.left**2 * rows, noise.right**2 * columns
 
     def of_lack(self, struck: FloatArray) -> FloatArray:
-        """Return the local mean square error (n, n') of the image by terms that add ``struck`` (r, r') to W."""
         off = np.square(self.model.prepared.image(self.gain * struck))
         return np.asarray(gaussian_filter(off, _NEAR, mode="nearest"))
 
     def of_print(self, image: FloatArray) -> FloatArray:
-        """Return the mean square error (n, n') of an ``image`` whose print changes within every projector pixel."""
         left, right = self.model.sides
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
         moved = [each.sum(axis=0) for each in self.model.moved]
