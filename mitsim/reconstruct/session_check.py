@@ -506,8 +506,7 @@ class _Check:
             own.add(_BENT, bent**2 / 2 * own.size)
             parts = np.stack([(1 + sign * ratio) * c / slow - 1 for sign in (1, -1)])
             parts[1, 0] = 0.0  # the uniform pattern has one lit frame
-            least = max(_SLIGHT, _DEVIATIONS * flicker, _SURE * float(np.sqrt(_STEP * np.median(variances) / 2)))
-            wrong = np.abs(parts) > np.maximum(least, 4 * np.abs(parts[::-1]))
+            wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
                 self._mend(own, int(index), 1 - 2 * int(half), ("power", detail, "its response is divided by that"))
