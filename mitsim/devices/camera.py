@@ -1,8 +1,6 @@
-"""A lensless camera's geometry: from the numbers of a scene's sensor to its pixel grid, mask and shadow factors.
+"""Geometry of a lensless camera: from the numbers of a scene's sensor to its pixel grid, mask and shadow factors.
 
-Every part that needs the camera (the renderer's sensor, the factored frames, calibration files) reads this one model,
-so that a fact such as the mask distance is written once. Coordinates are index coordinates (``s_row = -y``,
-``s_col = -x``) in mm, centred on the optical axis.
+Coordinates are index coordinates (``s_row = -y``, ``s_col = -x``) in mm, centred on the optical axis.
 """
 
 from __future__ import annotations
@@ -25,15 +23,13 @@ from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import MaskMotion
 
 _NODES_PER_PIXEL = 14
-"""Nodes of a tilted mask for each pixel that its shadow is moved by: 2 more leave 4e-5 of frames of dots:7, 2 to 20
-mrad at the paper's geometry."""
+"""Nodes of a tilted mask for each pixel by which its shadow moves: two more change frames of dots:7 by 4e-5."""
 _MOST_TILTED_TERMS = 64
-"""Separable terms that a tilted mask is formed of: 0.8 GB at 512 pixels and as many cells a side."""
 _NOT_KNOWN_BEFORE = (
     "mask_offset", "mask_plate", "mask_motion", "mask_lean", "mask_fft", "mask_cells", "rows", "columns",
     "row_pitch", "roi",
 )  # fmt: skip
-"""Beginnings of the names of fields that calibrations of 0.4 do not know."""
+"""Beginnings of the names of fields that calibrations of 0.4 lack."""
 
 
 PIXELS = 1, 16384
@@ -153,12 +149,12 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @classmethod
     def build(cls, where: str, **values: object) -> CameraGeometry:
-        """Return the geometry of loose ``values``; a bad one raises a MitsimError of one line from ``where`` on."""
+        """Return the geometry of loose ``values``; a MitsimError of one line begins with ``where``."""
         return validate(cls, values, where)
 
     @property
     def identity(self) -> dict[str, object]:
-        """Return what manifests state: all fields but those that are unset and unknown to calibrations of 0.4."""
+        """Return all fields for manifests but those that are unset and unknown to calibrations of 0.4."""
         known = {name: value for name, value in self if value or not name.startswith(_NOT_KNOWN_BEFORE)}
         if self.mask_motion is not None:
             known["mask_motion"] = self.mask_motion.model_dump()
@@ -166,37 +162,34 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return rows and columns of the whole sensor."""
         return self.rows or self.pixels, self.columns or self.pixels
 
     @property
     def pitches(self) -> tuple[float, float]:
-        """Return the distances between rows, and between columns [mm]."""
         return self.row_pitch or self.pixel_pitch, self.pixel_pitch
 
     @property
     def frame_shape(self) -> tuple[int, int]:
-        """Return rows and columns of a frame, which are those of the region of interest."""
         return self.shape if self.roi is None else self.roi[2:]
 
     @property
     def axes_alike(self) -> bool:
-        """Return True if pixels are square, and columns as many and as far off the axis as rows."""
+        """Return True if pixels are square, and columns equal rows in number and offset."""
         return self.pitches[0] == self.pitches[1] and np.array_equal(self.centres(0), self.centres(1))
 
     @property
     def frame_side(self) -> float:
-        """Return the side in pixels of a square with as many as a frame; a whole number for square frames."""
+        """Return the side in pixels of a square of equal area; a whole number for square frames."""
         return side_of(self.frame_shape)
 
     @property
     def half_width(self) -> float:
-        """Return half the sensor's longer side [mm]; light is followed to the square of that side."""
+        """Return half the sensor's longer side [mm]."""
         return max(self.half_sides)
 
     @property
     def half_sides(self) -> tuple[float, float]:
-        """Return half the sensor's height, along rows' numbers, and half its width [mm]."""
+        """Return half the sensor's height and half its width [mm]."""
         (rows, columns), (row, column) = self.shape, self.pitches
         return rows * row / 2, columns * column / 2
 
@@ -211,62 +204,57 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def pixel_edges(self) -> FloatArray:
-        """Return the (pixels + 1,) edges of pixels along the sensor's longer side [mm]."""
+        """Return the (pixels + 1,) pixel edges along the sensor's longer side [mm]."""
         return centred_edges(*max(zip(self.shape, self.pitches, strict=True), key=math.prod))
 
     def centres(self, axis: int) -> FloatArray:
-        """Return the (m,) centres of a frame's rows (``axis`` 0) or columns (1) [mm]."""
+        """Return the (m,) centres of a frame's rows (0) or columns (1) [mm]."""
         edges = centred_edges(self.shape[axis], self.pitches[axis])
         centres = np.asarray((edges[:-1] + edges[1:]) / 2)
         return centres if self.roi is None else centres[self.roi[axis] : self.roi[axis] + self.roi[axis + 2]]
 
     @property
     def mask_offset(self) -> tuple[float, float]:
-        """Return the coordinates (row, column) of the mask's centre [mm]; (0, 0) on the axis."""
         return self.mask_offset_row, self.mask_offset_column
 
     def build_mask(self) -> Mask | Plate:
-        """Return the mask in coordinates of its own centre; for a plate, the part that can be seen."""
+        """Return the mask in coordinates of its own centre; of a plate, the visible part."""
         if self.mask_plate is not None:
             return within(self.mask_plate, self.mask_reach)
         return mls_mask(cast("MaskKind", self.mask), self.mask_feature, self.mask_order)
 
     @property
     def mask_reach(self) -> float:
-        """Return the distance from its centre to which a mask is seen [mm]."""
+        """Return the visible distance from the mask's centre [mm]."""
         seen = self.half_width + (self.mask_distance + self.mask_thickness) * self.tan_half_fov
         leaning = 1 + self.tan_half_fov * sum(map(abs, self.mask_tilt))
         return (seen + max(self.pitches) + max(map(abs, self.mask_offset))) * leaning
 
     @property
     def centred(self) -> bool:
-        """Return True if a separable solver subtracts row and column means from frames, as for a FlatCam mask."""
+        """Return True if a separable solver subtracts row and column means."""
         return self.build_mask().centred
 
     @property
     def diffracts(self) -> bool:
-        """Return True if diffraction at the mask is simulated."""
         return self.build_mask().diffracts
 
     @property
     def mask_tilt(self) -> tuple[float, float]:
-        """Return the tangents by which the mask's distance grows along rows and columns; (0, 0) if it is even."""
+        """Return the slopes of the mask's distance along rows and columns."""
         made = self.mask_plate.flaws.tilt_mrad if self.mask_plate else (0.0, 0.0)
         lean = self.mask_lean_mrad or (0.0, 0.0)
         return math.tan((made[0] + lean[0]) * 1e-3), math.tan((made[1] + lean[1]) * 1e-3)
 
     @property
     def tilt_shift_mm(self) -> float:
-        """Return the largest shift of shadows on the mask by its tilt [mm].
-
-        A ray of slope t that leaves the even plane at s meets the tilted one t s tan(tilt) beside.
-        """
+        """Return the largest shift of shadows by the tilt [mm]: t s tan(tilt) for a ray of slope t at s."""
         return self.tan_half_fov * self.mask_reach * sum(map(abs, self.mask_tilt))
 
     def tilt_nodes(self, waves: bool) -> tuple[int, int] | None:
         """Return the nodes of rows and columns that form the shadow of a tilted mask (:mod:`mitsim.optics.terms`).
 
-        The value is None for an even mask, one that is drawn on a raster, and one that would take too many terms.
+        The value is None for an even mask, one that is drawn on a raster, and one that needs too many terms.
         """
         if not any(self.mask_tilt) or self.is_drawn(waves):
             return None
@@ -277,75 +265,66 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         return None if many else (by_column, by_row)
 
     def tilt_left_out(self, waves: bool) -> bool:
-        """Return True if the mask is tilted and its shadow, with ``waves`` or without, is that of an even one."""
+        """Return True if the mask's tilt is neglected in its shadow."""
         return any(self.mask_tilt) and self.tilt_nodes(waves) is None
 
     @property
     def mask_words(self) -> str:
-        """Return the mask in words."""
         return self.mask_plate.words if self.mask_plate else f"{self.mask}, order {self.mask_order}"
 
     @property
     def mask_terms(self) -> int:
-        """Return the number of separable terms of the mask as it is mounted; 1 if it has no closed form."""
+        """Return the number of separable terms of the mounted mask; 1 without a closed form."""
         if self.is_drawn(waves=False):
             return 1
         return len(self.build_mask().terms) * math.prod(self.tilt_nodes(waves=False) or (1,))
 
     def is_correlated(self, waves: bool) -> bool:
-        """Return True if frames, with ``waves`` or without, are correlations with a shadow on a raster."""
+        """Return True if frames are correlations with a shadow on a raster."""
         return self.is_drawn(waves) or (self.mask_fft and self.may_be_drawn(waves))
 
     def may_be_drawn(self, waves: bool) -> bool:
-        """Return True if frames may be sums of terms as well as correlations with a shadow on a raster.
-
-        Both work for a plate of more than two terms that is mounted straight and at rest, over square pixels.
-        """
+        """Return True if both sums of terms and correlations work."""
         mask = self.build_mask()
         still = self.mask_motion is None and not any(self.mask_tilt) and self.pitches[0] == self.pitches[1]
         return still and not (waves or self.is_drawn(waves)) and mask.crosses is None
 
     def is_drawn(self, waves: bool) -> bool:
-        """Return True if the mask's shadow, with ``waves`` or without, is drawn on a raster.
-
-        A turned mask, a picture of light, more than a thousand terms, and waves behind many terms have no short closed
-        form.
-        """
+        """Return True if the shadow is drawn on a raster, because it has no short closed form."""
         mask = self.build_mask()
         turned = bool(mask.flaws.turn_deg)
         return mask.irradiance or turned or mask.many or (waves and mask.amplitude.crosses is None)
 
     @property
     def few_wave_terms(self) -> bool:
-        """Return True if waves behind the mask are a sum of few terms: it is at rest, and mounted straight."""
+        """Return True if waves behind the mask are a sum of few terms."""
         return self.diffracts and not self.is_drawn(waves=True) and not any(self.mask_tilt) and self.mask_motion is None
 
     @property
     def wall_shift_features(self) -> float:
-        """Return the largest shift between a mask's two faces along a ray through the field stop, in features.
+        """Return the largest shift between a mask's two faces along a ray, in features.
 
-        The two-face model of a thick mask needs less than 1, because a ray may then not cross a wall between the faces.
+        The two-face model needs less than 1, because a ray may then not cross a wall between the faces.
         """
         return self.mask_thickness * self.tan_half_fov / self.mask_feature
 
     @property
     def active_sides(self) -> tuple[float, float]:
-        """Return the sides of a pixel's active part along rows' and columns' numbers [mm]."""
         root = math.sqrt(self.pixel_fill_factor)
         return self.pitches[0] * root, self.pitches[1] * root
 
     def angular_response(self, squared_tan: FloatArray) -> FloatArray:
-        """Return a pixel's response cos^n(theta), relative to normal incidence, to rays of tan^2(theta)."""
+        """Return a pixel's response cos^n(theta) to rays of tan^2(theta)."""
         return np.asarray((1 + squared_tan) ** (-self.angular_exponent / 2))
 
 
 def side_of(shape: tuple[int, int]) -> float:
-    """Return the side in pixels of a square with as many as a frame of ``shape``; a whole number for square frames."""
+    """Return the side in pixels of a square with the area of ``shape``."""
     return shape[0] if shape[0] == shape[1] else math.sqrt(shape[0] * shape[1])
 
 
 def centred_edges(count: int, pitch: float) -> FloatArray:
-    """Return the (count + 1,) edges of ``count`` equal cells about zero in the unit of ``pitch``."""
+    """Return the (count + 1,) edges of equal cells about zero."""
     return np.asarray((np.arange(count + 1, dtype=np.float64) - count / 2) * pitch)
 
 
@@ -354,19 +333,7 @@ def centred_edges(count: int, pitch: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class Devices:
-    """Camera and projector.
-
-    Attributes
-    ----------
-    camera
-        Sensor and mask in space, as the scene states them.
-    sensor
-        Electronics of the camera.
-    projector
-        Light and lens of the projector.
-    camera_file
-        File of the electronics, for messages.
-    """
+    """Camera, electronics ``sensor`` of ``camera_file``, and projector."""
 
     camera: CameraGeometry
     sensor: SensorModel

@@ -1,8 +1,7 @@
-"""Lists that a person writes about files of a real camera: its session, flat frames, known pictures, a chart.
+"""Lists that a user writes about files of a real camera: its session, flat frames, known pictures, a chart.
 
-A list of frames is `session.toml` or `session.json` in their folder; a session's list need not name its frames, which
-then count in the order of their names. A list of known pictures is a file of any name, and its paths begin in its own
-folder. Nothing here opens a frame or imports numpy.
+A list of frames is `session.toml` or `session.json` in their folder. If a session's list does not name its frames,
+the order of their names counts. Paths of a list of known pictures begin in its own folder. No frame is opened here.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ DARK = "dark"
 
 
 def read_list(folder: Path, fields: str) -> tuple[Path, Table]:
-    """Return path and contents of the list in a ``folder``; refuse none or two, naming the needed ``fields``."""
+    """Return path and contents of the list in a ``folder``; raise MitsimError for none or two."""
     lists = [folder / name for name in LISTS if (folder / name).is_file()]
     if len(lists) != 1:
         found = "holds both" if lists else "holds neither" if folder.is_dir() else "no such folder, nor"
@@ -64,7 +63,7 @@ def _refusal(folder: Path, text: str) -> MitsimError:
 
 
 def _check_files(folder: Path, names: Iterable[str]) -> None:
-    """Refuse a name that is listed twice, or that no file in the ``folder`` has."""
+    """Raise MitsimError for a name that is listed twice or missing in the ``folder``."""
     seen = set[str]()
     for name in names:
         if name in seen:
@@ -161,18 +160,11 @@ class FrameList(Configuration):
 
 @dataclass(frozen=True, eq=False)
 class SessionFrames:
-    """A real session's frames, each of which is in the folder once.
+    """Frames of a real session, each of which is in the folder once.
 
-    Attributes
-    ----------
-    folder, listed
-        Folder of the frames, and its list.
-    shots
-        Frame by side, number of the pattern, sign, exposure and repeat.
-    dark
-        Frames with the projector off.
-    preparer
-        Makes frames of the files' numbers; None if nothing is done to them.
+    ``shots`` has the frames by side, number of the pattern, sign, exposure and repeat. ``preparer`` makes frames of
+    the
+    files' numbers; None if nothing is done to them.
     """
 
     folder: Path
@@ -183,16 +175,15 @@ class SessionFrames:
 
     @property
     def wanted(self) -> Wanted:
-        """Return how the frames are read."""
         return Wanted.of(self.listed.raw, self.listed.prepare)
 
     @property
     def planes(self) -> tuple[str, ...]:
-        """Return the planes of a mosaic that are calibrated one by one; "" alone if the frames are of one plane."""
+        """Return the planes of a mosaic that are calibrated one by one; else "" alone."""
         return PLANES if self.listed.prepare.channel == ALL else ("",)
 
     def of_plane(self, name: str) -> SessionFrames:
-        """Return the session of the one of the :attr:`planes` called ``name``, which the camera's identity then has."""
+        """Return the session of one of the :attr:`planes`, which becomes part of the camera's identity."""
         if not name:
             return self
         prepare = self.listed.prepare.model_copy(update={"channel": name})
@@ -200,7 +191,7 @@ class SessionFrames:
         return replace(self, listed=self.listed.model_copy(update={"prepare": prepare, "camera": camera}))
 
     def with_preparer(self) -> SessionFrames:
-        """Return the session with its preparer, which reads the dark and flat frames, and with the end of its scale.
+        """Return the session with its preparer, which reads dark and flat frames, and the end of its scale.
 
         Raises MitsimError for frames that cannot be read, and for a list of all planes.
         """
@@ -214,7 +205,6 @@ class SessionFrames:
         return replace(self, listed=self.listed.model_copy(update={"digital": preparer.digital}), preparer=preparer)
 
     def read(self, name: str) -> Numbers:
-        """Return the (rows, columns) frame in the file called ``name``."""
         from mitsim.core.images import read_image
 
         values = read_image(self.folder / name, self.wanted)
@@ -222,40 +212,37 @@ class SessionFrames:
 
     @property
     def pairs(self) -> bool:
-        """Return True if a +-1 pattern is the difference of two frames, and not taken from one and a uniform one."""
+        """Return True if a +-1 pattern is the difference of two frames."""
         return self.listed.signed_capture == "pair"
 
     def repeats_of(self, half: Half, exposure: int = 0) -> tuple[StripeFile, ...]:
-        """Return all repeats of one ``half`` of a pattern at one ``exposure`` of the ladder."""
+        """Return all repeats of one ``half`` at one ``exposure`` of the ladder."""
         return tuple(self.shots[(*half, exposure, repeat)] for repeat in range(self.listed.repeats))
 
     @cached_property
     def files(self) -> tuple[str, ...]:
-        """Return the names of all frames, dark ones last."""
         return (*(shot.file for shot in self.shots.values()), *(frame.file for frame in self.dark))
 
     @cached_property
     def order(self) -> list[Half]:
-        """Return the halves of patterns in the order in which they were taken, which is that of the list."""
+        """Return the halves of patterns in the order of the list."""
         keys = [(f.side, f.index, f.sign) for f in self.listed.frames or self.shots.values()]
         return list(dict.fromkeys(keys))
 
     def frame_name(self, half: Half) -> str:
-        """Return the names of the files that show a ``half`` of a pattern, and which half it is."""
+        """Return the file names that show a ``half``, and the half."""
         files = [shot.file for key, shot in self.shots.items() if key[:3] == half]
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""
         return f"{files[0]}{more} ({_words((*half, 0, 0))})"
 
     def exposure_s(self, frame: StripeFile | DarkFile) -> float:
-        """Return the exposure of a ``frame`` [s]."""
         return frame.exposure_s or self.listed.digital.exposure_s * self.listed.exposure_ladder[frame.exposure]
 
 
 def load_frames(folder: Path | str) -> SessionFrames:
-    """Return which file of the ``folder`` shows what.
+    """Return which file of the ``folder`` shows which pattern.
 
-    Raises MitsimError for a folder without a list, a list that breaks a rule, and for frames that are missing or there
-    twice.
+    Raises MitsimError without a list, for a list that breaks a rule, and for frames that are missing or there twice.
     """
     folder = Path(folder)
     place, data = read_list(folder, "camera, n, signed_capture and digital")
@@ -307,10 +294,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
 
 
 def _check_exposures(session: SessionFrames) -> None:
-    """Refuse halves of a pair or repeats that are exposed unlike, and dark frames that no other frame is exposed as.
-
-    Frames of several exposures state their numbers, and no seconds.
-    """
+    """Raise MitsimError for pairs or repeats of unequal exposure, and for dark frames of unused exposures."""
     folder, rungs = session.folder, len(session.listed.exposure_ladder)
     frames: tuple[StripeFile | DarkFile, ...] = (*session.shots.values(), *session.dark)
     for frame in frames:
@@ -343,11 +327,10 @@ def _words(key: Key) -> str:
 # -------- Frames that characterise a camera
 
 _MOST_SETS, _MOST_FRAMES = 4096, 10_000
-"""Largest numbers of sets in a list, and of frames in a set: ten times what EMVA 1288's longest procedures take."""
 
 
 def capacity_of(sensor: SensorModel) -> float:
-    """Return the electrons that saturate a pixel: its full well, or the ADC's end; MitsimError without either."""
+    """Return the electrons that saturate a pixel: full well or end of the ADC; MitsimError without either."""
     full = sensor.superpixel_full_well_e
     if sensor.largest_dn is not None:
         full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
@@ -396,27 +379,26 @@ class FlatList(Configuration):
 
 @dataclass(frozen=True)
 class FlatFrames:
-    """The ``folder`` of a camera's frames, all of which are there, and its list."""
+    """The ``folder`` of a camera's frames, and its list."""
 
     folder: Path
     listed: FlatList
 
     @property
     def wanted(self) -> Wanted:
-        """Return how the frames are read."""
         return Wanted(raw=self.listed.raw)
 
     @property
     def sets(self) -> tuple[DarkSet, ...]:
-        """Return all sets, lit ones first."""
         return (*self.listed.lit, *self.listed.dark)
 
 
 def load_flats(folder: Path | str) -> FlatFrames:
-    """Return which file of the ``folder`` shows what.
+    """Return the files of the ``folder`` with their meaning.
 
-    Raises MitsimError for a folder without a list, a list that breaks a rule, frames that are missing or without a
-    partner, and for an exposure under light without one in the dark.
+    Raises MitsimError without a list, for a list that breaks a rule, for frames that are missing or without a
+    partner,
+    and for an exposure under light without one in the dark.
     """
     folder = Path(folder)
     place, data = read_list(folder, "name, pixel_pitch_um, bits, and sets lit and dark of files and exposure_s")
@@ -441,15 +423,13 @@ def load_flats(folder: Path | str) -> FlatFrames:
 # -------- Captures of known pictures that a camera is calibrated by
 
 MOST_CAPTURES = 4096
-"""Largest number of captures in a list: more than a day of taking them."""
 MOST_TERMS = 4
-"""Most codes of a side: a normal matrix of that many times their numbers is inverted."""
+"""Most codes of a side, because a normal matrix grows with them."""
 Colour = Literal["red", "green", "blue"]
 Orientation = Literal["upright", "mirrored", "upside down", "turned"]
 """How a picture lies as the camera's code runs; turned is both others."""
 Scale = Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)]
 _PLACING = "mosaic", "orientation", "turn_deg", "turn_about", "crop"
-"""Parts of a preparation that move pixels: frames of two such are of two cameras."""
 
 
 class KnownCapture(Configuration):
@@ -494,16 +474,11 @@ class KnownList(Configuration):
 
 @dataclass(frozen=True, eq=False)
 class KnownCaptures:
-    """A list whose runs and pictures are there.
+    """A list whose runs and pictures exist.
 
-    Attributes
-    ----------
-    path, listed
-        Path and contents of the list.
-    lines
-        Planes that every run has, in folders of their own; None if each is a single RUN folder.
-    manifests
-        Manifests of the first run by the names of its lines; "" where there are none.
+    ``lines`` are planes that every run has in folders of their own (None without them), ``manifests`` those of the
+    first
+    run by line.
     """
 
     path: Path
@@ -512,18 +487,17 @@ class KnownCaptures:
     manifests: dict[str, RunManifest]
 
     def run(self, capture: KnownCapture, line: str = "") -> Path:
-        """Return the RUN folder of a ``capture``, or of a ``line`` of it."""
         return self.path.parent / capture.run / line
 
     def picture(self, capture: KnownCapture) -> Path:
-        """Return the file of a ``capture``'s picture."""
         return self.path.parent / capture.picture
 
 
 def load_known(path: Path | str) -> KnownCaptures:
     """Return the list in the file ``path``, TOML or JSON.
 
-    Raises MitsimError for a list that breaks a rule, and for runs or pictures that are missing, unfinished, of several
+    Raises MitsimError for a list that breaks a rule, and for runs or pictures that are missing, unfinished, of
+    several
     cameras, or of other lines than the first.
     """
     path = Path(path)
@@ -551,9 +525,9 @@ def load_known(path: Path | str) -> KnownCaptures:
 
 
 def preparation_of(manifest: RunManifest, place: Path | str) -> Preparation:
-    """Return what an import did to files before they were the frames of a ``manifest`` at a ``place``.
+    """Return the preparation that an import applied before the frames of a ``manifest``; empty for other runs.
 
-    Other runs have an empty preparation. MitsimError where the manifest states what no import does.
+    Raises MitsimError if the manifest states another one.
     """
     return validate(Preparation, manifest.configuration.get("prepare") or {}, f"{place}: a run's configuration.prepare")
 
@@ -561,7 +535,7 @@ def preparation_of(manifest: RunManifest, place: Path | str) -> Preparation:
 def _difference(
     manifests: dict[str, RunManifest], known: dict[str, RunManifest], run: str, first: str, path: Path
 ) -> str:
-    """Return how a ``run`` differs from the ``first``, whose manifests are ``known``: in lines, camera, or pixels."""
+    """Return how a ``run`` differs from the ``first``: in lines, camera, or pixels."""
     if [*manifests] != [*known]:
         names = [", ".join(name for name in each if name) or "no" for each in (manifests, known)]
         return f"{run} has {names[0]} planes, but {first} has {names[1]}; give runs of one kind"
@@ -607,13 +581,13 @@ class ChartPlace(Configuration):
         return patches
 
     def means(self, image: FloatArray) -> FloatArray:
-        """Return the (24, ...) means over the patches of an ``image``; MitsimError where one lies outside."""
+        """Return the (24, ...) means over the patches; MitsimError where one lies outside."""
         import numpy as np
 
         return np.array([block.mean(axis=(0, 1)) for block in self.blocks(image)])
 
     def blocks(self, image: FloatArray) -> list[FloatArray]:
-        """Return the pixels (rows, columns, ...) of each patch in an ``image``; MitsimError where one lies outside."""
+        """Return the pixels (rows, columns, ...) of each patch; MitsimError where one lies outside."""
         rows, columns = image.shape[:2]
         outside = next((box for box in self.patches if box[1] > rows or box[3] > columns), None)
         if outside is not None:
@@ -623,6 +597,6 @@ class ChartPlace(Configuration):
 
 
 def load_chart(name: Path | str) -> ChartPlace:
-    """Return the chart ``name``: a shipped scene that shows one, or a JSON file. MitsimError when it cannot be read."""
+    """Return the chart of a shipped scene or a JSON file; MitsimError when it cannot be read."""
     path = locate(name, "scenes", "chart.json")
     return validate(ChartPlace, read_json(path), f"file {path}")

@@ -1,7 +1,7 @@
 """A coded mask: from a 0/1 code, a construction and a feature size to its transmission at any point of the mask plane.
 
-Coordinates are the project's index coordinates, ``s_row = -y`` and ``s_col = -x`` in mm, centred on the
-optical axis, so that an index grows with its coordinate. The mask is opaque outside its features.
+Coordinates are index coordinates, ``s_row = -y`` and ``s_col = -x`` in mm, centred on the optical axis. The mask is
+opaque outside its features.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 
 MaskKind = Literal["separable", "flatcam", "open"]
-"""How a plate is made from a code; see :class:`Mask`."""
 CameraMask = Literal["separable", "flatcam", "open", "plate"]
-"""The mask of a camera: a :class:`Mask`, or a :class:`mitsim.devices.plate.Plate`."""
 Term = tuple[float, FloatArray, FloatArray]
 """Weight, row profile (N,) and column profile (N,) of a separable part of a transmission."""
 BoolArray = npt.NDArray[np.bool_]
@@ -29,7 +27,7 @@ _TAPS = {
     13: (12, 11, 8), 14: (13, 12, 2), 15: (14,), 16: (15, 13, 4),
 }
 # fmt: on
-"""Feedback taps by order: those of ``scipy.signal.max_len_seq``, so that masks are the papers'."""
+"""Feedback taps by order, as in ``scipy.signal.max_len_seq``."""
 
 
 # ---- What goes wrong when a mask is made and mounted ----
@@ -40,27 +38,15 @@ _TAPS = {
 # turned in its plane, and tilted to the sensor.
 
 _REACH = 8.3
-"""Standard deviations beyond which a Gaussian holds less than rounding, 1e-16."""
 _LINES = 16
-"""Lines that cross a disc of dust: what they leave of its edge is 1e-3 of its shadow
-(tests/unit/devices/test_flaws.py)."""
+"""Lines that cross a disc of dust; they leave 1e-3 of its shadow."""
 _CHORDS = 16
-"""Chords a cell that a disc's part of it is summed from: 1e-4 of its area."""
 _MOST_DISCS = 100
-"""Discs in sight: each adds 34 lines, and a mask of 4000 lines takes 128 MiB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dust(ByValue):
-    """Discs on a mask.
-
-    Attributes
-    ----------
-    centres_mm
-        (k, 2) rows and columns of the centres.
-    radius_mm, opacity
-        Radius of each disc, and the part of the light that it takes, also where discs overlap.
-    """
+    """Discs on a mask: (k, 2) centres, one radius, and one opacity, also where discs overlap."""
 
     centres_mm: FloatArray
     radius_mm: float
@@ -70,7 +56,7 @@ class Dust(ByValue):
         self._hold(centres_mm=np.array(self.centres_mm, dtype=np.float64))
 
     def turn(self, quarters: int) -> Dust:
-        """Return the dust on a mask turned by ``quarters`` of a turn, as ``numpy.rot90`` turns its features."""
+        """Return the dust on a mask that ``numpy.rot90`` turns by ``quarters``."""
         row, column = self.centres_mm.T
         for _ in range(quarters % 4):
             row, column = -column, row
@@ -79,19 +65,7 @@ class Dust(ByValue):
 
 @dataclass(frozen=True)
 class Flaws:
-    """What is wrong with a mask, besides its lines.
-
-    Attributes
-    ----------
-    blur_mm
-        standard deviation of its edges [mm].
-    turn_deg
-        angle in its plane, from the rows' direction to the columns' [degrees].
-    tilt_mrad
-        how its distance grows along rows and along columns.
-    dust
-        on it.
-    """
+    """Flaws of a mask: blur of its edges, turn from rows to columns, tilt along rows and along columns, and dust."""
 
     blur_mm: float = 0.0
     turn_deg: float = 0.0
@@ -100,18 +74,17 @@ class Flaws:
 
     @property
     def margin_mm(self) -> float:
-        """Return the distance that the blur reaches [mm]."""
         return _REACH * self.blur_mm
 
     def reach(self, extent_mm: float) -> float:
-        """Return the side [mm] of a square that holds a mask of side ``extent_mm`` as it is mounted."""
+        """Return the side [mm] of a square that holds a mounted mask of side ``extent_mm``."""
         angle = np.radians(self.turn_deg)
         # A tilted mask meets a ray beside where an even one does, by less than the tangent of its tilt.
         tilt = 1 + sum(abs(angle) for angle in self.tilt_mrad) * 1e-3
         return float(extent_mm * (abs(np.cos(angle)) + abs(np.sin(angle))) * tilt**2 + 2 * self.margin_mm)
 
     def turned_back(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the coordinates on the mask itself of points (``row``, ``column``) of its plane."""
+        """Return the coordinates on the mask itself of points of its plane."""
         if not self.turn_deg:
             return row, column
         cosine, sine = np.cos(np.radians(self.turn_deg)), np.sin(np.radians(self.turn_deg))
@@ -135,10 +108,8 @@ class Mask(ByValue):
         ``separable``: transmission a(row) a(column) with a the 0/1 bits (25 % open).
         ``flatcam``: (1 + m(row) m(column)) / 2 with m = 2 bits - 1 (50 % open).
         ``open``: every feature open, an aperture of the mask's size.
-    feature_mm
-        side of one feature [mm].
     bits
-        (N,) 0/1 code, read-only; the same code serves rows and columns.
+        (N,) 0/1 code of rows and columns, read-only.
     """
 
     kind: MaskKind
@@ -159,17 +130,16 @@ class Mask(ByValue):
 
     @property
     def extent_mm(self) -> float:
-        """Return the side of the patterned square [mm]; it spans -extent/2 .. +extent/2."""
         return len(self.bits) * self.feature_mm
 
     @property
     def lines(self) -> FloatArray:
-        """Return the (N + 1,) coordinates of the lines between rows, and between columns [mm]."""
+        """Return the (N + 1,) coordinates of the lines between features [mm]."""
         return np.asarray((np.arange(len(self.bits) + 1) - len(self.bits) / 2) * self.feature_mm)
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """Return the transmission as a sum of terms (weight, row profile (N,), column profile (N,))."""
+        """Return the terms (weight, row profile (N,), column profile (N,))."""
         ones = np.ones(len(self.bits))
         if self.kind == "open":
             return ((1.0, ones, ones),)
@@ -184,30 +154,29 @@ class Mask(ByValue):
 
     @property
     def centred(self) -> bool:
-        """Return True if a separable solver subtracts row and column means from frames."""
+        """Return True if a separable solver subtracts row and column means."""
         return self.kind == "flatcam"
 
     @property
     def opening_mm(self) -> float:
-        """Return the mean width of the openings [mm]."""
         is_open = np.ones_like(self.bits) if self.kind == "open" else self.bits
         return mean_opening(is_open[:, None] > 0, np.diff(self.lines))
 
     @property
     def amplitude(self) -> Mask:
-        """Return the mask whose values are the factors of a field: itself, as roots of 0 and 1 are 0 and 1."""
+        """Return the mask itself, because roots of 0 and 1 are 0 and 1."""
         return self
 
     @property
     def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
-        """Return the openings as grids that do not overlap: (N,) rows and (N,) columns of each, open where both are."""
+        """Return grids of openings that do not overlap, (N,) rows and (N,) columns each."""
         bits = self.bits.astype(bool)
         if self.kind == "open":
             return ((np.ones_like(bits), np.ones_like(bits)),)
         return ((bits, bits),) if self.kind == "separable" else ((bits, bits), (~bits, ~bits))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
-        """Return the transmission (0..1) at points (``s_row``, ``s_col``) of the mask plane [mm]; arrays broadcast."""
+        """Return the transmission (0..1) at points of the mask plane [mm]."""
         count = len(self.bits)
         row, column = (np.floor(np.asarray(s, dtype=np.float64) / self.feature_mm + count / 2) for s in (s_row, s_col))
         in_rows, in_columns = ((at >= 0) & (at < count) for at in (row, column))
@@ -217,15 +186,7 @@ class Mask(ByValue):
 
 
 def mean_opening(is_open: BoolArray, widths: FloatArray) -> float:
-    """Return the mean width of openings down the rows of a mask, in the unit of ``widths``; 0 without one.
-
-    Parameters
-    ----------
-    is_open
-        (N, c) of each place.
-    widths
-        (N,) of the rows.
-    """
+    """Return the mean width of openings (N, c) down the rows of ``widths`` (N,); 0 without one."""
     begins = np.diff(is_open, axis=0, prepend=False) & is_open
     return float((widths @ is_open).sum() / max(np.count_nonzero(begins), 1))
 
@@ -234,9 +195,8 @@ def mean_opening(is_open: BoolArray, widths: FloatArray) -> float:
 def mls_code(order: int) -> npt.NDArray[np.int8]:
     """Return the (2**order - 1,) bits of the maximum length sequence of an ``order`` from 2 to 16, read-only.
 
-    The bits of ``scipy.signal.max_len_seq(order)[0]``, whose import alone takes a second: a linear feedback shift
-    register that starts with ones. Polynomial and phase matter: another sequence moves the system's condition number
-    by tens of percent.
+    They are ``scipy.signal.max_len_seq(order)[0]``, whose import takes a second. Polynomial and phase matter, because
+    another sequence changes the condition number by tens of percent.
     """
     bits = [1] * order
     for start in range(2**order - 1 - order):
@@ -250,17 +210,7 @@ def mls_code(order: int) -> npt.NDArray[np.int8]:
 
 
 def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int = 9) -> Mask:
-    """Return the mask of :func:`mls_code`; the defaults are the paper's.
-
-    Parameters
-    ----------
-    kind
-        construction, see :class:`Mask`.
-    feature_mm
-        side of a feature [mm].
-    order
-        2 to 16: the mask has 2**order - 1 features a side.
-    """
+    """Return the mask of :func:`mls_code`, by default the paper's."""
     return Mask(kind, feature_mm, mls_code(order))
 
 
@@ -268,17 +218,10 @@ def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int 
 
 
 def etch(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Return lines (2 N + 2,) and transmissions (2 N + 1, 2 N + 1) of a mask whose openings have grown on each side.
+    """Return lines (2 N + 2,) and values (2 N + 1, 2 N + 1) of a mask whose openings grew on each side.
 
     Every place gets the greatest transmission within a square of half-side ``grow_mm``, or the least where that is
-    below 0; beyond the mask it is opaque.
-
-    Parameters
-    ----------
-    values
-        (N, N) transmissions.
-    feature_mm, grow_mm
-        their size, and how far edges move outward.
+    negative; beyond the mask it is opaque.
     """
     count = len(values)
     even = (np.arange(count + 1) - count / 2) * feature_mm
@@ -297,21 +240,9 @@ def etch(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatAr
 
 
 def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Return a mask's lines and transmissions with dust on it.
+    """Return a mask's lines (N + 1,) and transmissions (N, N) with the dust within ``reach_mm`` of the centre.
 
-    Parameters
-    ----------
-    lines, values
-        (N + 1,) and (N, N) of the clean mask.
-    dust
-        of which what touches the square within ``reach_mm`` of the centre is drawn.
-    reach_mm
-        half that square's side.
-
-    Raises
-    ------
-    MitsimError
-        for more dust in sight than is drawn.
+    Raises MitsimError for more dust than can be drawn.
     """
     centres = dust.centres_mm[(np.abs(dust.centres_mm) < reach_mm + dust.radius_mm).all(axis=1)]
     if len(centres) > _MOST_DISCS:

@@ -1,4 +1,4 @@
-"""A camera file's table ``[mask]``: a mask's numbers in, the camera's geometry with that mask out."""
+"""A camera file's table ``[mask]``, and the camera's geometry with that mask."""
 
 from __future__ import annotations
 
@@ -39,20 +39,16 @@ _OWN = {
     "drawing": "file!",
     "psf": "file! psf_distance_mm! aperture_mm2! psf_reduce",
 }
-"""Fields that each kind has beside its name and the feature size; with !, those that it cannot do without."""
+"""Fields that each kind has beside its name and the feature size; those with ! are required."""
 _FLAWS = {
     "over_etch_um", "edge_blur_um", "opaque_transmission", "clear_transmission", "rotation_deg", "tilt_row_mrad",
     "tilt_column_mrad", "dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed",
 }  # fmt: skip
 """The fields that every kind has."""
 _DUST = {"dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed"}
-"""Those that say nothing where there is no dust."""
 _QUARTER = 90
-"""Degrees of a turn that takes features to features."""
 _MOST_ETCHED = LARGEST // 2
-"""Features a side of a mask that is etched: each has two lines then."""
 _MOST_GROWTH = 8
-"""Features by which openings grow or shrink at most: beyond it nothing of a code is left."""
 
 
 class MaskProfile(Configuration):
@@ -123,7 +119,7 @@ class MaskProfile(Configuration):
         return self
 
     def plate(self, folder: Path) -> Plate:
-        """Return the plate as it is made; files count from ``folder``. Raises MitsimError if it is too large."""
+        """Return the plate as it is made; files are relative to ``folder``. Raises MitsimError if it is too large."""
         drawn = self.plate_drawing(folder)
         if not self._stated:
             return drawn
@@ -151,22 +147,13 @@ class MaskProfile(Configuration):
         return Plate(feature, values, ", ".join([drawn.words, *stated]), lines, flaws)
 
     def plate_of_light(self, folder: Path, mask_distance_mm: float) -> Plate:
-        """Return the light behind a phase mask as a plate: how much brighter each place is than without a mask.
+        """Return the light behind a phase mask as a plate: brightness relative to light without a mask.
 
-        A point at depth z0 lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask. Of its light the
-        aperture's area goes through, and the picture says where.
-
-        Parameters
-        ----------
-        folder
-            that the file counts from.
-        mask_distance_mm
-            d.
-
-        Raises
-        ------
-        MitsimError
-            for a picture that cannot be read or is too large, and a point that is not beyond the mask.
+        A point at depth z0 lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask at distance d.
+        The
+        picture distributes the light that goes through the aperture's area. Raises MitsimError for a picture that
+        cannot be
+        read or is too large, and a point that is not beyond the mask.
         """
         path, distance = folder / str(self.file), self.psf_distance_mm or 0.0
         if distance <= mask_distance_mm:
@@ -180,12 +167,10 @@ class MaskProfile(Configuration):
 
     @property
     def _stated(self) -> set[str]:
-        """Return the names of the flaws that the mask has."""
         named = {name for name in _FLAWS - _DUST if getattr(self, name) != type(self).model_fields[name].default}
         return named | (_DUST if self.dust_per_mm2 else set())
 
     def plate_drawing(self, folder: Path) -> Plate:
-        """Return the plate as it is drawn; files count from ``folder``."""
         if self.kind in get_args(MaskKind):
             if 2**self.order - 1 > LARGEST:
                 problem = f"mask {self.kind} of order {self.order}: flaws are worked out for at most {LARGEST} features"
@@ -204,7 +189,7 @@ class MaskProfile(Configuration):
         return Plate(self.feature_mm, (draws < self.open_part).astype(np.float64), words)
 
     def put_on(self, camera: CameraGeometry, folder: Path) -> CameraGeometry:
-        """Return the ``camera`` with this mask; a drawing's file counts from ``folder``. Raises as :meth:`plate`."""
+        """Return the ``camera`` with this mask. Raises as :meth:`plate`."""
         mask: dict[str, object] = {"mask_feature": self.feature_mm, "mask_plate": None}
         if self.kind == "psf":
             picture = self.plate_of_light(folder, camera.mask_distance)
@@ -217,10 +202,10 @@ class MaskProfile(Configuration):
 
 
 def mura(features: int) -> FloatArray:
-    """Return the (p, p) modified uniformly redundant array of an odd prime p ``features``, 0 and 1: one period of it.
+    """Return one (p, p) period of the modified uniformly redundant array of an odd prime p ``features``.
 
     Gottesman and Fenimore, Applied Optics 28, 4344 (1989), equation 11: row 0 is closed, else column 0 is open, else
-    what C_i C_j = 1 makes so, with C_k = 1 for squares modulo p and -1 for others.
+    features with C_i C_j = 1, where C_k = 1 for squares modulo p and -1 for others.
     """
     signs = np.full(features, -1)
     signs[np.arange(1, features) ** 2 % features] = 1
@@ -230,7 +215,7 @@ def mura(features: int) -> FloatArray:
 
 
 def load_mask(path: Path | str) -> MaskProfile | None:
-    """Return the table ``[mask]`` of the camera file ``path``, None without one. Errors name field, value and rule."""
+    """Return the table ``[mask]`` of the camera file ``path``, None without one; errors name field, value and rule."""
     table = read_toml(path)
     if "mask" not in table:
         return None
@@ -248,32 +233,20 @@ def load_mask(path: Path | str) -> MaskProfile | None:
 
 _PICTURE = Wanted("point spread function", colour=True)
 _PIXEL_BYTES = 64
-"""Of memory for a pixel: four colours of double precision, and as many arrays of their mean."""
+"""Memory of a pixel: four colours of double precision, and as many arrays of their mean."""
 _BORDER = 16
-"""Width [pixels] of the frame along the picture's edges that shows the background, where the light of a point that
-is centred does not reach."""
+"""Width [pixels] of the frame along the picture's edges that shows the background."""
 
 
 def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> FloatArray:
-    """Return the point spread function in a picture (PNG, TIFF, NPY, OpenEXR).
+    """Return the point spread function in a picture (PNG, TIFF, NPY, OpenEXR), with sum 1.
 
-    Colours are averaged, the median of a frame along the edges is taken off as background, ``reduce`` x ``reduce``
-    pixels are averaged, what is left below zero (noise around the background) is zero, and the sum is made 1.
+    Colours are averaged, the median along the edges is subtracted as background, ``reduce`` x ``reduce`` pixels are
+    averaged, and negative values become zero. Rows and columns that remain at the far edges are left out.
 
-    Parameters
-    ----------
-    path
-        of the picture; rows first, any depth of grey, or colours of 8 bits.
-    reduce
-        pixels a side that become one; rows and columns that remain at the far edges are left out.
-    most
-        pixels a side that there may be then; None: any number.
-
-    Raises
-    ------
-    MitsimError
-        for a file that is no picture, has a palette or is too large, a ``reduce`` that does not fit, no light above the
-        background.
+    Raises MitsimError for a file that is no picture, has a palette or is too large (more than ``most`` pixels per
+    side),
+    a ``reduce`` that does not fit, or no light above the background.
     """
     path = Path(path)
     size = image_size(path, _PICTURE)

@@ -1,12 +1,9 @@
 """Pattern families: from a text such as ``dots:7`` to the factors P_L, P_R and the shots that show every pattern.
 
 Pattern (i, j) is ``P_L[:, i] P_R[:, j]^T`` over the projector's n x n pixels (paper, section III-B). A family with
-values +-1 cannot be projected as it is: each of its patterns is shown twice, as (1 + P)/2 and (1 - P)/2, and the
-measurement is the difference.
-
-A family is a function with the decorator :func:`pattern_family`, which is all that the command line's parsing and help,
-the checks of requests and the documents know of it. Requests are checked here: numpy is imported where patterns are
-made.
+values +-1 shows each pattern as two shots, (1 + P)/2 and (1 - P)/2. A family is a function with the decorator
+:func:`pattern_family`, from which the command line, the checks of requests and the documents are made. numpy is
+imported only where patterns are made.
 """
 
 from __future__ import annotations
@@ -28,20 +25,18 @@ if TYPE_CHECKING:
     from mitsim.core.manifests import Patterns
 
     PatternFactor = npt.NDArray[np.int8]
-    """(n, K) of 0/1 or +-1: one side of K separable patterns."""
+    """(n, K) of 0/1 or +-1."""
 
 
 _MOST_DIGITS = 9
-"""Digits of K that are read; no projector has 1e9 pixels a side."""
 _MOST_CHECKED = 4096
-"""K that a family's own check is asked about before the projector's pixels are known; patterns have no more a side."""
 
 # ---- What is projected ----
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One projected frame: pattern (row, column), whole (sign 0) or the positive or negative half of a +-1 pattern."""
+    """One projected frame: pattern (row, column), whole (sign 0) or the positive or negative half."""
 
     row: int
     column: int
@@ -49,20 +44,19 @@ class Shot:
 
     @property
     def names(self) -> tuple[str, int, int, int]:
-        """Return the names of the shot's random streams."""
         return ("capture", self.row, self.column, self.sign)
 
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Which light belongs together, and how much of it each shot shows.
+    """Classes of light that shots switch together.
 
     Attributes
     ----------
     labels
         (n^2,) class of each projector pixel, 0 to C - 1; or of each row of light, where pixels share rows.
     weights
-        (shots, C) fraction 0..1 of full power that each class emits in each shot.
+        (shots, C) fraction of full power that each class emits in each shot.
     """
 
     labels: Labels
@@ -70,32 +64,23 @@ class Lighting:
 
     @classmethod
     def uniform(cls, n: int) -> Lighting:
-        """Return one shot with each of ``n`` x ``n`` projector pixels fully lit."""
+        """Return one shot with all ``n`` x ``n`` pixels fully lit."""
         import numpy as np
 
         return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
 
     @property
     def lit(self) -> float:
-        """Return the part of all pixels that a shot lights in the mean, by their power."""
+        """Return the mean part of all pixels that a shot lights."""
         return float(self.weights.mean(axis=0)[self.labels].mean())
 
     def shots(self, chosen: list[int] | npt.NDArray[np.int64]) -> Lighting:
-        """Return the classes in the ``chosen`` shots only."""
         return replace(self, weights=self.weights[chosen])
 
 
 @dataclass(frozen=True, eq=False)
 class PatternFamily:
-    """Separable patterns on an n x n grid.
-
-    Attributes
-    ----------
-    name
-        as given on the command line.
-    left, right
-        P_L and P_R, (n, K) of 0/1 or +-1.
-    """
+    """Separable patterns ``left``, ``right`` (n, K) of 0/1 or +-1, P_L and P_R, on an n x n grid."""
 
     name: str
     left: PatternFactor
@@ -103,12 +88,10 @@ class PatternFamily:
 
     @property
     def n(self) -> int:
-        """Return the projector pixels a side."""
         return int(self.left.shape[0])
 
     @property
     def signed(self) -> bool:
-        """Return True if patterns take the value -1."""
         return bool((self.left < 0).any() or (self.right < 0).any())
 
     @property
@@ -118,7 +101,7 @@ class PatternFamily:
         return tuple(Shot(*place) for place in places)
 
     def light(self, shot: Shot) -> FloatArray:
-        """Return the (n, n) fraction 0..1 of full power that each projector pixel emits in one ``shot``."""
+        """Return the (n, n) fraction of full power in one ``shot``."""
         import numpy as np
 
         pattern = np.outer(self.left[:, shot.row], self.right[:, shot.column]).astype(np.float64)
@@ -126,7 +109,7 @@ class PatternFamily:
 
     @cached_property
     def lighting(self) -> Lighting:
-        """Return the finest partition of pixels that are always lit alike, and every shot's light of it."""
+        """Return the finest partition of pixels that are always lit alike, and every shot's light."""
         import numpy as np
 
         _, row = np.unique(self.left, axis=0, return_inverse=True)
@@ -148,13 +131,13 @@ class PatternFamily:
 # every multiple of 4 up to 48, then gaps.
 
 Way = tuple[Literal["doubled", "skew", "symmetric", "product"], int]
-"""How a matrix is built, and its order, its conference matrix's prime, or the order of its left factor."""
+"""Construction of a matrix, and its order, its conference matrix's prime, or the order of its left factor."""
 
 
 def way_to(order: int) -> Way:
-    """Return how the matrix of that ``order`` is built.
+    """Return the construction of the matrix of that ``order``.
 
-    Raises MitsimError for an order that no construction here reaches, with the nearest ones that are reached.
+    Raises MitsimError for an order without a construction, with the nearest ones.
     """
     way = _way(order)
     if way is None:
@@ -169,10 +152,7 @@ def hadamard_orders(limit: int) -> list[int]:
 
 
 def stripe_count(n: int) -> int:
-    """Return N, the stripe patterns of a side for ``n`` projector pixels: the smallest order of at least n.
-
-    Raises MitsimError if no order up to 2 n is reached.
-    """
+    """Return the smallest order N of at least ``n``; MitsimError if no order up to 2 n is possible."""
     found = next(filter(_way, range(n, 2 * n + 1)), None)  # with a power of two among them
     if found is None:
         raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
@@ -196,15 +176,11 @@ def _way(order: int) -> Way | None:
 
 
 def is_prime(value: int) -> bool:
-    """Return True if ``value`` is a prime."""
     return value > 1 and all(value % factor for factor in range(2, int(value**0.5) + 1))
 
 
 def hadamard_matrix(order: int) -> PatternFactor:
-    """Return the (``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones.
-
-    Raises MitsimError as :func:`way_to`.
-    """
+    """Return the (``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones."""
     import numpy as np
 
     matrix = _construct(order)
@@ -244,10 +220,7 @@ def _conference(q: int) -> npt.NDArray[np.int64]:
 
 
 def stripe_signs(n: int) -> PatternFactor:
-    """Return the (``n``, N) first rows of the smallest Hadamard matrix that has them; column 0 is all +1.
-
-    They are the +-1 patterns of a calibration's stripes. Raises as :func:`stripe_count`.
-    """
+    """Return the (``n``, N) first rows of the smallest Hadamard matrix that has them, for a calibration's stripes."""
     return hadamard_matrix(stripe_count(n))[:n]
 
 
@@ -256,18 +229,9 @@ def stripe_signs(n: int) -> PatternFactor:
 
 @dataclass(frozen=True)
 class PatternAxis:
-    """One axis of a family's patterns: what its factor is made from.
+    """One axis of a family's patterns, ``left`` (rows) or ``right`` (columns), which have random streams of their own.
 
-    Attributes
-    ----------
-    n
-        projector pixels along it.
-    k
-        the number in the family's name; 1 of a family without one.
-    name
-        ``left`` of rows, ``right`` of columns: the two have random streams of their own.
-    seed
-        of random streams.
+    ``k`` is the number in the family's name, 1 without one.
     """
 
     n: int
@@ -278,7 +242,7 @@ class PatternAxis:
 
 @dataclass(frozen=True)
 class Family:
-    """What is known of a pattern family before patterns are made; see :func:`pattern_family`."""
+    """Properties of a pattern family; see :func:`pattern_family`."""
 
     name: str
     forms: tuple[str, ...]
@@ -305,20 +269,20 @@ def pattern_family(
     Parameters
     ----------
     *forms
-        how it is called: ``NAME``, or ``NAME:K``, and ``NAME:RxC`` as well where rows and columns may differ.
+        Names: ``NAME``, or ``NAME:K``, and ``NAME:RxC`` as well where rows and columns may differ.
     label
-        its name in reports; the name itself if not given.
+        Name in reports; the name itself if not given.
     random
-        whether it takes a seed.
+        True if it takes a seed.
     signed
-        whether patterns of a K take the value -1.
+        Returns True if patterns of a K take the value -1.
     check
-        raises MitsimError for a K that it does not have.
+        Raises MitsimError for a K that it does not have.
 
     Raises
     ------
     ValueError
-        for a name that is taken.
+        For a name that is taken.
     """
     name = forms[0].partition(":")[0]
     if name in FAMILIES:
@@ -379,21 +343,17 @@ def random_binary(axis: PatternAxis) -> PatternFactor:
 
 
 def pattern_names() -> str:
-    """Return the names of all families for messages: "uniform, dots:K, dots:RxC, hadamard:K or random:K"."""
+    """Return the names of all families for messages."""
     *most, last = (form for family in FAMILIES.values() for form in family.forms)
     return f"{', '.join(most)} or {last}"
 
 
 def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
-    """Return family and periods (one, or those of rows and of columns) of the patterns ``text``.
+    """Return family and periods of the patterns ``text``, for ``n`` projector pixels per side (None: any number).
 
-    ``n`` is the number of projector pixels a side, None for any number.
-
-    Raises
-    ------
-    MitsimError
-        for an unknown family, a K that is not a whole number, or K outside 1..n, and a Hadamard matrix of an order
-        that is not known.
+    Raises MitsimError for an unknown family, a K that is not a whole number or outside 1..n, and a Hadamard matrix
+    of an
+    unknown order.
     """
     name, colon, size = text.partition(":")
     family = FAMILIES.get(name)
@@ -418,33 +378,20 @@ def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
 
 
 def takes_seed(text: str) -> bool:
-    """Return True if the patterns ``text`` are drawn at random."""
     name = text.partition(":")[0]
     return name in FAMILIES and FAMILIES[name].random
 
 
 def shot_count(text: str) -> int:
-    """Return the number of shots of the patterns ``text``, two for each with -1; errors as :func:`read_name`."""
+    """Return the number of shots of the patterns ``text``, two for each with -1."""
     family, periods = read_name(text)
     return periods[0] * periods[-1] * (2 if any(map(family.signed, periods)) else 1)
 
 
 def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
-    """Return the patterns of a name.
+    """Return the patterns of a name, one of :func:`pattern_names`, for ``n`` projector pixels per side.
 
-    Parameters
-    ----------
-    text
-        one of :func:`pattern_names`, K a number: patterns a side. R and C are those of rows and of columns.
-    n
-        projector pixels a side.
-    seed
-        of random families.
-
-    Raises
-    ------
-    MitsimError
-        for an unknown family, a K that is not a whole number, K outside 1..n, or more shots than a run has.
+    Raises MitsimError as :func:`read_name`, and for more shots than a run has.
     """
     from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests make no patterns
 
@@ -459,25 +406,19 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
 
 
 def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.NDArray[np.int64]]:
-    """Return the orders in which the frames of a run may have been taken, by name, as permutations p.
+    """Return orders in which the frames of a run may have been taken, by name, as permutations p.
 
-    If the frames were taken in that order, shot k of ``patterns.captures`` is frame p[k] of those at hand, counted
-    from 0; frames[p] are then in the order of the shots.
-
-    ``row-major`` is the order that captures have here, ``column-major`` that of a loop over rows inside one over
-    columns, and ``reversed`` is row-major from its end. Sylvester's Hadamard patterns also have ``sequency`` (Walsh)
-    and ``dyadic`` (Paley) order on both axes, and ``natural`` order, a synonym of row-major. Signed pairs are taken
-    + before - unless the order says otherwise: ``halves-exchanged`` is - before + in each pair, ``plus-first`` all +
-    frames before all -, and ``minus-first`` the reverse; the last three also follow another order, as in
-    ``sequency,plus-first``. Two names may have the same permutation, for example where patterns have one row.
-
-    Parameters
-    ----------
-    patterns
-        factors and shots of a run; rows and columns may differ in number.
-    taken
-        order that `mitsim import --order` applied to the frames at hand (``RunManifest.order``). None: the frames at
-        hand are the camera's.
+    If the frames were taken in that order, shot k of ``patterns.captures`` is frame p[k] of those at hand. Captures
+    are
+    ``row-major``; ``column-major`` loops over rows inside columns, and ``reversed`` starts at the end. Sylvester's
+    Hadamard
+    patterns also have ``sequency`` (Walsh) and ``dyadic`` (Paley) order on both axes, and ``natural`` order, a
+    synonym of
+    row-major. In signed pairs, + precedes - except for ``halves-exchanged`` (- before +), ``plus-first`` (all +
+    before all
+    -) and ``minus-first``, which also follow another order, as in ``sequency,plus-first``. Two names may have the
+    same
+    permutation. ``taken`` is the order that `mitsim import --order` applied to the frames at hand.
     """
     import numpy as np
 
@@ -505,16 +446,16 @@ def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.N
 
 
 def _places(*keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the place of each shot when shots are sorted by the first of the ``keys``, then by the next."""
+    """Return the place of each shot when shots are sorted by the ``keys``, the first before the next."""
     import numpy as np
 
     return np.argsort(np.lexsort(keys[::-1]))
 
 
 def _sign_changes(side: FloatArray) -> npt.NDArray[np.int64]:
-    """Return how often each column of a +-1 ``side`` of K patterns changes its sign within its first K rows.
+    """Return the sign changes of each column of a +-1 ``side`` within its first K rows.
 
-    Return nothing unless the rows are Sylvester's matrix, whose columns have 0 to K - 1 changes, each number once.
+    The array is empty unless the rows are Sylvester's matrix, whose columns have each of 0 to K - 1 changes once.
     """
     import numpy as np
 

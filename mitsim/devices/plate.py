@@ -1,9 +1,8 @@
-"""A mask given feature by feature: its transmission in, the separable terms that make it up out, and what they leave.
+"""A mask given feature by feature, its separable terms, and the part that they leave out.
 
-What is separable, as the product of two maximum length sequences is, has one term, FlatCam's and a MURA two, and these
-are exact: crosses of the matrix (Bebendorf, Numerische Mathematik 86, 565, 2000), 0 and 1 where the mask's are. Any
-other mask is the sum of its singular vectors. Coordinates, and what goes wrong when it is made and mounted, are
-those of :mod:`mitsim.devices.mask`.
+Masks of one or two terms (maximum length sequences, FlatCam, MURA) are exact crosses of the matrix (Bebendorf,
+Numerische Mathematik 86, 565, 2000). Other masks are sums of singular vectors. Coordinates and flaws are those of
+:mod:`mitsim.devices.mask`.
 """
 
 from __future__ import annotations
@@ -26,56 +25,47 @@ from mitsim.core.seeds import stream
 from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, draw_dust, mean_opening
 
 LEFT_OUT = 1e-7
-"""Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""
+"""Part of a transmission (rms) that singular vectors may leave: a tenth of the finest accuracy of a plan."""
 RASTER_LEFT_OUT = 1e-4
-"""The same of light on a raster, of single pixels; of frames of dots it leaves 1e-5 and less
-(tests/unit/optics/test_correlation.py)."""
+"""The same for light on a raster; frames of dots err by 1e-5 or less."""
 _SKETCHES = 96, 192
-"""Directions in which the largest terms are looked for, until they hold all but that: at 512 pixels a disc of 64
-features has 59 terms, a zone plate of 512 has 535. Of more than the last, sums take longer than correlations."""
+"""Directions in which the largest terms are searched; with more terms, correlations are faster."""
 MOST_TERMS = _SKETCHES[-1]
 """Of a raster."""
 _SMALL = 512
-"""Values a side up to which means from every value on are held: of a disc of 5 pixels, points' light a third of a pixel
-apart alone leaves 6e-3 of a frame, and every one 2e-5 (tests/physics/test_raster.py)."""
+"""Values per side up to which means start at every value: a third of a pixel between means leaves 6e-3 of a frame."""
 _TURNS = 2
-"""Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
+"""Power iterations of a sketch; a third changes the number of terms by 1 %."""
 FEW = 2
-"""Terms that are looked for as exact crosses: FlatCam's, of whose fields diffraction makes four terms."""
 _MOST_DECOMPOSED = 1024
-"""Distinct rows and columns of which singular vectors are worked out: those of 4096 take six minutes and 2 GB, and no
-sum of so many terms is faster than a correlation."""
+"""Most distinct rows and columns for singular vectors: 4096 take six minutes, and correlations are then faster."""
 LARGEST = 4096
 """Features a side: a transmission takes 128 MiB."""
 _MOST_LINES = 2 * LARGEST
-"""Lines between features that are not equal, as over-etching leaves them: twice as many."""
 _ROUNDING = 1e-12
-"""Rest of a matrix of numbers up to 1 that is rounding after two crosses."""
 _GRIDS = 4
-"""Grids of openings that the reference draws from; with more it draws over the whole mask."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plate(ByValue):
-    """A square plate of square features, each of a transmission of its own; MitsimError for values out of range.
+    """A square plate of square features, each with its own transmission; MitsimError for values out of range.
 
     Attributes
     ----------
     feature_mm
-        side of one feature [mm].
+        Side of one feature.
     values
-        (N, N) transmission of light's power, 0 to 1, read-only.
+        (N, N) transmission of power, 0 to 1, read-only.
     words
-        what it is, for messages and manifests.
+        Description for messages and manifests.
     lines_mm
-        (N + 1,) coordinates of the lines between its rows, and between its columns, where features are not equal.
+        (N + 1,) coordinates of the lines between features that are not equal.
     flaws
-        what else is wrong with it.
+        Other flaws.
     irradiance
-        whether values are the light behind it, of any finite size, instead: waves are in them already.
+        True if values are the light behind it, of any finite size, which includes waves.
     averaged
-        features along a sensor pixel, over which light is averaged wherever it is asked for: finer structure makes no
-        terms.
+        Features along a sensor pixel, over which light is always averaged: finer structure makes no terms.
     """
 
     feature_mm: float
@@ -102,7 +92,7 @@ class Plate(ByValue):
 
     @cached_property
     def digest(self) -> str:
-        """Return the SHA-256 of the transmissions, and of uneven lines, as 64 hexadecimal digits."""
+        """Return the SHA-256 of the transmissions, and of uneven lines."""
         digest = hashlib.sha256(np.ascontiguousarray(self.values).tobytes())
         if self.lines_mm is not None:
             digest.update(self.lines_mm.tobytes())
@@ -110,54 +100,50 @@ class Plate(ByValue):
 
     @property
     def identity(self) -> str:
-        """Return what manifests state, which is equal for equal plates alone."""
+        """Return a text for manifests that is equal only for equal plates."""
         return f"{self.words}, features of {self.feature_mm:g} mm, sha256 {self.digest}"
 
     @property
     def extent_mm(self) -> float:
-        """Return the side of the square [mm]; it spans -extent/2 .. +extent/2."""
         return len(self.values) * self.feature_mm if self.lines_mm is None else float(np.ptp(self.lines_mm))
 
     @cached_property
     def lines(self) -> FloatArray:
-        """Return the (N + 1,) coordinates of the lines between rows, and between columns [mm]."""
+        """Return the (N + 1,) coordinates of the lines between features [mm]."""
         if self.lines_mm is not None:
             return self.lines_mm
         return np.asarray((np.arange(len(self.values) + 1) - len(self.values) / 2) * self.feature_mm)
 
     @property
     def blur_mm(self) -> float:
-        """Return the standard deviation of the Gaussian that blurs the profiles [mm]."""
         return self.flaws.blur_mm
 
     @property
     def even(self) -> bool:
-        """Return True if features are squares of one size with sharp edges."""
         return self.lines_mm is None and not self.blur_mm
 
     @property
     def plain(self) -> bool:
-        """Return True if features are square and there are no flaws."""
         return self.lines_mm is None and self.flaws == NO_FLAWS
 
     @property
     def open_part(self) -> float:
-        """Return the mean transmission of the square, without dust."""
+        """Return the mean transmission without dust."""
         width = np.diff(self.lines) / self.extent_mm
         return float(width @ self.values @ width)
 
     @cached_property
     def opening_mm(self) -> float:
-        """Return the mean width of the openings along rows, or along columns if that is less [mm].
+        """Return the mean width of the openings along rows or columns, whichever is less [mm].
 
-        Open is what lets half as much light through as the clearest feature, however fine a drawing's pixels are.
+        A feature is open if it transmits half as much as the clearest one.
         """
         is_open, widths = self.values >= self.values.max() / 2, np.diff(self.lines)
         return min(mean_opening(is_open, widths), mean_opening(is_open.T, widths))
 
     @cached_property
     def crosses(self) -> tuple[Term, ...] | None:
-        """Return the transmission as at most two exact terms (weight, row (N,), column profile (N,)), or None."""
+        """Return at most two exact terms (weight, row (N,), column profile (N,)), or None."""
         rest = self.values.copy()
         terms: list[Term] = []
         while True:
@@ -172,12 +158,12 @@ class Plate(ByValue):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """Return the transmission as terms (weight, row profile (N,), column profile (N,)) up to :attr:`left_out`."""
+        """Return terms (weight, row profile (N,), column profile (N,)) up to :attr:`left_out`."""
         return self._terms_and_rest[0]
 
     @property
     def left_out(self) -> float:
-        """Return the relative rms part of the transmission that the terms leave; 0 if they are exact."""
+        """Return the relative rms part of the transmission that the terms leave."""
         return self._terms_and_rest[1]
 
     @cached_property
@@ -207,7 +193,7 @@ class Plate(ByValue):
 
     @cached_property
     def most_terms(self) -> int:
-        """Return the number of distinct rows or columns, whichever are fewer: terms that the plate takes at most."""
+        """Return the largest number of terms: distinct rows or columns, whichever are fewer."""
         if self.crosses is not None:
             return len(self.crosses)
         both = self.values, np.ascontiguousarray(self.values.T)
@@ -215,12 +201,12 @@ class Plate(ByValue):
 
     @property
     def many(self) -> bool:
-        """Return True if there are so many terms that frames are never their sum."""
+        """Return True if there are too many terms for a sum."""
         return self.most_terms > _MOST_DECOMPOSED
 
     @cached_property
     def largest(self) -> LargestTerms:
-        """Return the terms of the light that pixels see of large values, where some hundreds hold it."""
+        """Return the terms of the light that pixels see, where some hundreds suffice."""
         return LargestTerms(self.values, self.averaged)
 
     @cached_property
@@ -233,7 +219,7 @@ class Plate(ByValue):
 
     @property
     def centred(self) -> bool:
-        """Return True if a separable solver does better without the means of rows and columns, as for a FlatCam."""
+        """Return True if a separable solver does better without the means of rows and columns."""
         plain, without = self.residuals
         return without < plain
 
@@ -244,28 +230,27 @@ class Plate(ByValue):
 
     @cached_property
     def amplitude(self) -> Plate:
-        """Return the plate whose values are the factors of a field: roots of the transmissions, without phase."""
+        """Return the plate of the roots of the transmissions, without phase."""
         return self if self.binary else replace(self, values=np.sqrt(self.values))
 
     @cached_property
     def binary(self) -> bool:
-        """Return True if every feature is open or closed."""
         return bool(np.isin(self.values, (0, 1)).all())
 
     @property
     def mirrored(self) -> tuple[bool, bool]:
-        """Return whether the plate is its own mirror image along rows, and along columns."""
+        """Return True for each axis along which the plate is its own mirror image."""
         even = self.lines_mm is None or np.array_equal(self.lines_mm, -self.lines_mm[::-1])
         return tuple(even and np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
 
     @cached_property
     def symmetric(self) -> bool:
-        """Return True if rows equal columns; the profiles of each singular term then are the same."""
+        """Return True if rows equal columns."""
         return np.array_equal(self.values, self.values.T)
 
     @property
     def uneven_part(self) -> float:
-        """Return the part that determines the whole by symmetry: an eighth of a zone plate."""
+        """Return the part that determines the whole by symmetry."""
         return float(0.5 ** (sum(self.mirrored) + self.symmetric))
 
     @property
@@ -276,10 +261,7 @@ class Plate(ByValue):
 
     @cached_property
     def grids(self) -> tuple[tuple[BoolArray, BoolArray], ...] | None:
-        """Return the openings as grids that do not overlap, as :attr:`mitsim.devices.mask.Mask.openings`.
-
-        The value is None for more than 4 grids, and for a mask without even features.
-        """
+        """Return at most 4 grids of openings that do not overlap; None for more, and without even features."""
         if not self.binary or not self.plain:
             return None
         patterns, which = np.unique(self.values[self.values.any(axis=1)], axis=0, return_inverse=True)
@@ -291,10 +273,7 @@ class Plate(ByValue):
 
     @property
     def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
-        """Return grids that hold all openings: exactly with :attr:`grids`, else all rows and columns that have any.
-
-        If features are uneven or turned, it is a square of :attr:`cover` features a side.
-        """
+        """Return grids that hold all openings; for uneven or turned features, a square of :attr:`cover`."""
         if self.grids is not None:
             return self.grids
         rows, columns = (np.asarray(self.values.any(axis=axis)) for axis in (1, 0))
@@ -302,11 +281,11 @@ class Plate(ByValue):
 
     @property
     def cover(self) -> int:
-        """Return the side, in features, of the smallest centred square that holds the mask as it is mounted."""
+        """Return the side, in features, of the smallest centred square that holds the mounted mask."""
         return int(np.ceil(self.flaws.reach(self.extent_mm) / self.feature_mm))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
-        """Return the transmission (0..1) at points (``s_row``, ``s_col``) of the plane [mm], without blur and dust."""
+        """Return the transmission (0..1) at points of the plane [mm], without blur and dust."""
         count = len(self.values)
         s_row, s_col = self.flaws.turned_back(np.asarray(s_row), np.asarray(s_col))
         if self.lines_mm is None:
@@ -349,14 +328,11 @@ def within(plate: Plate, reach_mm: float) -> Plate:
 def _distinct(
     values: FloatArray, lines: FloatArray | None = None
 ) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
-    """Return the distinct rows and columns of ``values``, of which drawings have few.
+    """Return the distinct rows and columns of ``values``, weighted by their number and widths between uneven ``lines``.
 
-    They count by their number, and by their widths between uneven ``lines``.
-
-    Returns
-    -------
-    (N,) which distinct row and which distinct column each is; roots of what these count, (rows, 1) and (columns,); and
-    (rows, columns) values times both.
+    The result has the (N,) index of the distinct row and column of each, roots of their weights, (rows, 1) and
+    (columns,),
+    and (rows, columns) values times both roots.
     """
     widths = np.ones(len(values)) if lines is None else np.diff(lines) * (len(lines) / np.ptp(lines))
     rows, first, row = np.unique(values, axis=0, return_index=True, return_inverse=True)
@@ -372,26 +348,15 @@ def _distinct(
 
 
 class LargestTerms:
-    """Terms of large ``values`` (N, N) that hold means over squares of ``averaged`` values a side up to 1e-4, rms.
+    """Terms of large ``values`` (N, N) that hold means over squares of ``averaged`` values per side up to 1e-4, rms.
 
     With S the means along an axis, at most a third of a square apart, and U sigma W^T the singular vectors of S V S^T
-    that are kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
-    approximation, from both sides). Half a square apart would leave a thousand times as much between the squares.
-    Vectors come from a sketch in random directions (Halko, Martinsson and Tropp, SIAM Review 53, 217, 2011).
-
-    Parameters
-    ----------
-    values, averaged
-        as above.
-    sizes
-        numbers of terms that are tried, in this order.
-
-    Attributes
-    ----------
-    count
-        of the terms.
-    left_out
-        of the means, root mean square, as a part of all; above 1e-4 where so many terms are too few.
+    that are kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T (Nystroem's approximation).
+    Vectors
+    come from a sketch in random directions (Halko, Martinsson and Tropp, SIAM Review 53, 217, 2011). ``sizes`` are
+    numbers
+    of terms that are tried in order. ``left_out`` is the rms part of the means, above 1e-4 where ``count`` is too
+    small.
     """
 
     def __init__(self, values: FloatArray, averaged: int = 1, sizes: Sequence[int] = _SKETCHES) -> None:
@@ -424,13 +389,11 @@ class LargestTerms:
         return tuple((1.0, left[:, k], right[k]) for k in range(self.count))
 
     def _means(self, values: FloatArray) -> FloatArray:
-        """Return the (starts, m) means S ``values`` of (N, m), beyond which there is no light."""
         below = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
         ends = np.minimum(self._starts + self._averaged, len(values))
         return np.asarray((below[ends] - below[np.maximum(self._starts, 0)]) / self._averaged)
 
     def _spread(self, means: FloatArray) -> FloatArray:
-        """Return S^T ``means`` (N, k) of (starts, k)."""
         below = np.concatenate((np.zeros((1, means.shape[1])), np.cumsum(means, axis=0)))
         places = np.arange(len(self._values))
         first, beyond = (np.searchsorted(self._starts, places - less, "right") for less in (self._averaged, 0))
@@ -438,7 +401,7 @@ class LargestTerms:
 
 
 def _beyond_one(values: FloatArray, lines: FloatArray | None) -> float:
-    """Return the relative rms part that the best separable product leaves of ``values`` between ``lines``."""
+    """Return the relative rms part of ``values`` that the best separable product leaves."""
     *_, weighted = _distinct(values, lines)
     total = np.linalg.norm(weighted)
     if not total:
@@ -464,8 +427,9 @@ _PICTURES = ".png", ".tif", ".tiff"
 def read_drawing(path: Path) -> FloatArray:
     """Return the (rows, columns) transmissions, 0 to 1, of the drawing ``path``; pictures are linear in transmission.
 
-    Row 0 is at the top and column 0 at the left of who looks from the sensor toward the scene. MitsimError for a file
-    that is no PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
+    Row 0 is at the top and column 0 at the left for a viewer from the sensor. Raises MitsimError for a file that is
+    no
+    PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
     """
     rows, columns = image_size(path, _DRAWING)
     if (rows - columns) % 2 and 2 * max(rows, columns) > LARGEST:
@@ -481,9 +445,9 @@ def read_drawing(path: Path) -> FloatArray:
 
 
 def make_square(values: FloatArray, feature_mm: float) -> tuple[float, FloatArray]:
-    """Return a drawing of pixels of ``feature_mm`` with opaque margins that make it square about its centre.
+    """Return the side of the pixels, and a drawing with opaque margins that make it square about its centre.
 
-    Before it, the side of its pixels is returned, which is halved if margins of half a pixel are needed.
+    Pixels are halved if margins of half a pixel are needed.
     """
     if (values.shape[0] - values.shape[1]) % 2:
         values, feature_mm = values.repeat(2, axis=0).repeat(2, axis=1), feature_mm / 2

@@ -1,4 +1,4 @@
-"""A projector's light: a TOML file in, a checked and frozen model with the spectrum of its photons out."""
+"""A projector's light: a TOML file, checked to a frozen model with the spectrum of its photons."""
 
 from __future__ import annotations
 
@@ -26,15 +26,7 @@ _FIELDS = 4
 
 @dataclass(frozen=True, eq=False)
 class Spectrum(ByValue):
-    """Wavelengths and the share of the photons at each.
-
-    Attributes
-    ----------
-    wavelengths_nm
-        (w,) wavelengths [nm], above 0; read-only.
-    weights
-        (w,) shares, not negative, that sum to 1; read-only.
-    """
+    """Wavelengths (w,) [nm] and the shares (w,) of the photons at each, which sum to 1; read-only."""
 
     wavelengths_nm: FloatArray
     weights: FloatArray
@@ -50,39 +42,29 @@ class Spectrum(ByValue):
 
 @dataclass(frozen=True)
 class Lines:
-    """Spectral lines that light is traced at, all of them along one path.
-
-    Attributes
-    ----------
-    wavelengths_nm
-        of the lines [nm].
-    shares
-        part of the power that a scene states in each of them; 1 in all, unless some lines are left out.
-    """
+    """Spectral lines, all along one path; ``shares`` of the power sum to 1 unless some lines are left out."""
 
     wavelengths_nm: tuple[float, ...]
     shares: tuple[float, ...]
 
     @property
     def several(self) -> bool:
-        """Return True if light is told apart by line."""
         return len(self.wavelengths_nm) > 1
 
     @property
     def single(self) -> tuple[Lines, ...]:
-        """Return each of the lines alone."""
         return tuple(Lines((nm,), (share,)) for nm, share in zip(self.wavelengths_nm, self.shares, strict=True))
 
     @property
     def apart(self) -> tuple[Lines, ...]:
-        """Return each line at its own place among all; the other places have its wavelength without power."""
+        """Return each line at its own place; the other places have its wavelength without power."""
         size, pairs = len(self.shares), zip(self.wavelengths_nm, self.shares, strict=True)
         alone = [(nm, tuple(share * (at == place) for at in range(size))) for place, (nm, share) in enumerate(pairs)]
         return tuple(Lines((nm,) * size, shares) for nm, shares in alone)
 
     @property
     def mean_nm(self) -> float:
-        """Return the one wavelength that carries as many photons per watt [nm], to a picometre."""
+        """Return the wavelength that carries as many photons per watt [nm], to a picometre."""
         if not self.several:
             return self.wavelengths_nm[0]
         return round(float(np.average(self.wavelengths_nm, weights=self.shares)), 3)
@@ -97,11 +79,11 @@ class Lines:
         return Lines(tuple(power), tuple(power.values()))
 
     def bands(self, count: int) -> tuple[Lines, ...]:
-        """Return the lines of each of ``count`` bands, shortest first.
+        """Return the lines of each of ``count`` bands, shortest first; MitsimError for fewer than one band or too many.
 
-        Bands are cut where the power's mean squared distance from its band's :attr:`mean_nm` is least, so that a sum
-        over bands is a Gauss rule of one node for each. Raises MitsimError for fewer than one band, or more than lines
-        with power.
+        Bands minimise the power's mean squared distance from their :attr:`mean_nm`, so that a sum over bands is a
+        Gauss rule
+        of one node each.
         """
         lines = self.shining
         size = len(lines.shares)
@@ -133,8 +115,6 @@ Share = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class Coherence(Configuration):
-    """What decides the contrast of a laser projector's speckle (:func:`mitsim.optics.frames.contrast_of`)."""
-
     beam_radius_mm: float | None = Field(default=None, ge=1e-3, le=1e3)
     """1/e^2 radius of a scanned beam's spot [mm]; none: all is lit at once.
 
@@ -262,10 +242,11 @@ class ProjectorModel(Configuration):
 
     @property
     def glare(self) -> float:
-        """Return the part of a pixel's light that the lens scatters, with which a chessboard has the ``ansi_contrast``.
+        """Return the part of a pixel's light that the lens scatters, from the ``ansi_contrast``.
 
-        A Gaussian leaves, of a picture of side 1 at the middles of its four fields along one axis, the parts ``even``
-        of an even picture and ``fields`` of one that is +1 and -1 in turn, times the field's own sign.
+        At the middles of the four fields along one axis, a Gaussian leaves ``even`` of an even picture, and
+        ``fields`` of one
+        that alternates between +1 and -1, times the field's own sign.
         """
         if self.ansi_contrast is None:
             return 0.0
@@ -282,19 +263,18 @@ class ProjectorModel(Configuration):
 
     @property
     def lines(self) -> Lines:
-        """Return the lines of the light with their shares of the power; the effective wavelength if none are known."""
         shares = self.radiant_shares or (1.0,)
         total = sum(shares)
         return Lines(self.wavelengths_nm or (self.effective_wavelength_nm,), tuple(share / total for share in shares))
 
     def at(self, wavelength_nm: float) -> ProjectorModel:
-        """Return a projector that shows one line of ``wavelength_nm`` alone."""
+        """Return a projector of one line."""
         alone = {"wavelengths_nm": (wavelength_nm,), "radiant_shares": (1.0,), "effective_wavelength_nm": wavelength_nm}
         return self.model_copy(update=alone)
 
     @property
     def traced_lines(self) -> Lines:
-        """Return the lines, which paths carry together; raise MitsimError for more than they can carry."""
+        """Return the lines, which paths carry together; raise MitsimError for too many."""
         lines = self.lines
         if len(lines.shares) > MOST_LINES:
             problem = f"colour: projector {self.name} has {len(lines.shares)} lines, and a path carries {MOST_LINES}"
@@ -302,7 +282,7 @@ class ProjectorModel(Configuration):
         return lines
 
     def in_bands(self, count: int) -> ProjectorModel:
-        """Return a projector whose lines are ``count`` bands of its own (:meth:`Lines.bands`), at their means."""
+        """Return a projector whose lines are the means of ``count`` bands (:meth:`Lines.bands`)."""
         bands = self.lines.bands(count)
         waves, shares = tuple(band.mean_nm for band in bands), tuple(sum(band.shares) for band in bands)
         return self.model_copy(update={"wavelengths_nm": waves, "radiant_shares": shares})
@@ -333,29 +313,26 @@ class ProjectorModel(Configuration):
 SPECTRA_NM = 360.0, 830.0
 """Wavelengths that Mitsuba's spectra are of: CIE's."""
 _PLACES = 4701
-"""Places of the table of a response: in steps of 0.1 nm the corners of a measured curve are rounded by 1e-4 of it."""
 _PLANES = 0, 1, 2, 3
-"""Of the pixels of 2 x 2 filters, row by row."""
 Band = tuple[float, float]
 """First and last wavelength [nm]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Response(ByValue):
-    """What light of each wavelength counts in a camera's pixels, or in those under filters of one colour.
+    """Response of a camera's pixels, or of those under filters of one colour, to light of each wavelength.
 
     Attributes
     ----------
     counts
-        (k,) electrons a photon times the wavelength [nm], evenly over :data:`SPECTRA_NM`; outside ``range_nm`` as if
-        the efficiency stayed what it is at the end.
-    range_nm
-        wavelengths that are counted [nm].
+        (k,) electrons a photon times the wavelength [nm], evenly over :data:`SPECTRA_NM`; outside ``range_nm`` with
+        the
+        efficiency of the end.
     beyond_nm
-        of a curve that goes on where Mitsuba's spectra end: integral of efficiency and wavelength beyond, over its
-        value at the end [nm]; else 0.
+        For a curve beyond Mitsuba's spectra: integral of efficiency and wavelength beyond, over its value at the end
+        [nm].
     planes
-        numbers, row by row, of those of each 2 x 2 pixels that it is of; all of a camera without a mosaic.
+        Numbers, row by row, of its pixels in each 2 x 2; all for a camera without a mosaic.
     """
 
     counts: FloatArray
@@ -379,7 +356,7 @@ class Response(ByValue):
 
     @classmethod
     def of_each(cls, sensor: SensorModel) -> tuple[Response, ...]:
-        """Return the responses of pixels under filters of each colour, or of all pixels without a mosaic."""
+        """Return the responses under filters of each colour, or of all pixels without a mosaic."""
         if sensor.mosaic is None:
             return (cls.of(sensor),)
         colours = {name: getattr(sensor.mosaic_curves, name) for name in dict.fromkeys(sensor.mosaic)}
@@ -388,7 +365,6 @@ class Response(ByValue):
 
     @classmethod
     def _along(cls, curve: EfficiencyCurve, sensor: SensorModel, planes: tuple[int, ...] = _PLANES) -> Response:
-        """Return the response of a ``curve`` of a ``sensor``, which some ``planes`` have."""
         wavelengths = np.linspace(*SPECTRA_NM, _PLACES)
         known, efficiency = np.array(curve.wavelengths_nm), np.array(curve.efficiency)
         first, last = max(SPECTRA_NM[0], known[0]), min(SPECTRA_NM[1], known[-1])
@@ -404,19 +380,10 @@ class Response(ByValue):
 
     @property
     def part(self) -> float:
-        """Return the part of the sensor's pixels that have this response."""
         return len(self.planes) / len(_PLANES)
 
     def bands(self, count: int, part: int = 0, parts: int = 1) -> tuple[Band, ...]:
-        """Return equal bands of the wavelengths that are counted [nm].
-
-        Parameters
-        ----------
-        count
-            Number of bands.
-        part, parts
-            Number, from 0, of the only part of each band that is returned, and number of parts of a band.
-        """
+        """Return equal bands of the counted wavelengths [nm], or number ``part`` of ``parts`` of each."""
         first, last = self.range_nm
         edges = first + (last - first) * np.arange(count * parts + 1) / (count * parts)
         return tuple((float(edges[place]), float(edges[place + 1])) for place in range(part, count * parts, parts))
@@ -424,21 +391,20 @@ class Response(ByValue):
 
 @dataclass(frozen=True, eq=False)
 class CountedLamps(ByValue):
-    """A scene's lamps, as its camera counts them.
+    """A scene's lamps as its camera counts them.
 
     Attributes
     ----------
     responses
-        of the camera's pixels; of those under each colour of filters, if it has a mosaic.
+        Responses of the pixels, one for each colour of filters.
     bands
-        wavelengths that light is told apart by [nm]: four of each response.
+        Separated wavelengths [nm], four of each response.
     spectra, shares
-        of each band: wavelengths at which the mask diffracts its light, and (bands,) its part of what all pixels count.
+        Per band: wavelengths of diffraction, and (bands,) part of the counts.
     unknown
-        part of the light, or more, that the camera would count if its efficiency went on as it ends, and that is in no
-        frame; of several responses the largest.
+        Largest part of the light that would count if the efficiency did not end, and that is in no frame.
     units
-        wavelength [nm] of each line of the projector, and its irradiance [W m^-2] that a count of 1 stands for.
+        Wavelength [nm] and irradiance [W m^-2] for a count of 1, per line of the projector.
     """
 
     responses: tuple[Response, ...]
@@ -450,22 +416,19 @@ class CountedLamps(ByValue):
 
     @property
     def range_nm(self) -> Band:
-        """Return the wavelengths that all pixels count [nm]."""
         firsts, lasts = zip(*(response.range_nm for response in self.responses), strict=True)
         return max(firsts), min(lasts)
 
     def rows(self, response: int) -> slice:
-        """Return the places of the bands of a ``response``, given by its number."""
         return slice(response * MOST_LINES, (response + 1) * MOST_LINES)
 
     def units_of(self, lines: Lines) -> tuple[float, ...]:
-        """Return the irradiance [W m^-2] of each of the projector's ``lines`` for a count of 1."""
+        """Return the irradiance [W m^-2] of each line for a count of 1."""
         known = dict(self.units)
         return tuple(known[wavelength] for wavelength in lines.wavelengths_nm)
 
     @property
     def whole(self) -> Spectrum:
-        """Return all bands in one."""
         shares = np.ones(len(self.spectra)) / len(self.spectra) if self.shares is None else self.shares
         wavelengths = [spectrum.wavelengths_nm for spectrum in self.spectra]
         weights = [share * spectrum.weights for share, spectrum in zip(shares, self.spectra, strict=True)]
@@ -475,10 +438,9 @@ class CountedLamps(ByValue):
 def line_units(sensor: SensorModel, lines: Lines) -> tuple[float, ...]:
     """Return the irradiance [W m^-2] of each of the ``lines`` at which the ``sensor`` counts 1.
 
-    Behind a mosaic the lines have parts of the count, as of their power, that make as many in the mean over all pixels:
-    s_l / sum_k s_k w_k lambda_k, with w_k the electrons a photon of line k. A line's own light is then as much beside
-    its part of the lamps' as all light of the projector is beside all of theirs. MitsimError for a line that the sensor
-    does not see; behind a mosaic, where it sees none.
+    Behind a mosaic the lines share the count as they share power, s_l / sum_k s_k w_k lambda_k, with w_k the
+    electrons a
+    photon of line k. MitsimError for a line that the sensor does not see; behind a mosaic, where it sees none.
     """
     if sensor.mosaic is not None:
         mean = np.mean(sensor.planes(lines.wavelengths_nm), axis=0)

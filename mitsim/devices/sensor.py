@@ -1,4 +1,4 @@
-"""The numbers that describe an image sensor: a TOML file in, a checked and frozen model out."""
+"""Numbers of an image sensor: a TOML file, checked to a frozen model."""
 
 from __future__ import annotations
 
@@ -18,40 +18,34 @@ from mitsim.core.manifests import Digital
 EXPOSURE_S = 1e-12, 1e6
 """Shortest and longest exposure [s]: gated avalanche diodes open for 1e-10 s; cooled CCDs collect for some 1e4 s."""
 EXPOSURE_FRACTION = 1e-6, 1.0
-"""Mean of the brightest pixel as a part of the full well; a millionth is less than an electron of most wells."""
+"""Mean of the brightest pixel as a part of the full well."""
 _PART = Field(strict=True, ge=EXPOSURE_FRACTION[0], le=EXPOSURE_FRACTION[1], allow_inf_nan=False)
 ExposureFraction = Annotated[float, _PART]
 MOST_PIXELS = 1 << 20
-"""Along a side of a sensor, before binning: frames are of at most 16 384, binned up to 64 times."""
+"""Pixels along a side, before binning."""
 PITCH_TOLERANCE = 1e-3
 """Relative difference of two pitches of the same pixels that is rounding in a data sheet."""
 BASE = "base"
-"""Name of a file's line that says which camera's fields it takes where it has none of its own."""
+"""Name of a file's line that names the camera whose fields it inherits."""
 _MOST_BASES = 4
-"""Files that stand on each other; chosen: people need one."""
 _LARGEST_CODE = 2**32 - 1
 """What a frame's uint32 holds."""
 _ALWAYS = {"binning", "dark_current_e_per_s", "black_level_dn", "bits"}
-"""Fields that manifests hold whatever they are: calibrations of 0.4 do."""
+"""Fields that are always in manifests, because calibrations of 0.4 have them."""
 _EFFICIENCIES = {"quantum_efficiency"}, {"quantum_efficiency_curve"}, {"mosaic", "mosaic_curves"}
-"""Fields of which one kind replaces the others, in a file that stands on another."""
+"""Fields that replace each other when a file inherits from another."""
 _LEVELS = 256
-"""Parts of the full well at which the linearity polynomial must rise: its terms end at the fifth power."""
 
 
 class SensorModel(Configuration, defer_build=True):
     """A camera after EMVA 1288 release 4.0: per-pixel electronics and how pixels are binned.
 
     The fields describe one **pixel**; a frame's element is a **superpixel** of `binning` x `binning` = b^2
-    pixels whose values are summed. The `superpixel_` properties follow: area, full well and dark current
-    times b^2, gain unchanged, read noise times b (b^2 independent readings), black level and largest code
-    times b^2 (the sum of b^2 codes needs more bits than one). The sum is rounded once where a camera rounds
-    each pixel, which leaves out (b^2 - 1)/12 DN^2 of variance. With `binning_on_chip` charge is summed and read
-    once: read noise, row noise, offsets, black level and largest code are those of one reading.
-
-    Every field that is left out is an effect that the camera does not have: nothing is computed for it.
-
-    Ranges hold every device known, with room: what lies outside is a slip of the unit or of the keyboard.
+    pixels whose values are summed. Area, full well, dark current, black level and largest code of a superpixel
+    are b^2 times those of a pixel, and its read noise is b times as large. The sum is rounded once where a camera
+    rounds each pixel, which neglects (b^2 - 1)/12 DN^2 of variance. With `binning_on_chip` charge is summed and
+    read once: read noise, row noise, offsets, black level and largest code are those of one reading. A field
+    that is left out is an effect that the camera does not have. Ranges hold every known device, with room.
     """
 
     name: str
@@ -208,19 +202,11 @@ class SensorModel(Configuration, defer_build=True):
         return self
 
     def efficiency(self, wavelength_nm: float, plane: Plane | None = None) -> float:
-        """Return the electrons per photon.
+        """Return the electrons per photon, at all wavelengths the same for a camera whose file states one number.
 
-        Parameters
-        ----------
-        wavelength_nm
-            Wavelength of the light; a camera whose file states one number has it at all wavelengths.
-        plane
-            Colour of the filter, for a camera with a mosaic; None for one without.
-
-        Raises
-        ------
-        MitsimError
-            Outside the curve, for a camera whose file states no efficiency, or a plane that it does not have.
+        ``plane`` is the colour of the filter of a camera with a mosaic. Raises MitsimError outside the curve,
+        without an
+        efficiency, or for a plane that the camera does not have.
         """
         if (self.mosaic is None) != (plane is None):
             filters = f"a mosaic {self.mosaic}" if self.mosaic else "no mosaic"
@@ -239,9 +225,9 @@ class SensorModel(Configuration, defer_build=True):
         return float(found)
 
     def planes(self, wavelengths_nm: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the electrons per photon of the mosaic's four pixels, row by row, each at the ``wavelengths_nm``.
+        """Return the electrons per photon of the mosaic's four pixels at the ``wavelengths_nm``.
 
-        MitsimError for a camera without a mosaic, and outside its curves.
+        Raises MitsimError without a mosaic, and outside its curves.
         """
         if self.mosaic is None:
             raise MitsimError(f"sensor {self.name!r}: has no mosaic of colour filters; use a camera that has one")
@@ -250,49 +236,46 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def states_efficiency(self) -> bool:
-        """Return True if light makes a known number of electrons in a pixel without colour filters."""
         return self.quantum_efficiency is not None or self.quantum_efficiency_curve is not None
 
     @property
     def sensor_only(self) -> bool:
-        """Return True if no source states what light becomes, so that the camera can neither capture nor sense."""
+        """Return True if no source states an efficiency, so that the camera can neither capture nor sense."""
         return not self.states_efficiency and self.mosaic is None
 
     @property
     def frame_shape(self) -> tuple[int, int] | None:
-        """Return rows and columns of whole superpixels that are read; None for those of the scene's film."""
+        """Return rows and columns of superpixels; None for those of the scene's film."""
         if self.rows is None or self.columns is None:
             return None
         return self.rows // self.binning, self.columns // self.binning
 
     @property
     def pitches_mm(self) -> tuple[float, float]:
-        """Return the distances between rows, and between columns of superpixels [mm]."""
         row = self.row_pitch_um or self.pixel_pitch_um
         return row * self.binning * 1e-3, self.superpixel_pitch_um * 1e-3
 
     @property
     def identity(self) -> dict[str, object]:
-        """Return what manifests state: all fields but the source, and but effects that the file does not name."""
+        """Return all fields for manifests but the source and effects that the file does not name."""
         fields, stated = type(self).model_fields, self.model_dump(exclude={"source"}).items()
         return {name: value for name, value in stated if name in _ALWAYS or value != fields[name].default}
 
     @property
     def has_fixed_pattern(self) -> bool:
-        """Return True if pixels differ in offset, response or dark current, or by defects."""
         return any((*self.offset_parts, *self.response_parts, self.dark_current_spread_e_per_s, self.has_defects))
 
     @property
     def has_defects(self) -> bool:
-        """Return True if some pixels are hot or dead."""
         return self.hot_pixels > 0 or self.dead_pixels > 0
 
     @property
     def offset_parts(self) -> tuple[float, float, float]:
         """Return the standard deviations of a superpixel's offset by pixel, row and column [electrons].
 
-        Of b^2 readings b share a row's offset, in each of b rows. Therefore they are (b^2, b^3, b^3)^(1/2) of one
-        pixel's; on chip there is one reading.
+        They are (b^2, b^3, b^3)^(1/2) times one pixel's, because b readings share a row's offset in each of b rows.
+        On chip
+        there is one reading.
         """
         pixel, line = self._readings
         return self.dsnu_pixel_e * pixel, self.dsnu_row_e * line, self.dsnu_column_e * line
@@ -310,21 +293,17 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def codes(self) -> int:
-        """Return the number of codes that are summed in a superpixel."""
         return 1 if self.binning_on_chip else self.binning**2
 
     @property
     def dark_factor(self) -> float:
-        """Return the dark current over the stated one, 2^((T - T_stated) / T_doubling) (EMVA 1288 4.0)."""
+        """Return the factor 2^((T - T_stated) / T_doubling) of the dark current (EMVA 1288 4.0)."""
         if self.temperature_c is None or self.dark_current_temperature_c is None or self.dark_doubling_c is None:
             return 1.0
         return float(2 ** ((self.temperature_c - self.dark_current_temperature_c) / self.dark_doubling_c))
 
     def known_line_time_s(self) -> float:
-        """Return the time between the beginnings of two rows' exposures [s]; 0 for a global shutter.
-
-        Raises MitsimError for a rolling shutter whose file does not state it.
-        """
+        """Return the time between rows' exposures [s], 0 for a global shutter; MitsimError if it is not stated."""
         if self.shutter == "global":
             return 0.0
         if self.line_time_us is None:
@@ -335,68 +314,65 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def superpixel_crosstalk(self) -> float:
-        """Return the part of a superpixel's even light that its neighbours get from the pixels at its sides."""
+        """Return the part of a superpixel's even light that its neighbours get."""
         return self.crosstalk / self.binning
 
     @property
     def superpixel_row_noise_e(self) -> float:
-        """Return the standard deviation of the noise that a row of superpixels shares [electrons]."""
+        """Return the standard deviation of the noise of a row of superpixels [electrons]."""
         return self.row_noise_e * self._readings[1]
 
     @property
     def superpixel_reading_noise_e(self) -> float:
-        """Return the standard deviation of a superpixel's reading by its own and its row's noise [electrons]."""
+        """Return the standard deviation of a superpixel's reading with its row's noise [electrons]."""
         own = self.superpixel_read_noise_e
         return math.hypot(own, self.superpixel_row_noise_e) if self.row_noise_e else own
 
     @property
     def full_well_dn(self) -> float:
-        """Return the digital number, not yet rounded, of a superpixel whose full well is full; inf without one."""
+        """Return the unrounded digital number of a full superpixel; inf without a full well."""
         full = self.superpixel_full_well_e
         bent = full * (1 + sum(self.linearity)) if self.linearity else full
         return bent * self.gain_dn_per_e + self.superpixel_black_level_dn
 
     @property
     def superpixel_pitch_um(self) -> float:
-        """Return the distance between superpixel centres in a row [um]."""
         return self.pixel_pitch_um * self.binning
 
     @property
     def superpixel_area_m2(self) -> float:
-        """Return the light-collecting area [m^2]; the fill factor is part of the quantum efficiency."""
+        """Return the area [m^2]; the fill factor is part of the quantum efficiency."""
         if self.row_pitch_um is None:
             return (self.superpixel_pitch_um * 1e-6) ** 2
         return self.superpixel_pitch_um * self.row_pitch_um * self.binning * 1e-12
 
     @property
     def superpixel_full_well_e(self) -> float:
-        """Return the electrons that a superpixel holds: b^2 full wells, or less if the node on chip holds less."""
+        """Return b^2 full wells, or less if the node on chip holds less."""
         full = self.full_well_e * self.binning**2
         return full if self.binned_full_well_e is None else min(full, self.binned_full_well_e)
 
     @property
     def superpixel_read_noise_e(self) -> float:
-        """Return the standard deviation of a superpixel's reading [electrons], of b^2 readings, or one on chip."""
         return self.read_noise_e * self._readings[0]
 
     @property
     def superpixel_dark_current_e_per_s(self) -> float:
-        """Return the dark electrons a second and superpixel at the sensor's temperature, without hot pixels."""
+        """Return the dark electrons a second at the sensor's temperature, without hot pixels."""
         return self.dark_current_e_per_s * self.binning**2 * self.dark_factor
 
     @property
     def superpixel_black_level_dn(self) -> float:
-        """Return the digital number of a superpixel without charge."""
         return self.black_level_dn * self.codes
 
     @property
     def largest_dn(self) -> int | None:
-        """Return the largest code of a superpixel, b^2 (2^bits - 1), on chip 2^bits - 1; None for real numbers."""
+        """Return b^2 (2^bits - 1), on chip 2^bits - 1; None for real numbers."""
         return None if self.bits is None else (2**self.bits - 1) * self.codes
 
 
 def check_exposure(seconds: float) -> float:
-    """Return the exposure of every frame, ``seconds``; raise ArgumentError if no camera has it."""
+    """Return the exposure ``seconds``; raise ArgumentError if no camera has it."""
     shortest, longest = EXPOSURE_S
     if not shortest <= seconds <= longest:
         raise ArgumentError("exposure", f"{seconds:g}: give the seconds of every frame, {shortest:g} to {longest:g}")
@@ -404,15 +380,16 @@ def check_exposure(seconds: float) -> float:
 
 
 def load_sensor(path: Path | str) -> SensorModel:
-    """Return the sensor in the TOML file at ``path``; a MitsimError names the file, field, value and rule."""
+    """Return the sensor in a TOML file; a MitsimError names the file, field, value and rule."""
     return validate(SensorModel, sensor_table(path), f"file {path}")
 
 
 def sensor_table(path: Path | str) -> Table:
-    """Return the fields of the sensor in the TOML file at ``path``, without its table ``[mask]``.
+    """Return the fields of the sensor in a TOML file without its table ``[mask]``.
 
-    A line ``base`` names a shipped camera, or a file beside it, whose fields count where the file has none of its own.
-    Raises MitsimError if there is no such base.
+    A line ``base`` names a shipped camera, or a file beside it, whose fields are inherited. Raises MitsimError if
+    there is
+    no such base.
     """
     table, read, first = read_toml(path), [Path(path).resolve()], path
     while (base := table.pop(BASE, None)) is not None:
@@ -446,7 +423,7 @@ def sensor_table(path: Path | str) -> Table:
 
 
 def digital_of(sensor: SensorModel, exposure_s: float) -> Digital:
-    """Return how digital numbers of the binned ``sensor`` become electrons a second at an exposure [s]."""
+    """Return the conversion of digital numbers of the binned ``sensor`` to electrons a second."""
     full = sensor.full_well_dn
     largest = math.inf if sensor.largest_dn is None else float(sensor.largest_dn)
     end = min(full if math.isinf(full) else float(math.floor(full)), largest)
@@ -494,7 +471,7 @@ class EfficiencyCurve(Configuration):
         return self
 
     def at(self, wavelength_nm: float) -> float:
-        """Return the electrons per photon of ``wavelength_nm``; raise MitsimError outside the curve."""
+        """Return the electrons per photon; raise MitsimError outside the curve."""
         first, last = self.wavelengths_nm[0], self.wavelengths_nm[-1]
         if not first <= wavelength_nm <= last:
             problem = f"got {wavelength_nm:g} nm; the curve of quantum efficiency is of {first:g} to {last:g} nm"

@@ -1,4 +1,4 @@
-"""How a calibration session is run: a TOML file in, a checked and frozen model out."""
+"""How a calibration session is run: a TOML file, checked to a frozen model."""
 
 from __future__ import annotations
 
@@ -63,9 +63,8 @@ class BoardShape(Configuration):
 # `session_flicker` alone.
 
 LARGEST_ROTATION_MRAD = 10.0
-"""Beyond it the cosine, which is taken for 1, moves a mask's edge 3 mm off the axis by 0.15 um."""
+"""Beyond it, the neglected cosine moves a mask's edge 3 mm off the axis by 0.15 um."""
 LARGEST_TILT_MRAD = 50.0
-"""It lifts that edge by 0.15 mm: a mask that has come loose."""
 DRIFT_UNITS: Mapping[str, str] = MappingProxyType({
     "mask_rows_um": "um", "mask_columns_um": "um", "mask_axis_um": "um", "mask_rotation_mrad": "mrad",
     "mask_tilt_rows_mrad": "mrad", "mask_tilt_columns_mrad": "mrad", "vibration_um": "um rms", "temperature_k": "K",
@@ -170,15 +169,12 @@ class Drift(Configuration):
 
     @property
     def ripples(self) -> Mapping[str, tuple[float, float]]:
-        """Return amplitude, relative to its light, and frequency [Hz] of sources that ripple: ``power``, ``lamp``."""
+        """Return relative amplitude and frequency [Hz] of sources that ripple: ``power``, ``lamp``."""
         both = ("power", self.power_ripple, self.power_ripple_hz), ("lamp", self.lamp_ripple, self.lamp_ripple_hz)
         return {name: (amplitude, hertz) for name, amplitude, hertz in both if amplitude and hertz}
 
     def alone(self, kind: str, amount: float | None = None) -> Drift:
-        """Return one ``kind`` of drift without the others, by another ``amount`` if one is given.
-
-        Raises MitsimError for an unknown kind, or an amount that is not allowed.
-        """
+        """Return one ``kind`` of drift alone; MitsimError for an unknown kind, or an amount that is not allowed."""
         if kind not in DRIFT_UNITS:
             raise MitsimError(f"drift {kind!r}: there is no such kind; use {', '.join(DRIFT_UNITS)}")
         chosen = getattr(self, kind) if amount is None else float(amount)
@@ -186,31 +182,28 @@ class Drift(Configuration):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Return the names of the kinds of drift that move something."""
         return tuple(kind for kind in DRIFT_UNITS if getattr(self, kind))
 
     @property
     def mask_mm(self) -> tuple[float, float, float]:
-        """Return how far the mask moves along rows, columns and axis [mm], for all reasons."""
+        """Return the motion of the mask along rows, columns and axis [mm]."""
         axis = self.mask_axis_um + self.gap_um_per_k * self.temperature_k
         return self.mask_rows_um / 1e3, self.mask_columns_um / 1e3, axis / 1e3
 
     @property
     def tilt_mrad(self) -> tuple[float, float] | None:
-        """Return how the mask's distance comes to grow along rows and along columns [mrad]; None without a tilt."""
         tilt = self.mask_tilt_rows_mrad, self.mask_tilt_columns_mrad
         return tilt if any(tilt) else None
 
     @property
     def motion(self) -> MaskMotion | None:
-        """Return how the mask is turned and shakes; None if it does neither."""
         if not (self.mask_rotation_mrad or self.vibration_um):
             return None
         return MaskMotion(rotation_mrad=self.mask_rotation_mrad, vibration_um=self.vibration_um)
 
 
 def amount_in_words(kind: str, amount: float) -> str:
-    """Return an ``amount`` of a ``kind`` of drift with its unit; parts of a whole as a percentage."""
+    """Return an ``amount`` of drift with its unit; parts of a whole as a percentage."""
     unit = DRIFT_UNITS[kind]
     return f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"
 
@@ -218,7 +211,6 @@ def amount_in_words(kind: str, amount: float) -> str:
 # -------- How a calibration session is run
 
 MOST_REPEATS = 1024
-"""Shots of one frame: 30 dB less noise, where a session of 512 frames takes days."""
 MOST_RUNGS, LONGEST = 8, 1e6
 """Exposures of one frame, and the longest over the shortest: 120 dB, more than any scene on a sensor has."""
 MOST_SEED = 2**32 - 1
@@ -288,7 +280,7 @@ class SessionRecipe(Configuration):
         return self
 
     def of_one_depth(self) -> SessionRecipe:
-        """Return the recipe itself as that of one calibration; raise MitsimError if it has depths."""
+        """Return the recipe; raise MitsimError if it has depths."""
         if self.depths:
             problem = f"recipe: has {len(self.depths)} depths, and this makes one calibration"
             raise MitsimError(f"{problem}; use calibrate_depths, or leave depths out")
@@ -321,14 +313,9 @@ Half = tuple[Side, int, int]
 
 
 def halves(count: int, pairs: bool) -> Iterator[list[Half]]:
-    """Yield the halves that show each pattern, in the order of the list: horizontal stripes, then vertical ones.
+    """Yield the halves that show each of ``count`` patterns per side: horizontal stripes, then vertical ones.
 
-    Parameters
-    ----------
-    count
-        patterns of a side.
-    pairs
-        whether a +-1 pattern is the difference of two frames. If not, each side begins with a uniform frame.
+    With ``pairs``, a +-1 pattern is the difference of two frames. Otherwise each side begins with a uniform frame.
     """
     for side in SIDES:
         if not pairs:
@@ -340,14 +327,7 @@ def halves(count: int, pairs: bool) -> Iterator[list[Half]]:
 def halves_in_order(count: int, pairs: bool, order: Order = "listed", seed: int = 0) -> list[Half]:
     """Return the halves in the order in which they are taken; those that are subtracted follow one another.
 
-    Parameters
-    ----------
-    count, pairs
-        as :func:`halves`.
-    order
-        ``listed``; ``reversed``; ``interleaved``: a pattern of one side, then the same of the other; ``random``.
-    seed
-        of a random order.
+    ``interleaved`` alternates between the sides, and ``random`` uses the ``seed``.
     """
     patterns = list(halves(count, pairs))
     if order == "reversed":
@@ -416,15 +396,9 @@ class Modelling:
     def used_patterns(self, changes: Sequence[int], pairs: bool, repeats: int) -> list[tuple[Side, int]]:
         """Return side and number of the +-1 patterns whose frames are used.
 
-        They are uniform light, then ever finer stripes, vertical and horizontal ones. Coarse stripes cast the deepest
-        shadows, which a mask's fringes change least.
-
-        Parameters
-        ----------
-        changes
-            of sign in each pattern of a side; none in number 0.
-        pairs, repeats
-            whether a pattern is two frames, or one beside its side's uniform one; and how often each is taken.
+        They are uniform light, then ever finer stripes (by their ``changes`` of sign), because a mask's fringes
+        change the
+        deep shadows of coarse stripes least. ``pairs`` and ``repeats`` give the frames of a pattern.
         """
         shots = max(self.frames // repeats, 2)
         most = shots // 2 if pairs else max(shots - 2, 1)
@@ -436,12 +410,6 @@ class Modelling:
 
 
 def frames_of(chosen: Sequence[tuple[Side, int]], pairs: bool, repeats: int) -> int:
-    """Return the number of frames of the ``chosen`` patterns.
-
-    Parameters
-    ----------
-    chosen, pairs, repeats
-        as :meth:`Modelling.used_patterns` has them.
-    """
+    """Return the number of frames of the ``chosen`` patterns."""
     sides = len({side for side, _ in chosen})
     return repeats * (2 * len(chosen) if pairs else len(chosen) + sides)
