@@ -1,1 +1,1 @@
-"""What networks learn from: pictures, and pairs of frames and truths; their training; trained networks as solvers."""
+"""Learning: pictures, pairs of frames and truths, training, and trained networks as solvers."""

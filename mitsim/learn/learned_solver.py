@@ -1,6 +1,6 @@
 """A trained network as a method of solving, and its file.
 
-`torch.load` reads the file with `weights_only`: tensors, and a text of JSON. Nothing in the file is executed.
+`torch.load` reads the file with `weights_only`, so that nothing in it is executed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 _MOST_BYTES = 1 << 28
 _SAME_CAMERA = 0.02
 """Relative difference of two calibrations' models above which they belong to two cameras: four times that of two
-sessions of 512 frames, and that of a scene an eighth of a pixel aside."""
+sessions of 512 frames."""
 _OTHER_NOISE = 1.5
 """Factor by which the noise may lie outside the range of the training; half an exposure gives 1.4."""
 _NO_NOISE = 1e-14
@@ -64,7 +64,6 @@ class LearnedSolver(Solver):
 
     @property
     def name(self) -> str:
-        """The method, and the first digits of a fingerprint that equal networks share."""
         digest = hashlib.sha256(self.manifest.model_dump_json().encode())
         for name, values in self.network.state_dict().items():
             digest.update(name.encode() + values.cpu().contiguous().numpy().tobytes())
@@ -205,10 +204,7 @@ def datum_variance(problem: DiagonalProblem) -> float:
 
 
 def beyond_noise(prepared: Prepared, problem: DiagonalProblem, image: FloatArray) -> tuple[float, float]:
-    """Return the energy of the frames, within the model's range, that an image (n, n') does not reproduce.
-
-    The second number is the rms part of the whole energy that is unexplained beyond the noise.
-    """
+    """Return the frames' energy in the model's range that an image does not reproduce, and the rms unexplained part."""
     missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
     beyond = max(missed - datum_variance(problem) * prepared.rank, 0.0)
     return missed, float(np.sqrt(beyond / problem.energy))

@@ -1,19 +1,17 @@
 """Learned methods: the network that all share, the camera's model as tensors, the methods, and FlatNet's losses.
 
 *Network.* A U-Net (Ronneberger et al., arXiv 1505.04597) returns a change of its input. Its last layer begins at zero,
-so an untrained network changes nothing. It sees an image in one of eight ways, turned and mirrored: training draws one
-for each step, and a reconstructed image is the mean over all.
+so that an untrained network changes nothing. Training turns and mirrors images in one of eight ways for each step; a
+reconstructed image is the mean over all.
 
-*Camera.* In the basis where the model is diagonal (:mod:`mitsim.reconstruct.solver`) W = sigma o C + noise, with
-C = V_L^T X V_R the coefficients of the image X. Over the noise's standard deviation, w = s o C + noise of variance 1.
-The image nearest to both the data and an image Z, argmin ||w - s o C||^2 + rho ||X - Z||^2, is ::
+*Camera.* In the basis where the model is diagonal (:mod:`mitsim.reconstruct.solver`) W = sigma o C + noise, with C =
+V_L^T X V_R the coefficients of the image X. Over the noise's standard deviation, w = s o C + noise of variance 1. The
+image nearest to both the data and an image Z, argmin ||w - s o C||^2 + rho ||X - Z||^2, is ::
 
     X = Z + V_L [s (w - s o V_L^T Z V_R) / (s^2 + rho)] V_R^T
 
-Unmeasured directions stay those of Z. V and s occur together, so that the free signs of an SVD do not matter.
-
-*Methods.* All begin at the image nearest to the frames and to an even grey; a network fills in what the camera does not
-measure.
+Unmeasured directions remain those of Z. All methods begin at the image nearest to the frames and to an even grey; a
+network adds the unmeasured part.
 """
 
 from __future__ import annotations
@@ -38,23 +36,13 @@ from mitsim.reconstruct.solver import Accumulator, Prepared
 # -------- Network
 
 LEVELS = (1, 2, 4, 6)
-"""Channels of each level over those of the first. Each level halves the pixels along an axis. All levels but the last
-take the same arithmetic, and a pixel of the image sees 50 others on either side."""
+"""Channels of each level over those of the first. Each level halves the pixels along an axis, so that all but the last
+need the same arithmetic."""
 WAYS = 8
 
 
 class UNet(nn.Module):
-    """U-Net that returns a change of images.
-
-    Parameters
-    ----------
-    channels_in, channels_out
-        Images that the network reads and changes.
-    width
-        Channels of the first level.
-    stacked
-        Pixels along each axis that are stacked as channels before the first level, for frames.
-    """
+    """U-Net that returns a change of images; frames are ``stacked`` as channels before the first level."""
 
     def __init__(self, channels_in: int, channels_out: int, width: int, stacked: int = 1) -> None:
         super().__init__()
@@ -73,8 +61,8 @@ class UNet(nn.Module):
     def forward(self, images: Tensor, way: int = 0) -> Tensor:
         """Return the change of images (B, channels_in, n, n') that are seen in a way from 0 to 7.
 
-        The bits of the way mirror both axes and exchange them. Training uses half precision (bfloat16) where the
-        processor computes with it, because it is twice as fast.
+        The bits of the way mirror both axes and exchange them. Training uses bfloat16 where the processor computes with
+        it, because it is twice as fast.
         """
         axes = [axis for axis in (-2, -1) if way >> (axis + 2) & 1]
         half = self.training and has_half(images.device)
@@ -123,8 +111,8 @@ def has_half(device: torch.device) -> bool:
 # -------- Camera
 
 BIN = 4
-"""Sensor pixels along an axis of one bin, for networks that read frames: 47 um of the shipped camera, whose mask has
-features of 60 um. Frames of a pair under 49 patterns then take 3 MB, so that memory holds a thousand pairs."""
+"""Sensor pixels along an axis of one bin, for networks that read frames: 47 um of the shipped camera. Frames under 49
+patterns then need 3 MB a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +126,7 @@ class Diagonal:
     sigma
         (r, r') singular values of the whole model [electrons / s].
     slabs
-        (K, b, r) and (K', b', r') sums of U_L and U_R over the sensor pixels of a bin, for every pattern; 0 where a
-        pattern lights no pixel of a direction.
+        (K, b, r) and (K', b', r') sums of U_L and U_R over the pixels of a bin, for every pattern; 0 where unlit.
     """
 
     left: Tensor
@@ -206,7 +193,7 @@ class Data:
 
 
 class Binning(Accumulator):
-    """Sum of frames that also keeps them, binned, in `frames` (K, K', b, b') of single precision."""
+    """Sum of frames that also keeps them binned, in `frames` (K, K', b, b') of single precision."""
 
     def __init__(self, prepared: Prepared) -> None:
         super().__init__(prepared)
@@ -230,19 +217,13 @@ def _bin(values: FloatArray) -> FloatArray:
 
 _GREY = 0.5
 _START = 60.0
-"""One over the variance of pictures about grey before the first step: drawn pictures have a deviation of 0.13."""
+"""Inverse variance of pictures about grey before the first step: drawn pictures have a deviation of 0.13."""
 _LEAST_ERROR = 1e-5
-"""Squared error below which a picture gains nothing: 50 dB, more than an 8-bit scene gives."""
+"""Squared error below which a picture gains nothing: 50 dB."""
 
 
 class Method(nn.Module):
-    """Common part of the methods: the first image and the loss.
-
-    Parameters
-    ----------
-    shape
-        (n, n') of the images.
-    """
+    """Common part of the methods: the first image and the loss."""
 
     PASSES, WIDTH = 1, 24
     reads_frames, holds_camera = False, False
@@ -301,8 +282,7 @@ class FlatNet(Refined):
 class Unrolled(Method):
     """Half-quadratic splitting of a few steps, each a U-Net and the image nearest to the frames and to its output.
 
-    The splitting is that of Geman and Yang (1995). The last step applies the frames, so that the image agrees with
-    them as far as they determine it.
+    The splitting is that of Geman and Yang (1995).
     """
 
     STEPS, WIDTH = 3, 16
@@ -395,7 +375,6 @@ class Preprocessed(Refined):
 
 
 def decibels(images: Tensor, truths: Tensor) -> Tensor:
-    """Return the mean logarithm of the squared error of images (B, 1, n, n')."""
     return torch.log((images - truths).square().mean(dim=(1, 2, 3)) + _LEAST_ERROR).mean()
 
 
@@ -412,15 +391,14 @@ CLASSES: dict[str, type[Method]] = {
 _FEATURES = 16
 _LEAST_FEATURES = 1e-5
 _PATCH = (32, 64, 128)
-"""Channels of the adversary's layers, half of those of Isola et al. (arXiv 1611.07004), whose pictures have colours. A
-number of the last layer depends on 46 x 46 pixels."""
+"""Channels of the adversary's layers, half of those of Isola et al. (arXiv 1611.07004), whose pictures have colours."""
 _RATE, _BETAS, _SLOPE = 2e-4, (0.5, 0.999), 0.2
 
 
 class Critic:
     """FlatNet's two other losses: differences of features, and an adversary.
 
-    Features come from a network with drawn weights, which serve as well as learned ones (Liu et al., arXiv 2103.10571),
+    Features come from a network with drawn weights, which work as well as learned ones (Liu et al., arXiv 2103.10571),
     so that no weights are downloaded.
     """
 
@@ -436,10 +414,7 @@ class Critic:
         self.optimiser = torch.optim.Adam(self.adversary.parameters(), lr=_RATE, betas=_BETAS)
 
     def loss(self, images: Tensor, truths: Tensor) -> Tensor:
-        """Return the loss to add for images (B, 1, n, n').
-
-        For features it is, for each level, the mean logarithm of the squared difference over the squared features.
-        """
+        """Return the loss to add for images (B, 1, n, n'): differences of features, and the adversary's."""
         features, adversary = self._weights
         found = images.new_zeros(())
         if features:

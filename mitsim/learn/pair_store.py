@@ -1,10 +1,9 @@
 """Store of pairs: frames and truths to learn from, in a folder; and the manifests of stores and of models.
 
-The folder holds `pairs.json` and shards `pairs_00000.h5` and so on. A shard keeps its pairs' pictures and truths, and
-the light of a white print: times a picture, that is the light of the picture. A thousand pairs of 49 frames therefore
-take some 100 MB instead of 25 GB. Where light is no such product, or the mask's shadow no sum of few terms, a shard
-keeps the expected frames of each pair. The sensor chain draws the noise when a pair is read, always the same for the
-same seed.
+The folder holds `pairs.json` and shards `pairs_00000.h5` and so on. A shard keeps pictures, truths, and the light of a
+white print: times a picture, that is the light of the picture. A thousand pairs of 49 frames therefore take 100 MB
+instead of 25 GB. Where light is no such product, or the mask's shadow no sum of few terms, a shard keeps the expected
+frames. Noise is drawn when a pair is read.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ FORMAT = 1
 WHITE = 255
 """Code of a picture that is reflectance 1."""
 _LIGHTS_KEPT = 32
-"""Lights of shards in memory, some 10 MB each: as many as a network's batch meets."""
+"""Lights of shards in memory, some 10 MB each."""
 Frames = npt.NDArray[np.float32]
 
 
@@ -132,12 +131,10 @@ class PairsManifest(BaseModel):
 
     @cached_property
     def family(self) -> PatternFamily:
-        """The patterns."""
         return parse_patterns(self.patterns, self.n, self.seed)
 
     @cached_property
     def sensor_model(self) -> SensorModel:
-        """The sensor that draws noise."""
         return SensorModel.model_validate_json(self.sensor)
 
 
@@ -174,8 +171,7 @@ class ModelManifest(Configuration):
 class PrintPart:
     """Light (classes, places) of a white print in one kind of cells [electrons/s], and its optics.
 
-    `rows` and `columns` give the picture's pixel of each row and column of cells. Light of lamps has one class and is
-    in every shot.
+    `rows` and `columns` give the picture's pixel of each row and column of cells.
     """
 
     optics: FrameOptics
@@ -246,14 +242,10 @@ class PrintLight:
 
 
 Pair = tuple[dict[str, Any], Sequence[str]]
-"""Arrays and numbers of a pair by their names in a shard, and its warnings."""
 
 
 def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, light: PrintLight | None) -> None:
-    """Write the file of a shard as a whole, with the light of its pairs unless each has frames.
-
-    `digest` identifies the store's configuration; `speckle` is the contrast in a frame.
-    """
+    """Write the file of a shard as a whole, with the light of its pairs unless each has frames."""
     with whole_hdf5(path) as file:
         file.attrs.update({"configuration_sha256": digest, "speckle": speckle})
         if light is not None:
@@ -317,7 +309,7 @@ class PairStore:
 
     @property
     def photographs(self) -> Labels:
-        """Number (N,) of the photograph that each pair shows; all crops of a photograph have the same number."""
+        """Number (N,) of the photograph that each pair shows."""
         numbers = np.arange(len(self))
         files = re.match(r"([0-9]+) files of", self.manifest.pictures)  # stores that were made before files had numbers
         labels = self.manifest.photographs or (range(int(files[1])) if files else numbers)

@@ -1,14 +1,12 @@
 """Pairs to learn from: pictures on the prints of a bench, their frames and truths.
 
-Each cell of the light lies in one pixel of the picture. The light of a picture is therefore that of a white print times
-the reflectance of each cell's pixel. That holds for light from one flat sheet straight to the sensor, however the
-projector blurs, scatters or leaks. Elsewhere (:func:`mitsim.bench.board.traced_anew`) each picture's light is traced.
+The light of a picture is that of a white print times the reflectance of each cell's pixel, for light from one flat
+sheet straight to the sensor. Elsewhere (:func:`mitsim.bench.board.traced_anew`) each picture's light is traced.
 Idealised frames follow the paper's separable model.
 
-Pictures are square, of eight bits, drawn from a seed or cut from a folder of files. Drawn pictures have the statistics
-of natural ones: leaves that hide each other (the dead leaves of Matheron, 1968), whose sizes follow a power law, with
-soft edges, shades and a texture of 1/f amplitude; some have lines of letters, and some stripes. A picture depends on
-the seed and its number alone. None is a photograph.
+Pictures are square, of eight bits, drawn from a seed or cut from files. Drawn pictures have the statistics of natural
+ones: leaves that hide each other (the dead leaves of Matheron, 1968), whose sizes follow a power law, with soft edges,
+shades and a texture of 1/f amplitude; some have letters or stripes. A picture depends on the seed and its number alone.
 """
 
 from __future__ import annotations
@@ -76,8 +74,7 @@ _PAIR_BYTES, _FRAME_BYTES = 4, 4
 _SHADOW_BYTES = 40
 """Bytes of the stored shadow for a pixel of the frame's sides and a pixel of the projector's; measured 27 to 30."""
 _FORMED = 0.5
-"""Time to form a pair's frames over that of a capture, whose Monte Carlo error is probed as well; measured 0.4 to 0.6
-(uniform light, 49 dots)."""
+"""Time to form a pair's frames over that of a capture; measured 0.4 to 0.6."""
 
 Opening = Callable[[Mapping[str, str]], Bench]
 
@@ -92,14 +89,10 @@ class WhitePrints:
 
     Attributes
     ----------
-    light
-        Light merged into one group.
     white
         (n, n) apparent reflectance of the white prints.
     shares
         (n^2, n^2) part of each projector pixel's direct light that each pixel of the picture reflects.
-    warnings
-        Warnings of the light.
     """
 
     light: SampledLight
@@ -181,16 +174,16 @@ def electrons_per_joule(bench: Apparatus) -> float:
 
 Codes = npt.NDArray[np.uint8]
 _OVER = 2
-"""Points per pixel and axis that a picture is drawn on; four show no difference, because edges are soft."""
+"""Points per pixel and axis of a drawn picture; four show no difference, because edges are soft."""
 _RADII = 0.015, 0.35
 """Smallest and largest leaf over the side: two pixels of 128, and a third of the picture."""
 _POWERS = 1.6, 3.2
-"""Power by which the number of leaves falls with their radius, drawn for each picture; natural pictures have about 3
-(Lee, Mumford and Huang, 2001), portraits and pictures of things have fewer small leaves."""
+"""Power by which the number of leaves falls with their radius; natural pictures have about 3 (Lee, Mumford and Huang,
+2001), portraits fewer small leaves."""
 _COVERED = 2.5
 _MOST_LEAVES = 600
 _SOFT = 0.3, 2.5
-"""Width of an edge in pixels, from sharp to out of focus, because a network learned nothing from hard ones."""
+"""Width of an edge in pixels, because a network learned nothing from hard ones."""
 _SHADE, _TEXTURE = 0.25, 0.12
 _DARKEST, _BRIGHTEST = (0.03, 0.15), (0.55, 0.95)
 _LETTERS, _STRIPES = 0.2, 0.15
@@ -200,8 +193,6 @@ _SMALLEST_CROP = 0.5
 
 @dataclass(frozen=True)
 class DrawnPictures:
-    """Pictures drawn from a seed."""
-
     seed: int
     photographs: ClassVar[tuple[int, ...]] = ()
     source: ClassVar[str] = "drawn by code: dead leaves with soft edges, shades and 1/f texture, letters, stripes"
@@ -292,8 +283,7 @@ def _lay_stripes(canvas: FloatArray, rng: np.random.Generator) -> None:
 class FolderPictures:
     """Grey pictures of the files in a folder, in the order of their names.
 
-    The first pictures are the middle squares of the files; further ones are squares drawn from them, turned and
-    mirrored.
+    The first pictures are the middle squares of the files; further ones are drawn squares, turned and mirrored.
     """
 
     folder: Path
@@ -305,7 +295,7 @@ class FolderPictures:
 
     @cached_property
     def source(self) -> str:
-        """Number, folder and digest of the files, which a store states."""
+        """Number, folder and digest of the files."""
         digest = hashlib.sha256()
         for path in self.files:
             digest.update(f"{path.name} {check_plain(path, 'picture').st_size}\n".encode())
@@ -368,8 +358,8 @@ class _Maker:
     def check(self, shards: Sequence[Shard]) -> None:
         """Read all pictures and open all benches before any light is traced.
 
-        Raise MitsimError if one cannot be read or opened, or if a bench's light must be traced for each picture and
-        that of the first bench need not.
+        Raise MitsimError if one fails, or if only the bench's light, unlike the first one's, must be traced for each
+        picture.
         """
         if isinstance(self._pictures, FolderPictures):
             files = len(self._pictures.files)

@@ -1,7 +1,4 @@
-"""Requests for pairs and for trainings: options or arguments in, a checked request or a refusal in one line out.
-
-Importing this file imports neither numpy nor torch.
-"""
+"""Requests for pairs and for trainings, checked or refused in one line, without an import of numpy or torch."""
 
 from __future__ import annotations
 
@@ -20,11 +17,10 @@ from mitsim.devices.session import Drift
 # -------- Pairs
 
 MOST_PAIRS = 10**6
-"""Pairs that may be asked for: beyond what any of these networks was trained on, and within five digits of shards."""
+"""Most pairs of a request: within five digits of shards."""
 CALIBRATION = "calibration"
-"""CAL folder in a folder of pairs of the idealised model, whose factors are known."""
 Between = Annotated[tuple[float, float], Field(strict=False)]
-"""Least and largest number that are drawn, all between them with equal chance."""
+"""Least and largest number of an even distribution."""
 
 
 class Variation(Configuration):
@@ -115,7 +111,6 @@ class PairsRequest(PairOptions):
             raise ArgumentError("exposure", f"{capture.exposure}: exposure_fraction varies; leave out one of both")
 
     def groups(self) -> list[dict[str, float]]:
-        """Return the numbers that are drawn for each bench."""
         if self.vary is None:
             return [{}]
         return [self.vary.draw(self.capture.seed, group) for group in range(self.vary.groups)]
@@ -145,8 +140,8 @@ UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
 )  # fmt: skip
 """Names of the classes of :mod:`mitsim.learn.methods`."""
 _LARGEST_BATCH, _LONGEST, _LARGEST_WEIGHT = 256, 1_000_000, 100
-"""Pairs a step, thirty times what is usual; steps, ten days of the smallest network on two processors; and weight of a
-loss beside the squared error, which then does not count."""
+"""Largest batch, number of steps (ten days of the smallest network on two processors), and weight of a loss beside the
+squared error."""
 FEWEST_PAIRS, FEWEST_PHOTOGRAPHS = 8, 3
 """Least numbers that can be divided: one photograph teaches, one chooses the best step, and one judges."""
 

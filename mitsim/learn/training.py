@@ -1,8 +1,8 @@
 """Train a network on a store of pairs: sums of frames, batches, steps, judgement, and resumption.
 
-What frames measure of an image is their sum W (:mod:`mitsim.learn.methods`). Frames are therefore read once, and a step
-takes as long under 49 patterns as under one. Every step draws from random streams of its own number, so that an
-interrupted training continues bit-equal at the same number of threads.
+Frames are read once into their sum W (:mod:`mitsim.learn.methods`), so that a step takes as long under 49 patterns as
+under one. Every step draws from random streams of its own number, so that an interrupted training continues bit-equal
+at the same number of threads.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mitsim.reconstruct.solvers import SOLVERS
 
 _PART, _MOST = 16, 48
 """One photograph in 16 chooses the best step, and one judges, up to 48 pairs each: their mean PSNR is then known to 0.5
-dB, and its change from step to step much better."""
+dB."""
 _LOOKS = 20
 _PATIENCE = 6
 _GAIN_DB = 0.01
@@ -45,8 +45,8 @@ _RISING = 0.15
 _DECAY, _BETAS, _LONGEST_GRADIENT = 1e-4, (0.9, 0.99), 1.0
 """Options of AdamW, and the norm to which gradients are cut, because the first steps would diverge otherwise."""
 _BASE_BYTES, _CHANNEL_BYTES, _HALF = 6e8, 100.0, 0.6
-"""Memory of torch; memory of a pixel with its gradient for each channel of the first level (76 measured at a width of
-16, 96 at 24); and the part of it in half precision (0.55 measured)."""
+"""Memory of torch; memory of a pixel with its gradient for each channel of the first level (76 to 96 measured); and its
+part in half precision (0.55 measured)."""
 _FRAME_PIXELS = 8
 _LOOK = 0.05
 _UNFINISHED = ".unfinished"
@@ -67,8 +67,6 @@ class Sums:
         Smallest and largest noise of a datum over its rms.
     frames
         (N, K, K', b, b') binned frames; None for methods that read none.
-    photographs
-        (N,) number of the photograph that each pair shows; None if all differ.
     """
 
     truths: FloatArray
@@ -106,8 +104,7 @@ class Sums:
 def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, Labels]:
     """Return the numbers of the pairs that teach, that choose the best step, and that give the stated PSNR.
 
-    `photographs` (N,) names the photograph of each pair. All pairs of a photograph belong to one part, because a
-    network that has learned one crop knows much of the next.
+    All pairs of a photograph belong to one part, because a network that has learned one crop knows much of the next.
     """
     names = stream(seed, "judging").permutation(np.unique(photographs))
     count = min(max(len(names) // _PART, 1), _MOST)
@@ -121,13 +118,7 @@ def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, La
 
 @dataclass(eq=False)
 class Trainer:
-    """Network in training.
-
-    Attributes
-    ----------
-    taken, curve, best
-        Steps, judgements (step, PSNR) of the pairs that choose, and the weights after the best step.
-    """
+    """Network in training; ``curve`` has the judgements (step, PSNR), ``best`` the weights after the best step."""
 
     request: Training
     prepared: Prepared
@@ -235,10 +226,7 @@ class Trainer:
         return truths, replace(data, frames=torch.as_tensor(self.sums.frames[chosen]).to(self._like))
 
     def _turn(self, truths: Tensor, data: Data, random: np.random.Generator) -> tuple[Tensor, Data]:
-        """Turn the second half of a batch, with the data that its frames would give.
-
-        A store then teaches as eight times as many pictures.
-        """
+        """Turn the second half of a batch and its data, so that a store teaches as eight times as many pictures."""
         half = len(truths) // 2
         ways = [axis for axis in (-2, -1) if random.random() < 0.5]
         turned = truths[half:].flip(ways)
@@ -274,7 +262,6 @@ class Trainer:
 
 
 def weights_of(network: Method) -> dict[str, Tensor]:
-    """Return a copy of the weights."""
     return {name: values.detach().cpu().clone() for name, values in network.state_dict().items()}
 
 
@@ -317,14 +304,8 @@ def train_network(
 ) -> Trained:  # fmt: skip
     """Train a network and write its file.
 
-    Parameters
-    ----------
-    factors
-        Calibration with which images will be reconstructed.
-    output
-        File of the network. The file from which a training resumes lies beside it until the end.
-    sums
-        Sums of these pairs with these factors if they were read before.
+    ``factors`` is the calibration of later reconstructions. ``output`` is the network's file, beside which the
+    resumable state lies until the end. ``sums`` are sums of these pairs with these factors if they were read before.
     """
     job, output = job or Job(), Path(output)
     started = time.perf_counter()

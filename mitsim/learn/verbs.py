@@ -1,4 +1,4 @@
-"""Pairs, training and trained networks for programs: folders and options in, pairs or a network out.
+"""Verbs of pairs, training and trained networks for programs.
 
 torch, an extra, is imported when it is used; a MitsimError states how to install it.
 """

@@ -1,15 +1,12 @@
 """Time and error of captures at several accuracies, of each part of their light, and of the reference, on one scene.
 
-Every error is relative to the *judge*, a factored answer with a seed of its own, every effect of the scene and, where
-its time allows, more anchors, layers and cells than the plans have. The judge's own noise is subtracted, because seeds
-differ and squares therefore add.
+Every error is relative to the *judge*, a factored answer with its own seed, every effect of the scene and, where its
+time allows, more anchors, layers and cells than the plans. The judge's own noise is subtracted, because independent
+squares add.
 
-*run*: a whole `mitsim capture`, from opening the scene to the last file. *part*: the error without an effect, or with
-anchors, layers or cells reduced to one, and the time of light with all parts less that of light without this part.
-*surfaces*: the same for light over 2, 3, 4 and more surfaces. *reference*: one frame of the scene's own integrator;
-time for all frames, and samples for another error, are extrapolated.
-
-The time of the solver does not depend on the scene; `python benchmarks/solver.py --forms` measures it.
+*run*: a whole `mitsim capture`. *part*: the error without an effect, or with anchors, layers or cells reduced to one,
+and the time that this part costs. *surfaces*: the same for light over 2, 3, 4 and more surfaces. *reference*: one frame
+of the scene's own integrator; time for all frames, and samples for another error, are extrapolated.
 """
 
 from __future__ import annotations
@@ -73,9 +70,9 @@ if TYPE_CHECKING:
 ACCURACIES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 """Two steps a decade, from a first look to far below the sensor's noise."""
 QUOTED = 1e-3
-"""The default accuracy of a capture."""
+"""Default accuracy of a capture."""
 SAMPLES = (16, 64)
-"""Samples a pixel of the reference: the second has half the error of the first."""
+"""Samples per pixel of the reference."""
 LONGEST_S = 30.0
 """Predicted seconds above which a run, or a step of the reference, is not measured."""
 PART_S, JUDGE_S = 1.5, 12.0
@@ -85,19 +82,19 @@ _REPEATS, _REPEATED_S = 3, 5.0
 _ALIKE = 0.1
 """Relative difference of two single runs of the same work on an idle machine."""
 _FINER, _STEP = 10.0, 1.25
-"""The judge's noise is a tenth of the quoted accuracy where time allows, and grows by this factor where not."""
+"""The judge's noise is a tenth of the quoted accuracy where time allows, and grows by this factor otherwise."""
 RUN, PART, REFERENCE, PARENT = "factored", "part", "reference", "interreflection"
 ORDERS = {"2 surfaces": (2, 2), "3 surfaces": (3, 3), "4 surfaces": (4, 4), "5 or more": (5, MOST)}
-"""Orders of light by row. A surface keeps at most its albedo of the light, so little is left beyond four."""
+"""Orders of light by row; little light is left beyond four surfaces."""
 _FEWER = 4
-"""Factor by which fewer samples determine what an order changes, because it is traced alone."""
+"""Factor by which fewer samples determine the effect of an order, because it is traced alone."""
 
 # -------- A scene and its patterns, with what the pilot measured of them
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A scene, a pattern family and a seed, whose pilot looks down to ``accuracy``."""
+    """A scene, a pattern family and a seed, whose pilot explores down to ``accuracy``."""
 
     bench: Apparatus
     family: PatternFamily
@@ -106,21 +103,18 @@ class Probe:
 
     @cached_property
     def pilot_runs(self) -> pilot.PilotRuns:
-        """Runs of the pilot, made once."""
         return pilot.PilotRuns(self.bench, self.family.lighting, self.accuracy, self.seed)
 
     @property
     def pilot_result(self) -> PilotResult:
-        """Return what the pilot measured."""
         return self.pilot_runs.pilot_result
 
     @cached_property
     def few_shots(self) -> Labels:
-        """Numbers of at most eight evenly spread shots; what changes all frames differs among them by few percent."""
+        """Numbers of at most eight evenly spread shots, among which common changes differ by few percent."""
         return np.unique(np.linspace(0, len(self.family.shots) - 1, 8).astype(np.int64))
 
     def plan(self, accuracy: float) -> Plan:
-        """Return the plan for an ``accuracy``."""
         return explain_plan(accuracy, self.pilot_result, SceneFacts.of(self.bench))
 
     def finest(self, plan: Plan) -> Plan:
@@ -143,8 +137,9 @@ class Probe:
         return replace(plan, settings=settings)
 
     def within(self, plan: Plan, seconds: float) -> tuple[Plan, float]:
-        """Return the ``plan`` with the least noise whose light is predicted to take at most so many ``seconds``, or
-        else with the noise of its own accuracy, and the predicted seconds."""
+        """Return the ``plan`` with the least noise within the predicted ``seconds``, or else of its own accuracy, and
+        its time.
+        """
         accuracy = plan.accuracy / _FINER
         while True:
             choice = predicted_candidate(accuracy, self.pilot_result, plan.settings, {})
@@ -155,8 +150,7 @@ class Probe:
     def trace(
         self, plan: Plan, seed: int, bench: Apparatus | None = None, target: Target | None = None
     ) -> SampledLight:
-        """Return the light of a ``plan`` by classes of projector pixels, on another ``bench`` or to another ``target``
-        error if they are given."""
+        """Return the light of a ``plan`` by classes of projector pixels."""
         return trace_light(
             bench or self.bench, plan, self.family.lighting, seed, Sampling(by_pixel=False, target=target)
         )
@@ -177,7 +171,7 @@ def stack_frames(expected: ExpectedFrames) -> tuple[FloatArray, float]:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """The answer that errors are relative to: its light, its expected frames, and the errors of these."""
+    """Reference answer for errors: its light, its expected frames, and their errors."""
 
     probe: Probe
     light: SampledLight
@@ -188,7 +182,7 @@ class Judge:
 
     @classmethod
     def trace(cls, probe: Probe, seconds: float = JUDGE_S) -> Judge:
-        """Return the best answer that is predicted to take so many ``seconds``."""
+        """Return the best answer within the predicted ``seconds``."""
         plan, seed = probe.plan(probe.accuracy), probe.seed + 1
         finest, work = probe.within(probe.finest(plan), seconds)
         if work > seconds:  # the plan's own numbers then; what they leave is stated with the judge
@@ -205,14 +199,13 @@ class Judge:
         return max(math.sqrt(max(distance**2 - self.mc_error**2, 0.0)), self.mc_error / 2)
 
     def row(self, **measured: Value) -> dict[str, Value]:
-        """Return columns of a row with those of the judge."""
         sensor = self.probe.bench.sensor
         noise = NoiseTarget(self.probe.bench.devices, Exposure(), 1.0)(self.expected)
         judge = {"judge_error": math.hypot(self.mc_error, self.systematic_error), "judge_mc_error": self.mc_error}
         return {**measured, **judge, "sensor_noise": noise if np.isfinite(sensor.full_well_e) else None}
 
     def of_reference(self) -> SampledLight:
-        """Return the light without effects that the reference lacks, traced again where these have shaped it."""
+        """Return the light without effects that the reference lacks, traced again where they have shaped it."""
         probe, plan, absent = self.probe, self.light.plan, names(lambda effect: not effect.in_reference)
         if not any(EFFECTS[name].retraced(Physics.of(probe.bench)) for name in absent & plan.settings.effects):
             return reform(self.light, absent)
@@ -224,20 +217,20 @@ class Judge:
 
 
 def repeated(work: Callable[[], float]) -> list[float]:
-    """Return the seconds of each repeat of some ``work``, which returns its own."""
+    """Return the seconds of each repeat of ``work``, which returns its own."""
     seconds = [work()]
     return seconds + [work() for _ in range(_REPEATS - 1) if seconds[0] <= _REPEATED_S]
 
 
 def spread(seconds: Sequence[float]) -> dict[str, Value]:
-    """Return the columns of a time that was measured several times."""
+    """Return the columns of a repeated time."""
     return {
         "seconds": median(seconds), "least_s": min(seconds), "most_s": max(seconds), "repeats": len(seconds)
     }  # fmt: skip
 
 
 def extra(with_it: Sequence[float], without: Sequence[float]) -> dict[str, Value]:
-    """Return the columns of a difference of two times, each measured several times.
+    """Return the columns of a difference of two repeated times.
 
     ``seconds`` is None if the difference may be chance (``within_noise``). A single measurement may be a tenth off.
     """
@@ -344,7 +337,6 @@ def full_plan(probe: Probe) -> Plan:
 
 
 def _light_of(probe: Probe, bench: Apparatus, plan: Plan) -> Callable[[], float]:
-    """Return work that traces the light of a ``plan`` and forms its frames; its kernels are compiled at once."""
 
     def work(plan: Plan) -> object:
         return list(probe.trace(plan, probe.seed, bench, at_once).frames(probe.family.lighting, probe.seed))
@@ -356,8 +348,7 @@ def _light_of(probe: Probe, bench: Apparatus, plan: Plan) -> Callable[[], float]
 def measure_surfaces(judge: Judge, settings: Settings) -> Iterator[dict[str, Value]]:
     """Yield a row for each order of light, if the plan follows light over several surfaces.
 
-    Light of an order alone determines what the order changes. Its time is that of following light to this order less
-    that of following it to the order before, with the frames of followed light.
+    The time of an order is that of following light to this order less that to the order before.
     """
     probe = judge.probe
     if PARENT not in probe.plan(probe.accuracy).settings.effects:
@@ -424,7 +415,7 @@ def at_once(expected: ExpectedFrames) -> float:
 
 
 def with_samples(settings: Settings, samples: int) -> Settings:
-    """Return ``settings`` with so many ``samples`` of a projector pixel and of a cell in each group's first round."""
+    """Return ``settings`` with ``samples`` of a projector pixel and of a cell in each group's first round."""
     each = {name: samples / 8 if row.anchors else float(samples) for name, row in PASSES.items() if name != "sharp"}
     return replace(settings, samples={**settings.samples, **each})
 
@@ -463,8 +454,9 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _derive(results: Results) -> Results:
-    """Return results with the column ``on_front`` for runs that no other run beats in both time and error, and a row
-    of the reference at the error of the quoted run."""
+    """Return results with the column ``on_front`` for runs that no other run beats in both time and error, and a row of
+    the reference at the error of the quoted run.
+    """
     runs = [row for row in results.rows if row["estimator"] == RUN and not row["extrapolated"]]
     front = pareto_front([(float(str(row["seconds"])), float(str(row["error"]))) for row in runs])
     rows = [{**row, "on_front": (row["seconds"], row.get("error")) in front} for row in results.rows]
@@ -475,7 +467,7 @@ def _derive(results: Results) -> Results:
 
 
 def _reaching(row: dict[str, Any], error: float) -> dict[str, Any]:
-    """Return the ``row`` of the reference at samples that leave another ``error``, which falls with their root."""
+    """Return the ``row`` of the reference at another ``error``, which falls with the root of the samples."""
     more = (row["error"] / error) ** 2
     times = {name: row[name] * more for name in ("seconds", "least_s", "most_s")}
     setting = f"{float(row['setting'].split()[0]) * more:.0e} spp"
@@ -499,7 +491,7 @@ def _unbiased(rows: DataFrame) -> tuple[str, bool]:
 
 
 def _faster(rows: DataFrame) -> tuple[str, bool | None]:
-    """Judge how much longer than transport and optics of the quoted run the reference takes for the same error."""
+    """Judge how much longer than the quoted run's transport and optics the reference takes for the same error."""
     quoted = choose_rows(rows, {"estimator": RUN, "accuracy": QUOTED, "extrapolated": False}).to_dict("records")
     slow = choose_rows(rows, {"estimator": REFERENCE}).to_dict("records")
     if not quoted or not slow:

@@ -1,4 +1,4 @@
-"""Frames that characterise a camera: simulated or a real camera's, their statistics, and what closed forms expect."""
+"""Frames that characterise a camera: simulated or a real camera's, their statistics, and closed-form expectations."""
 
 from __future__ import annotations
 
@@ -27,13 +27,12 @@ from mitsim.studies.emva_options import Procedure
 # -------- Simulated frames, and what closed forms expect of frames
 
 _TO = 1.15
-"""Light of the brightest step, relative to saturation, so that the largest variance is inside."""
+"""Light of the brightest step relative to saturation, so that the largest variance is inside."""
 _DARK_STEPS = 6
 _DARK_FILL, _DARK_ELECTRONS = 0.4, 2000.0
-"""Dark electrons at the longest exposure: a fraction of saturation, or enough for a current to a permille."""
+"""Dark electrons at the longest exposure: a fraction of saturation, or enough to determine a current to a permille."""
 _LONGEST_S = 10.0
 _FILLED_BY_DARK = 0.01
-"""Fraction of saturation that dark current may fill at the ladder's exposure."""
 _DITHERED, _CLEAR = 0.6, 8.0
 """Noise of reading [DN], and deviations from 0, from which mean readings follow offsets."""
 _SESSIONS = 1000
@@ -41,12 +40,11 @@ _SESSIONS = 1000
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The frames of a camera in S sets of frames that are taken alike.
+    """Frames of a camera in S sets of frames that are taken alike.
 
     Attributes
     ----------
     light, electrons : (S,) light on a pixel, in any unit, and in photoelectrons; 0 in the dark.
-    dark, bright : sets for nonuniformity.
     lamp : relative errors of the light of each set, and of all sets.
     surface : relative variances of uneven light by row, column and pixel.
     """
@@ -88,7 +86,6 @@ class Frames:
 
     @classmethod
     def as_taken(cls, taken: Sequence[Alike], found: FoundCamera) -> Frames:
-        """Return the frames of a real camera that was found in them."""
         transfer = found.transfer
         light, time, counts = (
             np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s", "count")
@@ -101,7 +98,6 @@ class Frames:
 
     @property
     def step(self) -> float:
-        """Electrons between the set nearest to saturation and the one before it."""
         levels = np.unique(self.electrons)
         return float(np.diff(levels)[np.searchsorted(levels[1:-1], capacity_of(self.sensor))])
 
@@ -114,7 +110,6 @@ class Frames:
             yield image if places is None else image.flat[places]
 
     def take(self, job: Job, places: Places | None = None) -> list[Alike]:
-        """Simulate the frames of all sets."""
         largest = math.inf if self.sensor.largest_dn is None else float(self.sensor.largest_dn)
 
         def taken(index: int) -> Alike:
@@ -131,7 +126,7 @@ class Frames:
         )  # fmt: skip
 
     def expect(self) -> Session:
-        """Return the statistics that closed forms expect, with the nonuniformity that is set."""
+        """Return the statistics that closed forms expect, with the given nonuniformity."""
         pairs, (m, n), stacks = [self.expected_pair(index) for index in range(len(self.light))], self.shape, []
         for index in (self.dark, self.bright):
             still, parts = self.parts(index, 0.0), self.parts(index)
@@ -142,7 +137,6 @@ class Frames:
         return self.session(pairs, *stacks)
 
     def expected_pair(self, index: int, part: float = 1.0) -> Pair:
-        """Return the expected statistics of a set at a part of its light."""
         sensor, light = self.sensor, np.array([part * self.electrons[index], 0.0])
         response = math.hypot(*sensor.response_parts) if light[0] > MOST_FITTED * capacity_of(sensor) else 0.0
         moments = average_moments(light, float(self.exposure_s[index]), self.equal, self.spread, response)[:2]
@@ -153,7 +147,6 @@ class Frames:
 
     @property
     def equal(self) -> SensorModel:
-        """The sensor with equal pixels of the same mean dark current."""
         names = (
             *(f"dsnu_{part}_e" for part in SPLIT[1:]), *(f"prnu_{part}" for part in SPLIT[1:]),
             "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s", "dead_pixels", "crosstalk",
@@ -186,7 +179,7 @@ class Frames:
         return float(np.diff(mean)[0] / np.diff(around)[0])
 
     def parts(self, index: int, light: float = 1.0) -> FloatArray:
-        """Return the spatial variances (row, column, pixel) [e-^2] that are set, at a part of a set's light."""
+        """Return the given spatial variances (row, column, pixel) [e-^2] at a part of a set's light."""
         sensor, (pixel, row, column) = self.sensor, np.square(self.sensor.offset_parts)
         dark = dark_current_variance(sensor) * float(self.exposure_s[index]) ** 2
         _, rows, columns = np.square(sensor.response_parts)
@@ -235,7 +228,7 @@ def _draw_stacks(frames: Frames, expected: Session, rng: np.random.Generator) ->
     """Draw dark and bright stacks: sums of squares of offsets, responses and remaining noise.
 
     By row, column and pixel these are independent: with f degrees of freedom squares are chi-square, and products of
-    two parts normal. Offsets are the same in both stacks.
+    two parts normal. Both stacks share offsets.
     """
     m, n = frames.shape
     places = frames.dark, frames.bright
@@ -269,21 +262,18 @@ def _draw_stacks(frames: Frames, expected: Session, rng: np.random.Generator) ->
 
 _LEAST_SIDE = 16
 _SURE = 6.0
-"""Standard errors from which a difference is not chance, among thousands of comparisons."""
 _UNEQUAL = 0.1
-"""Standard deviation of the light in a set from which the lamp was off or the exposure was different."""
+"""Standard deviation of the light in a set that indicates a lamp off or another exposure."""
 _WHITE = 0.02
 """Correlation of neighbours' noise that charge between pixels may cause."""
 _OUT, _SWAPPED = 0.02, 1.5
-"""Response relative to the other sets from which a set is reported, and from which frames are refused."""
+"""Relative response from which a set is reported, and from which frames are refused."""
 _MIXED, _SCALED, _PEAK = 0.1, 0.99, 0.6
 """Limits of refusals: correlation of neighbours' noise, amplitude of a pattern in the codes, and the least fraction of
-the brightest signal with the largest variance.
-"""
+the brightest signal with the largest variance."""
 _COMB, _EVEN, _STEADY, _STRAIGHT, _STILL, _DARK_CUT, _DEAD = 0.05, 0.03, 0.01, 0.05, 0.1, 0.01, 0.01
 """Limits of remarks: pattern in the codes, unevenness (EMVA 1288 4.0), scatter of the light, misfits of a variance and
-of a dark mean [DN], unexplained dark readings at 0, and dead pixels.
-"""
+of a dark mean [DN], unexplained dark readings at 0, and dead pixels."""
 _FLOATS = 9
 """Arrays of the frame's size in double precision that a set needs."""
 
@@ -331,7 +321,6 @@ def read_again(flats: FlatFrames, shape: tuple[int, int], places: Places | None 
 
 
 def mean_image(flats: FlatFrames, index: int) -> FloatArray:
-    """Return the mean image (M, N) [DN] of a set."""
     files = flats.sets[index].files
     total = 0.0 + sum(read_image(flats.folder / name, flats.wanted).astype(np.float64) for name in files)
     return np.asarray(total / len(files))
@@ -372,7 +361,7 @@ def _faults(flats: FlatFrames, taken: Sequence[Alike]) -> Iterator[str]:
 
 
 def _altered(flats: FlatFrames, taken: Sequence[Alike], used: Sequence[Alike]) -> list[tuple[bool, bool, str]]:
-    """Return signs that numbers were altered or sets exchanged: seen, refused, and the text."""
+    """Return signs of altered numbers or exchanged sets: seen, refused, and the text."""
     names, means = _names(flats), [each.mean for each in taken]
     peak, dark = means[saturation_of(taken)[0]], min(each.mean for each in taken if not each.light)
     combs = [
@@ -405,7 +394,7 @@ def _altered(flats: FlatFrames, taken: Sequence[Alike], used: Sequence[Alike]) -
 
 
 def _responses(names: Sequence[str], taken: Sequence[Alike]) -> list[tuple[str, float, str]]:
-    """Return the sets whose response to light differs from the others: name, ratio, and the exposure that they fit.
+    """Return the sets whose response differs from the others: name, ratio, and the exposure that they fit.
 
     Logarithms of responses follow a robust line over light, because a camera bends and a lamp drifts smoothly.
     """
@@ -434,7 +423,7 @@ def _responses(names: Sequence[str], taken: Sequence[Alike]) -> list[tuple[str, 
 
 
 def remarks(flats: FlatFrames, found: FoundCamera) -> tuple[str, ...]:
-    """Return what does not fit the camera that was found in the sets, with its size and its effect."""
+    """Return each misfit of the sets to the camera that was found, with its size and effect."""
     transfer, pixels = found.transfer, found.pixels
     used = [
         (name, abs(off), taken)

@@ -1,23 +1,19 @@
 """Studies of the paper on the camera: the mask's distance, the sensor's pixels, the resolution, and depth.
 
-*distance*, section IV-C and figure 5: the mask at 500 to 2000 um, and on to where diffraction ends the shadow; mean
-PSNR of eight test images by the number of dots.
+*distance*, section IV-C and figure 5: the mask at 500 to 2000 um, and on to where diffraction ends the shadow.
 
-*binning*, section V-D and its supplement: 512, 256, 128 and 64 pixels a side, the last two with fewer data than
-unknowns in a single frame. Frames are binned by averaging after capture.
+*binning*, section V-D and its supplement: 512 to 64 pixels a side, the last two with fewer data than unknowns in a
+single frame. Frames are averaged after capture.
 
 *resolution*, section V-C and figure 11: bars of 0.13 to 0.6 line pairs a mm under 9, 16 and 49 patterns, and the
-transfer of a slanted edge. The paper takes (I_max - I_min) / (I_max + I_min) of the mean along the bars, of which noise
-alone makes 0.2 to 0.5: it is in the table as `contrast_of_extremes`; figure and verdicts take the contrast at the bars'
-own frequency. Pixels of the image are 0.9375 mm, so that it shows at most 0.533 line pairs a mm.
-
-The slanted edge is ISO 12233's: the edge's place is fitted row by row, all pixels are put in order of their distance
-from it, four bins a pixel, and the spectrum of the derivative is the modulation transfer function.
+slanted edge of ISO 12233. The paper's contrast (I_max - I_min) / (I_max + I_min) is 0.2 to 0.5 by noise alone: it is in
+the table as `contrast_of_extremes`; figure and verdicts use the contrast at the bars' own frequency. Pixels of the
+image are 0.9375 mm, so that it shows at most 0.533 line pairs a mm.
 
 *depth*, section V-A and the limitations: "our method is robust to small variations in depth", with camera and projector
-co-located. Parallax moves each projector pixel's light by B (1/z - 1/z_0), where B is the distance between both.
-Idealised: a plane beside the calibrated distance, any baseline. Rendered: the shipped devices, 60 mm, with the sheet
-moved, and its depth neglected, found, or calibrated at; and scenes of many depths, one found for each projector pixel.
+co-located. Parallax moves each projector pixel's light by B (1/z - 1/z_0), with the baseline B. Idealised: a plane
+beside the calibrated distance, any baseline. Rendered: the shipped devices, 60 mm, with the sheet moved, and its depth
+neglected, found, or calibrated; and scenes of many depths, one found for each projector pixel.
 """
 
 from __future__ import annotations
@@ -39,14 +35,13 @@ from mitsim.studies.framework.panels import Images, Lines
 from mitsim.studies.framework.studio import Image, Studio, finding, image_arrays, measure_image
 
 _FAMILIES, _SHOWN = ("uniform", "dots:5", "dots:7"), ("uniform", "dots:7")
-"""Families of the first two studies, and those whose images are shown."""
 _STABLE_DB = 3.0
-"""Loss of an image that still counts as stable: half of its squared error is then as before."""
+"""Loss of an image that still counts as stable: its squared error doubles."""
 
 # -------- The distance of the mask
 
 _COMPARABLE_DB = 1.0
-"""A difference that may be seen: a fifth of the squared error."""
+"""Least visible difference: a fifth of the squared error."""
 
 DISTANCE = Study(
     "distance",
@@ -121,17 +116,14 @@ BINNING = Study(
 # -------- The resolution
 
 PAIRS_A_MM = (0.13, 0.17, 0.21, 0.26, 0.35, 0.43, 0.52, 0.6)
-"""The paper's groups 20 to 5, and one that pixels of 0.9375 mm can't resolve."""
+"""The paper's groups 20 to 5, and one that pixels of 0.9375 mm cannot resolve."""
 _FINEST = 0.52
-"""The paper's group 5."""
 _RESOLVED = 0.1
-"""Contrast above which bars are resolved: what the eye needs of a print."""
+"""Contrast above which bars are resolved: the eye's limit for a print."""
 _SEEN, _BESIDE = slice(16, -16), slice(8, -8)
-"""Pixels that are evaluated: the margin is beside the bars of the sheet's other half, or beyond the print."""
+"""Evaluated pixels, without the margin beside the other half's bars or beyond the print."""
 _SHOWN_CYCLES, _SHOWS = 0.35, 0.4
-"""Cycles a pixel up to which the truth must show bars, and its least contrast: pixels that average over such bars leave
-0.8 of their contrast.
-"""
+"""Frequency [cycles a pixel] up to which the truth must show bars, and its least contrast."""
 
 
 def _resolution_measure(studio: Studio, point: Point) -> Found:
@@ -215,9 +207,8 @@ RESOLUTION = Study(
 
 
 _BINS = 4
-"""Bins a pixel along the edge's normal, as the standard has them."""
 _LEAST_STEP = 0.05
-"""Least step of reflectance that an edge is looked for at."""
+"""Least step of reflectance that counts as an edge."""
 
 
 def contrast(image: FloatArray, axis: int) -> float:
@@ -231,15 +222,10 @@ def contrast(image: FloatArray, axis: int) -> float:
 
 
 def modulation(image: FloatArray, axis: int, frequency: float) -> float:
-    """Return the contrast of bars along an ``axis`` at their own frequency, which noise at others does not imitate.
+    """Return the contrast of bars along an ``axis`` at their own ``frequency`` [cycles a pixel].
 
     It is the amplitude over the mean of the fundamental of the profile across the bars, times pi / 4, because a square
     wave of contrast c has a fundamental of 4 c / pi.
-
-    Parameters
-    ----------
-    frequency
-        Cycles a pixel.
     """
     profile = image.mean(axis=axis)
     phase = 2 * np.pi * frequency * np.arange(len(profile))
@@ -252,7 +238,7 @@ def slanted_edge(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the modulation transfer of an ``image`` of one edge, a few degrees off its columns, by frequency.
 
     Frequencies [cycles a pixel] end at half a cycle. The transfer is 1 at zero, and that of the bins and of the
-    difference in place of the derivative is divided out. MitsimError for an image without an edge from left to right.
+    difference in place of the derivative is divided out. MitsimError for an image without an edge.
     """
     rows, columns = image.shape
     centres: FloatArray = np.arange(columns, dtype=np.float64) + 0.5
@@ -287,13 +273,12 @@ def _centroid(weights: FloatArray, places: FloatArray) -> float:
 # -------- Depth
 
 CALIBRATED_MM = 400.0
-"""The paper's distance."""
 _BESIDE_MM = (395.0, 405.0)
 """Small variations of depth: the bag's folds."""
 DEPTHS_MM = (360.0, 380.0, 395.0, CALIBRATED_MM, 405.0, 420.0, 440.0)
-"""A tenth of the distance either way, as the shipped scenes with depth have."""
+"""A tenth of the distance either way, as in the shipped scenes with depth."""
 BASELINES_MM = (0.0, 15.0, 60.0, 150.0, 300.0)
-"""From co-located, over a pico projector that touches the camera, to one on the other side of a bench."""
+"""From co-located, over a pico projector that touches the camera, to the other side of a bench."""
 ALONG = {"columns": (0.0, -1.0), "rows": (-1.0, 0.0), "both": (-(0.5**0.5), -(0.5**0.5))}
 """Unit vectors of the baseline; that of the shipped devices is along the columns."""
 DEEP = {"cards": ("dots:7", "dots:7x14"), "cookie_bag": ("dots:7", "dots:7x16")}

@@ -59,17 +59,16 @@ FIGURES: Mapping[str, tuple[str, str]] = {
     **{f"dsnu_{part}": (f"DSNU1288.{part}", "e-") for part in SPLIT},
     **{f"prnu_{part}": (f"PRNU1288.{part}", "%") for part in SPLIT},
 }
-"""Symbol and unit of the figures of EMVA 1288 that `mitsim.sensor.emva.figures` finds."""
 _VARIANCES = "dsnu", "prnu", "row_noise"
-"""Beginnings of the figures that are found as variances."""
+"""Prefixes of the figures that are found as variances."""
 _UNITS = {
     "gain_dn_per_e": "DN/e-", "quantum_efficiency": "e-/photon", "e_per_s": "e-/s", "_dn": "DN", "_e": "e-", "": "1"
 }  # fmt: skip
-"""Unit of a field of a camera file by the first of these that its name ends with."""
+"""Unit of a field of a camera file by its first matching ending."""
 
 
 def figures_set(frames: Frames) -> dict[str, float]:
-    """Return the figures that the camera of some frames is set to; variances of those that are found as such."""
+    """Return the figures that the camera of some frames is set to; variances of those found as variances."""
     sensor, brightest, current = frames.sensor, int(frames.light.argmax()), mean_dark_current(frames.sensor)
     alive, light = 1 - sensor.dead_pixels, float(frames.light[brightest])
     # At no exposure if the light varies by exposure.
@@ -115,8 +114,8 @@ def fields_set(model: SensorModel) -> dict[str, float | None]:
 class Row:
     """A figure, or a field of the camera that explains the frames; None if nothing is set.
 
-    `expected` is given if the procedure finds another figure than the set one. `deviations` and `bias` are differences
-    in standard errors.
+    `expected` is given if the procedure finds another figure than the set one. `deviations` and `bias` are in standard
+    errors.
     """
 
     name: str
@@ -248,7 +247,6 @@ class Characterisation:
 
     @property
     def parts(self) -> tuple[Part, Part]:
-        """Tables and plots of the page."""
 
         def cell(row: Row, name: str) -> str:
             value = getattr(row, name)
@@ -294,7 +292,7 @@ class Characterisation:
 
 
 def figures_of(done: Characterisation) -> Mapping[str, Figure]:
-    """Draw the plots by file name; plots of figures that the frames do not show are left out."""
+    """Draw the plots by file name, without those of figures that the frames do not show."""
     rows, what = {row.name: row for row in done.rows}, "camera found" if done.real else "closed form"
     gain, black = rows["system_gain"].found, done.frames.sensor.superpixel_black_level_dn
 

@@ -1,8 +1,4 @@
-"""`mitsim demo`: the main job on any bench, from plan to report.
-
-Folders ``run`` and ``calibration`` are what `mitsim capture` and `mitsim calibrate` write; the comparison of pattern
-families and exposure conventions uses the same light, which is traced once.
-"""
+"""`mitsim demo`: the main job on any bench, from plan to report."""
 
 from __future__ import annotations
 
@@ -36,15 +32,13 @@ from mitsim.sensor.chain import Digital
 from mitsim.studies.framework.campaign import DEMO_FOLDERS, DEMO_PAGE, study_folder
 
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
-"""Families before and after the main one in the report: the paper's, from the fewest frames to the most."""
 _SECOND_SHOWN = 0.4
-"""Part of a family's shots after which its second example of a pattern comes, so that it is neither like the first nor
-its mirror image."""
+"""Part of a family's shots before its second example, which should neither repeat nor mirror the first."""
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What `mitsim demo` reports.
+    """Result of `mitsim demo`.
 
     Attributes
     ----------
@@ -57,7 +51,7 @@ class DemoResult:
     trust
         Stated and actual errors of each family's image.
     seconds, kernels
-        Wall time by stage, and the kernels that were compiled in it.
+        Wall time and compiled kernels by stage.
     """
 
     psnr: dict[str, float]
@@ -74,11 +68,9 @@ class DemoResult:
     warnings: tuple[str, ...]
 
     def payload(self) -> dict[str, Any]:
-        """Return the result as JSON has it."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Return the result as text."""
         table = [
             f"{label(name):>14}: {value:5.1f} dB rendered and calibrated, {self.psnr_ideal[name]:5.1f} dB idealised"
             for name, value in self.psnr.items()
@@ -174,10 +166,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
 
 
 def _compare(lit: LitScene, factors: Factors, name: str, shots: Capture | None) -> FamilyResult:
-    """Reconstruct a family in both models at equal peak, and rendered under each exposure convention.
-
-    All families share light, sensor, factors and truth. ``shots`` are those of the family if they were taken already.
-    """
+    """Reconstruct a family in both models at equal peak, and rendered under each exposure convention."""
 
     def recover(frames: Unexposed, seconds: float) -> Recovery:
         solution = frames.solve(seconds)
@@ -210,7 +199,6 @@ def _compare(lit: LitScene, factors: Factors, name: str, shots: Capture | None) 
 
 
 def _white(lit: LitScene, factors: Factors) -> Digital:
-    """Return the noisy frame of uniform light at equal peak [DN]."""
     frames = lit.rendered_frames(factors, lit.bench.family("uniform"), lit.light.seed)
     (shot,), (frame,), exposer = frames.family.shots, frames.expected, frames.exposer(frames.seconds(EQUAL_PEAK))
     return exposer.digital(exposer.shot_electrons(frame, *shot.names), *shot.names)
@@ -271,7 +259,7 @@ def _page(
 
 
 def doubts(family: FamilyResult) -> tuple[str, ...]:
-    """Return why the image of a family is flagged: its frames do not fit, or its error exceeds any reflectance."""
+    """Return reasons why a family's image is flagged: its frames do not fit, or its error exceeds any reflectance."""
     found, rendered = [], family.rendered
     if rendered and rendered.trust and rendered.trust.cause:
         # Rank and condition, which the sentences after the first state, are no warning.
@@ -285,9 +273,6 @@ def doubts(family: FamilyResult) -> tuple[str, ...]:
 
 
 def scene_line(path: Path) -> str:
-    """Return the name of the scene's folder, and the first sentence of the comment that opens the file, if any.
-
-    A comment further down describes its own element and is left out.
-    """
+    """Return the name of the scene's folder, and the first sentence of the comment that opens the file, if any."""
     name, (sentence, _) = path.resolve().parent.name, opening_words(path)
     return f"{name}: {sentence}" if sentence else name

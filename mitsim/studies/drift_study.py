@@ -1,14 +1,13 @@
 """Loss of an image by each kind of drift between calibration and capture, measured and predicted [dB].
 
 *Measured*: frames of the traced light through the camera after the drift are exposed with noise, and solved with the
-factors from before the drift, by the lambda that the solver chose without the drift, and by a lambda of their own.
+factors from before the drift, by the lambda chosen without the drift, and by a lambda of their own.
 
 *Predicted* (:mod:`mitsim.studies.causes`): from the same factors and the closed-form shadow of the paper's model before
-and after the drift. The prediction uses the truth, the mean noise of a datum and, for lamps, the frame of their light;
-no frame of the simulation, no drawn noise and no solution.
+and after the drift, with the truth, the mean noise of a datum and, for lamps, the frame of their light; without
+simulated frames, drawn noise or solutions.
 
-Amounts are those of a recipe's table [drift] (``--recipe``, by default calibration/drift.toml), or those of ``--over``,
-whose first is shown beside the other kinds. The paper has no such figure.
+Amounts are those of a recipe's table [drift] (``--recipe``, by default calibration/drift.toml), or those of ``--over``.
 """
 
 from __future__ import annotations
@@ -73,14 +72,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AMBIENT, SESSION = "ambient frame", "session"
-"""Sources of noise in addition to those of frames."""
 OFFSETS = "offset nonuniformity"
-"""Differences of pixels in what they read without light, dark currents included."""
+"""Differences of pixels' readings without light, including dark current."""
 _SPLITS = 4
-"""Rounds that find the common response of the pixels of each row and column. Each leaves (s2 / s1)^2 of what is left,
-where s1 and s2 are the map's largest singular values: 2e-3 for 24 x 24 pixels that differ by a tenth."""
+"""Rounds that find the common response of rows and columns; each reduces the rest by (s2 / s1)^2 of the map's largest
+singular values."""
 _STEP_MM = 5e-4
-"""Shift over which a shadow's slope is computed either way: half a micrometre, a twentieth of a pixel."""
+"""Shift over which a shadow's slope is computed either way: a twentieth of a pixel."""
 _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 """Places [deviations] and weights of the Gauss-Hermite rule that is exact for a normal law up to the fifth power."""
 
@@ -90,15 +88,7 @@ _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted loss by a drift.
-
-    Attributes
-    ----------
-    before_db
-        PSNR [dB] without the drift, measured.
-    predicted_before_db, predicted_db
-        without the drift, and with it and the same lambda, as predicted.
-    """
+    """Predicted loss by a drift: PSNR [dB] without it, measured and predicted, and with it at the same lambda."""
 
     before_db: float
     predicted_before_db: float
@@ -106,28 +96,20 @@ class Prediction:
 
     @property
     def predicted_lost_db(self) -> float:
-        """Return the predicted loss: the squared error that the drift adds to that of the image without drift."""
         added = squared_error(self.predicted_db) - squared_error(self.predicted_before_db)
         return 10 * math.log10(1 + added / squared_error(self.before_db))
 
     @property
     def predicted_error_db(self) -> float:
-        """Return the uncertainty of the loss: the change if the image without drift is as predicted, too, because
-        what the model leaves out, such as detail inside projector pixels, may have any share in the added error."""
+        """Return the change of the loss if the image without drift is as predicted, too, because the model's omissions
+        may have any share in the added error.
+        """
         return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome(Prediction):
-    """Images with and without a drift.
-
-    Attributes
-    ----------
-    after_db, auto_db
-        PSNR [dB] with the drift, by the lambda from before it and by one of its own.
-    image
-        (n, n) with the drift, by the lambda from before it.
-    """
+    """Images with and without a drift: PSNR [dB] by the lambda from before it and by its own, and the (n, n) image."""
 
     after_db: float
     auto_db: float
@@ -135,7 +117,6 @@ class Outcome(Prediction):
 
     @property
     def lost_db(self) -> float:
-        """Return the measured loss."""
         return self.before_db - self.after_db
 
     @property
@@ -153,9 +134,9 @@ class DriftStand:
     lit
         the scene in its light.
     factors, recipe
-        what the session found, and how it was run.
+        result and recipe of the session.
     family, seed
-        the patterns, and seed of the noise and of what drifts at random.
+        the patterns, and seed of the noise and of random drifts.
     """
 
     lit: LitScene
@@ -167,14 +148,8 @@ class DriftStand:
     def outcome(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> Outcome:
         """Return the effect of a drift; MitsimError for a drift that the bench cannot have.
 
-        Parameters
-        ----------
-        drift
-            what moves.
-        session
-            factors of a session that drifted by it; None: those from before the drift.
-        lit
-            scene in light of the projector that moved; None: its light as it was.
+        ``session`` are factors of a session that drifted by it, ``lit`` is the scene in light of a moved projector;
+        with None both are those from before the drift.
         """
         scene, model = lit or self.lit, self._model
         if session is not None:
@@ -198,18 +173,16 @@ class DriftStand:
 
     @property
     def image(self) -> FloatArray:
-        """Image (n, n) without a drift."""
         return self._before.image
 
     @property
     def flags(self) -> dict[str, Value]:
-        """Return why the image without a drift is flagged, by its solution, its light or its factors."""
+        """Return reasons why the image without a drift is flagged, by its solution, its light or its factors."""
         others = (*self.lit.light.warnings, *self.lit.light.unreached, *self.factors.warnings)
         return flags_of(self._before.status, others=others)
 
     @property
     def before_db(self) -> float:
-        """PSNR [dB] without a drift."""
         return psnr(self.image, self.lit.truth)
 
     @cached_property
@@ -218,7 +191,6 @@ class DriftStand:
 
     @cached_property
     def exposure_s(self) -> float:
-        """Exposure time of each frame [s]."""
         return self._frames.seconds(EQUAL_PEAK)
 
     @cached_property
@@ -241,12 +213,11 @@ class DriftStand:
         return float(sum(exposer.electrons(frame).sum() for frame in self._expected))
 
     def session_mixes(self, drift: Drift) -> tuple[FloatArray, FloatArray]:
-        """Return the matrices (n, n) that the factors are multiplied by, on the right, as a session's power drifts.
+        """Return the (n, n) matrices that multiply the factors on the right as a session's power drifts.
 
-        The response to stripes h_i is a difference of shots of powers a and b, so that it is one to
-        ``h_i (a + b) / 2 + (a - b) / 2``: the factor is Phi C with ``C = (H diag((a + b) / 2) + 1 ((a - b) / 2)^T)
-        H^T / N``. The responses to uniform light scale the vector that all responses of a side share, hence the root of
-        their mean power.
+        The response to stripes h_i is a difference of shots of powers a and b, so that it is one to ``h_i (a + b) / 2 +
+        (a - b) / 2``: the factor is Phi C with ``C = (H diag((a + b) / 2) + 1 ((a - b) / 2)^T) H^T / N``. The responses
+        to uniform light scale the vector that all responses of a side share, hence the root of their mean power.
         """
         signs = stripe_signs(self.family.n).astype(np.float64)
         powers = Session(self.lit.bench, self.recipe.model_copy(update={"drift": drift}), self.seed).powers
@@ -274,19 +245,17 @@ class DriftStand:
 
     @cached_property
     def fixed(self) -> Mapping[str, FloatArray]:
-        """What each difference of the sensor's pixels adds to the image (n, n)."""
+        """Contribution of each difference of the sensor's pixels to the image (n, n)."""
         still = self.linear.expected_image(self.lit.truth).image
         alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
         return {name: self.linear.expected_image(self.lit.truth, each).image - still for name, each in alone.items()}
 
     def clear(self, factors: Factors, light: SampledLight) -> FloatArray:
-        """Return the image (n, n) of frames without noise of a ``light``, by ``factors`` and the lambda of the image
-        without a drift."""
+        """Return the image (n, n) of noiseless frames of a ``light``, by ``factors`` and the lambda without a drift."""
         return LitScene(light).rendered_frames(factors, self.family, self.seed).clear(self.linear.lam)
 
     @cached_property
     def linear(self) -> LinearImage:
-        """Solver with the lambda of the image without a drift."""
         factors = self.factors
         return LinearImage(factors.left, factors.right, self.family, self._before.lam, factors.manifest.centre)
 
@@ -332,8 +301,9 @@ class DriftStand:
 
     @cached_property
     def _response(self) -> FloatArray | None:
-        """Relative differences (m, m') of pixels' responses from the factors, which are of the same pixels and
-        therefore contain what all pixels of a row, or of a column, have alike."""
+        """Relative differences (m, m') of pixels' responses from the factors, which already contain those common to a
+        row or column.
+        """
         response = specimen(self.lit.bench.sensor, self.lit.bench.geometry.frame_shape).response
         if response is None:
             return None
@@ -346,7 +316,7 @@ class DriftStand:
 
     @cached_property
     def _fixed_frame(self) -> FloatArray | None:
-        """What pixels read (m, m') beyond what a user subtracts without an ambient frame [electrons/s]."""
+        """Readings of pixels (m, m') beyond those that a user subtracts without an ambient frame [electrons/s]."""
         sensor, shape = self.lit.bench.sensor, self.lit.bench.geometry.frame_shape
         own = specimen(sensor, shape)
         if (own.offset_e is None and own.dark_e_per_s is None) or self._expected.has_ambient:
@@ -365,12 +335,13 @@ class DriftStand:
         return found
 
     def scatter(self, drift: Drift, error: FloatArray) -> float:
-        """Return the variance that the draw of a random ``drift`` brings into the mean squared error, for an ``error``
-        (n, n') of the image without drift."""
+        """Return the variance that a random ``drift`` causes in the mean squared error, beside an ``error`` (n, n')."""
         return self.linear.scatter(self.lit.truth, self._frame_changes(drift), error) / error.size**2
 
     def _terms(self, drift: Drift) -> SeparableTerms:
-        """Return what a ``drift`` of mask or projector adds to the camera's operator, in the unit of its factors."""
+        """Return the terms that a ``drift`` of mask or projector adds to the camera's operator, in the unit of its
+        factors.
+        """
         bench = self.lit.bench
         best = IdealCamera(bench, bench.geometry.mask, self._spectrum).factors
         at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
@@ -416,7 +387,6 @@ class DriftStand:
 
 
 def squared_error(db: float) -> float:
-    """Return the mean squared error of a PSNR ``db``, peak 1."""
     return float(10 ** (-db / 10))
 
 
@@ -436,20 +406,19 @@ def _weigh(parts: list[tuple[SeparableTerms, float]]) -> SeparableTerms:
 # -------- Each kind of drift alone: the decibels that it costs
 
 _SEEDS = 4
-"""Of noise and of what drifts at random: the fewest whose standard error is worth the name, known to 40 %."""
+"""Seeds of noise and random drifts: their standard error is then known to 40 %."""
 _LAMPS = ("lamp", "lamp_flicker", "lamp_ripple")
 _RIPPLES = "power_ripple", "lamp_ripple"
-"""Kinds that a rolling shutter sees by its line time."""
 _LAMP_SCENE, _LAMP = "lamp_bench", "11.7"
-"""Scene with a lamp beside the projector, a tenth as bright on the sheet, for what lamps do where no scene is given."""
+"""Scene with a lamp beside the projector, a tenth as bright on the sheet, for drifts of lamps by default."""
 _LINES = {"lost_db": "measured", "predicted_lost_db": "predicted"}
 _LOST = "PSNR lost [dB]"
 _ERRORS = {"predicted_lost_db": "predicted_error_db"}
 _BEFORE = "without the drift"
 _SHOWN = 4
-"""Kinds whose images are shown, those that cost the most: images that lose less than a decibel look alike."""
+"""Number of shown kinds, the most costly first: images that lose less than a decibel look alike."""
 AGREE_DB = 0.5
-"""Decibels between predicted and measured loss that a prediction is good for: the issue asks as much of plans."""
+"""Largest useful difference [dB] between predicted and measured loss."""
 
 
 def _points(scope: Scope) -> Sequence[Point]:
@@ -509,7 +478,6 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) -> Factors:
-    """Return the factors of a session by a ``recipe`` whose power drifts by ``drift``."""
     seed, own = int(point["seed"]), recipe.model_copy(update={"drift": drift})
     if own.model_copy(update={"source": ""}) == load_recipe().model_copy(update={"source": ""}):
         return studio.factors(point.setup, seed)
@@ -519,13 +487,14 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
 
 
 def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
-    """Return the scene in light of a projector that moved, by the plan of its light before, because errors of another
-    plan would be in one image alone and would pass for the drift's."""
+    """Return the scene in light of a projector that moved, by the plan of its light before, because another plan's
+    errors would pass for the drift's.
+    """
     return LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan))
 
 
 def _by_kind(results: Results) -> Results:
-    """Return results whose rows name kind and amount (``what``), True in ``first`` for the first amount of a kind."""
+    """Return results whose rows name kind and amount, and the first amount of a kind."""
     first, rows = dict[Value, Value](), list[dict[str, Value]]()
     for row in results.rows:
         kind, amount = str(row["kind"]), float(str(row["amount"]))
@@ -535,7 +504,6 @@ def _by_kind(results: Results) -> Results:
 
 
 def _by_amount(results: Results) -> dict[str, Figure]:
-    """Draw the loss over the amount for each kind with several amounts."""
     drawn: dict[str, Figure] = {}
     for kind, unit in {row["kind"]: row["unit"] for row in results.rows if not row["first"]}.items():
         label = f"{DRIFT_WORDS[str(kind)]} [{unit}]"
@@ -554,7 +522,6 @@ def _by_amount(results: Results) -> dict[str, Figure]:
 
 
 def _images(results: Results) -> dict[str, Figure]:
-    """Draw the images of the kinds that cost the most, dearest first."""
     first = choose_rows(results.frame, {"first": True})
     lost = {what: mean_of(choose_rows(first, {"what": what}), "lost_db").value for what in distinct(first, "what")}
     dearest = sorted(lost, key=lambda what: -lost[what])[:_SHOWN]

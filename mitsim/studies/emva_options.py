@@ -8,9 +8,9 @@ from mitsim.devices.sensor import SensorModel
 
 
 class Procedure(Lit, Seeded):
-    """How a camera is characterised on simulated frames.
+    """Options of a characterisation on simulated frames.
 
-    Below 32 rows a row's part is known to a quarter; 50 steps and 16 frames are the least that EMVA 1288 asks for.
+    Below 32 rows a row's part is uncertain by a quarter; EMVA 1288 requires at least 50 steps and 16 frames.
     """
 
     VERB = "characterise"
@@ -22,12 +22,10 @@ class Procedure(Lit, Seeded):
 
     @property
     def wavelength_nm(self) -> float:
-        """Wavelength of the light [nm]."""
         return self.wavelength
 
     @property
     def stated(self) -> dict[str, float]:
-        """Entries of the procedure in JSON."""
         sizes = {name: getattr(self, name) for name in ("pixels", "steps", "frames", "seed")}
         return {**sizes, "wavelength_nm": self.wavelength}
 

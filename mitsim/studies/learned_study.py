@@ -2,23 +2,17 @@
 
 Paper, section "Deep Network-based Denoising vs Reconstruction": on simulated frames learned methods look best; on real
 ones FlatNet fails under uniform light, a U-Net removes artefacts and resolves no more; under coded light all do well;
-"catastrophic results in case of any mismatch". It shows pictures. Here frames are rendered where the paper's are real.
+"catastrophic results in case of any mismatch". Here frames are rendered where the paper's are real. A gain is of each
+print, over the classical image of the same frames with the highest PSNR.
 
-A gain is of each print, over the classical image of the same frames with the highest PSNR. A claim on networks holds
-if it holds for every training.
+With `--data DIR`, the study is one of real captures of a FlatCam. The factors of codes learned from one capture
+(:mod:`mitsim.studies.twin_study`) are a twin, whose frames of drawn pictures with white noise teach networks. The other
+capture is then reconstructed and compared with the authors' image, because no truth is known.
 
-With `--data DIR`, the study is one of real captures of a FlatCam instead. Codes of its mask are learned from one
-capture and its authors' image (:mod:`mitsim.studies.twin_study`), and their factors are a twin: frames of drawn
-pictures through them, with white noise, teach networks, and no real frame does. The other capture is then
-reconstructed, and compared with the authors' image, because no truth is known.
-
-The study needs torch, and hours, so that it is no part of `mitsim study all`.
-
-The bench of rendered frames is the middle of the shipped photograph: its camera, and 64 x 64 of the projector's pixels,
-each as large as there, on a sheet half as wide. Every direction is therefore as hard to distinguish from its neighbours
-as on the whole, and a step of a training takes a quarter of the time. The other conditions are those of other studies:
-the sheet moved (`depth`), the mask moved (`drift`), an exposure of a tenth, the coat of the gift card (`reflectivity`),
-the lamp (`ambient`). Frames and networks are kept in the study's folder. torch, an extra, is imported when it is used.
+The bench of rendered frames is the middle of the shipped photograph: its camera and 64 x 64 of its projector pixels on
+a sheet half as wide, so that directions are as hard to distinguish and a training step takes a quarter of the time. The
+other conditions are those of other studies (`depth`, `drift`, an exposure of a tenth, `reflectivity`, `ambient`). The
+study needs torch and hours, and therefore is no part of `mitsim study all`.
 """
 
 from __future__ import annotations
@@ -90,17 +84,16 @@ if TYPE_CHECKING:
 
 SIDE = 64
 _CANVAS_PIXELS, _CANVAS_MM = 3 * SIDE, 180.0
-"""Width of the projector's picture, whose last third is the window: the picture is even about the projector, 60 mm
-beside the camera, and its pixels have the photograph's 0.9375 mm at 400 mm."""
+"""Width of the projector's picture, whose last third is the window, so that pixels keep the photograph's 0.9375 mm at
+400 mm."""
 _SHEET_MM = 64.0
-"""Width of the sheet: half of the photograph's."""
 DEPTH, DRIFT, DIM, GLOSS, AMBIENT = "depth", "drift", "dim", "gloss", "ambient"
 MISMATCHES = (DEPTH, DRIFT, GLOSS, AMBIENT)
-"""Conditions that a calibration does not know; the noise of dim frames is stated by the capture."""
+"""Conditions that a calibration does not include; the noise of dim frames is stated by the capture."""
 PLACES = {RENDERED: (IDEALISED, RENDERED, DRIFT, DIM), DEPTH: (DEPTH,), GLOSS: (GLOSS,), AMBIENT: (AMBIENT,)}
-"""Conditions that share their light, by the place that the light is of."""
+"""Conditions that share their light, by place."""
 _DEPTH_MM = 405.0
-"""Distance of a sheet 5 mm behind the calibrated distance, a small variation in the study of depth."""
+"""Distance of a sheet 5 mm behind the calibrated distance."""
 _DRIFT_UM = 4.0
 """Motion of the mask down the rows: the image moves by 0.9 pixels, as much as by 5 mm of depth along the columns."""
 _DIM = 0.1
@@ -109,15 +102,14 @@ _COAT = """<bsdf type="roughplastic" id="sheet_bsdf">
             <float name="alpha" value="0.1"/>
             <float name="int_ior" value="1.49"/>
             <texture name="diffuse_reflectance" type="bitmap">"""
-"""The gift card's coat, in place of plain paint."""
 _PAINT = """<bsdf type="diffuse" id="sheet_bsdf">
             <texture name="reflectance" type="bitmap">"""
 
 
 def place_setup(studio: Studio, setup: Setup, place: str) -> Setup:
-    """Return the setup of one of :data:`PLACES`, whose scene file is written to the ``studio``'s shared folder.
+    """Return the setup of one of :data:`PLACES`, whose scene file is written to the shared folder.
 
-    MitsimError where a shipped scene lacks what is changed in it.
+    MitsimError where a shipped scene lacks what is changed.
     """
     shipped = "lamp_bench" if place == AMBIENT else "photograph"
 
@@ -149,22 +141,22 @@ def place_setup(studio: Studio, setup: Setup, place: str) -> Setup:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A print under one condition and one family of patterns, as a file has it.
+    """A print under one condition and one family of patterns, as stored in a file.
 
     Attributes
     ----------
     truth, left, right, rows, columns
-        (n, n) apparent reflectance, (m, n) factors that images are made with, patterns P_L and P_R.
+        (n, n) apparent reflectance, (m, n) factors, patterns P_L and P_R.
     centre
         True where frames lose their means.
     quarters, energy
-        sum of all frames, see :class:`mitsim.reconstruct.solver.Accumulator`.
+        sum of all frames (:class:`mitsim.reconstruct.solver.Accumulator`).
     frame
         (m, m') the frame itself if there is one, else empty.
     basis
-        first row of the left singular vectors that the sum refers to.
+        first row of the left singular vectors of the sum.
     unexplained
-        part of the frames, rms, that no image gives, beyond the sensor's noise.
+        rms part of the frames, beyond noise, that no image gives.
     """
 
     truth: FloatArray
@@ -180,14 +172,10 @@ class Case:
     unexplained: Any = 0.0
 
     def prepare(self) -> Prepared:
-        """Return the factorised model."""
         return prepare(self.left, self.right, self.rows, self.columns, centre=bool(self.centre))
 
     def sums(self, prepared: Prepared) -> Accumulator:
-        """Return the sum of all frames for a ``prepared`` model of these factors.
-
-        MitsimError where its singular vectors are not those of the sum.
-        """
+        """Return the sum of all frames; MitsimError if its singular vectors are not those of ``prepared``."""
         if self.frame.size:
             sums = prepared.accumulator()
             sums.add(self.frame, 0, 0)
@@ -200,13 +188,11 @@ class Case:
         return Accumulator.of_sums(prepared, self.quarters, float(self.energy))
 
     def write(self, path: Path) -> None:
-        """Write the case to a file."""
         with path.open("wb") as file:
             np.savez(file, allow_pickle=False, **vars(self))
 
     @classmethod
     def read(cls, path: Path) -> Case:
-        """Read a case from a file."""
         with path.open("rb") as file:
             return cls(**read_npz(file, path))
 
@@ -214,12 +200,7 @@ class Case:
 def case_of(studio: Studio, setup: Setup, condition: str, patterns: str, seed: int) -> Case:
     """Return the frames of a setup's print, exposed at equal peak, from a file that studios share.
 
-    Parameters
-    ----------
-    studio, setup
-        Studio, and bench with its print.
-    condition, patterns, seed
-        Test condition, pattern family, and seed of all noise.
+    ``seed`` is that of all noise.
     """
 
     def write(path: Path) -> None:
@@ -255,7 +236,7 @@ def case_of(studio: Studio, setup: Setup, condition: str, patterns: str, seed: i
 
 
 def calibrated(studio: Studio, setup: Setup, seed: int) -> Factors:
-    """Return the factors that a session at the calibrated distance estimates, its noise from ``seed``."""
+    """Return the factors that a session at the calibrated distance estimates, with noise from ``seed``."""
     return studio.factors(place_setup(studio, setup.with_print(None), RENDERED), seed)
 
 
@@ -272,20 +253,18 @@ class Budget:
 
 
 FULL = Budget(pairs=256, steps=800, groups=16)
-"""About a minute of a processor a training, so that a hundred of them take hours; `mitsim train` has 4000 steps on 128
-pixels a side, 20 times as much."""
+"""About a minute of a processor per training, because there are a hundred; `mitsim train` takes 20 times as much."""
 QUICK = Budget(pairs=16, steps=6, groups=2)
-"""A first look at the page, in about a minute; such networks show nothing."""
+"""First look in about a minute; such networks show nothing."""
 VARIED, ELSEWHERE, PICTURES = "varied", "elsewhere", "pictures"
 TRAININGS = (IDEALISED, RENDERED, VARIED)
-"""Training sets beside pairs of another camera, and pictures alone."""
 _ELSEWHERE_MM = 1.0
-"""Distance of the mask from the sensor of another camera: half of this one's."""
+"""Distance of another camera's mask from its sensor: half of this one's."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A network that is trained: training set, patterns, method, and the ``seed`` of the training."""
+    """A network to train: training set, patterns, method, and the ``seed`` of the training."""
 
     training: str
     patterns: str
@@ -295,8 +274,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class School:
-    """Training of networks for the bench of a ``setup``, in the shared folder of a ``studio``, with pairs and
-    calibration of a ``seed``, within a ``budget``."""
+    """Training of networks for the bench of a ``setup``, in the shared folder of a ``studio``."""
 
     studio: Studio
     setup: Setup
@@ -304,10 +282,8 @@ class School:
     budget: Budget
 
     def network(self, cell: Cell) -> tuple[LearnedSolver, float | None]:
-        """Return the network of a ``cell``, and the processor time of its training [s]; None if it was trained before,
-        or in parts.
-
-        An interrupted training is resumed. One network that pictures alone taught serves all patterns.
+        """Return the network of a ``cell``, and the processor time of its training [s], or None if it resumed or
+        existed.
         """
         from mitsim.learn.learned_solver import read_network
         from mitsim.learn.training import train_network
@@ -332,7 +308,7 @@ class School:
         return model, seconds
 
     def _store(self, training: str, patterns: str) -> PairStore:
-        """Return the pairs of a set, which are made once; their interrupted making is resumed."""
+        """Return the pairs of a set, which are made once; interrupted work is resumed."""
         from mitsim.learn.pair_store import PairStore, read_pairs_manifest
         from mitsim.learn.pairs import make_pairs
 
@@ -387,10 +363,8 @@ class School:
 
 FAMILIES = ("uniform", "dots:4", "dots:7")
 _TRAININGS = 3
-"""Trainings of a network, from other first weights and orders of the pairs."""
 NONE, AUTOMATIC, BEST = "none", "automatic", "best"
-"""Training of classical images, and their weights: chosen by the frames, or that of the highest PSNR, which only a test
-with the truth can choose."""
+"""Training of classical images, and their weights: automatic, or that of the highest PSNR, which needs the truth."""
 CLASSICAL = (TIKHONOV, MARKOV, TV, NONNEGATIVE)
 _AROUND = tuple(float(weight) for weight in np.logspace(-0.75, 2.0, 12))
 """Weights of iterative methods over the automatic one, up to where the best lies under a mismatch."""
@@ -399,7 +373,7 @@ _DETAIL_PIXELS = 1.5
 
 
 def cells(seeds: Sequence[int], families: Sequence[str], quick: bool) -> list[Cell]:
-    """Return all networks that are trained, the quickest first; two methods and sets if ``quick``."""
+    """Return all networks to train, the quickest first; two methods and sets if ``quick``."""
     methods = (REFINED, UNROLLED) if quick else (REFINED, FLATNET, UNROLLED)
     kinds = [*product(TRAININGS[:2] if quick else TRAININGS, families, methods)]
     if not quick:
@@ -411,7 +385,7 @@ def cells(seeds: Sequence[int], families: Sequence[str], quick: bool) -> list[Ce
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    """Return points of classical images, which keep the frames of a print at a place, and then of all networks."""
+    """Return points of classical images, which keep the frames of a print, and then of all networks."""
     check_torch()
     seed, setup = scope.seeds[0], scope.setup
     if scope.data is not None:
@@ -474,9 +448,9 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def scores(image: FloatArray, truth: FloatArray) -> dict[str, Value]:
-    """Return PSNR and SSIM of an image (n, n), and of its detail the correlation with the truth's and the relative rms.
+    """Return PSNR and SSIM of an image (n, n), and correlation and relative rms of its detail.
 
-    Much detail that does not correlate is invented.
+    Strong detail that does not correlate with the truth's is invented.
     """
     own, true = (each - gaussian_filter(each, _DETAIL_PIXELS) for each in (image, truth))
     correlated = float(np.corrcoef(own.ravel(), true.ravel())[0, 1])
@@ -508,8 +482,7 @@ def classical_rows(case: Case) -> Iterator[tuple[dict[str, Value], FloatArray]]:
 
 
 def _with_correlation(prepared: Prepared, sums: Accumulator) -> tuple[Prepared, Accumulator]:
-    """Return the model for images whose neighbouring pixels are alike, and its sums, which are the others', rotated,
-    because both models have one range."""
+    """Return the model and rotated sums for images whose neighbouring pixels are alike."""
     other = prepared.with_correlation()
     turns = []
     for before, after in ((prepared.left, other.left), (prepared.right, other.right)):
@@ -529,7 +502,7 @@ def _flags(found: Solution, case: Case) -> dict[str, Value]:
 def network_row(model: LearnedSolver, factors: Factors, case: Case) -> tuple[dict[str, Value], FloatArray]:
     """Return scores, flags and image of a network with a calibration's ``factors``.
 
-    It is flagged for frames that the image does not reproduce (``flag_image``), frames that no image gives
+    An image is flagged for frames that it does not reproduce (``flag_image``), frames that no image gives
     (``flag_frames``; ``misfit`` is 1 for either), another camera or calibration, and unknown noise.
     """
     from mitsim.learn.learned_solver import beyond_noise
@@ -550,11 +523,10 @@ def network_row(model: LearnedSolver, factors: Factors, case: Case) -> tuple[dic
 
 AUTHORS, REAL, SIMULATED = "authors' image", "real", "simulated"
 _TAUGHT = "gb"
-"""Plane whose factors networks learn by; those of the others differ by half a pixel and a gain."""
+"""Plane whose factors teach networks; those of the others differ by half a pixel and a gain."""
 _MARGIN = 1.5
-"""Factor by which noise is drawn beyond that of the known capture's planes, so that networks meet none unflagged."""
+"""Factor by which the noise range exceeds the known capture's, so that a usual capture is not flagged."""
 _COLOURS = (("r",), ("gb", "gr"), ("b",))
-"""Planes that make the red, green and blue of an image."""
 _BACK = {"transposed, mirrored": "transposed, upside down", "transposed, upside down": "transposed, mirrored"}
 """Orientations whose inverse is another one."""
 TEACHING = {"pairs": 192, "steps": 300, "batch": 2}
@@ -569,17 +541,17 @@ def _captures(data: str) -> Mapping[str, tuple[Path, Path]]:
 
 
 def twin_camera(measured: Measured, learned: Learned) -> tuple[tuple[FloatArray, FloatArray], Prepared]:
-    """Return the factors of a ``measured`` plane by codes that were ``learned``, and their factorised model."""
+    """Return the factors of a ``measured`` plane by ``learned`` codes, and their factorised model."""
     sides = learned.codes.factors(measured.offset, measured.plane)
     rows, columns = (np.ones((side.shape[1], 1)) for side in sides)
     return sides, prepare(*sides, rows, columns, centre=True)
 
 
 def noise_range(planes: Sequence[Measured], learned: Learned) -> tuple[float, float]:
-    """Return the least and the largest standard deviation of white noise in the twin's frames [DN of the taught plane].
+    """Return the range of standard deviations of white noise in the twin's frames [DN of the taught plane].
 
-    They reach from the noise of the known ``planes`` to everything that the codes do not explain of them, each over its
-    plane's gain, and a factor :data:`_MARGIN` beyond.
+    It extends from the noise of the known ``planes`` to their whole unexplained part, each over its plane's gain, and a
+    factor :data:`_MARGIN` beyond.
     """
     gains = learned.codes.gains
     scales = [abs(gains[_TAUGHT] / gains[each.plane]) for each in planes]
@@ -589,7 +561,7 @@ def noise_range(planes: Sequence[Measured], learned: Learned) -> tuple[float, fl
 
 
 def twin_sums(prepared: Prepared, noise: tuple[float, float], truths: FloatArray, seed: int) -> Sums:
-    """Return the sums of frames of pictures ``truths`` (N, n, n), 0 to 1: the idealised product, and white noise.
+    """Return the sums of idealised frames of ``truths`` (N, n, n), 0 to 1, with white noise.
 
     Logarithms of the ``noise`` of a datum [DN] are drawn evenly between two ends.
     """
@@ -605,7 +577,6 @@ def twin_sums(prepared: Prepared, noise: tuple[float, float], truths: FloatArray
 
 
 def teach(method: str, prepared: Prepared, sums: Sums, seed: int) -> Any:
-    """Return a network that learned from a twin's frames."""
     from mitsim.learn.training import Trainer, first_network
 
     request = Training(method=method, steps=TEACHING["steps"], batch=TEACHING["batch"], seed=seed)
@@ -619,7 +590,7 @@ def teach(method: str, prepared: Prepared, sums: Sums, seed: int) -> Any:
 
 
 def _image(prepared: Prepared, frame: FloatArray, method: str, network: Any) -> tuple[FloatArray, float]:
-    """Return the (n, n) image of a frame [DN], and the part of the frame that it would not give beyond noise, rms."""
+    """Return the (n, n) image of a frame [DN], and the rms part of the frame that it leaves unexplained."""
     import torch
 
     from mitsim.learn.learned_solver import beyond_noise, datum_variance
@@ -641,9 +612,8 @@ def _image(prepared: Prepared, frame: FloatArray, method: str, network: Any) -> 
 def transfer(data: str, held_out: str, seed: int) -> Found:
     """Return rows and images of a capture ``held_out``, by codes and networks of the others in the folder ``data``.
 
-    A row has the correlation with the authors' image and the part of the frame that the image does not explain, for a
-    plane's real frame, and for a simulated frame of the taught plane, which the authors' image and the real frame's
-    noise give. MitsimError for files that are no such captures.
+    A row has the correlation with the authors' image and the unexplained part of the frame, for a plane's real frame
+    and for a simulated frame of the taught plane. MitsimError for files that are no such captures.
     """
     planes = read_captures(_captures(data), seed)
     known = [each for each in planes if each.capture != held_out]
@@ -685,9 +655,9 @@ def transfer(data: str, held_out: str, seed: int) -> Found:
 
 
 def compare(results: Results) -> Results:
-    """Add columns: PSNR and correlation of detail less those of the best classical image of the same frames
-    (``gain_db``, ``detail_gain``), PSNR less that of a calibrated bench where the condition is a mismatch
-    (``below_db``), and the ``network`` without its seed."""
+    """Add columns: PSNR and correlation of detail less those of the best classical image (``gain_db``,
+    ``detail_gain``), PSNR less that of a calibrated bench (``below_db``), and ``network``.
+    """
     rows = results.frame
     if "weight" not in rows:
         return results
@@ -708,8 +678,7 @@ def compare(results: Results) -> Results:
 def _gains(
     claim: str, training: str, condition: str, patterns: str, method: Any = (REFINED, FLATNET, UNROLLED), **more: Any
 ) -> Level:
-    """Return the claim that the gain of every training lies in a range, for each of some methods; ``more`` are
-    attributes of :class:`Level`."""
+    """Return the claim that the gain of every training lies in a range, for each method."""
     where = {"training": training, "condition": condition, "patterns": patterns, "method": method}
     return Level(
         claim, **{"where": where, "column": "gain_db", "each": "method", "every": "seed", "optional": True, **more}

@@ -1,25 +1,24 @@
 """Studies of cameras that the paper compares with: a mask that moves in place of the light, and a diffuser for a mask.
 
-*multishot*, section IV-D: the mask moves by -15 to +15 of its features, and there are as many frames as patterns. The
-paper does not name the axes; a grid of k x k places has as many frames as dots of period k, and is taken here. A line
-of 49 places along the rows, as a mask on one slide would go, is idealised only, because it would take 49 calibrations.
-Frames through a mask at rest share the error of one calibration, those through a moved one have seven.
+*multishot*, section IV-D: the mask moves by -15 to +15 of its features on a grid of k x k places, with as many frames
+as dots of period k (the paper does not name the axes). A line of 49 places is idealised only, because it would take 49
+calibrations. Frames through a mask at rest share the error of one calibration.
 
 SweepCam (Hua, Nakamura, Asif & Sankaranarayanan, TPAMI 2020) moves the mask instead of the light. Moved by a along the
-rows and by b along the columns, a separable mask casts Y_ab = Phi_L(a) X Phi_R(b)^T. For places on a grid, all frames
-side by side are one frame of a separable camera whose factors are those of the places on top of each other,
+rows and by b along the columns, a separable mask casts Y_ab = Phi_L(a) X Phi_R(b)^T. All frames of a grid side by side
+are therefore one frame of a separable camera,
 
     [Y_ab]_ab = [Phi_L(a)]_a X [Phi_R(b)]_b^T,
 
-so that :mod:`mitsim.reconstruct.solver` solves them exactly, as it does one frame. Light is traced up to the mask, so
-one scene's light serves all places.
+which :mod:`mitsim.reconstruct.solver` solves exactly. Light is traced up to the mask, so that one scene's light serves
+all places.
 
 *convolutional*, section V-E and figure 12: a DiffuserCam under uniform light and 4 to 49 dots. A convolutional camera
 has "no simple closed form", and its iterative reconstruction takes ten times as long as the separable one. The point
 spread function is that of a rendered diffuser (:mod:`mitsim.transport.plugins.diffuser`) and, with `-D psf=FILE`, also
-a measured one: the picture of DiffuserCam's tutorial, which mitsim does not ship. The sensor gets all light; the speed
-of both solvers is measured also on a sensor that ends where the picture does. Lambda is the best one. Times are CPU
-seconds on one thread, and equal error is an error within 1 % of the direct solution's.
+a measured one. The sensor gets all light; the speed of both solvers is also measured on a sensor that ends where the
+picture does. Lambda is the best one. Times are CPU seconds on one thread, and equal error is an error within 1 % of the
+direct solution's.
 """
 
 from __future__ import annotations
@@ -72,11 +71,11 @@ EXPOSURES = (EQUAL_PEAK, EQUAL_FRAME)
 # -------- A camera whose mask moves
 
 Places = Mapping[float, Pair]
-"""Left and right factor, (pixels, n) each, of the camera with its mask moved so far [mm] along both axes."""
+"""Left and right factor, (pixels, n) each, by the shift of the mask [mm] along both axes."""
 
 
 def move_mask(bench: Apparatus, row_mm: float, column_mm: float) -> Apparatus:
-    """Return a bench whose mask has its centre so far off the axis; only for what is made of traced light."""
+    """Return a bench with a moved mask, only for use with traced light."""
     offset = {"mask_offset_row": row_mm, "mask_offset_column": column_mm}
     return replace(bench, devices=replace(bench.devices, camera=bench.geometry.model_copy(update=offset)))
 
@@ -97,11 +96,10 @@ def ideal_places(bench: Apparatus, places_mm: Iterable[float], board_flux: float
 def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, accuracy: float = 1e-3) -> Places:
     """Return factors as sessions with the mask at each place estimate them, all in one board's light.
 
-    One place a side needs one session, not each frame, because a mask that has moved along both axes determines the
-    left factor of its row and the right one of its column. The sessions are rendered without the sensor's noise, whose
-    effect on factors is added in closed form (:func:`mitsim.reconstruct.factors.predicted_error`): seven times 512
-    noisy frames take four times as long. ``seed`` and ``accuracy`` are those of
-    :meth:`mitsim.bench.apparatus.Bench.calibrate`; every place has noise of its own.
+    One session a place suffices, because a mask that has moved along both axes determines the left factor of its row
+    and the right one of its column. The sessions are rendered without the sensor's noise, whose effect on factors is
+    added in closed form (:func:`mitsim.reconstruct.factors.predicted_error`), because noisy frames take four times as
+    long.
     """
     recipe, job = load_recipe(), Job()
     session = Session(bench, recipe, seed)
@@ -128,9 +126,9 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
 def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float], Frame]) -> Places:
     """Return factors whose products hold between places as well.
 
-    A session does not determine how its product is shared between left and right, not even their sign. One frame of the
-    board in uniform light through the mask at each place's row and the first one's column does (``white``, at row and
-    column [mm]).
+    A session does not determine how its product, and its sign, is shared between left and right. One frame of the board
+    in uniform light through the mask at each place's row and the first one's column does (``white``, at row and column
+    [mm]).
     """
     first, found = next(iter(factors)), {}
     for place, (left, right) in factors.items():
@@ -154,7 +152,6 @@ class MovedMask:
     _formed: dict[tuple[float, float], ExpectedFrames] = field(default_factory=dict)
 
     def expected_frames(self, row_mm: float, column_mm: float) -> ExpectedFrames:
-        """Return the frame through the mask at one place, without noise."""
         place = row_mm, column_mm
         if place not in self._formed:
             bench = move_mask(self.lit.bench, *place)
@@ -170,7 +167,7 @@ class MovedMask:
         return self.lit.uniform_s(self.model) / (len(places) if exposure == EQUAL_TOTAL else 1)
 
     def solve(self, rows_mm: Sequence[float], columns_mm: Sequence[float], seconds: float) -> Solution:
-        """Solve one exposure of so many ``seconds`` at each place of a grid, at automatic lambda."""
+        """Solve one exposure of ``seconds`` at each place of a grid, at automatic lambda."""
         left = np.concatenate([self.side(0, place) for place in rows_mm])
         right = np.concatenate([self.side(1, place) for place in columns_mm])
         uniform = np.ones((self.lit.bench.n, 1))
@@ -181,12 +178,12 @@ class MovedMask:
             return model.solve(sums)
 
     def side(self, axis: int, place: float) -> FloatArray:
-        """Return a factor as the solver takes it: each loses its means by itself, as frames do."""
+        """Return a factor without means, place by place, as frames lose theirs."""
         factor = self.factors[place][axis]
         return centre_columns(factor) if self.lit.bench.geometry.centred else factor
 
     def measure(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
-        """Return the noisy frame at one place [electrons/s], less ambient light as a user subtracts it."""
+        """Return the noisy frame at one place [electrons/s], less ambient light."""
         bench, expected = self.lit.bench, self.expected_frames(row_mm, column_mm)
         speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
         exposer = Exposer(bench.devices, seconds, integer(self.seed, "mask", f"{row_mm:g}", f"{column_mm:g}"), speckle)
@@ -197,13 +194,12 @@ class MovedMask:
 
 
 REACH = 15.0
-"""Features that the mask moves either way."""
 GRIDS = {2: (0, 6), 3: (0, 3, 6), 4: (0, 2, 4, 6), 7: tuple(range(7))}
-"""Indices along an axis of the seven places between both ends, by their number: all are calibrated once."""
+"""Indices along an axis of the seven calibrated places, by number of places."""
 UNIFORM, SWEPT, LINE, DOTS = "uniform frames", "SweepCam", "SweepCam, along rows alone", "shifting dots"
 _FRAMES = 49
 _COUNTS_DB = 0.5
-"""A gain that counts: a tenth of the squared error."""
+"""Least gain that counts: a tenth of the squared error."""
 
 
 def _multishot_measure(studio: Studio, point: Point) -> Found:
@@ -215,7 +211,6 @@ def _multishot_measure(studio: Studio, point: Point) -> Found:
         return tuple(float(place) for place in np.linspace(-REACH, REACH, number) * bench.geometry.mask_feature)
 
     def factors() -> Places:
-        """Return those of seven places, the middle one on the axis."""
         places = spread(7)
         if model == IDEALISED:
             return ideal_places(bench, places, lit.board_flux)
@@ -295,26 +290,24 @@ WHOLE, CROPPED = "all light", "cropped"
 PERIODS = (1, 2, 3, 4, 5, 7)
 """The paper's numbers of patterns: 1 to 49."""
 _N = 128
-"""Pixels a side of the images of test pictures, as the paper's."""
 _REDUCE, _SHAPE, _PITCH_MM = 4, (300, 400), 4 * 5.86e-3
-"""The public picture, 1200 x 1600, in pixels of four; the traced one has the same, as large as IMX249's."""
+"""Binning, shape and pitch of the public picture (1200 x 1600); the traced one is as large."""
 WHITE_W_M2, WAVELENGTH_NM = 0.3, 550.0
-"""Irradiance where all light of a white, uniformly lit scene falls: the paper's projector (0.14 W over 120 mm square
-at 400 mm) on a bare sensor, 9.7 W m^-2 / pi x 0.0144 m^2 / 0.16 m^2; in green. Exposure follows the peak, so both
-only set how much dark current there is."""
+"""Irradiance of a white scene's light at one point: the paper's projector (0.14 W over 120 mm square at 400 mm) on a
+bare sensor, 9.7 W m^-2 / pi x 0.0144 m^2 / 0.16 m^2; in green. Exposure follows the peak, so that both only determine
+the dark current."""
 _LEAST_LAMBDA = 1e-9
-"""Lambda over the largest of S at which the search for the best one ends: shot noise of full wells calls for 1e-7."""
+"""Smallest lambda of the search over the largest of S: shot noise of full wells needs 1e-7."""
 _BEYOND_DB = 2.0
-"""Fall of PSNR below the best so far at which the search, from large lambda to small, is over."""
+"""Fall of PSNR below the best that ends the search, from large lambda to small."""
 _FINER = (0.5, 0.25)
-"""Steps [decades] by which the search then moves: a quarter of a decade changes PSNR by 0.1 dB at most."""
+"""Further steps of the search [decades]: a quarter of a decade changes PSNR by 0.1 dB at most."""
 _EQUAL_ERROR, _EQUAL_ANSWER = 1.01, 1e-6
-"""Where iterations have come as far as a direct solution: an error against the truth within 1 % of its own, 0.09 dB;
-and their relative difference, which no image shows."""
+"""Factor of equal error against the truth (0.09 dB), and relative difference of equal answers."""
 _LOOSE, _TIGHT = 1e-6, 1e-12
 """Residuals at which conjugate gradients within the direct solver end, for either."""
 _MOST_STEPS = 1000
-"""Iterations at most: 170 were seen to the equal answer."""
+"""Most iterations: equal answers took 170."""
 
 
 def take(
@@ -323,8 +316,7 @@ def take(
 ) -> tuple[FloatArray, float]:  # fmt: skip
     """Return noisy frames of an (n, n) reflectance under a family of 0/1 patterns, and the exposure of each [s].
 
-    The frames are (patterns, rows, columns) in the unit of ``ShiftedLight.image_of``: a white scene is 1. The exposure
-    follows one of :data:`mitsim.report.CONVENTIONS`.
+    The frames are (patterns, rows, columns) in the unit of ``ShiftedLight.image_of``: a white scene is 1.
     """
     expected = np.maximum(camera.under(family).image_of(reflectance), 0.0)  # transforms leave 1e-17 below zero
     peak = float(expected.max())
@@ -365,23 +357,11 @@ def best_image(classes: Classes, frames: FloatArray, truth: FloatArray) -> tuple
 def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorModel, seed: int) -> dict[str, float]:
     """Time conjugate gradients on all frames and the direct solver, from the same frames at equal peak [CPU seconds].
 
-    Parameters
-    ----------
-    classes
-        Camera and period of the dots.
-    whole
-        The same camera with a sensor that gets all light, whose best lambda both solvers take.
-
-    Returns
-    -------
-    ``prepare_s`` once for a camera, dots and lambda; ``direct_s`` and ``iterative_s`` for every image, to equal error;
+    ``whole`` is the camera with a sensor that gets all light, whose best lambda both solvers use. Return ``prepare_s``
+    once for a camera, dots and lambda; ``direct_s`` and ``iterative_s`` for every image, to equal error;
     ``direct_exact_s`` and ``iterative_exact_s`` to equal answers; ``iterations`` and ``iterations_exact``; ``psnr_db``
-    of the direct solution; ``difference`` of both, relative.
-
-    Raises
-    ------
-    MitsimError
-        Where iterations do not come to the direct solution.
+    of the direct solution; the relative ``difference``. MitsimError if the iterations do not converge to the direct
+    solution.
     """
     camera, clock = classes.camera, time.process_time
     family = parse_patterns(f"dots:{classes.k}", len(truth))
@@ -401,7 +381,7 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
     steps, start = 0, clock()
 
     def watch(image: FloatArray) -> bool:
-        """Note when the iterations come within the error of the exact image, and near it."""
+        """Note when the iterations reach the error of the exact image, and its values."""
         nonlocal steps
         steps, spent = steps + 1, clock() - start
         if relative_error(image, truth) <= enough:
@@ -479,7 +459,7 @@ def _convolutional_measure(studio: Studio, point: Point) -> Found:
 
 
 def _times(rows: DataFrame, column: str, over: str, least: float) -> tuple[str, Holds]:
-    """Judge whether a ``column`` of seconds is at least so many times another; patterns serve as repeats."""
+    """Judge whether a ``column`` of seconds is at least ``least`` times another; patterns serve as repeats."""
     times = rows[column].astype(float) / rows[over].astype(float)
     ends = dict.fromkeys(f"{float(f'{each:.2g}'):g}" for each in (times.min(), times.max()))
     # Seconds vary by factors.

@@ -48,10 +48,10 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def axis_of(setup: Setup, knob: str) -> tuple[str, str]:
-    """Return the name of a knob with its unit, and its meaning; either may be on an axis.
+    """Return the name of a knob with its unit, and its meaning.
 
-    The comment beside the ``<default>`` of a parameter in the setup's scene file states the meaning. A unit is first in
-    the comment, or in square brackets.
+    The comment beside the ``<default>`` of a parameter states the meaning. A unit is first in the comment, or in square
+    brackets.
     """
     if knob in NO_SCENE:
         own = {"accuracy": "relative rms error of the light [1]", "seed": "of the noise [1]"}
@@ -68,13 +68,12 @@ def axis_of(setup: Setup, knob: str) -> tuple[str, str]:
 
 
 def _knobs(results: Results) -> list[str]:
-    """Return what was varied, in the order of the command; the first of what was not, if nothing was."""
+    """Return the varied knobs in the order of the command; the first knob if none was varied."""
     knobs = list(dict(results.scope.sweep))
     return [name for name in knobs if len(distinct(results.frame, name)) > 1] or knobs[:1]
 
 
 def _panels(results: Results) -> Mapping[str, Figure]:
-    """Draw the images, and each measure over the first knob with numbers, a curve for each setting of the others."""
     first, *others = knobs = _knobs(results)
     axes = {knob: axis_of(results.scope.setup, knob) for knob in knobs}
     names: dict[Any, str] = {(knob, each): f"{knob} {each}" for knob in knobs for each in distinct(results.frame, knob)}
@@ -91,7 +90,6 @@ def _panels(results: Results) -> Mapping[str, Figure]:
 
 
 def _table(results: Results) -> Sequence[Part]:
-    """Return each measure at each setting, and how many images of it are flagged."""
     columns = {MEASURES[name][0]: f"{name.replace('_', '-')} {MEASURES[name][1].rpartition(' ')[2]}"
                for name in results.scope.measures}  # fmt: skip
     names = {(knob, each): str(each) for knob in _knobs(results) for each in distinct(results.frame, knob)}
@@ -99,7 +97,6 @@ def _table(results: Results) -> Sequence[Part]:
 
 
 def _message(results: Results) -> str:
-    """Return where the images are best, and where they are worst."""
     parts = Panel(names={(knob, each): f"{knob} {each}" for knob in _knobs(results)
                          for each in distinct(results.frame, knob)}).parts(results.frame, _knobs(results))  # fmt: skip
     levels = {name: mean_of(rows).value for name, (rows, _) in parts.items() if rows["psnr_db"].notna().any()}

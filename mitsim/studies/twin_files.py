@@ -1,7 +1,4 @@
-"""What `mitsim study twin` and `transfer` compare with: a folder of real captures in, their files out; or a line that
-says where to get them.
-
-The folder has one of two others, or both, named and filled as the public repositories have them:
+"""Files of real captures for `mitsim study twin` and `transfer`, in folders named as the public repositories.
 
 * ``flatcam``: raw captures ``fc_6.png``, .. of a FlatCam behind a Bayer sensor, and their authors' images of them,
   ``rec_6.png``, .. (siddiquesalman/flatnet on GitHub);
@@ -17,33 +14,23 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_plain
 
 FLATCAM, DIFFUSERCAM = "flatcam", "diffusercam"
-"""Folders of captures."""
 PSF = "psf_sample.tif"
 SOURCES = (
     f"{FLATCAM}/fc_6.png, rec_6.png, .. of github.com/siddiquesalman/flatnet, {DIFFUSERCAM}/{PSF} of "
     "github.com/Waller-Lab/DiffuserCam-Tutorial, or one of both"
 )
-"""Where the files are from, for people."""
 
 
 @dataclass(frozen=True)
 class TwinFiles:
-    """Files of real captures.
-
-    Attributes
-    ----------
-    captures
-        raw frame and its authors' image, by the capture's name.
-    psf
-        point spread function of a DiffuserCam; None: none is compared.
-    """
+    """Raw frame and authors' image by the capture's name, and a DiffuserCam's point spread function or None."""
 
     captures: dict[str, tuple[Path, Path]]
     psf: Path | None
 
     @classmethod
     def find(cls, folder: Path | None, study: str = "twin") -> TwinFiles:
-        """Those in a ``folder``, for a ``study``; MitsimError where there are none, or too few."""
+        """Return the files in a ``folder`` for a ``study``; MitsimError where there are too few."""
         if folder is None:
             raise MitsimError(f"study {study}: needs real captures; give --data FOLDER with {SOURCES}")
         if not folder.is_dir():

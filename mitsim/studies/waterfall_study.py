@@ -3,15 +3,12 @@
 An effect is measured in three ways: *alone*, added to the idealised model; *in order*, added after all effects before
 it, so that the steps add up to the whole; *left out* of the whole. The paper has no such figure.
 
-Effects of the scene are removed from its light (:mod:`mitsim.studies.causes`). Three more belong to the camera:
-*saturation*, the full well and the end of the ADC; *quantisation*, its steps and its first number; and *calibration
-noise*, the error of the factors that follows from the noise of a session's frames. Shot noise, read noise and dark
-current are always on, because the paper's model has such noise as well. The exposure is that of equal peak with the
-effects on.
+Effects of the scene are removed from its light (:mod:`mitsim.studies.causes`). The camera adds *saturation*,
+*quantisation* and *calibration noise* (of the factors). Shot noise, read noise and dark current are always on, because
+the paper's model has them. The exposure is that of equal peak with the effects on.
 
 Images are made with the *model assumed*, the exact factors of the idealised camera, and with the *model calibrated*,
-factors that a session before a white board gives with the same effects. With everything on, frames and calibrated
-factors are those of a user, bit for bit.
+factors of a session with the same effects.
 """
 
 from __future__ import annotations
@@ -64,19 +61,13 @@ _IN_SESSIONS = frozenset({causes.FALLOFF, causes.DIFFRACTION, causes.KEYSTONE, c
 _ROOM = 1024.0
 """Full wells of a sensor without saturation: a power of two changes no other number."""
 _LARGEST_ADC, _CODES = 24, 2**32
-"""Bits of an ADC without saturation, at most, and codes that a frame can hold."""
+"""Most bits of an ADC without saturation, and codes that a frame can hold."""
 _SURE = 6.0
-"""Deviations of noise by which the brightest pixel stays below saturation: 1e-9 for each pixel and frame."""
+"""Deviations of noise by which the brightest pixel stays below saturation."""
 
 
 class Sessions:
-    """Calibration sessions with a bench's camera, with all of their effects or without some.
-
-    Parameters
-    ----------
-    bench, seed
-        camera that is calibrated, and the seed of the session's light and noise.
-    """
+    """Calibration sessions with a bench's camera, with all of its effects or without some."""
 
     def __init__(self, bench: Apparatus, seed: int) -> None:
         self._session, job = Session(bench, load_recipe(), seed), Job()
@@ -101,8 +92,7 @@ class Sessions:
         return Factors.of(estimate(self._lit, Job())[0], self.manifest)
 
     def factors(self, off: frozenset[str], noise: bool) -> Factors:
-        """Return the factors of a session without the effects ``off``, with the ``noise`` of the real session or
-        without noise."""
+        """Return the factors of a session without the effects ``off``, with or without its ``noise``."""
         found, whole = self._estimate(off), self._estimate(frozenset())
         if not noise:
             return Factors.of(found, self.manifest)
@@ -141,17 +131,7 @@ class Sessions:
 
 
 class Levels:
-    """Images of a scene with any of its effects.
-
-    Parameters
-    ----------
-    lit, scene_ablation
-        scene, and its light.
-    sessions
-        calibration sessions of the camera.
-    patterns, seed
-        pattern family, and seed of the frames' noise.
-    """
+    """Images of a scene with any of its effects, by ``sessions`` of its camera."""
 
     def __init__(self, lit: LitScene, scene_ablation: Ablation, sessions: Sessions, patterns: str, seed: int) -> None:
         self.lit, self._ablation, self._sessions = lit, scene_ablation, sessions
@@ -182,7 +162,6 @@ class Levels:
 
 
 def sensor_without(sensor: SensorModel, off: frozenset[str]) -> SensorModel:
-    """Return a ``sensor`` without saturation or quantisation, where these are ``off``."""
     changed: dict[str, object] = {}
     if SATURATION in off:
         most = math.floor(math.log2(_CODES / sensor.binning**2))
@@ -211,7 +190,6 @@ def _align(side: FloatArray, like: FloatArray) -> FloatArray:
 
 ALONE, IN_ORDER, LEFT_OUT = WAYS = ("alone", "in order", "left out")
 _KEPT = 64
-"""Images of a scene that are kept: of 17 effects three ways, and the two ends."""
 _IDEAL = "idealised"
 _LAST = {"way": IN_ORDER, "effect": EFFECTS[-1]}
 
@@ -224,7 +202,6 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    """Measure the image without and with an effect, and the whole change at the last step."""
     setup, seed, way, effect = point.setup, int(point["seed"]), point["way"], str(point["effect"])
     lit = studio.lit_scene(setup)
     scene_ablation = studio.once("ablation", 1, setup, lambda: Ablation.of(lit.light))
