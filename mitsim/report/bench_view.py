@@ -1,4 +1,4 @@
-"""A drawing of a bench to scale, pictures of it in its own light, and a model that can be turned."""
+"""A drawing of a bench to scale, previews in its own light, and a model that can be turned."""
 
 from __future__ import annotations
 
@@ -46,21 +46,17 @@ _STYLE = {
     "axes.spines.right": False,
 }
 _PLAN_INCHES, _SQUARE_INCHES = (4.4, 2.4), (3.6, 3.6)
-"""Sizes of a page's pictures: narrower than 500 pixels, so that a telephone shows them whole."""
 _FEW = 60_000
-"""Triangles up to which a shape is filled in the drawing, in a second; of larger shapes the corners are dots."""
+"""Largest number of triangles that are filled in the drawing; corners of larger shapes are dots."""
 _FLAT = 1e-4
-"""Relative difference of depths below which they are equal: single precision is 1e-7."""
 _NO_PIXELS = 5e-3
 """Parallax [projector pixels] that no image shows."""
 _IN_SIGHT = 1.4
-"""Ratio of the model's longest side to the mean of all sides that its picture has room for: `lamp_bench` has 1.34."""
 _ACROSS = 7
 """Period of dots across the baseline: the paper's."""
 _NAMES = 3
-"""Names of things outside a plan that its title has room for."""
 _BESIDE, _BEHIND = 0.3, 1.2
-"""Part of the scene that is drawn: beside the light, relative to its width, and behind it, relative to its depth."""
+"""Part of the scene that is drawn beside and behind the light."""
 _LAMP, _DARK = "#f0c419", "#9a6b00"
 _SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 _CLOSED = [0, 1, 2, 3, 0]
@@ -129,7 +125,6 @@ class BenchView:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Reasons why no calibration can give an image of the bench."""
         return self.layout.obstacles
 
     def summary(self) -> dict[str, Any]:
@@ -164,12 +159,10 @@ class BenchView:
         }
 
     def lines(self) -> list[str]:
-        """Return the facts, a line each."""
         return [f"{name}: {words}" for name, words in self.facts.items()]
 
     @property
     def _window_mm(self) -> tuple[float, float]:
-        """Height and width of the box around the projector's window on the aligned plane."""
         distance = self.bench.geometry.scene_distance
         (top, bottom), (left, right) = self.bench.windows
         return (bottom - top) * distance, (right - left) * distance
@@ -193,7 +186,7 @@ class BenchView:
 
     @property
     def _parts(self) -> list[tuple[str, tuple[float, float], Callable[[Axes], None]]]:
-        """Name of each part, its size [inches] on a page, and the function that draws it."""
+        """Return name and size [inches] of each part, and the function that draws it."""
         seen = "From the camera, without its mask"
         return [
             ("From above", _PLAN_INCHES, lambda axes: self._plan(axes, 0)),
@@ -210,12 +203,12 @@ class BenchView:
 
     @cached_property
     def _end(self) -> float:
-        """Depth [mm] to which light is drawn: the aligned plane, or the farthest that is lit."""
+        """Return the depth [mm] to which light is drawn."""
         return max(self.bench.geometry.scene_distance, self.layout.depths[1] if self.layout.depths else 0.0)
 
     @cached_property
     def _range(self) -> tuple[float, float]:
-        """Ends [mm] of both plans across z: of the light, and of the scene where that is not far beside it."""
+        """Return the ends [mm] of both plans across z."""
         layout, reach = self.layout, self.bench.geometry.tan_half_fov * self._end
         lit = np.concatenate([[-reach, reach], layout.projector[:2], layout.window_at(self._end)[:, :2].ravel()])
         seen = [each.points[each.points[:, 2] < _BEHIND * self._end][:, :2].ravel() for each in layout.surfaces]
@@ -229,7 +222,7 @@ class BenchView:
         return bool(inside.all() and z.min() <= _BEHIND * self._end and z.max() >= min(0.0, self.layout.projector[2]))
 
     def _plan(self, axes: Axes, axis: int) -> None:
-        """Draw the bench from above (``axis`` 0, +x upwards) or from the side (1, +y upwards)."""
+        """Draw the bench from above (``axis`` 0) or from the side (1)."""
         layout, geometry, end, (low, high) = self.layout, self.bench.geometry, self._end, self._range
         aligned, tan, projector = geometry.scene_distance, geometry.tan_half_fov, layout.projector
         start, across = min(0.0, float(projector[2])), high - low
@@ -276,7 +269,6 @@ class BenchView:
         axes.set(xlabel="z, distance from the sensor [mm]", ylabel="x, to the left [mm]" if axis == 0 else "y, up [mm]")
 
     def _camera(self, axes: Axes) -> None:
-        """Draw sensor and mask from above, along columns, in a scale of their own."""
         geometry = self.bench.geometry
         half, distance, tan = geometry.half_sides[1], geometry.mask_distance, geometry.tan_half_fov
         reach, mask, thick = 1.25 * (half + distance * tan), geometry.build_mask(), max(geometry.mask_thickness, 0.0)
@@ -302,7 +294,7 @@ class BenchView:
         axes.set_title("The camera enlarged, from above", loc="left")
 
     def _from_beside(self, axes: Axes) -> None:
-        """Draw the preview from a free place, with the light and the camera's field over it."""
+        """Draw the preview from a free place, with the light and the camera's field."""
         preview, layout, geometry = self.previews[1], self.layout, self.bench.geometry
         _show(axes, preview, "From beside")
         axes.set_xlabel("orange: the projector's light; blue: the camera's field")
@@ -319,7 +311,7 @@ class BenchView:
     # ---- As a model that can be turned ----
 
     def model(self) -> Model:
-        """Build the bench in three dimensions, as a figure of plotly, which shows itself in a notebook."""
+        """Build a figure of plotly."""
         from plotly import graph_objects
 
         layout, geometry, end = self.layout, self.bench.geometry, self._end
@@ -366,17 +358,9 @@ class BenchView:
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the drawing to a PNG file, or all of it to a page without network, an HTML file; returns its path.
+        """Write the drawing to a PNG file, or all of it to a page without network (HTML).
 
-        Parameters
-        ----------
-        path
-            The file, which is replaced.
-
-        Raises
-        ------
-        MitsimError
-            For another ending, and when the file cannot be written.
+        Raises MitsimError for another ending, and when the file cannot be written.
         """
         path = check_view(path)
         write_bytes(path, self._repr_png_() if path.suffix.lower() == ".png" else self._page().encode())
@@ -415,7 +399,7 @@ class BenchView:
 
 
 def _fill_surfaces(axes: Axes, surfaces: list[Surface], axis: int) -> None:
-    """Draw the scene as it is seen from above (``axis`` 0) or the right (1): near triangles cover far ones."""
+    """Draw the scene from above (``axis`` 0) or the right (1); near triangles cover far ones."""
     corners, heights, colors = [], [], []
     for surface in surfaces:
         if len(surface.triangles) > _FEW:
@@ -438,19 +422,17 @@ def _fill_surfaces(axes: Axes, surfaces: list[Surface], axis: int) -> None:
 
 
 def _as_text(name: str) -> str:
-    """Escape dollar signs, between which matplotlib reads a formula."""
+    """Escape dollar signs, which begin a formula of matplotlib."""
     return name.replace("$", r"\$")
 
 
 def _field_at(tan: float, depth: float) -> FloatArray:
-    """Return the corners (4, 3) of the field stop at a ``depth``."""
     return np.column_stack([_SQUARE * tan * depth, np.full(4, depth)])
 
 
 def _measure(
     axes: Axes, start: tuple[float, float], end: tuple[float, float], words: str, upright: bool = False
 ) -> None:
-    """Draw a dimension between two points."""
     arrow = {"arrowstyle": "<->", "color": BLACK, "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", end, start, arrowprops=arrow)
     middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
@@ -468,7 +450,6 @@ def _show(axes: Axes, preview: Preview, title: str) -> None:
 
 
 def _mesh(surface: Surface) -> Any:
-    """Build a shape of the model, in the greys or colours of its print."""
     from plotly import graph_objects
 
     z, x, y = surface.points.astype(np.float32).T[[2, 0, 1]]
@@ -487,7 +468,6 @@ def _mesh(surface: Surface) -> Any:
 
 
 def _line(name: str, points: FloatArray, color: str, width: float = 3, mode: str = "lines") -> Any:
-    """Build a line of the model, or markers."""
     from plotly import graph_objects
 
     z, x, y = points.T[[2, 0, 1]]
@@ -497,7 +477,6 @@ def _line(name: str, points: FloatArray, color: str, width: float = 3, mode: str
 
 
 def _place_words(place: FloatArray) -> str:
-    """Return the place of the projector in words."""
     sides = ("left of", "right of"), ("above", "below"), ("ahead", "behind")
     words = [
         f"{abs(value):.4g} mm {plus if value > 0 else minus}"

@@ -1,4 +1,4 @@
-"""An image in colour from images of spectral lines: its colours, and their differences from known ones."""
+"""An image in colour from images of spectral lines, and its difference from known colours."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class ColourImage:
     truth : (n, n', lines) array
         Perfect images of the lines, relative to the board; None for a real camera.
     chart
-        Place of a colour chart in the image, on which colours are then fitted; MitsimError if it lies outside.
+        Place of a colour chart on which colours are fitted; MitsimError if it lies outside.
     facts
-        How the images were found, in words, for the page.
+        How the images were found, in words.
     solution, of_lines
-        Numbers of one solve for all lines, or of the solve of each line, by the keys of the command line's JSON.
+        Numbers of one solve for all lines, or of each line's, by the keys of the JSON.
     inputs
         Source of one solve for all lines: an image of other inputs is not replaced.
     """
@@ -60,7 +60,6 @@ class ColourImage:
 
     @cached_property
     def model(self) -> ColourModel:
-        """Conversion of reflectances at the lines to colours."""
         waves = self.lines.wavelengths_nm
         if self.chart is None:
             return ColourModel.of_lines(waves)
@@ -73,12 +72,11 @@ class ColourImage:
 
     @property
     def ok(self) -> bool:
-        """True if the images of all lines can be used as they are."""
         return not self.warnings
 
     @property
     def psnr_db(self) -> float | None:
-        """PSNR over the images of all lines together; None without a truth."""
+        """PSNR over all lines together; None without a truth."""
         count = self.images.shape[0]
         return None if self.truth is None else psnr(self.images.reshape(count, -1), self.truth.reshape(count, -1))
 
@@ -89,20 +87,21 @@ class ColourImage:
 
     @cached_property
     def truth_xyz(self) -> FloatArray | None:
-        """(n, n', 3) CIE XYZ of the truth, by the same matrix; None without a truth."""
+        """(n, n', 3) CIE XYZ of the truth by the same matrix; None without a truth."""
         return None if self.truth is None else self.model.xyz(self.board * self.truth)
 
     @cached_property
     def delta_e(self) -> FloatArray | None:
-        """(n, n') CIE Delta E 2000 of each pixel to the truth's, by the same matrix; None without a truth."""
+        """(n, n') CIE Delta E 2000 to the truth; None without a truth."""
         return None if self.truth_xyz is None else delta_e(self.xyz, self.truth_xyz)
 
     @cached_property
     def patches(self) -> list[dict[str, Any]]:
-        """Name of each patch of the chart, and CIE Delta E 2000 of its mean to its spectrum in D65.
+        """Return CIE Delta E 2000 of the mean of each patch to its spectrum in D65; empty without a chart.
 
-        ``delta_e`` is of this image, ``floor`` of the patch's spectrum at the lines by the fixed matrix, below which no
-        camera behind these lines is, and ``truth`` of the truth by the image's matrix. Empty without a chart.
+        ``floor`` is that of the patch's spectrum at the lines by the fixed matrix, the least for these lines.
+        ``truth`` is that
+        of the truth by the image's matrix.
         """
         if self.chart is None:
             return []
@@ -118,12 +117,10 @@ class ColourImage:
         ]
 
     def patch_mean(self, key: str) -> float | None:
-        """Return the mean over all patches of the number ``key``; None where it is not known."""
         return _mean(patch[key] for patch in self.patches)
 
     @property
     def sentences(self) -> list[str]:
-        """Statements on the colours, for the command line."""
         sentences = [f"colours by a matrix fitted on {self.model.fitted_on}"]
         if self.delta_e is not None:
             sentences.append(f"Delta E 2000 of a pixel to the truth {self.delta_e.mean():.2f} in the mean")
@@ -134,13 +131,11 @@ class ColourImage:
 
     @property
     def described(self) -> list[str]:
-        """Quality of each line, and how the images were found, for the command line's details."""
         qualities = [f"{name}: {each or 'no truth to compare with'}" for name, each in self.qualities.items()]
         return [*qualities, *(f"{name}: {value}" for name, value in self.facts.items())]
 
     @property
     def table(self) -> dict[str, str]:
-        """Statements on each line that was solved by itself, by line."""
         rows = {}
         for number, line in enumerate(self.lines.names if self.of_lines else ()):
             found, size = self.of_lines[line], float(np.sqrt(np.square(self.images[..., number]).mean()))
@@ -172,7 +167,7 @@ class ColourImage:
         }
 
     def write(self, folder: Path, **origin: Any) -> None:
-        """Write image.exr, image.png, and colour.json last, with the entries ``origin``; an earlier page is removed."""
+        """Write image.exr, image.png, and colour.json last; an earlier page is removed."""
         rgb = linear_srgb(self.xyz)
         named = dict(zip("RGBXYZ", np.moveaxis(np.concatenate([rgb, self.xyz], axis=-1), -1, 0), strict=True))
         channels = {name: values.astype(np.float32) for name, values in named.items()}
@@ -199,8 +194,7 @@ class ColourImage:
 
 
 def state_image(folder: Path, lines: ColourManifest, **more: Any) -> None:
-    """Write colour.json; with ``status="incomplete"`` before an image is made, so that the same work can replace a
-    killed one."""
+    """Write colour.json; with ``status="incomplete"``, a killed work can be replaced."""
     remove_page(folder)
     write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), **more)
 

@@ -1,7 +1,6 @@
-"""The page of `mitsim demo`: one self-contained HTML file, with images inside and without scripts or links.
+"""The page of `mitsim demo`: one self-contained HTML file without scripts or links.
 
-The content of a page is :class:`ReportData`; sections without data are left out. A page carries no time of writing,
-so that the same data give the same bytes.
+Sections without data are left out. The same data give the same bytes.
 """
 
 from __future__ import annotations
@@ -38,23 +37,20 @@ from mitsim.report.pages import (
 )
 
 _PATTERN_CORNER = 40
-"""Projector pixels a side that are shown of a pattern, so that single pixels can be seen."""
 _SMALLEST = 384
-"""Pixels a side of a picture: the width of a column of the page, on a screen of two dots a pixel."""
 _GAIN_DB = 0.5
 """Least gain that counts: a tenth of the squared error."""
 _SHOWN_PERCENT = 99.0
-"""Part of the errors that the scale of their picture holds: of a normal error, up to 2.6 deviations."""
+"""Part of the errors within the scale of their picture."""
 COVERED = 1.96
-"""Standard uncertainties on either side of a pixel within which the truth is expected with a chance of 95 %."""
+"""Standard uncertainties of a 95 % interval."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trust:
-    """The stated standard ``uncertainty`` of an image's pixels beside their actual ``error``, (n, n') reflectance.
+    """Stated standard ``uncertainty`` and actual ``error`` of an image, (n, n') reflectance.
 
-    ``chi_square`` is the misfit a datum, None where there are no more data than unknowns; ``cause`` is the finding that
-    flags the misfit.
+    ``chi_square`` is None where there are no more data than unknowns; ``cause`` flags the misfit.
     """
 
     uncertainty: FloatArray
@@ -64,7 +60,7 @@ class Trust:
 
     @classmethod
     def of(cls, image: Reconstruction, truth: FloatArray) -> Trust | None:
-        """Compare an ``image`` with the (n, n') ``truth``; None where its uncertainty is not known."""
+        """Compare an ``image`` with the truth; None where its uncertainty is not known."""
         if image.uncertainty is None:
             return None
         misfit, error = image.misfit, np.abs(image.image - truth)
@@ -74,21 +70,19 @@ class Trust:
 
     @property
     def stated(self) -> float:
-        """Standard uncertainty, rms over the image."""
         return float(np.sqrt(np.mean(np.square(self.uncertainty))))
 
     @property
     def actual(self) -> float:
-        """Error, rms over the image."""
         return float(np.sqrt(np.mean(np.square(self.error))))
 
     @property
     def within(self) -> float:
-        """Part of the pixels whose truth lies in their 95 % interval."""
+        """Return the part of the pixels whose truth lies in their 95 % interval."""
         return float(np.mean(self.error <= COVERED * self.uncertainty))
 
     def pictures(self) -> tuple[Picture, Picture]:
-        """Draw the stated uncertainty and the actual error on one scale."""
+        """Draw stated uncertainty and actual error on one scale."""
         largest = max(float(self.uncertainty.max()), float(np.percentile(self.error, _SHOWN_PERCENT)))
         scale = Scale(0.0, largest, "of the board's reflectance")
         stated, actual = (f"rms {reflectance(value)}" for value in (self.stated, self.actual))
@@ -98,7 +92,6 @@ class Trust:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Return the entries of demo.json."""
         return {
             "uncertainty": self.stated,
             "rms_error": self.actual,
@@ -110,7 +103,7 @@ class Trust:
 
 @dataclass(frozen=True, eq=False)
 class Recovery:
-    """One reconstruction: (n, n) reflectance, its quality, lambda, the solver's sentence, and how far to trust it."""
+    """One reconstruction with its quality, lambda, the solver's sentence, and trust."""
 
     image: FloatArray
     quality: Quality
@@ -121,11 +114,11 @@ class Recovery:
 
 @dataclass(frozen=True, eq=False)
 class FamilyResult:
-    """A pattern family, e.g. name "dots:7" and label "49 dots".
+    """A pattern family.
 
-    ``shots`` counts frames, of which a signed pattern takes two. ``patterns`` are some (n, n) examples, 0..1 or -1..1.
-    ``idealised`` solves the paper's model with its own factors, ``rendered`` rendered frames with calibrated factors,
-    whose PSNR [dB] by exposure convention is ``by_exposure``.
+    ``shots`` counts frames. ``patterns`` are some (n, n) examples. ``idealised`` solves the paper's model,
+    ``rendered``
+    rendered frames with calibrated factors, whose PSNR [dB] by exposure convention is ``by_exposure``.
     """
 
     name: str
@@ -139,7 +132,7 @@ class FamilyResult:
 
 
 class BudgetRow(NamedTuple):
-    """A source of error: relative rms of the expected frames [1] (None: unknown), and the meaning of that number."""
+    """A source of error: relative rms of the expected frames (None: unknown), and its meaning."""
 
     name: str
     value: float | None
@@ -150,9 +143,10 @@ class BudgetRow(NamedTuple):
 class ReportData:
     """Content of the demo's page.
 
-    ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, as seen along +z, row 0 at the top.
-    ``main`` is the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in
-    DN by caption, ``error`` is the relative error of the expected frames, and ``calibration`` the JSON of `calibrate`.
+    ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, row 0 at the top as seen along +z.
+    ``main`` is
+    the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in DN by
+    caption.
     """
 
     title: str
@@ -180,10 +174,7 @@ class ReportData:
 
 
 def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
-    """Return headline and detail, such as "49 dots beat uniform by 11.0 dB" and both PSNRs.
-
-    MitsimError when one of the two families has no rendered result.
-    """
+    """Return headline and detail, such as "49 dots beat uniform by 11.0 dB"; MitsimError without a rendered result."""
     if best.rendered is None or baseline.rendered is None:
         raise MitsimError(f"report: no rendered result of {best.label} or {baseline.label}; reconstruct both first")
     ours, theirs = best.rendered.quality.psnr_db, baseline.rendered.quality.psnr_db
@@ -206,13 +197,13 @@ def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
 
 
 def build_report(report: ReportData, path: Path) -> Path:
-    """Write the page of a ``report`` to ``path``, all or nothing, and return it."""
+    """Write the page to ``path``, all or nothing."""
     write_text(path, render_html(report))
     return Path(path)
 
 
 def render_html(report: ReportData) -> str:
-    """Render the page of a ``report``; MitsimError when an image holds values that are not finite."""
+    """Render the page; MitsimError when an image is not finite."""
     best = {}
     for row in ("idealised", "rendered"):
         psnr = {f.name: getattr(f, row).quality.psnr_db for f in report.families if getattr(f, row) is not None}
@@ -251,12 +242,12 @@ def render_html(report: ReportData) -> str:
 
 
 def _reflectance(image: npt.ArrayLike, name: str = "image") -> str:
-    """Draw reflectance as a grey PNG, cut to 0..1 for display only."""
+    """Draw reflectance as a grey PNG, cut to 0..1."""
     return data_uri(grey_png(lightness(_finite(image, name)), smallest=_SMALLEST))
 
 
 def _pattern(pattern: npt.ArrayLike) -> str:
-    """Draw the top left corner of a pattern: 0..1 as it is, -1..1 with -1 black."""
+    """Draw the top left corner of a pattern, with -1 black."""
     values = _finite(pattern, "pattern")[:_PATTERN_CORNER, :_PATTERN_CORNER]
     return data_uri(grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values, smallest=_SMALLEST))
 
@@ -269,5 +260,5 @@ def _finite(image: npt.ArrayLike, name: str) -> FloatArray:
 
 
 def _trouble(status: str) -> str:
-    """Return the first part of the solver's sentence, unless it is "Solved: ..." and nothing is missing."""
+    """Return the first part of the solver's sentence, "" if solved."""
     return "" if status.startswith("Solved: ") else sentence(re.split(r"; |\. ", status)[0])

@@ -1,6 +1,6 @@
-"""`mitsim report`: pictures and a page of a run, a calibration or an image, from the files of its folder alone.
+"""`mitsim report`: pictures and a page of a run, a calibration or an image, from its folder's files alone.
 
-The truth of an image is read from its run, as long as the run is where it was.
+The truth of an image is read from its run, if the run is still in its place.
 """
 
 from __future__ import annotations
@@ -60,22 +60,17 @@ _ELSEWHERE = {
     *("seconds", "warnings", "versions", "command", "kernels", "result", "estimate", "verdict", "camera"),
     *("opened", "inputs", MADE_OF),
 }
-"""Keys of a manifest or result outside the table of numbers: the page shows them elsewhere, or only programs need
-them."""
+"""Keys of a manifest or result outside the table of numbers."""
 _TRUTH = "what a perfect image shows: of each projector pixel what it lights, black where that is not seen"
 _MISFIT = 2.0
-"""Least chi-square a datum that is white: chance alone, some hundredths about 1, would fill any smaller scale."""
+"""Least chi-square that is white, so that chance fills no scale."""
 _SHOWN_PERCENT = 99.0
-"""Part of the errors within the scale of their picture: single pixels at edges are off by far more."""
+"""Part of the errors within the scale of their picture."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Content of a folder's page.
-
-    ``kernels`` are number and seconds of compiled kernels; ``tables`` are lines by the titles of tables; ``parts`` are
-    the pages of the folders in it; ``facts`` say how an image in colour was found.
-    """
+    """Content of a folder's page; ``tables`` are lines by title, ``parts`` pages of the folders in it."""
 
     kind: str
     verdict: str
@@ -115,10 +110,9 @@ def report_folder(folder: Path | str) -> Path:
 
 
 def _write(folder: Path, shown: Shown) -> None:
-    """Write pictures and pages, last of all the folder's own page, because it says that everything is there."""
+    """Write pictures and pages, the folder's own page last, because it marks completion."""
 
     def named(xyz: FloatArray) -> str:
-        """Return the colour of (3,) ``xyz`` as a page names it."""
         return f"#{bytes(np.rint(255 * lightness(linear_srgb(xyz))).astype(np.uint8)).hex()}"
 
     for name, part in shown.parts.items():
@@ -174,7 +168,7 @@ def _content(folder: Path) -> Shown:
 
 
 def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> Shown:
-    """Show a folder of several, one for each value of an ``axis`` in a ``unit``."""
+    """Show a folder of several, one for each value of an ``axis``."""
     parts = {name: _content(folder / name) for name in names}
     first, *_, last = *parts.values(), *parts.values()
     return Shown(
@@ -192,7 +186,7 @@ def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> 
 
 
 def _of_run(lines: SpectralFolder) -> Shown:
-    """Show the frames of a run, on one scale from the black level, and its truth."""
+    """Show the frames of a run on one scale from the black level, and its truth."""
     shots = load_run(lines.folder)
     manifest, taken, black = shots.manifest, shots.manifest.patterns, np.float64(shots.manifest.digital.black_level_dn)
     accuracy = (manifest.plan or {}).get("accuracy")
@@ -234,7 +228,6 @@ def _of_run(lines: SpectralFolder) -> Shown:
 
 
 def _of_calibration(folder: Path) -> Shown:
-    """Show both factors of a calibration."""
     factors = load_calibration(folder)
     manifest, result = factors.manifest, factors.manifest.result
     errors = (result.get(name) for name in ("phi_error", "predicted_phi_error"))
@@ -261,7 +254,7 @@ def _of_calibration(folder: Path) -> Shown:
 
 
 def _tables(manifest: Any, folder: Path, known: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
-    """Return the tables on the pages of runs and calibrations; ``known`` are the first numbers."""
+    """Return the tables of runs and calibrations; ``known`` are the first numbers."""
     files = [path for path in folder.iterdir() if path.is_file() and path.name != PAGE]
     sizes = f"{len(files)}, {size_text(sum(path.stat().st_size for path in files))}"
     numbers = {key: value for key, value in manifest.model_dump().items() if key not in _ELSEWHERE}
@@ -274,7 +267,6 @@ def _tables(manifest: Any, folder: Path, known: Mapping[str, Any]) -> dict[str, 
 
 
 def _numbers(data: Any) -> dict[str, float]:
-    """Return the numbers of some ``data`` by name, because other programs may have written it."""
     listed = data.items() if isinstance(data, Mapping) else ()
     return {name: value for name, value in listed if isinstance(value, (int, float))}
 
@@ -283,7 +275,7 @@ def _numbers(data: Any) -> dict[str, float]:
 
 
 def _of_image(folder: Path) -> Shown:
-    """Show an image and what is known of it: truth, error, uncertainty, depth and misfit."""
+    """Show an image with its truth, error, uncertainty, depth and misfit."""
     result = read_result(folder)
     image = finite_channel(read_frame(folder / IMAGE_FILE)[0], "reflectance", folder / IMAGE_FILE)
     quality, similar, warnings = result.get("psnr"), result.get("ssim"), result.get("warnings") or ()
@@ -331,13 +323,12 @@ def _of_image(folder: Path) -> Shown:
 
 
 def _error_picture(error: FloatArray, unit: str, about: str, least: float = 0.0) -> Picture:
-    """Draw the error of an image, on a scale to ``least`` at least that the largest hundredth of it exceeds."""
     scale = Scale(0.0, max(float(np.percentile(error, _SHOWN_PERCENT)), least), unit)
     return Picture.of("error", "How they differ", error, scale, about)
 
 
 def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
-    """Return the truth that an image was compared with; None where run or calibration are gone, or have changed."""
+    """Return the truth of an image; None where run or calibration are gone, or have changed."""
     made_of, inputs = result.get(MADE_OF), result.get("inputs")
     if not isinstance(made_of, dict) or not isinstance(inputs, dict):
         return None
@@ -356,7 +347,7 @@ def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
 
 
 def _of_colours(lines: SpectralFolder) -> Shown:
-    """Show an image in colour; lines that were solved one by one have pages of their own."""
+    """Show an image in colour; lines that were solved one by one have their own pages."""
     folder, colours, names = lines.folder, lines.colours, lines.names
     assert colours is not None
     data = read_json(folder / COLOUR)

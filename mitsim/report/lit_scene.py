@@ -1,13 +1,13 @@
 """Exposures of a scene under any pattern family, and the images that they give, for comparisons in studies.
 
-There are two models with the same truth and the same sensor. The *rendered* model uses the traced light and calibrated
-factors. The *idealised* model is the paper's, with its own exact factors: a planar scene that is lit evenly, without
-falloff, and a geometric shadow of one separable term. It takes reflectance and mean flux from the rendered bench, so
-that exposure and noise are equal and only the model differs.
+The *rendered* model uses the traced light and calibrated factors. The *idealised* model is the paper's, with its own
+exact factors: a planar scene that is lit evenly, without falloff, and a geometric shadow of one separable term. It
+takes
+reflectance and mean flux from the rendered bench, so that exposure and noise are equal.
 
-Exposure conventions: *equal peak* exposes each family so that its brightest pixel fills the same part of the full well;
-*equal frame* gives every frame the exposure of uniform light; *equal total* shares that exposure among the family's
-frames. *A peak of 5600 electrons* is an equal peak that is dim.
+Exposure conventions: *equal peak* fills the same part of the full well with each family's brightest pixel; *equal
+frame*
+gives every frame the exposure of uniform light; *equal total* shares that exposure among the family's frames.
 """
 
 from __future__ import annotations
@@ -49,11 +49,10 @@ from mitsim.sensor.chain import electrons_from_irradiance, response_variance
 NONUNIFORMITY, SPECKLE = "response nonuniformity", "speckle"
 """Names of noise sources beside those of :mod:`mitsim.calibrate.board_session`."""
 DIM_E = 5600
-"""Electrons of the brightest pixel with which the idealised model has the paper's decibels of uniform light and of 49
-dots, mask at 2000 um: 22.8 and 34.8."""
+"""Electrons of the brightest pixel that give the paper's 22.8 and 34.8 dB of uniform light and 49 dots at 2000 um."""
 DIM = f"a peak of {DIM_E} electrons"
 LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
-"""Lambdas relative to the largest sigma^2, a quarter of a decade apart, for a search with the truth."""
+"""Lambdas relative to the largest sigma^2 for a search with the truth."""
 
 
 class LitScene:
@@ -69,7 +68,6 @@ class LitScene:
         return self.light.truth
 
     def quality(self, image: FloatArray) -> Quality:
-        """Compare an (n, n) ``image`` with the truth."""
         return Quality.of(image, self.truth, self.light.apparent.error)
 
     def expected_frames(
@@ -86,15 +84,12 @@ class LitScene:
         return camera.frames(family, self.truth * self.board_flux, plane)
 
     def rendered_frames(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
-        """Return rendered frames, and the calibrated ``factors`` that solve them; ``seed`` is of the noise."""
+        """Return rendered frames with calibrated ``factors``."""
         sides = factors.left, factors.right
         return Unexposed(self, RENDERED, family, sides, factors.manifest.centre, seed)
 
     def idealised_frames(self, family: PatternFamily, seed: int, plane: Plane | None = None) -> Unexposed:
-        """Return frames of the paper's model with its own factors, of a scene in the calibrated or another ``plane``.
-
-        The noise has another seed than that of rendered frames.
-        """
+        """Return frames of the paper's model with its own factors; their noise differs from that of rendered frames."""
         camera = self._ideal
         return Unexposed(self, IDEALISED, family, camera.calibrated(self.board_flux), camera.centre, seed + 1, plane)
 
@@ -111,16 +106,17 @@ class LitScene:
 
     @property
     def board_flux(self) -> float:
-        """Mean irradiance on the sensor without the mask by a projector pixel of a white board [W m^-2]."""
+        """Return the irradiance by a pixel of a white board on the sensor without the mask [W m^-2]."""
         return float(self.light.apparent.board_flux.mean())
 
 
 @dataclass(frozen=True, eq=False)
 class Unexposed:
-    """Frames of a scene under a family before any exposure, and the factors that solve them.
+    """Frames of a scene before any exposure, and the factors that solve them.
 
-    ``model`` is one of :data:`mitsim.report.MODELS`; ``centre`` is True where means are subtracted from frames;
-    ``plane`` is the place of an idealised scene, None for the plane of the factors.
+    ``centre`` is True where means are subtracted from frames; ``plane`` is that of an idealised scene, None for that
+    of the
+    factors.
     """
 
     lit: LitScene
@@ -133,21 +129,17 @@ class Unexposed:
 
     @cached_property
     def expected(self) -> ExpectedFrames:
-        """Frames without noise."""
         return self.lit.expected_frames(self.model, self.family, self.plane)
 
     def seconds(self, exposure: str) -> float:
-        """Return the exposure time [s] of a frame by a convention, one of ``CONVENTIONS`` or :data:`DIM`."""
+        """Return the exposure time [s] of a frame by a convention."""
         if exposure in (EQUAL_PEAK, DIM):
             peak_e = Exposure().fraction * self.lit.bench.sensor.superpixel_full_well_e
             return peak_time(self.lit.bench, self.expected) * (DIM_E / peak_e if exposure == DIM else 1.0)
         return self.lit.uniform_s(self.model) / (len(self.family.shots) if exposure == EQUAL_TOTAL else 1)
 
     def prepare(self, binning: int = 1) -> Prepared:
-        """Return the factorised model of frames whose pixels are averaged ``binning`` x ``binning``.
-
-        MitsimError where such squares do not fill a frame.
-        """
+        """Return the factorised model for averages of ``binning`` x ``binning`` pixels, which have to fill a frame."""
         rows, columns = (len(side) for side in self.sides)
         if rows % binning or columns % binning:
             raise MitsimError(
@@ -158,21 +150,13 @@ class Unexposed:
         return prepare(left, right, self.family.left, self.family.right, centre=self.centre)
 
     def data(self, seconds: float, binning: int = 1) -> tuple[Prepared, Accumulator]:
-        """Return the factorised model, and one noisy exposure of all frames, accumulated for it."""
+        """Return the factorised model, and one accumulated noisy exposure of all frames."""
         model = self.prepare(binning)
         (sums,) = accumulate(self.exposer(seconds), self.family, self.expected, [model], binning)
         return model, sums
 
     def solve(self, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1) -> Solution:
-        """Solve one exposure of so many ``seconds`` a frame.
-
-        Parameters
-        ----------
-        lam
-            Lambda; "best" takes the one of :data:`LAMBDAS` whose image is nearest to the truth.
-        binning
-            Pixels a side that are averaged.
-        """
+        """Solve one exposure of ``seconds`` a frame; ``lam="best"`` uses the truth and :data:`LAMBDAS`."""
         model, sums = self.data(seconds, binning)
         if lam != "best":
             return model.solve(sums, lam)
@@ -181,7 +165,7 @@ class Unexposed:
 
     @single_threaded_blas()
     def clear(self, lam: float) -> FloatArray:
-        """Solve the frames without noise by a lambda; the light of lamps is subtracted without noise, too."""
+        """Solve the frames without noise."""
         model, exposer, expected = self.prepare(), self.exposer(1.0), self.expected
         off = exposer.electrons(expected.projector_off) if takes_ambient_frame("auto", self.family, expected) else 0.0
         sums, positive = model.accumulator(), np.zeros(())
@@ -194,18 +178,17 @@ class Unexposed:
         return model.solve(sums, lam).image
 
     def exposer(self, seconds: float) -> Exposer:
-        """Return the camera at an exposure time of so many ``seconds``."""
         speckle = self.lit.light.speckle(self.family) if self.model == RENDERED else 0.0
         return Exposer(self.lit.bench.devices, seconds, self.seed, speckle)
 
     def noise(self, seconds: float) -> float:
-        """Return the standard deviation of a datum [electrons/s], rms over all frames, at so many ``seconds``."""
+        """Return the standard deviation of a datum [electrons/s], rms over all frames."""
         return float(np.sqrt(sum(self.noises(seconds).values())))
 
     def noises(self, seconds: float) -> dict[str, float]:
-        """Return the variance of a datum [(electrons/s)^2] by source, at so many ``seconds``.
+        """Return the variance of a datum [(electrons/s)^2] by source.
 
-        Differences between the pixels' responses are fixed, but count as noise because the factors lack them.
+        Differences between the pixels' responses count as noise because the factors lack them.
         """
         exposer, sensor = self.exposer(seconds), self.lit.bench.sensor
         light = [exposer.electrons(frame) for frame in self.expected]
@@ -222,12 +205,12 @@ class Unexposed:
 
 
 def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
-    """Return the exposure time [s] at which the brightest expected pixel fills the default part of the full well."""
+    """Return the exposure time [s] that fills the default part of the full well."""
     return Exposure().choose(bench.devices, peak_irradiance(expected))
 
 
 def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
-    """Average ``binning`` x ``binning`` pixels of a ``frame`` (m, m'), whose sides are multiples of it."""
+    """Average ``binning`` x ``binning`` pixels of a ``frame``, whose sides are multiples of it."""
     if binning == 1:
         return frame
     rows, columns = (size // binning for size in frame.shape)
@@ -237,10 +220,7 @@ def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
 def accumulate(
     exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared], binning: int = 1
 ) -> list[Accumulator]:
-    """Expose a family's frames once, subtract ambient light where there is some, and accumulate them for each model.
-
-    Pixels are averaged ``binning`` x ``binning`` after the exposure.
-    """
+    """Expose a family's frames once, subtract ambient light, and accumulate them for each model."""
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
         ambient = taken_off(exposer, family, expected)
@@ -254,7 +234,7 @@ def accumulate(
 # -------- The paper's idealised camera
 
 BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
-"""Range of a camera with a usual filter, in bands of 23 nm, over which a shadow's fringes hardly move."""
+"""Range and bands of a usual filter; bands of 23 nm hardly move a shadow's fringes."""
 GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector", "broadband"
 
 Pair = tuple[FloatArray, FloatArray]
@@ -263,7 +243,7 @@ Pair = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane scene at ``depth_mm``, lit from ``baseline_mm`` beside the camera along rows and columns."""
+    """A plane scene at ``depth_mm``, lit from ``baseline_mm`` beside the camera."""
 
     depth_mm: float
     baseline_mm: tuple[float, float]
@@ -271,7 +251,7 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class IdealCamera:
-    """The idealised camera of a ``bench``, with one mask in one light; a ``spectrum`` of None has no diffraction."""
+    """The idealised camera of a ``bench``; a ``spectrum`` of None has no diffraction."""
 
     bench: Apparatus
     mask: CameraMask
@@ -279,41 +259,34 @@ class IdealCamera:
 
     @property
     def centre(self) -> bool:
-        """True if a solver subtracts row and column means from the frames."""
+        """Return True if a solver subtracts row and column means."""
         return self._geometry.centred
 
     @cached_property
     def terms(self) -> SeparableTerms:
-        """The camera's operator, of projector pixels that shine evenly."""
+        """Return the operator of projector pixels that shine evenly."""
         return self._terms(*self.directions)
 
     def points(self) -> SeparableTerms:
-        """Return the camera's operator for point sources at the centres of the projector's pixels."""
+        """Return the operator for point sources at the pixels' centres."""
         rows, columns = (Directions(pixels.centres, 0.0) for pixels in self.directions)
         return self._terms(rows, columns)
 
     @cached_property
     def factors(self) -> Pair:
-        """(pixels, n) left and right factor of the nearest separable operator [transmission]."""
+        """Return the (pixels, n) factors of the nearest separable operator."""
         best = best_term(centre_terms(self.terms) if self.centre else self.terms)
         return best.left, best.right
 
     def calibrated(self, board_flux: float) -> Pair:
-        """Return the factors in a calibration's unit [sqrt(electrons / s)].
-
-        ``board_flux`` [W m^-2] is the irradiance by a pixel of a white board on the sensor without the mask.
-        """
+        """Return the factors in a calibration's unit [sqrt(electrons / s)]."""
         model = self.bench.projector
         rate = electrons_from_irradiance(board_flux, 1.0, self.bench.sensor, model.effective_wavelength_nm)
         left, right = self.factors
         return left * np.sqrt(rate), right * np.sqrt(rate)
 
     def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:
-        """Return the frames of a family.
-
-        ``flux`` (n, n) is the irradiance by each projector pixel on the sensor without the mask [W m^-2]; a ``plane``
-        of None is the calibrated one.
-        """
+        """Return the frames of a family; ``flux`` (n, n) is each pixel's irradiance without the mask [W m^-2]."""
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
         optics = self._optics if plane is None else self._optics_at(plane)
         return ExpectedFrames([AccumulatedLight(optics, (light,))], family.lighting, seed=0)
@@ -332,7 +305,6 @@ class IdealCamera:
 
     @property
     def directions(self) -> tuple[Directions, Directions]:
-        """Directions of the projector's pixels, along rows and columns."""
         rows, columns = (Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows)
         return rows, columns
 
@@ -345,7 +317,7 @@ class IdealCamera:
 
 
 def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
-    """Return the lights that are compared, by name; None is light without diffraction."""
+    """Return the compared lights by name; None is light without diffraction."""
     edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
     return {
         GEOMETRIC: None,
@@ -358,10 +330,11 @@ def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
 def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> dict[str, str | int | float]:
     """Return relative rms differences of a mask in one ``light`` from its geometric shadow, among ``systems`` by light.
 
-    ``terms`` counts separable terms. ``point_source`` and ``scene_pixel`` are differences of operators, for point
-    sources at the centres of projector pixels and averaged over these pixels; ``factor`` is the difference of the
-    factor that a solver uses on one side. ``separability`` is the remainder of the operator without its best separable
-    term, and ``separability_centred`` the same after row and column means are subtracted.
+    ``point_source`` and ``scene_pixel`` are differences of operators, for points and averaged over projector pixels,
+    and
+    ``factor`` that of a solver's factor. ``separability`` is the remainder of the operator without its best
+    separable term,
+    ``separability_centred`` the same after row and column means are subtracted.
     """
     system, geometric = systems[light], systems[GEOMETRIC]
     factor, assumed = system.factors[0], geometric.factors[0]
@@ -381,7 +354,7 @@ def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> dict[str, str 
 
 
 def point_profiles(bench: Apparatus) -> dict[str, FloatArray]:
-    """Return the (pixels,) shadow of a point on the axis, down the rows behind the separable mask, by light."""
+    """Return the (pixels,) shadow of a point on the axis, by light."""
     camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
     return {
         name: best_term(shadow_terms(camera, axis, axis, camera.scene_distance, spectrum)).left[:, 0]

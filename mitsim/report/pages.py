@@ -1,7 +1,4 @@
-"""Parts of HTML pages: templates, numbers as text, plans as bars, and pictures of numbers.
-
-Processes that measure points import this module, and load neither templates nor figures.
-"""
+"""Parts of HTML pages: templates, numbers as text, plans as bars, and pictures of numbers."""
 
 from __future__ import annotations
 
@@ -41,7 +38,6 @@ def render_page(template: str, **shown: Any) -> str:
 
 @cache
 def _environment() -> Environment:
-    """Return the templates' environment, kept for the next page because compiling takes longer than filling."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("mitsim.report")
@@ -54,10 +50,7 @@ def _environment() -> Environment:
 
 
 def page_figure(figure: Figure) -> tuple[str, int]:
-    """Return a figure as the data URI of an SVG, and its width on a page [pixels].
-
-    An SVG is sharp at any size and has a third of a PNG's bytes. The same figure gives the same bytes.
-    """
+    """Return a figure as the data URI of an SVG, the same bytes for the same figure, and its width [pixels]."""
     from matplotlib import rc_context
 
     with rc_context({"svg.hashsalt": "mitsim"}):  # names inside the file; without it they are random
@@ -71,13 +64,12 @@ DASH = "\N{EN DASH}"
 _SUPERSCRIPT = str.maketrans("+-0123456789", "⁺⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _TIMES = "\N{MULTIPLICATION SIGN}"
 _POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?\d+)(?![\w.]\w)")
-"""A number such as 4.9e-03 that is no part of a name or of a longer number."""
 _SIZE = re.compile(r"(?<![\w:.])(\d+(?:\.\d+)?)( ?)x\2(?=\d+(?:\.\d+)?(?![\w:]))")
 """512 x 512 and 3x3, but not dots:7x16."""
 
 
 def scientific(value: float | None) -> str:
-    """Print three digits, or two and a power of ten below 0.01 and from 10,000 on; None is a dash."""
+    """Print three digits, or two and a power of ten below 0.01 and from 10,000; None is a dash."""
     if value is None or value == 0.0:
         return DASH if value is None else "0"
     if 1e-2 <= abs(value) < 1e4:
@@ -86,12 +78,11 @@ def scientific(value: float | None) -> str:
 
 
 def duration(value: float) -> str:
-    """Print seconds in three digits."""
     return f"{value:.2f} s" if value < 10 else f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
 
 
 def round_to_error(value: float, error: float) -> str:
-    """Print a number to the second digit of its standard error, or five digits where the error is 0 or not finite."""
+    """Print a number to the second digit of its standard error, else five digits."""
     if not (error > 0 and math.isfinite(error) and math.isfinite(value)):
         return f"{value:.5g}"
     places = 1 - math.floor(math.log10(error))
@@ -99,17 +90,16 @@ def round_to_error(value: float, error: float) -> str:
 
 
 def reflectance(value: float) -> str:
-    """Print an error in reflectance in four places, because all are below 1 and few are below 0.001."""
+    """Print an error in reflectance in four places."""
     return f"{value:.4f}" if value >= 1e-3 else scientific(value)
 
 
 def sentence(text: str) -> str:
-    """Turn a warning of the command line into a sentence with a capital and a full stop."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 def typeset(text: str) -> str:
-    """Replace 4.9e-03 by a power of ten, 4.9e-02 by 0.049, +- by one sign, x in sizes by a times sign and um by µm."""
+    """Replace 4.9e-03 by a power of ten, +- and x in sizes by signs, and um by µm."""
     text = _POWER.sub(_power, text).replace("+-", "\N{PLUS-MINUS SIGN}")
     text = _SIZE.sub(rf"\1\2{_TIMES}\2", text)
     return re.sub(r"(?<=[\d\[(] )um\b|(?<=[\[(/])um\b", "\N{GREEK SMALL LETTER MU}m", text)
@@ -128,12 +118,12 @@ def _power(found: re.Match[str]) -> str:
 # -------- Plans, times and plain data on a page
 
 _LEAST_STAGE = 0.01
-"""Part of the total time below which a stage has no line of its own: its bar would be three pixels wide."""
+"""Part of the total time below which a stage has no line of its own."""
 _MOST_LISTED = 6
 
 
 def plan_rows(plan: Mapping[str, Any] | None) -> tuple[PlanRow, ...]:
-    """Return the rows of a ``plan`` from a manifest, without rows that other programs wrote in another form."""
+    """Return the rows of a ``plan`` that have mitsim's own form."""
     listed = (plan or {}).get("effects")
     rows = []
     for each in listed if isinstance(listed, list) else ():
@@ -150,7 +140,7 @@ def plan_rows(plan: Mapping[str, Any] | None) -> tuple[PlanRow, ...]:
 
 
 def stages_of(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Return the seconds of each stage that takes a visible part of the total, and the rest as "all else"."""
+    """Return the seconds of each visible stage, and the rest as "all else"."""
     total, stages = total_of(seconds), {name: value for name, value in seconds.items() if name != "total"}
     shown = {name: value for name, value in stages.items() if value >= _LEAST_STAGE * total}
     rest = total - math.fsum(shown.values())
@@ -158,12 +148,12 @@ def stages_of(seconds: Mapping[str, float]) -> dict[str, float]:
 
 
 def total_of(seconds: Mapping[str, float]) -> float:
-    """Return the total of ``seconds`` by stage, stated or added up."""
+    """Return the total of ``seconds``, stated or added up."""
     return seconds.get("total", math.fsum(seconds.values()))
 
 
 def lines_of(data: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Flatten JSON ``data`` to lines of a table, by dotted name, without long lists and missing values."""
+    """Flatten JSON ``data`` to lines by dotted name, without long lists and missing values."""
     lines: dict[str, str] = {}
     for key, value in data.items():
         name = f"{prefix}{key}"
@@ -187,18 +177,17 @@ def _text(value: Any) -> str:
 # -------- Pictures of numbers, which state what black and white are
 
 SMALLEST, LARGEST = 512, 1024
-"""Pixels a side of a picture: an image of 128 is shown four times as large, and 1024 fill a page in one dot each."""
 _MOST_FRAMES = 64
 _MOST_READ = _MOST_FRAMES << 18
-"""Pixels that are read for a contact sheet: 64 frames of 512 x 512 take 0.3 s, and larger frames are fewer."""
+"""Pixels that are read for a contact sheet, which takes 0.3 s."""
 _LONGEST = 4
-"""Largest ratio of rows to columns of a contact sheet, and of columns to rows, that fits a page."""
+"""Largest ratio of the sides of a contact sheet."""
 _GAP = 2
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Numbers, in a ``unit``, that are black and white in a picture."""
+    """Black and white ends of a picture in a ``unit``."""
 
     black: float
     white: float
@@ -206,11 +195,11 @@ class Scale:
 
     @classmethod
     def of(cls, values: npt.ArrayLike, unit: str, black: float | None = None) -> Scale:
-        """Scale numbers from ``black``, by default the least of ``values``, to the largest of them."""
+        """Scale from ``black``, by default the least of ``values``, to the largest."""
         return cls(float(np.min(values)) if black is None else black, float(np.max(values)), unit)
 
     def levels(self, values: npt.NDArray[Any]) -> FloatArray:
-        """Return ``values`` with black at 0 and white at 1; all black where the ends are equal."""
+        """Return ``values`` with black at 0 and white at 1; all black if both are equal."""
         span = self.white - self.black
         return (np.asarray(values, dtype=np.float64) - self.black) / (span if span > 0 else np.inf)
 
@@ -227,7 +216,7 @@ REFLECTANCE = Scale(0.0, 1.0, "of the board's reflectance")
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG with the ``name`` of its file, a title and a caption; a ``wide`` one takes the whole width of a page."""
+    """A PNG with file name, title and caption; a ``wide`` one fills a page's width."""
 
     name: str
     title: str
@@ -239,38 +228,32 @@ class Picture:
     def of(
         cls, name: str, title: str, values: npt.NDArray[Any], scale: Scale, about: str = "", wide: bool = False
     ) -> Picture:
-        """Draw numbers (rows, columns), enlarged or reduced by whole factors, with ``about`` and the scale below."""
+        """Draw numbers (rows, columns), enlarged or reduced by whole factors."""
         words = scale.words(values)
         caption = f"{about}: {words}" if about else words
         return cls(name, title, caption, png(scale.levels(values), LARGEST, SMALLEST), wide)
 
     @property
     def uri(self) -> str:
-        """The PNG as a data URI."""
         return data_uri(self.data)
 
     def write(self, folder: Path) -> Path:
-        """Write the PNG to a ``folder``, whole or not at all, and return its path."""
+        """Write the PNG to a ``folder``, whole or not at all."""
         path = folder / f"{self.name}.png"
         write_bytes(path, self.data)
         return path
 
 
 def write_beside(path: Path, values: npt.NDArray[Any], unit: str) -> tuple[Path, str]:
-    """Write a picture beside a frame's file, as ``FRAME.exr.png``, and return its path and caption."""
+    """Write FRAME.exr.png beside a frame's file, and return its path and caption."""
     picture = Picture.of(path.name, path.name, values, Scale.of(values, unit))
     return picture.write(path.parent), picture.caption
 
 
 def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[int, int], columns: int) -> Picture:
-    """Draw all frames of a capture side by side, or as many of them, evenly taken, as fit a page.
+    """Draw ``count`` frames of a ``shape`` side by side, or as many, evenly taken, as fit a page.
 
-    Parameters
-    ----------
-    read
-        Returns frame number i less the black level, (rows, columns) [DN].
-    count, shape, columns
-        Number of frames, (rows, columns) of each, and frames a row as the patterns have them.
+    ``read`` returns frame i less the black level [DN].
     """
     most = max(1, min(_MOST_FRAMES, _MOST_READ // (shape[0] * shape[1])))
     chosen = [number * count // most for number in range(most)] if count > most else [*range(count)]
@@ -303,11 +286,10 @@ def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[in
 
 Value = str | int | float | bool | None
 _SEEN = 0.05
-"""Error from which one place shows it: less would be 0.0, which is no error."""
 
 
 class Mean(NamedTuple):
-    """A mean, its standard error (NaN of a single value), and how many values it is of."""
+    """A mean, its standard error (NaN of a single value), and the number of values."""
 
     value: float
     error: float
@@ -317,7 +299,7 @@ class Mean(NamedTuple):
         return format(self)
 
     def __format__(self, sign: str) -> str:
-        """Print the mean with its error; ``sign`` is "+" for a number that always shows its sign."""
+        """Print the mean with its error; ``sign`` "+" always shows its sign."""
         if math.isnan(self.error):
             return f"{self.value:{sign}.1f}"
         places = 1 if self.error >= _SEEN else 2
@@ -325,7 +307,7 @@ class Mean(NamedTuple):
 
     @classmethod
     def of_numbers(cls, numbers: Sequence[float], what: str) -> Mean:
-        """Return the mean of independent ``numbers``; MitsimError that names ``what`` if there are none."""
+        """Return the mean of independent ``numbers``; MitsimError that names ``what`` without any."""
         if not numbers:
             raise MitsimError(f"study: nothing was measured of {what}")
         array = np.array(numbers)

@@ -1,6 +1,6 @@
-"""Matplotlib figures with one message each and units on every axis.
+"""Matplotlib figures with one message each, units on every axis, and colours for the colour-blind.
 
-Colours are safe for the colour-blind. The caller saves the figure, and no state of pyplot is touched.
+The caller saves the figure, and no state of pyplot is touched.
 """
 
 from __future__ import annotations
@@ -37,33 +37,24 @@ SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
 _PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 _GRID, LINK, GREY, PALE = "#e5e7eb", "#d1d5db", "#6b7280", "#c7d2de"
-"""Colours of grid lines, lines between data, lines beside data, and bars for comparison."""
 FONT = 11.0
-"""Points: as large as the text of a page that is :data:`WIDTH` inches wide."""
 WIDTH = 8.6
 COLUMN = 4.65
-"""Inches of a figure of curves: two fit a page side by side, and one fits a telephone with letters of 12 pixels."""
+"""Inches of a figure of curves, of which two fit a page side by side."""
 _BARS = 6.2
-"""Inches of a figure of bars with their names, which fits a telephone with letters of 10 pixels."""
 _PANEL = 2.3
 _CELL = 1.5
-"""Largest size [inches] of an image in a grid: six fit a page."""
 _LABEL = 1.1
-"""Inches beside a grid for the names of its rows."""
 _CAPTION = 0.32
-"""Inches of a row for the captions below its images."""
 _LETTER = 0.085
 """Mean width of a letter [inches]."""
 _HANDLE = 0.6
-"""Inches of a line in a legend, and of the space beside its name."""
 ROW = 0.27
-"""Inches of a row of bars: a line of text, and a third of a line between two."""
+"""Inches of a row of bars."""
 _NAME_LETTERS = 34
-"""Letters in a line of a bar's name, which leave half of the figure to the bars."""
 _UPRIGHT_LETTERS, TITLE_LETTERS = 26, 46
-"""Letters in a line beside and above a panel of curves."""
 LOGARITHMIC = 30.0
-"""Ratio of the largest to the least value from which an axis is logarithmic."""
+"""Ratio of largest to least value from which an axis is logarithmic."""
 Curve = Mapping[Any, Mean]
 """Means by what varies: numbers, or their text."""
 Point = tuple[float, float]
@@ -83,20 +74,13 @@ def curves(
 ) -> Figure:
     """Draw curves with bars of one standard error, in panels below each other on one scale.
 
-    Panels with fewer than two places along x are left out; a figure without panels is empty (:func:`tells`).
-
-    Parameters
-    ----------
-    panels
-        Curves by name, by the panels' titles. A curve without a name is not in the legend.
-    log
-        True for a logarithmic x axis even where the numbers span less than :func:`spans_decades` asks for.
-    ticks
-        True for a tick at every x that was measured, as far as there is room.
+    Panels with fewer than two places along x are left out. A curve without a name is not in the legend. ``log``
+    forces a
+    logarithmic x axis, and ``ticks`` sets one at every measured x that has room.
     """
 
     def points(curve: Curve) -> FloatArray:
-        """Return (points, 3) numbers, finite means and standard errors of a ``curve``, sorted."""
+        """Return (points, 3) numbers, finite means and standard errors, sorted."""
         found = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
         rows = np.array(found, dtype=np.float64).reshape(-1, 3)
         return rows[np.isfinite(rows[:, :2]).all(axis=1)]
@@ -134,13 +118,13 @@ def curves(
 
 
 def spans_decades(values: Iterable[float]) -> bool:
-    """Return True if all ``values`` are positive and span a factor of :data:`LOGARITHMIC` at least."""
+    """Return True if all ``values`` are positive and span a factor of :data:`LOGARITHMIC`."""
     found = np.array(list(values), dtype=np.float64)
     return bool(found.size and found.min() > 0 and found.max() >= LOGARITHMIC * found.min())
 
 
 def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
-    """Set ticks along x at the ``numbers``, in ascending order, whose labels do not overlap."""
+    """Set ticks at ascending ``numbers`` whose labels do not overlap."""
     logarithmic = axes.get_xscale() == "log"
     places = np.log(numbers) if logarithmic else np.asarray(numbers, dtype=np.float64)
     inches = (places - places[0]) / np.ptp(places) * (COLUMN - 1.2)
@@ -156,7 +140,7 @@ def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
 
 
 def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
-    """Draw (n, n) images [reflectance] with captions below, by the rows' names, cut to 0..1 for display only."""
+    """Draw (n, n) images [reflectance] with captions by the rows' names, cut to 0..1."""
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
     inches = (size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL
     figure, cells = panels_of(len(rows), len(columns), *inches, layout="compressed")
@@ -181,16 +165,9 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
 
 
 def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = "", ordered: bool = False) -> Figure:
-    """Draw horizontal bars with one standard error: a group for each name, a bar for each kind, its number behind it.
+    """Draw horizontal bars with one standard error: a group for each name, a bar for each kind.
 
-    Parameters
-    ----------
-    groups
-        Means by kind, by the groups' names, the first on top; a group may lack kinds.
-    x, title
-        Name of the axis with its unit, and title.
-    ordered
-        True to put the group with the largest first mean on top.
+    With ``ordered``, the group with the largest first mean is on top.
     """
     kinds = list(dict.fromkeys(kind for bars in groups.values() for kind in bars))
     if ordered:
@@ -219,7 +196,7 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
 
 
 def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
-    """Draw the singular values of each family's system, relative to the largest, over their rank in percent."""
+    """Draw the singular values of each system, relative to the largest, over their rank."""
     figure, axes = figure_of(0.42 * WIDTH)
     for index, (name, values) in enumerate(curves.items()):
         ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
@@ -237,19 +214,7 @@ def error_bars(
     bounds: Mapping[str, float] | None = None,
     axes: Axes | None = None,
 ) -> Figure:
-    """Draw relative errors on a logarithmic axis, the largest on top, with the numbers beside the axes.
-
-    Parameters
-    ----------
-    errors
-        Errors >= 0 by name; an error of 0 has no dot.
-    limit
-        Accuracy that was asked for.
-    bounds
-        Upper bounds at some confidence by name, drawn as thin lines.
-    axes
-        Axes to draw on; None for those of a new figure.
-    """
+    """Draw relative errors on a logarithmic axis, the largest on top, with ``bounds`` as thin lines; 0 has no dot."""
     ordered = sorted(errors.items(), key=lambda item: item[1])
     if axes is None:
         figure, axes = figure_of(0.7 + 0.36 * len(ordered))
@@ -294,23 +259,21 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 
 
 def _rows_height(names: Iterable[str]) -> float:
-    """Return the height [inches] of rows of bars, all as high as the name with the most lines."""
+    """Return the height [inches] of rows of bars."""
     lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in names]
     return ROW * len(lines) * (1 + 0.6 * (max(lines, default=1) - 1))
 
 
 def _bar_errors(errors: FloatArray) -> FloatArray | None:
-    """Return the errors, or None where no error is known, so that no bar of zero is drawn."""
     return None if np.isnan(errors).all() else errors
 
 
 def line_style(index: int) -> dict[str, Any]:
-    """Return colour and dashes of curve number ``index``."""
     return {"color": _PALETTE[index % len(_PALETTE)], "ls": _STYLES[index % len(_STYLES)]}
 
 
 def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both") -> None:
-    """Set the names of the axes with units, where given, and a grid behind the data."""
+    """Set names of the axes with units, and a grid behind the data."""
     if x:
         axes.set_xlabel(x, fontsize=FONT)
     if y:
@@ -320,7 +283,7 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
 
 
 def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
-    """Draw a legend below a figure, in as many columns as fit its width; without labels there is none."""
+    """Draw a legend below a figure, in as many columns as fit its width."""
     names = list(labels)
     if not names:
         return
@@ -330,7 +293,7 @@ def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
 
 
 def tells(figure: Figure) -> bool:
-    """Return True if a figure shows an image, or two points or bars; lines across all of the axes do not count."""
+    """Return True if a figure shows an image, or two points or bars."""
     for axes in figure.axes:
         if axes.images or any(
             isinstance(each, PolyCollection) or len(each.get_offsets()) > 1 for each in axes.collections
@@ -354,7 +317,7 @@ def figure_of(
 ) -> tuple[Figure, Axes]:
     """Return an empty figure [inches] with its own Agg canvas and one axes.
 
-    The layout "compressed" leaves space around an image of fixed aspect, whose labels "constrained" would cut off.
+    The layout "compressed" leaves space around an image of fixed aspect.
     """
     figure, places = panels_of(1, 1, height, width, layout)
     axes: Axes = places[0, 0]
@@ -369,7 +332,7 @@ def panels_of(
     layout: Literal["constrained", "compressed"] = "constrained",
     **shared: Any,
 ) -> tuple[Figure, Any]:
-    """Return an empty figure with (rows, columns) axes; ``shared`` are options of matplotlib's ``subplots``."""
+    """Return an empty figure with (rows, columns) axes."""
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     places: Any = figure.subplots(rows, columns, squeeze=False, **shared)
@@ -385,9 +348,9 @@ def panels_of(
 def draw_shot(
     shots: Capture, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None
 ) -> Axes:
-    """Draw a frame of a capture in digital numbers or expected electrons, or its truth, and return the axes.
+    """Draw a frame of a capture in digital numbers or expected electrons, or its truth.
 
-    MitsimError for a shot that does not exist, and for a quantity that a real camera does not know.
+    Raises MitsimError for a shot that does not exist, and for a quantity that a real camera does not know.
     """
     name = shots.manifest.patterns.family or "patterns"
     if quantity == "truth":
@@ -407,20 +370,20 @@ def draw_shot(
 
 
 def draw_sensed(sensed: Sensed, ax: Axes | None = None) -> Axes:
-    """Draw the digital numbers of a ``sensed`` frame, and return the axes."""
+    """Draw the digital numbers of a ``sensed`` frame."""
     title = f"{sensed.sensor.name}, exposure {sensed.exposure_s:.3g} s"
     return _draw(ax, sensed.digital, title, "digital number [DN]")
 
 
 def draw_rendered(rendered: Rendered, ax: Axes | None = None) -> Axes:
-    """Draw the irradiance of a ``rendered`` frame, the mean of its channels, and return the axes."""
+    """Draw the irradiance of a ``rendered`` frame, the mean of its channels."""
     channels = rendered.mean.shape[2]
     title = f"{rendered.facts['estimator']} estimator" + (f", mean of {channels} channels" if channels > 1 else "")
     return _draw(ax, rendered.mean.mean(axis=2), title, "irradiance [W/m$^2$]")
 
 
 def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
-    """Draw the factor of a camera's rows (``left``) or columns (``right``), and return the axes."""
+    """Draw the factor of a camera's rows (``left``) or columns (``right``)."""
     line = "row" if side == "left" else "column"
     title = f"{side.capitalize()} factor, of {line}s"
     axes = _draw(ax, getattr(factors, side), title, r"entry [$\sqrt{\mathrm{e^-/s}}$]")
@@ -431,10 +394,7 @@ def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: A
 def draw_image(
     image: Reconstruction, quantity: Literal["image", "uncertainty", "depth"] = "image", ax: Axes | None = None
 ) -> Axes:
-    """Draw a recovered image, its standard uncertainty, or its depths, and return the axes.
-
-    MitsimError for an uncertainty or depths that are not known.
-    """
+    """Draw a recovered image, its standard uncertainty, or its depths; MitsimError where they are not known."""
     board = "reflectance, 1 = board"
     if quantity == "image":
         unit, title = "light [electrons/s]" if "psf" in image.inputs else board, f"Image: {image.status.verdict.value}"
@@ -449,7 +409,7 @@ def draw_image(
 
 
 def draw_plan(plan: Plan, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
-    """Draw the relative error that each effect would leave if it were off, or the predicted seconds of each stage."""
+    """Draw the relative error that each effect would leave if it were off, or the predicted seconds."""
     if quantity == "error":
         errors = {f"{row.name} ({row.state})": row.error_if_off for row in plan.effects if row.error_if_off is not None}
         axes = _axes(ax, 0.7 + 0.36 * len(errors))
@@ -468,7 +428,6 @@ def draw_plan(plan: Plan, quantity: Literal["error", "seconds"] = "error", ax: A
 
 
 def _axes(ax: Axes | None, height: float = 0.5 * WIDTH, width: float = 0.7 * WIDTH) -> Axes:
-    """Return ``ax``, or the axes of a new figure of pyplot, which notebooks show [inches]."""
     if ax is not None:
         return ax
     from matplotlib import pyplot
@@ -485,7 +444,7 @@ def _draw(
     white: float | None = None,
     cmap: str = "gray",
 ) -> Axes:
-    """Draw numbers (rows, columns) in equal steps, or, where ``white`` is given, as a screen shows reflectances."""
+    """Draw numbers in equal steps, or reflectances as a screen shows them where ``white`` is given."""
     shown, axes = np.asarray(values, dtype=np.float64), _axes(ax)
     style: dict[str, Any] = {"cmap": cmap, "interpolation": "none"}
     extend, scale = "neither", "linear"

@@ -1,7 +1,6 @@
 """Images of a run's spectral lines from the folders RUN and CAL, compared with the truth where there is one.
 
-A run has one unnamed line, a folder for each line, or frames of all lines behind colour filters. :func:`reconstruct`
-makes the image of one line, :func:`reconstruct_colours` the images of several lines and one image in colour.
+A run has one unnamed line, a folder for each line, or frames of all lines behind colour filters.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ from mitsim.report.folder_page import report_folder
 
 @dataclass(frozen=True)
 class Judged:
-    """A reconstruction, the folder that holds it, and its quality against the truth (None for a real camera)."""
+    """A reconstruction, its folder, and its quality against the truth (None for a real camera)."""
 
     reconstruction: Reconstruction
     quality: Quality | None
@@ -71,7 +70,7 @@ class Judged:
     truth: FloatArray | None = None
 
     def summary(self) -> dict[str, Any]:
-        """Return all but the images, by the keys of the command line's JSON."""
+        """Return all but the images, by the keys of the JSON."""
         return {**summary_of(self.quality), **self.reconstruction.summary(), "output": self.output}
 
 
@@ -86,16 +85,8 @@ def reconstruct(
 ) -> Judged:
     """Recover the image of a run with a calibration, and write image.exr, image.png and result.json.
 
-    Parameters
-    ----------
-    run, calibration, output
-        RUN and CAL folders, and one for the image: new or empty, or with an earlier image of the same inputs.
-    lam, **options
-        As for :class:`mitsim.reconstruct.request.ImageRequest`.
-    overwrite
-        Whether an earlier image of other inputs may be replaced.
-    job
-        Clock of the work.
+    ``output`` is a new or empty folder, or one with an earlier image of the same inputs (of other inputs with
+    ``overwrite``). ``lam`` and ``options`` are those of :class:`mitsim.reconstruct.request.ImageRequest`.
 
     Raises
     ------
@@ -130,14 +121,9 @@ def reconstruct_psf(
 ) -> Judged:
     """Recover the image of a run with a measured point spread function, and write the files of :func:`reconstruct`.
 
-    Parameters
-    ----------
-    psf
-        Picture of the light of a scene point.
-    reduce
-        Pixels a side, of frames and picture, that become one.
-    run, output, overwrite, job, **options
-        As for :func:`reconstruct`; the options are ``lam``, ``method``, ``bounds`` and ``iterations``.
+    ``psf`` is a picture of the light of a scene point. ``reduce`` x ``reduce`` pixels of frames and picture become
+    one. The
+    ``options`` are ``lam``, ``method``, ``bounds`` and ``iterations``.
     """
     from mitsim.reconstruct.point_spread_image import psf_inputs, reconstruct_psf_request
 
@@ -152,7 +138,7 @@ def reconstruct_psf(
 
 
 def _origin(job: Job | None, run: Path | str, calibration: Path | str | None = None) -> dict[str, Any]:
-    """Return entries of result.json that say where an image comes from: the command and the folders."""
+    """Return entries of result.json for the command and the folders."""
     folders = {"run": run, "calibration": calibration}
     made_of = {name: str(Path(folder).absolute()) for name, folder in folders.items() if folder is not None}
     return {"command": job and job.command, MADE_OF: made_of}
@@ -215,7 +201,7 @@ def reconstruct_colours(
 
 
 class _Work(NamedTuple):
-    """Folders of a coloured image, the ``board`` that it is relative to, and the place of a chart in it."""
+    """Folders of a coloured image, its ``board``, and the place of a chart."""
 
     lines: ColourManifest
     run: Path
@@ -227,7 +213,7 @@ class _Work(NamedTuple):
     job: Job
 
     def finish(self, folder: Path, **found: Any) -> ColourImage:
-        """Combine the images of all lines to one in colour, and write it to ``folder``."""
+        """Combine the images of all lines to one in colour, and write it."""
         known: dict[str, Any] = {
             "lines": self.lines,
             "board": self.board or 1.0,
@@ -240,7 +226,7 @@ class _Work(NamedTuple):
 
 
 def _solve_one_by_one(work: _Work, **options: Any) -> ColourImage:
-    """Solve each line of a run by itself, in a folder of its own, and write the image in colour."""
+    """Solve each line of a run in a folder of its own, and write the image in colour."""
     lines, run, calibration, output, _, _, overwrite, job = work
     replaces = is_coloured(output) and (read_colours(output, IMAGE).names == lines.names or overwrite)
     with output_folder(output, overwrite=replaces) as folder:
@@ -280,7 +266,7 @@ def _solve_one_by_one(work: _Work, **options: Any) -> ColourImage:
 
 @single_threaded_blas()
 def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> ColourImage:
-    """Solve all lines from the same frames, which were seen through colour filters, and write the image in colour."""
+    """Solve all lines from frames behind colour filters, and write the image in colour."""
     lines, run, calibration, output, board, _, overwrite, job = work
     check_joint(lam)
     check_way(way)
@@ -362,9 +348,9 @@ def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> Colou
 
 
 def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
-    """Combine the ``statuses`` of a run's lines, by name, to one warning; return none where all lines are usable.
+    """Combine the ``statuses`` of lines to one warning; return none where all are usable.
 
-    Each verdict has the sentence of the first line with that verdict, and each flag appears once.
+    Each verdict has the sentence of its first line, and each flag appears once.
     """
     flagged = {name: status for name, status in statuses.items() if not status.ok}
     parts = []
@@ -396,10 +382,11 @@ Lambda = float | Literal["auto"]
 
 @dataclass(frozen=True, eq=False)
 class MosaicCamera:
-    """A camera under a ``mosaic`` of 2 x 2 colour filters, such as ``RGGB``.
+    """A camera under a ``mosaic`` of 2 x 2 colour filters.
 
-    ``lefts`` (lines, m, n) and ``rights`` (lines, m', n') are the factors of each line for pixels without filters, and
-    ``weights`` (4, lines) the responses of the four pixels to each line.
+    ``lefts`` (lines, m, n) and ``rights`` (lines, m', n') are factors without filters, ``weights`` (4, lines) the
+    responses
+    of the four pixels.
     """
 
     lefts: FloatArray
@@ -409,7 +396,6 @@ class MosaicCamera:
 
     @classmethod
     def of(cls, factors: Sequence[tuple[FloatArray, FloatArray]], weights: FloatArray, mosaic: str) -> MosaicCamera:
-        """Stack the (left, right) ``factors`` of all lines."""
         lefts, rights = (np.stack(side) for side in zip(*factors, strict=True))
         return cls(lefts, rights, weights, mosaic)
 
@@ -418,8 +404,9 @@ class MosaicCamera:
 class LineImages:
     """Images (lines, n, n') of all lines by one way.
 
-    ``lam`` is the lambda of the joint solve, or the geometric mean of the planes' or channels'. ``residual`` is ||Y -
-    model|| / ||Y|| over all frames, as planes or channels were solved. ``joint`` is the joint solution.
+    ``lam`` is that of the joint solve, or the geometric mean of the planes' or channels'. ``residual`` is ||Y -
+    model|| /
+    ||Y|| over all frames.
     """
 
     images: FloatArray
@@ -431,8 +418,7 @@ class LineImages:
 class Solver:
     """Images of all lines from frames behind a camera's filters, by one of the ways.
 
-    Each plane, or channel of demosaiced frames, is solved by itself. The joint way adds one model of all lines, and
-    needs the planes for lambda alone. Patterns are the columns P_L (n, K) and P_R (n', K').
+    Patterns are the columns P_L (n, K) and P_R (n', K'). The joint way needs the planes for lambda alone.
     """
 
     def __init__(self, way: str, camera: MosaicCamera, patterns: Patterns) -> None:
@@ -465,7 +451,7 @@ class Solver:
         self._sums = [model.accumulator() for model in self._models]
 
     def add(self, frame: FloatArray, row: int, column: int) -> None:
-        """Add the (m, m') ``frame`` [electrons/s] that was measured under pattern (``row``, ``column``)."""
+        """Add the (m, m') ``frame`` [electrons/s] of pattern (``row``, ``column``)."""
         if self._joint:
             self._gathered += self._joint.gather(frame, row, column)
         if self._mosaic:
@@ -476,13 +462,7 @@ class Solver:
             total.add(part, row, column)
 
     def images(self, lam: Lambda, relative: bool = False) -> LineImages:
-        """Solve for the images of all lines.
-
-        Parameters
-        ----------
-        lam, relative
-            Lambda: a number, ``relative`` to the largest sigma^2 where asked for, or ``auto``.
-        """
+        """Solve for all lines; a number ``lam`` may be ``relative`` to the largest sigma^2."""
         pairs = [*zip(self._models, self._sums, strict=True)]
         energy = sum(total.energy for total in self._sums)
         if isinstance(lam, str):
@@ -503,10 +483,7 @@ class Solver:
 
 
 def demosaic(frame: FloatArray, mosaic: str) -> FloatArray:
-    """Return the (m, m', 3) red, green and blue of a ``frame`` (m, m') behind a ``mosaic`` (Menon and others 2007).
-
-    MitsimError without colour-demosaicing.
-    """
+    """Return the (m, m', 3) colours of a ``frame`` (Menon and others 2007); MitsimError without colour-demosaicing."""
     check_way(DEMOSAIC)
     from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007
 
@@ -514,6 +491,5 @@ def demosaic(frame: FloatArray, mosaic: str) -> FloatArray:
 
 
 def _geometric(values: Sequence[float]) -> float:
-    """Return the geometric mean; 0 where one value is 0."""
     logs = np.log(values) if all(value > 0 for value in values) else -np.inf
     return float(np.exp(np.mean(logs)))

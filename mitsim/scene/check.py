@@ -1,9 +1,9 @@
 """Checks of a scene file before Mitsuba makes objects of it.
 
 Making objects can run native code and read any file, and Mitsuba accepts NaN, negative light or a reflectance of 2
-without a word. Therefore :mod:`mitsim.scene.outline` checks the bytes, ``mitsuba.parser`` parses them (it loads no
-plugin and needs no variant), and the resulting tree is checked here: ``limits`` has the plugins and numbers,
-``headers`` the files. :func:`mitsim.scene.load.load_scene` makes objects of the same tree.
+silently. Therefore :mod:`mitsim.scene.outline` checks the bytes, ``mitsuba.parser`` parses them without plugins, and
+the
+tree is checked here with the ``limits`` of numbers and the ``headers`` of files.
 """
 
 from __future__ import annotations
@@ -29,9 +29,8 @@ from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Ta
 _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")
 _LARGEST_MATERIAL = 256
-"""Objects of one BSDF, because all of them are compiled into every kernel; shipped materials have up to 4."""
+"""Largest number of objects of one BSDF, because all are compiled into every kernel."""
 _COLOURED = ("blackbody", "d65", "irregular", "mesh_attribute", "mitsim_glass", "mitsim_grating", "regular")
-"""Plugins whose light or reflectance may depend on wavelength."""
 _PARTING = "mitsim_glass"
 """Material with a dispersive index."""
 _ON_SHAPES = ("area", "mitsim_projector")
@@ -46,9 +45,7 @@ _PLACES = {
     **dict.fromkeys(("radius", "scene_distance"), (("Float", "Integer"), "a <float>")),
     **dict.fromkeys(("face_normals", "flip_normals"), (("Bool",), "a <boolean>")),
 }
-"""Property types and tags of positions and sizes that mitsim reads before Mitsuba does."""
 PREPARED = PICTURE, _ = "picture", "object"
-"""Parameters whose files mitsim prepares if a user names them."""
 _Type = mi.Properties.Type
 
 
@@ -61,17 +58,13 @@ class CheckedScene:
     files
         Files that it reads, the scene first.
     limits
-        Allowed ranges of bitmaps and mesh attributes, by name of parameter, file or attribute.
+        Allowed ranges of bitmaps and mesh attributes by name.
     unfit
         Estimators that must refuse the scene.
     shapes, small_lamps
-        Tags of shapes, and of lamps that no path can hit, in the scene's order.
+        Tags of shapes, and of lamps that no path can hit, in order.
     coloured, parting
         Tags of objects that may depend on wavelength, and of dispersive glass.
-    samples
-        ``sample_count`` of the camera's sampler, or None.
-    without_normals
-        Names of mesh files without vertex normals.
     own
         Paths of files that a user names and mitsim prepares, with their parameters.
     unread
@@ -97,18 +90,9 @@ class CheckedScene:
 def check_file(
     path: Path, defines: Mapping[str, str], outside: bool = False, variant: str | None = None
 ) -> CheckedScene:
-    """Read and check a scene.
+    """Read and check a scene, with ``defines`` instead of the values of ``<default>``.
 
-    Parameters
-    ----------
-    path
-        Scene XML. Includes, bitmaps, meshes and spectra must be in its folder.
-    defines
-        Values of parameters by name, which replace those of ``<default>``.
-    outside
-        Allow files outside the scene's folder.
-    variant
-        Variant of Mitsuba in which objects will be made; None for any.
+    Files have to be in the scene's folder unless ``outside``. Objects will be made in ``variant`` (None: any).
 
     Raises
     ------
@@ -136,7 +120,7 @@ def check_file(
 
 @contextmanager
 def looking_beside(outline: Outline) -> Iterator[None]:
-    """Let Mitsuba find files in the scene's folder; turn its errors into MitsimError of one line."""
+    """Let Mitsuba find files in the scene's folder; turn its errors into MitsimError."""
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
     beside.prepend(mi.filesystem.path(str(outline.path.parent)))
@@ -151,7 +135,7 @@ def looking_beside(outline: Outline) -> Iterator[None]:
 
 @dataclass
 class _Tree:
-    """Copies of the tree's nodes, because Mitsuba marks a property that is read as used."""
+    """Copies of the tree's nodes, because Mitsuba marks a property that is read."""
 
     outline: Outline
     files: SceneFiles
@@ -235,7 +219,6 @@ class _Tree:
                 self.coloured.append(tag)
 
     def _check_texture(self, node: mi.parser.SceneNode, name: str, limit: Range) -> None:
-        """Apply the limits of the parameter ``name`` to the texture that is given for it."""
         plugin = node.props.plugin_name()
         if plugin in ("blackbody", "d65") and limit.high <= 1:
             raise self.outline.tag(node).refusal("type", repr(plugin), f"{name} is no light; give another texture")

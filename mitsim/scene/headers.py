@@ -22,11 +22,8 @@ from mitsim.core.errors import cut
 MOST_TEXELS = 1 << 25
 """An environment map of 8192 x 4096."""
 FARTHEST = 1e7
-"""Largest coordinate [mm]: single precision resolves 1 mm at 10 km."""
 _ORIENTATION = 274
-"""Exif tag of the orientation (JEITA CP-3451, 4.6.4); 1 is as stored."""
 _HEADER = 1 << 16
-"""Bytes in which a header must end; usual ones have some 500."""
 _GREY = ("1", "L", "LA", "I", "I;16")
 """Pillow's modes of pictures without colours."""
 _PLY_TYPES = {
@@ -36,7 +33,6 @@ _PLY_TYPES = {
 }  # fmt: skip
 """NumPy's type for each type in a header."""
 _CORNERS, _INDICES = "corner count", "corner indices"
-"""Field names of a triangle's list; no property has a blank in its name."""
 _LINE = re.compile(
     rb"f\s+(?P<face>(?:[1-9][0-9]{0,8}(?:/[0-9]{0,9}){0,2}(?:\s+|$)){3,})(?:#.*)?|"
     rb"v\s+(?P<vertex>\S+\s+\S+\s+\S+)(?:\s[^\r]*)?|(?P<normal>vn)\s[^\r]*|(?:mtllib|usemtl)\s+(?P<material>[^\r]*)|#[^\r]*|"
@@ -44,15 +40,13 @@ _LINE = re.compile(
 )
 """Lines of Wavefront files that are read or ignored; free-form surfaces are refused (Wavefront, "Object Files")."""
 _TURNED, _BENT = 1e-3, 1e-2
-"""Part of a face's area by which one of its triangles may be turned over, because coordinates are rounded, and by which
-the triangles may exceed the face: 16 degrees between two of them.
+"""Parts of a face's area by which rounding may turn a triangle over, and triangles may exceed it (16 degrees).
 """
 _MOST_TEXT = 64 << 20
-"""Bytes of a text whose words, some ten million Python objects, stay below 1 GiB."""
 
 
 def check_image(path: Path) -> tuple[int, bool]:
-    """Return the number of texels of a PNG, JPEG, OpenEXR, Radiance or PFM image, and True if it has no colours."""
+    """Return the number of texels of an image, and True if it has no colours."""
     with open(path, "rb") as file:
         start = file.read(_HEADER)
     if start.startswith(exr.MAGIC):
@@ -75,14 +69,9 @@ def check_image(path: Path) -> tuple[int, bool]:
 
 
 def check_ply(path: Path) -> tuple[bool, str]:
-    """Check that ``path`` is a PLY mesh of triangles whose corners exist and lie within ``FARTHEST``.
+    """Check a PLY mesh, because Mitsuba would read beyond its arrays.
 
-    Mitsuba would read beyond its arrays. Further elements and properties are allowed in any order.
-
-    Returns
-    -------
-    tuple
-        True if vertices have normals, and the name of the texture, "" without.
+    Return True if vertices have normals, and the name of the texture, "" without.
     """
     with open(path, "rb") as file:
         start = file.read(_HEADER)
@@ -104,15 +93,11 @@ def check_ply(path: Path) -> tuple[bool, str]:
 
 
 def check_obj(path: Path) -> tuple[bool, str]:
-    """Check that ``path`` is a Wavefront mesh that Mitsuba reads correctly, with vertices within ``FARTHEST``.
+    """Check that Mitsuba reads a Wavefront mesh correctly.
 
-    Mitsuba drops continued lines, faces that it cannot read, and free-form surfaces. It covers every face by a fan of
-    triangles from its first corner, which overlap where the face is concave.
-
-    Returns
-    -------
-    tuple
-        True if any vertices have normals, and the name of the materials, "" without.
+    Mitsuba drops continued lines, faces that it cannot read, and free-form surfaces, and covers concave faces by a
+    fan that
+    overlaps. Return True if any vertices have normals, and the name of the materials, "" without.
     """
     if path.stat().st_size > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")
@@ -198,7 +183,7 @@ _Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class _Element:
-    """An element of a PLY file: number and properties (name and type; two types for the list of corners)."""
+    """Number and properties of an element of a PLY file."""
 
     count: int
     properties: list[tuple[str, str]]

@@ -22,11 +22,9 @@ if TYPE_CHECKING:
 _LARGEST = 1e20
 """Largest number: its square is far from the end of single precision (3.4e38)."""
 _RIGID = 1e-4
-"""Tolerance of a rotation: a matrix with five digits departs by 2e-5."""
 _SMALLEST_SIZE = 1e-9
 """Smallest scale of a transform [mm]: below any wavelength, and 1 / its cube is still finite."""
 _MOST_UNEVEN = 1e7
-"""Largest ratio of scales, because single precision has seven digits."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class Range:
     hint: str = ""
 
     def check(self, tag: Tag, name: str, numbers: Iterable[float]) -> None:
-        """Raise MitsimError for the first of the ``numbers`` that is not allowed."""
+        """Raise MitsimError for the first number that is not allowed."""
         for number in numbers:
             if not np.isfinite(number):
                 raise tag.refusal(name, number, "give a finite number")
@@ -67,7 +65,6 @@ REFLECTANCES = (
     *("reflectance", "diffuse_reflectance", "albedo", "base_color"),
     *("specular_reflectance", "specular_transmittance", "transmittance"),
 )
-"""Parameters that state the reflected or transmitted part of light."""
 LIMITS = {
     **dict.fromkeys(REFLECTANCES, REFLECTED),
     **dict.fromkeys(("radiance", "irradiance", "intensity", "scale", "sigma_t", "sigma_a"), LIGHT),
@@ -98,11 +95,10 @@ LIMITS = {
 }
 """Allowed range by name of the parameter, for any plugin; the camera checks its own."""
 TABLES = ("value", "values", "color", "color0", "color1", "scale")
-"""Numbers by which a texture without a file states its light."""
 
 
 def check_transform(tag: Tag, name: str, matrix: npt.NDArray[np.float64], rigid: bool) -> None:
-    """Raise MitsimError if a (4, 4) ``matrix`` cannot be inverted, or if it is not rigid although it must be."""
+    """Raise MitsimError if a (4, 4) ``matrix`` cannot be inverted, or is not ``rigid``."""
     if not np.isfinite(matrix).all():
         raise tag.refusal(name, np.nan, "give finite numbers")
     turn = matrix[:3, :3]
@@ -152,13 +148,13 @@ _LACKED = {
 
 
 def references(props: mi.Properties) -> list[int]:
-    """Return the indices of the nodes to which an object's ``props`` refer."""
+    """Return the indices of the nodes to which ``props`` refer."""
     resolved = mi.Properties.Type.ResolvedReference
     return [props[name].index() for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118 - no dict
 
 
 def check_plugin(tag: Tag, plugin: str) -> None:
-    """Raise MitsimError if the object at ``tag`` cannot be a ``plugin``."""
+    """Raise MitsimError if a ``plugin`` is not allowed."""
     allowed = PLUGINS.get(tag.name, "scene").split()
     if plugin not in allowed or (tag.name == "scene" and "version" not in tag.attributes):
         raise tag.refusal(
@@ -167,7 +163,7 @@ def check_plugin(tag: Tag, plugin: str) -> None:
 
 
 def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) -> None:
-    """Raise MitsimError if a ``variant`` lacks the ``plugin`` at ``tag``, or properties that it needs."""
+    """Raise MitsimError if a ``variant`` lacks the ``plugin``, or properties that it needs."""
     backend, _, kind = variant.rpartition("_")
     if plugin in _LACKED and kind != "spectral":
         rule = f"{variant} lacks it: {_LACKED[plugin].format(spectral=f'{backend}_spectral')}"
@@ -196,7 +192,7 @@ CHOICES = ("blendbsdf", "mask", "twosided")
 MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
 """Materials that reflect or refract into single directions."""
 _TURNING, _ALONG = (*BUMPS, "hair", "mitsim_grating"), ("alpha_u", "alpha_v", "anisotropic")
-"""Materials that vary with direction along the surface, and parameters that make others do so."""
+"""Materials that vary along the surface, and parameters that cause this."""
 SMALL_LAMPS = ("directional", "point", "spot")
 """Lamps that no path can hit."""
 _VOLUMETRIC = ("volpath", "volpathmis")
@@ -204,16 +200,11 @@ _VOLUMETRIC = ("volpath", "volpathmis")
 
 @dataclass(frozen=True)
 class Unfit:
-    """Reasons why estimators refuse a scene, and light that they lose in a scene that they accept; None for neither.
+    """Refusals of a scene by each estimator, and light that is lost in a scene that is accepted; None for neither.
 
-    Attributes
-    ----------
-    factored, reference
-        Refusal of each estimator.
-    caustics
-        Loss of the reference: light from lamps that no path can hit, over mirrors or glass to surfaces.
-    lamps, instances
-        Losses of the factored estimator: the same for lamps, and light over mirrors or glass inside instances.
+    ``caustics`` is lost by the reference: light from lamps that no path can hit, over mirrors or glass. ``lamps`` is
+    the
+    same for the factored estimator, and ``instances`` its light over mirrors or glass inside instances.
     """
 
     factored: MitsimError | None = None
@@ -224,7 +215,7 @@ class Unfit:
 
     @classmethod
     def of(cls, outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
-        """Determine the reasons from the ``nodes`` of a scene, the root first, whose tags are in ``outline``."""
+        """Determine the reasons from the ``nodes`` of a scene, the root first."""
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         factored = _unfit_for_factored(outline, tree)
@@ -254,10 +245,7 @@ def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estima
 
 
 def _unfit_for_factored(outline: Outline, tree: _References) -> MitsimError | None:
-    """Return the refusal of a projector whose picture blends its texels, because pixels are assumed to be even.
-
-    A sheet is refused that, followed forward, sends on 8 times the light it gets at grazing angles.
-    """
+    """Return the refusal of a projector whose picture blends texels, or of a sheet that multiplies light."""
     for node in tree.nodes:
         picture = tree.child(node, "irradiance") if node.props.plugin_name() == "projector" else None
         if picture is None or picture.props.plugin_name() != "bitmap":
@@ -323,13 +311,10 @@ def _lost_by_integrator(outline: Outline, tree: _References, cause: _Found | Non
 
 
 _Found = tuple[mi.parser.SceneNode, str]
-"""A node, and the name of one of its properties."""
 
 
 @dataclass(frozen=True)
 class _References:
-    """The nodes of a tree and their references."""
-
     nodes: Sequence[mi.parser.SceneNode]
 
     def to(self, plugins: Sequence[str]) -> Iterator[_Found]:

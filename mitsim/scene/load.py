@@ -32,9 +32,8 @@ if TYPE_CHECKING:
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
-"""Mitsuba's classes of lamps that no path can hit."""
 _FLAT, _TURNED = ("Rectangle", "Disk"), 1e-6
-"""Mitsuba's flat shapes, and the difference between normals that counts as parallel: single precision makes 1e-7."""
+"""Flat shapes, and the difference between parallel normals in single precision."""
 
 
 @dataclass(frozen=True)
@@ -47,28 +46,20 @@ class LoadedScene:
         All files that Mitsuba read, the scene first.
     camera, projector, grid
         Mitsuba sensor (with ``geometry``), emitter and projector pixels; the last two are None only for ``render``.
-    lamps
-        All other emitters.
     mirrors, glossy
         True if a surface reflects or refracts into single directions, or into lobes.
-    unfit
-        Estimators that must refuse the scene, with reasons.
     shapes
-        Tags of ``scene.shapes()`` in that order; empty if one tag gave several shapes.
+        Tags of ``scene.shapes()``; empty if one tag gave several shapes.
     small_lamps
         Lamps that no path can hit, with their tags.
     coloured, parting
         Tags of objects that may depend on wavelength, and of dispersive glass.
-    samples
-        ``sample_count`` of the camera's sampler, or None.
     notes
-        Changes that were made to the scene to render it correctly.
+        Changes to the scene that render it correctly.
     one_way
-        True if no surface sees another, because all are flat, reflect on one side and face the same way.
+        True if no surface sees another.
     sensor_note
         Difference between the sensor of a camera file and the scene's; None if the scene's is used.
-    own
-        Parameters whose files the user named, by path.
     in_view
         True if a projector shines directly on the sensor; such light is traced like that of mirrors.
     """
@@ -96,7 +87,7 @@ class LoadedScene:
 
     @property
     def pixels(self) -> ProjectorGrid:
-        """Return the projector's grid; raise MitsimError with the reason if there is none."""
+        """Return the projector's grid; raise MitsimError if there is none."""
         if self.grid:
             return self.grid
         found = [emitter for emitter in self.scene.emitters() if emitter.class_name() == "Projector"]
@@ -106,12 +97,12 @@ class LoadedScene:
 
     @cached_property
     def hairy(self) -> bool:
-        """Return True if a surface is hair, but for those in instances."""
+        """Return True if a surface outside instances is hair."""
         return any(shape.bsdf() and holds_hair(shape.bsdf().flags()) for shape in self.scene.shapes())
 
     @cached_property
     def smoothed(self) -> bool:
-        """Return True if a surface has shading normals that differ from its own, or an instance may hide one."""
+        """Return True if a surface may have shading normals that differ from its own."""
         return any(_is_smoothed(shape) for shape in self.scene.shapes())
 
 
@@ -125,23 +116,11 @@ def load_scene(
 ) -> LoadedScene:
     """Load a scene XML into the current variant; the plugin ``mitsim_lensless`` must be registered.
 
-    Parameters
-    ----------
-    path
-        Scene XML.
-    defines
-        Values of its parameters by name.
-    needs_projector
-        Refuse a scene without exactly one projector, or one that the factored estimator cannot render.
-    outside
-        Allow files outside the scene's folder.
-    sensor
-        Sensor whose pitch and format replace the scene's; None keeps them.
+    ``needs_projector`` refuses a scene without exactly one projector, or one that the factored estimator cannot
+    render.
+    Pitch and format of a ``sensor`` replace the scene's. ``outside`` allows files outside the scene's folder.
 
-    Raises
-    ------
-    MitsimError
-        One line that names the file, for any fault.
+    Raises MitsimError of one line that names the file, for any fault.
     """
     checked = check_file(path, defines or {}, outside, mi.variant())
     if needs_projector and checked.unfit.factored is not None:
@@ -207,15 +186,14 @@ def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
 
 
 def holds_hair(flags: Any) -> Any:
-    """Return True if the ``flags`` of a material, a number or one per lane, are those of hair or of what holds it."""
+    """Return True for ``flags`` of a material that is, or holds, hair."""
     both = int(mi.BSDFFlags.NonSymmetric) | int(mi.BSDFFlags.Null)
     return (flags & both) == both
 
 
 _SMOOTH_BY_CLASS = ("Instance", "SDFGrid")
-"""Mitsuba's classes of shapes whose shading normals are, or may be, interpolated, and which are no meshes."""
 _PARALLEL = 0.9999
-"""Cosine between the normals of a face and of its vertices above which the face is flat to rounding: half a degree."""
+"""Cosine between normals of a face and of its vertices that counts as flat."""
 
 
 def _is_smoothed(shape: mi.Shape) -> bool:
@@ -236,18 +214,16 @@ def _is_smoothed(shape: mi.Shape) -> bool:
 
 _ANY = Range(-np.inf, np.inf)
 _ROUNDING = 1e-5
-"""A reflectance of 1 after conversion of colours by single precision."""
 
 
 _WHOLE = 2.0**40
-"""Whole number for a normal of length 1: fine enough for 32 bits, and a vertex may have a million faces."""
+"""Whole number for a normal of length 1: a vertex may have a million faces."""
 
 
 def _add_up_normals(scene: mi.Scene, without_normals: frozenset[str]) -> None:
     """Compute vertex normals of meshes without normals such that every load gives the same bits.
 
-    Mitsuba adds them up over faces in 32 bits, in the order of its threads. Merged shapes of which some have normals of
-    their own stay as they are.
+    Mitsuba adds them up in 32 bits in the order of its threads.
     """
     parameters = mi.traverse(scene)
     for key in parameters.keys():  # noqa: SIM118 - SceneParameters is no dict
@@ -262,8 +238,7 @@ def _add_up_normals(scene: mi.Scene, without_normals: frozenset[str]) -> None:
 def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
     """Return vertex normals weighted by the angles of the faces (Thuermer and Wuethrich 1998, as in Mitsuba).
 
-    The sums are whole numbers, whose order does not matter. A zero sum gives Mitsuba's normal for a vertex without
-    faces.
+    Whole numbers are summed because their order does not matter. A zero sum gives Mitsuba's default normal.
     """
     corners = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
     points = [mesh.vertex_position(corner) for corner in corners]
@@ -281,21 +256,9 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
 
 
 def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> None:
-    """Refuse bitmaps and meshes with impossible light or reflectance, or numbers that are not finite.
+    """Raise MitsimError for bitmaps and meshes with values outside ``limits`` by use, or that are not finite.
 
-    Parameters
-    ----------
-    path
-        Scene XML, for the message.
-    scene
-        The loaded scene.
-    limits
-        Allowed ranges by the name of the use.
-
-    Raises
-    ------
-    MitsimError
-        One line with the file or mesh, the texel and its value.
+    The message has the file or mesh, the texel and its value.
     """
     parameters = mi.traverse(scene)
     for key in parameters.keys():  # noqa: SIM118 - SceneParameters is no dict
@@ -331,7 +294,7 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
 # plane y = 0, and the middle of its box is over the origin.
 
 _BEHIND = 0.01
-"""Part of a mesh's corners whose normal may oppose the winding of the face, because of slivers."""
+"""Part of a mesh's corners whose normal may oppose the winding, because of slivers."""
 _CODE_ROUNDING = 1e-9
 """Rounding of 8-bit codes that were divided by 255 and are multiplied again."""
 
@@ -340,11 +303,9 @@ _CODE_ROUNDING = 1e-9
 def with_own_files(checked: CheckedScene) -> Iterator[None]:
     """Prepare the files that the user named; the prepared files exist within the context.
 
-    Raises
-    ------
-    MitsimError
-        For a picture that is no reflectance, a mesh without faces or with normals that point inwards, and if files
-        cannot be written.
+    Raises MitsimError for a picture that is no reflectance, a mesh without faces or with normals that point inwards,
+    and if
+    files cannot be written.
     """
     with ExitStack() as stack:
         for node in checked.state.nodes:
@@ -412,15 +373,12 @@ _RAYS = 24
 _FAR = 3.0
 """Multiple of the aligned plane's distance beyond which a scene counts as too far."""
 _SMALL = 1e-2
-"""Part of the aligned plane's distance below which a scene is assumed to be in metres."""
 _MOST_SHAPES = 64
-"""Shapes that are aimed at one by one; each takes milliseconds."""
 _MOST_PASSED = 16
-"""Surfaces that a ray passes: eight panes of two faces."""
 
 
 def why_dark(loaded: LoadedScene) -> str:
-    """Return what is wrong with a scene of which the sensor sees nothing, and the remedy."""
+    """Return the reason why the sensor sees nothing, and the remedy."""
     geometry, grid = loaded.camera.geometry, loaded.pixels
     to_world = loaded.camera.world_transform()
     projector_to_world = mi.traverse(loaded.projector)["to_world"]

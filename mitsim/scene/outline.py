@@ -1,12 +1,10 @@
 """Positions of all tags of a scene file, and refusals of content that Mitsuba's parser must not receive.
 
-Mitsuba's parser (:mod:`mitsim.scene.check`) has faults that this module prevents (names of cases in
-tests/hard/hostile/): it recurses until its stack overflows ("depth of 100000"); it opens what ``<include>`` and
-``<spectrum>`` name while it reads, even a pipe or a file outside ("included pipe", "include above"), and each include
-again ("million includes"); ``<path>`` lets it find native code. It reads ``$albedo2`` as ``$albedo`` followed by 2
-("longer name with a known beginning"), an empty number as 0 ("empty number"), and a matrix without its last row ("last
-row"). Of two objects with one name it takes the second ("name twice"). It knows the lines of objects, but not those of
-their numbers.
+Mitsuba's parser has faults that this module prevents (cases in tests/hard/hostile/). It recurses until its stack
+overflows. It opens what ``<include>`` and ``<spectrum>`` name while it reads, even a pipe or a file outside, and each
+include again; ``<path>`` lets it find native code. It reads ``$albedo2`` as ``$albedo`` followed by 2, an empty
+number
+as 0, and a matrix without its last row. Of two objects with one name it takes the second.
 """
 
 from __future__ import annotations
@@ -27,11 +25,10 @@ if TYPE_CHECKING:
 
 
 DEEPEST = 16
-"""Nesting with references followed: shipped scenes have 5, and Mitsuba's stack ends below 10 000."""
+"""Deepest nesting with references followed: shipped scenes have 5."""
 MOST_ELEMENTS = 10_000
-"""A hundred times the largest shipped scene; they are checked in 0.2 s."""
+"""A hundred times the largest shipped scene."""
 _MOST_INCLUDES = 64
-"""Files of one scene, each of which is opened and read anew."""
 _DEEPEST_INCLUDE = 8
 """Below the 15 at which Mitsuba's parser ends."""
 _MOST_BYTES = 4 << 20
@@ -46,8 +43,6 @@ _NUMBERS = (*_TRIPLES, "float", "integer", "lookat", "matrix", "rgb")
 
 @dataclass(frozen=True)
 class Tag:
-    """One tag as written in a file."""
-
     path: Path
     line: int
     name: str
@@ -58,7 +53,7 @@ class Tag:
         return f"<{cut(self.name + written, 200)}>"
 
     def refusal(self, what: str, value: object, rule: str) -> MitsimError:
-        """Return ``file:line: what: got value in <tag ...>; rule`` as an error to raise."""
+        """Return ``file:line: what: got value in <tag ...>; rule`` as an error."""
         got = cut(value if isinstance(value, str) else f"{value:g}")
         return MitsimError(f"{self.path}:{self.line}: {cut(what)}: got {got} in {self}; {rule}")
 
@@ -66,25 +61,13 @@ class Tag:
 class Outline:
     """Positions of the tags of a scene and of its includes.
 
-    Parameters
-    ----------
-    path
-        Scene XML.
-    defines
-        Values of parameters by name, which precede those of ``<default>``; files become absolute paths.
-    files
-        Files that the scene may read; records includes.
+    ``defines`` precede the values of ``<default>``; files become absolute paths. ``files`` records includes.
+    ``projected``
+    are files that objects inside the projectors name.
 
-    Raises
-    ------
-    MitsimError
-        If the XML is not well formed, too large or nested too deep, names files that are not allowed, or has parameters
-        that are missing, unknown or not plain.
-
-    Attributes
-    ----------
-    projected
-        Files that objects inside its projectors name.
+    Raises MitsimError if the XML is not well formed, too large or nested too deep, names files that are not allowed,
+    or has
+    parameters that are missing, unknown or not plain.
     """
 
     def __init__(self, path: Path, defines: Mapping[str, str], files: SceneFiles) -> None:
@@ -115,7 +98,7 @@ class Outline:
             raise MitsimError(f"{path}: {len(unknown)} parameters are unknown; it knows {known}:", *unknown)
 
     def tag(self, node: mi.parser.SceneNode, name: str = "") -> Tag:
-        """Return the tag of the object ``node``, or of its property ``name``."""
+        """Return the tag of an object, or of its property ``name``."""
         key = node.file_index, node.offset
         return self._tags.get((*key, name)) or self._tags[(*key, "")]
 
@@ -263,7 +246,7 @@ def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the last sentence of an ``error`` of Mitsuba, whose first lines repeat a place in Mitsuba's own source."""
+    """Return the last sentence of an ``error`` of Mitsuba."""
     text = re.sub(r"\x1b\[[0-9;]*m|\[\w+\.cpp:\d+\] ", "", str(error))
     lines = [re.sub(r"\s+", " ", line).strip(" -*│╰╭─") for line in text.splitlines()]
     lines = [re.sub(r"^\d{4}-\d\d-\d\d [\d:]+ \w+ +\w* *\[[^\]]*\] *", "", line) for line in lines if line]
@@ -276,27 +259,15 @@ def one_line(error: BaseException) -> str:
 
 _NATIVE = (".so", ".dylib", ".dll")
 _MOST_BYTES_OF_A_SCENE = 512 << 20
-"""The largest environment map, 8192 x 4096 texels of float32, has 400 MiB."""
+"""Room for the largest environment map, 400 MiB."""
 _MOST_SPECTRUM = 1 << 20
 """Some 50 000 lines; measured spectra have 1000."""
 
 
 class SceneFiles:
-    """Files that one scene may read.
+    """Files that one scene may read: ``used`` ones, the scene first, and the parameters of the user's ``own``.
 
-    Parameters
-    ----------
-    scene
-        Scene XML; all other files are in its folder.
-    outside
-        Allow files outside that folder.
-
-    Attributes
-    ----------
-    used
-        Files that are read, the scene first.
-    own
-        Parameters of files that a user names.
+    All are in the scene's folder unless ``outside``.
     """
 
     def __init__(self, scene: Path, outside: bool = False) -> None:
@@ -316,26 +287,22 @@ class SceneFiles:
         return path
 
     def include(self, tag: Tag, name: str) -> Path:
-        """Return the file ``name`` of the ``<include>`` at ``tag``, relative to the file that names it."""
+        """Return the file of an ``<include>``, relative to the file that names it."""
         path = self.find(tag, name, tag.path.parent)
         _check_native(tag.path, path.parent)
         return path
 
     def spectrum(self, tag: Tag, folder: Path, name: str) -> None:
-        """Check the file ``name`` of a spectrum, for which Mitsuba looks in ``folder`` first."""
+        """Check the file of a spectrum, for which Mitsuba looks in ``folder`` first."""
         if self.find(tag, name, folder).stat().st_size > _MOST_SPECTRUM:
             raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
 
     def find_named(self, parameter: str, name: str) -> Path:
         """Return the path of the file that a user names for a scene ``parameter``.
 
-        A ``name`` is relative to the working folder if it starts with a dot, and to the scene's folder if only that has
-        it.
-
-        Raises
-        ------
-        MitsimError
-            If the file is missing, or both folders have one of that name.
+        A ``name`` is relative to the working folder if it starts with a dot, and to the scene's folder if only that
+        has it.
+        Raises MitsimError if the file is missing, or both folders have one of that name.
         """
         own, here = self.folder / name, Path(name)
         places = [here] if name.startswith(".") or here.is_absolute() else [own, here]
@@ -352,7 +319,7 @@ class SceneFiles:
         return path
 
     def find(self, tag: Tag, name: str, folder: Path | None = None) -> Path:
-        """Return the file ``name`` at ``tag``, relative to a ``folder`` (None: the scene's).
+        """Return the file ``name``, relative to a ``folder`` (None: the scene's).
 
         Raises MitsimError if it lies outside the scene's folder, or is no plain file of at most 512 MiB.
         """
@@ -387,13 +354,13 @@ def _check_native(scene: Path, folder: Path) -> None:
 # -------- Size of a projector's picture, where it is known without the renderer
 
 _MODES_OF_PIXELS = ("1", "L", "RGB")
-"""Of pictures whose dark texels are 0 in every channel, and nothing else is."""
+"""Modes of pictures whose dark texels are 0 in every channel."""
 _MOST_TEXELS = 1 << 24
 """A picture of 4096 x 4096, decoded in 0.1 s."""
 
 
 def lit_side(picture: Path) -> int | None:
-    """Return the side of the lit square in the PNG file ``picture`` in pixels; None if there is no such square."""
+    """Return the side of the lit square in a PNG file in pixels; None without one."""
     from PIL.PngImagePlugin import PngImageFile
 
     try:

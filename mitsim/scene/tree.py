@@ -1,7 +1,7 @@
 """Changes to the tree of a checked scene that let Mitsuba render what the scene describes.
 
-Mitsuba makes objects in single precision, but its parser's tree is in double precision. Therefore whatever would lose
-its position, width or brightness is changed in the tree, before objects are made of it.
+Mitsuba makes objects in single precision, but its parser's tree is in double precision. Therefore objects that would
+lose position, width or brightness are changed in the tree.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from mitsim.scene.outline import Outline, Tag
 # file are single precision already; where too few of their digits are left near the camera the scene is refused.
 
 _CENTRES = {"sphere": "center", "cylinder": "p0"}
-"""Positions of shapes beside ``to_world``, which are single precision in Mitsuba."""
 _PLACED = ("point", "spot", "projector", "mitsim_projector")
 """Lamps with a position."""
 _ROUNDING = 2.0**-24
@@ -42,22 +41,9 @@ _ALIGNED = float(CameraGeometry.model_fields["scene_distance"].default)
 def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tuple[Tag, float], ...]:
     """Move all objects of a checked tree so that its first ``mitsim_lensless`` is at the origin; directions are kept.
 
-    Parameters
-    ----------
-    outline
-        Outline of the scene, for refusals.
-    state
-        The tree, which is changed.
-
-    Returns
-    -------
-    tuple
-        Tag of each shape, and the distance [mm] by which its single precision vertices are moved.
-
-    Raises
-    ------
+    Return the tag of each shape, and the distance [mm] by which its single precision vertices are moved. Raises
     MitsimError
-        If a projector is so far from its camera that single precision loses the places of its light.
+    if a projector is too far from its camera for single precision.
     """
     nodes = state.nodes
     cameras = [node for node in nodes if node.props.plugin_name() == "mitsim_lensless"]
@@ -86,7 +72,7 @@ def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tupl
 
 
 def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
-    """Raise MitsimError for a mesh that loses its digits near the camera (``moved``: :func:`move_to_camera`)."""
+    """Raise MitsimError for a mesh that loses its digits near the camera."""
     if len(moved) != len(scene.shapes()):
         return
     for (tag, distance), shape in zip(moved, scene.shapes(), strict=True):
@@ -125,7 +111,7 @@ def _is(node: mi.parser.SceneNode, kind: str) -> bool:
 
 
 def placement_of(props: mi.Properties, centred: bool = True) -> FloatArray:
-    """Return the (4, 4) transform from an object to the world, about its own centre if ``centred``."""
+    """Return the (4, 4) transform to the world, about the object's centre if ``centred``."""
     name = _CENTRES.get(props.plugin_name(), "position")
     matrix = np.array(props["to_world"].matrix, dtype=np.float64) if "to_world" in props else np.eye(4)
     if centred and name in props:
@@ -163,37 +149,27 @@ def _place(props: mi.Properties, matrix: FloatArray) -> None:
 _SLENDER = 400.0
 """Ratio of distance to radius from which Mitsuba's cylinders lose 8e-4 of their light."""
 _SMALL = 64.0
-"""The same ratio for emitting spheres, whose light errs by 5e-4."""
+"""The same ratio for emitting spheres (5e-4)."""
 _FINEST = {"cylinder": 1e5, "lamp": 1e5, "sphere": 1e6}
 """Ratio at which rounding moves a mesh's corners by 3e-3 of the radius, and a sphere loses 5e-3."""
 _SIDES = 96
-"""Sides of a prism: its width changes by 5e-4 with direction."""
+"""Sides of a prism: its width changes by 5e-4."""
 _RINGS = 24
-"""Rings of a lamp, with twice as many sides: its visible area changes by 3e-4 (standard deviation over directions)."""
+"""Rings of a lamp, with twice as many sides: its visible area changes by 3e-4."""
 _POLISHED = ("conductor", "dielectric", "mitsim_glass", "thindielectric")
-"""Materials with light in single directions alone, which are followed on the cylinder itself."""
 _MIXED = ("plastic", "pplastic")
 """Materials whose specular chains need the cylinder, which cannot hold their matt light."""
 Uv = tuple[FloatArray, FloatArray]
 Mesh = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Corners (k, 3), normals (k, 3), uv (k, 2), and triangles (m, 3)."""
 
 
 @contextmanager
 def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -> Iterator[None]:
     """Replace thin cylinders and small lamps by meshes, whose files exist within the context.
 
-    Parameters
-    ----------
-    outline
-        Outline of the scene, for refusals.
-    state
-        The tree with its camera at the origin, which is changed.
-
-    Raises
-    ------
-    MitsimError
-        If a shape is too thin for its distance, for a thin cylinder of smooth plastic, and if files cannot be written.
+    Raises MitsimError if a shape is too thin for its distance, for a thin cylinder of smooth plastic, and if files
+    cannot be
+    written.
     """
     thin = set(_thin_shapes(outline, state.nodes))
     with ExitStack() as stack:
@@ -287,7 +263,7 @@ def _point(props: mi.Properties, name: str, default: tuple[float, float, float])
 
 
 def prism(props: mi.Properties) -> Mesh:
-    """Return the prism of a cylinder's ``props`` in the world, with normals and uv as Mitsuba's cylinder has them."""
+    """Return the prism of a cylinder in the world, with normals and uv of Mitsuba's cylinder."""
     radius = float(props.get("radius", 1.0))
     first, last = _point(props, "p0", (0, 0, 0)), _point(props, "p1", (0, 0, 1))
     v, u = np.meshgrid([0.0, 1.0], np.linspace(0, 1, _SIDES + 1), indexing="ij")
@@ -305,7 +281,7 @@ def prism(props: mi.Properties) -> Mesh:
 
 
 def ball(props: mi.Properties) -> Mesh:
-    """Return the mesh of a sphere's ``props`` in the world, of equal area."""
+    """Return the mesh of a sphere in the world, of equal area."""
     v, u = np.meshgrid(np.linspace(0, 1, _RINGS + 1), np.linspace(0, 1, 2 * _RINGS + 1), indexing="ij")
     sine = np.sin(np.pi * v)
     normal = np.stack([sine * np.cos(2 * np.pi * u), sine * np.sin(2 * np.pi * u), np.cos(np.pi * v)], axis=-1)
@@ -361,16 +337,13 @@ def put_wrappers(state: mi.parser.ParserState) -> None:
 
 _MESHES = ("obj", "ply")
 _FLAT = 1e-4
-"""Sine of the angle to a face below which a normal counts as the face's own: meshes are written with five digits."""
+"""Sine of the angle to a face below which a normal counts as the face's own."""
 
 
 def emit_by_faces(checked: CheckedScene) -> tuple[str, ...]:
-    """Set ``face_normals`` on emitting meshes whose normals are not those of their faces; return a sentence for each.
+    """Set ``face_normals`` on emitting meshes with other normals; return a sentence for each.
 
-    Raises
-    ------
-    MitsimError
-        If normals lie on either side of the faces, because then no side is known to emit.
+    Raises MitsimError if normals lie on either side of the faces, because then no side is known to emit.
     """
     notes, nodes = [], checked.state.nodes
     for node in nodes:
@@ -399,10 +372,7 @@ def _emits(props: mi.Properties, nodes: Sequence[mi.parser.SceneNode]) -> bool:
 
 
 def tilts(props: mi.Properties) -> tuple[FloatArray, FloatArray]:
-    """Return sine of the angle between normal and face, and their cosine, (k,) at every corner of the faces of a mesh.
-
-    Both are empty if vertices have no normals.
-    """
+    """Return sine and cosine of the angle between normal and face, (k,) at every corner; empty without normals."""
     geometry = {name: props[name] for name in ("filename", "flip_normals", "to_world") if name in props}
     mesh = mi.load_dict({"type": props.plugin_name(), **geometry})
     if not mesh.has_vertex_normals():
@@ -433,18 +403,9 @@ _PITCH = float(CameraGeometry.model_fields["pixel_pitch"].default)
 def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
     """Give the cameras of a scene the pitch and format of a camera file; return a sentence if something changes.
 
-    Parameters
-    ----------
-    checked
-        The scene, whose tree is changed.
-    sensor
-        Its pitch replaces the scene's if they differ by more than :data:`PITCH_TOLERANCE`; its rows and columns, if
-        stated, replace the film's size and crop window.
-
-    Raises
-    ------
-    MitsimError
-        For a camera without a film whose size can be set.
+    The pitch of the ``sensor`` replaces the scene's beyond :data:`PITCH_TOLERANCE`; its rows and columns replace the
+    film's
+    size and crop window. Raises MitsimError for a camera without a film whose size can be set.
     """
     nodes, words = checked.state.nodes, ""
     for node in nodes:

@@ -1,9 +1,10 @@
 """The projector's pixel grid: n x n pixels of a stock ``projector`` emitter and the directions that they light.
 
-The emitter's texture in the scene file is its all-white frame. The rectangle of lit texels is the *window* of n x n
-pixels that patterns use; dark texels around it are canvas. A window off the canvas's centre is a lens shift, as real
-projectors have it, and causes no keystone. Row 0 is at +y and column 0 at +x for a viewer along +z, which is Mitsuba's
-order of texels for an unrotated projector.
+The emitter's texture is its all-white frame. The rectangle of lit texels is the *window* of n x n pixels that
+patterns
+use; dark texels around it are canvas. A window off the canvas's centre is a lens shift, which causes no keystone.
+Row 0
+is at +y and column 0 at +x for a viewer along +z.
 """
 
 from __future__ import annotations
@@ -22,13 +23,11 @@ _NO_KEYSTONE = 1e-3
 
 
 _MOST_ACROSS = 16384
-"""Largest number of projector pixels across the camera's field: their shadow takes 67 MB for 512 sensor pixels and one
-layer. The paper's geometry has 150.
+"""Largest number of projector pixels across the camera's field: 67 MB for 512 sensor pixels and a layer.
 """
 
 
 _Place = tuple[int, float, float, tuple[int, int]]
-"""Pixels per side of a window, its first row and column, and its canvas."""
 
 
 @dataclass(frozen=True)
@@ -37,17 +36,16 @@ class ProjectorGrid:
 
     Attributes
     ----------
-    n
-        Pixels per side of the window.
     first_row, first_column
         Canvas texel of the window's pixel (0, 0); fractional for a drifted picture.
     canvas
         (rows, columns) of the whole texture.
     row_tan, column_tan
-        (first edge, last edge) of the window as tan-angles y/z and x/z from the camera in index coordinates, on the
-        plane at the camera's scene distance; the bounding box in case of keystone.
+        (first edge, last edge) of the window's bounding box as tan-angles y/z and x/z in index coordinates, on the
+        aligned
+        plane.
     keystone
-        Largest deviation of the window's corners from that box in projector pixels; 0 for a shifted lens.
+        Largest deviation of the corners from that box in projector pixels; 0 for a shifted lens.
     """
 
     n: int
@@ -60,26 +58,15 @@ class ProjectorGrid:
 
     @property
     def place(self) -> _Place:
-        """Return n, first row, first column and canvas."""
         return self.n, self.first_row, self.first_column, self.canvas
 
 
 def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> ProjectorGrid:
     """Find the lit window of a projector and its position in front of a camera.
 
-    Parameters
-    ----------
-    where
-        Path of the scene, with which errors begin.
-    projector
-        Stock emitter whose bitmap shows the window.
-    camera
-        Sensor with its geometry.
-
-    Raises
-    ------
-    MitsimError
-        If the texture is no bitmap with a lit square window, or does not light the camera's aligned plane.
+    Raises MitsimError, which begins with ``where``, if the texture is no bitmap with a lit square window, or does
+    not light
+    the camera's aligned plane.
     """
     parameters = mi.traverse(projector)
     if "irradiance.data" not in parameters:
@@ -113,13 +100,7 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
 def window_at(
     where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, depth: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return row and column tan-angles (first edge, last edge) of the window on a plane at ``depth`` [mm].
-
-    Raises
-    ------
-    MitsimError
-        If the projector does not light the plane.
-    """
+    """Return row and column tan-angles (first edge, last edge) on a plane, or raise MitsimError if it is unlit."""
     corners = _window_corners(where, projector, camera, grid.place, depth)
     (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
     return (float(top), float(bottom)), (float(left), float(right))
@@ -128,12 +109,9 @@ def window_at(
 def straightening(where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, z: float) -> FloatArray:
     """Return the (3, 3) homography that removes the keystone from tan-angles (row, column, 1) at the depth ``z``.
 
-    It maps to the positions of the projector pixels if the window filled its bounding box evenly.
-
-    Raises
-    ------
-    MitsimError
-        If the projector does not light the plane.
+    It maps to the positions of the projector pixels if the window filled its bounding box evenly. Raises MitsimError
+    if the
+    projector does not light the plane.
     """
     corners = _window_corners(where, projector, camera, grid.place, z)
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -143,7 +121,7 @@ def straightening(where: str, projector: mi.Emitter, camera: mi.Sensor, grid: Pr
 def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window: _Place, z: float) -> FloatArray:
     """Return the (4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
 
-    The plane and the projector's image are related by a homography, which four probes of the emitter determine.
+    The homography between plane and picture is determined by four probes of the emitter.
     """
     half = 0.25 * z  # any four points do
     probes = np.array([[half, half], [half, -half], [-half, half], [-half, -half]])
