@@ -39,10 +39,9 @@ from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, half_spread
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 
 EDGES = 2.9
-"""Energy of hard edges within a pixel over that of the ramp that the image shows: the dipole of an edge at t is t (1 -
-t) / 2 with a mean square of 1/120, and the slopes around it bring 1/346."""
+"""Energy of edges over that of the ramp: a dipole t (1 - t) / 2 has the mean square 1/120; slopes around it add 1/346.
+"""
 PRINT = (1 + EDGES) / 2
-"""Mean of :data:`EDGES` and 1, for print that may have hard edges or none."""
 _ALIKE = 0.5
 _LEAST_EIGENVALUE = 0.01
 _SIGNIFICANT = 3.0
@@ -92,8 +91,6 @@ def print_energy(model: Model, image: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class LitFrame:
-    """Frame (m, m') of few lit pixels, with the (m, c), (m', c') factors, slopes and blocks of the scene at these."""
-
     frame: FloatArray
     variance: float
     factors: tuple[FloatArray, FloatArray]
@@ -106,10 +103,6 @@ class LitFrame:
         return float(beyond)
 
     def of_depths(self, ranges: Sequence[FloatArray], wider: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return normal matrix and right side of dipoles that are one multiple of the light in a block.
-
-        ``ranges`` span the columns of both factors, and ``wider`` their slopes too.
-        """
         wide, wide_ = wider
         image = np.linalg.pinv(self.factors[0]) @ self.frame @ np.linalg.pinv(self.factors[1]).T
         own, own_ = wide.T @ ranges[0], wide_.T @ ranges[1]
@@ -164,8 +157,8 @@ def print_part(frames: Sequence[LitFrame]) -> float:
     """Return the part of the misfit of ``frames`` that is light beside pixels' centres, but not because of depth.
 
     Print has its light on either side of the centres, a surface beside the calibrated distance on one side. Therefore
-    the energy that depths explain, of the scene or block by block, is no print. Depths are estimated from the other
-    frames, because dipoles of print may add up to any depth in one.
+    the energy that depths explain is no print. They are estimated from the other frames, because dipoles may imitate a
+    depth.
     """
     moments, own, left_over, depths = np.zeros(3), 0.0, 0.0, list[tuple[FloatArray, FloatArray]]()
     for each in frames:
@@ -221,9 +214,8 @@ def offset_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> Flo
 def factor_slope(factor: FloatArray, spline: bool = False) -> FloatArray:
     """Return the change Phi' (m, n) of a ``factor`` (m, n) by scene pixel.
 
-    Where a shadow moves by more than a sensor pixel from one scene pixel to the next, the slope is computed along the
-    sensor, because neighbours in the scene may be a whole feature of the mask apart. A ``spline`` misses half as much
-    at the edges of features, and doubles the noise.
+    A fast shadow's slope is computed along the sensor, because neighbours in the scene may be a feature of the mask
+    apart. A ``spline`` halves the error at edges and doubles the noise.
     """
     rows, columns = factor.shape
     if columns == 1:
@@ -238,8 +230,7 @@ def factor_slope(factor: FloatArray, spline: bool = False) -> FloatArray:
 def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[FloatArray, FloatArray]) -> FloatArray:
     """Return the variance (n, n') of an image by the disagreement of the sensor's halves; 0 where it may be chance.
 
-    ``gain`` is G (r, r'), and ``known`` are the variances (n, n') by known errors that change from sensor row to row,
-    and from column to column.
+    ``known`` are the variances (n, n') by errors that change from sensor row to row, and from column to column.
     """
     total = np.zeros_like(known[0])
     sides = model.sides, model.sides[::-1]
@@ -280,18 +271,10 @@ def _shift(factor: FloatArray) -> float:
 class FrameNoise:
     """Noise of all measurements of a run, as its manifest states the sensor.
 
-    Attributes
-    ----------
-    ambient, variance, rows, columns
-        Mean noise variances [(electrons/s)^2]. That of the ambient frame is by sensor row (m,) and column (m',), or
-        None. Those of each pattern (K, K'), its rows (K, K', m) and its columns (K, K', m') do not include it.
-    light_error
-        Relative standard error of single projector pixels' light in simulated frames; 0: not stated.
-    power, light, means
-        Sum of the squares of all shots [(electrons/s)^2], sum (m, m') of all shots, and mean (K, K') of each pattern's
-        [electrons/s].
-    factor
-        Largest whole number that divides all digital numbers; 1 where they are not whole.
+    Variances [(electrons/s)^2] of the ``ambient`` frame are by sensor row (m,) and column (m',); those of patterns (K,
+    K'), ``rows`` (K, K', m) and ``columns`` (K, K', m') do not include it. ``light_error`` is the relative error of
+    single projector pixels' light in simulated frames; ``factor`` the largest whole number that divides all digital
+    numbers.
     """
 
     def __init__(self, manifest: RunManifest, ambient: tuple[FloatArray, FloatArray] | None = None) -> None:
@@ -354,7 +337,7 @@ class FrameNoise:
 def factor_energy(
     prepared: Prepared, patterns: tuple[FloatArray, FloatArray], noise: FactorNoise, image: FloatArray
 ) -> float:
-    """Return the energy that ``noise`` of the factors adds to all frames of an ``image``, less what the fit takes up.
+    """Return the energy that ``noise`` of the factors adds to all frames, less the part that the fit takes up.
 
     With d_L the error of Phi_L, independent numbers of variance s^2, frames move by d_L (P_ij o X) Phi_R^T: in the mean
     by m s^2 sum_p |P_L[p]|^2 ||X[p] V_R S_R||^2, and likewise for the other side.
@@ -407,8 +390,6 @@ def _term_response(side: Side, term: FloatArray, patterns: FloatArray) -> FloatA
 
 @dataclass(frozen=True, eq=False)
 class Accumulation:
-    """Sums of a run's frames; ``kept`` are few frames themselves, ``coefficients`` (c, c') their contributions to W."""
-
     shots: Capture
     factors: Factors
     solver: Solver
@@ -452,10 +433,7 @@ class Accumulation:
 
 
 def accumulate(shots: Capture, factors: Factors, solver: Solver = SOLVERS[TIKHONOV], **iterative: Any) -> Accumulation:
-    """Factorise the model of shots and factors, and add every frame.
-
-    Raises MitsimError when that takes more memory than is free, or a frame cannot be read.
-    """
+    """Factorise the model and add every frame; MitsimError where memory is short or a frame unreadable."""
     check_factorising(shots, factors, solver)
     prepared = solver.init(factors, shots.patterns)
     # The difference of a pair has no ambient frame.

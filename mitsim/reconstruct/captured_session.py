@@ -1,11 +1,10 @@
 """Factors of a camera from a folder with the frames of a real calibration session.
 
-Numbers are those of a simulated session: frames of one, written to such a folder, give its factors bit for bit.
+Frames of a simulated session, written to such a folder, give its factors bit for bit.
 
-*Exposures of one frame.* No frame of a session is brighter than the uniform one, so that a pixel that the uniform frame
-would not bring near saturation at an exposure is saturated by no frame. Weights of all exposures are therefore found
-once, by a uniform frame of the other side's stripes, and do not depend on noise of the merged frames. Merged rates have
-no bias and the variance sum_k w_k^2 v_k, which is least with w_k in proportion to 1/v_k (Granados et al. 2010, "Optimal
+*Exposures of one frame.* No frame of a session is brighter than the uniform one. Weights of all exposures are
+therefore found once, by a uniform frame of the other side's stripes, and do not depend on noise of the merged frames.
+The variance sum_k w_k^2 v_k of merged rates is least with w_k in proportion to 1/v_k (Granados et al. 2010, "Optimal
 HDR reconstruction with linear digital cameras", CVPR).
 """
 
@@ -44,9 +43,6 @@ from mitsim.reconstruct.session_check import SessionConditions, check_session
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
 _UNLIKE, _MATTERS = 4.0, 0.02
-"""Squared difference of repeated frames over the session's median, and difference over their light, above which one is
-wrong.
-"""
 _LIT = 0.01
 
 
@@ -128,10 +124,6 @@ def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFra
 
 
 def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]]) -> Iterator[tuple[FloatArray, float]]:
-    """Yield the response to each ``chosen`` +-1 pattern (side, number) of a ``session``, and the noise [electrons/s].
-
-    Raises MitsimError for a saturated frame.
-    """
     readings = _Readings(_checked(session)[0])
     for side, index in chosen:
         rate, variance, _ = readings.response(side, index)
@@ -503,7 +495,6 @@ class Ladder:
         return True if self.weights is None else np.asarray(self.weights[exposure] > 0)
 
     def variance(self, light: FloatArray | float, shots: int = 1) -> float:
-        """Return the mean noise variance [(electrons/s)^2] of a merged sum or difference of ``shots`` frames."""
         if self.weights is None:
             return float(self.digitals[0].variance(float(np.mean(light)), shots))
         parts = zip(self.weights, self.digitals, strict=True)

@@ -5,25 +5,22 @@ the pixels (a::2, b::2) of plane p, and their response w_pl to line l,
 
     Y_ij[a::2, b::2] = sum_l w_pl  Phi_Ll[a::2] (P_ij o X_l) Phi_Rl[b::2]^T,
 
-exactly, because factors are sub-sampled and nothing is interpolated. :class:`JointMosaic` solves all planes for all
-lines together,
+exactly, because factors are sub-sampled and nothing is interpolated. :class:`JointMosaic` minimises
 
-    min_X  sum_ij,p ||Y_ij,p - model||^2 + lambda sum_l ||X_l||^2,
+    sum_ij,p ||Y_ij,p - model||^2 + lambda sum_l ||X_l||^2
 
 by conjugate gradients on the normal equations, which for products of patterns are sums of separable terms:
 
     (N X)_l = sum_p,l' w_pl w_pl' [(P_L P_L^T) o (Phi_Ll[a::2]^T Phi_Ll'[a::2])] X_l' [the same of columns]^T.
 
 The preconditioner has one pair of factors for all lines, so that its eigenvectors make it diagonal. It is exact where
-the lines' factors are equal and rows of both parities are alike; the first step is then the solution.
+the lines' factors are equal and rows of both parities are alike.
 
-*Colours.* Reflectances at lines are converted to CIE XYZ and sRGB of the same surface in daylight (D65). An image of a
-line is relative to the calibration's board, so white is balanced: a white board has reflectance 1 at every line. A
-colour-correction matrix M (3, L) converts the reflectances r of L lines to the tristimulus values that the whole
-spectrum has under D65, XYZ = M r. Because a few numbers do not determine a spectrum, M is a least-squares fit over a
-chart whose patches have known spectra, with the white board held at the white of D65 (white-point preserving least
-squares, Finlayson and Drew, Color Imaging Conference 1997). Colour-matching functions (CIE 1931, 2 degrees),
-illuminants and charts are those of colour-science.
+*Colours.* An image of a line is relative to the calibration's board, so that a white board has reflectance 1 at every
+line. A matrix M (3, L) converts the reflectances r of L lines to the tristimulus values under daylight (D65), XYZ = M
+r. Because a few numbers do not determine a spectrum, M is a least-squares fit over a chart of known spectra, with the
+white board held at the white of D65 (white-point preserving least squares, Finlayson and Drew, Color Imaging
+Conference 1997). Colour-matching functions (CIE 1931, 2 degrees), illuminants and charts are those of colour-science.
 """
 
 from __future__ import annotations
@@ -45,7 +42,6 @@ from mitsim.reconstruct.solution import Solution
 
 
 PLANES = ((0, 0), (0, 1), (1, 0), (1, 1))
-"""First row and column of each plane of 2 x 2 filters."""
 _TOLERANCE = 1e-7
 _MOST_STEPS = 1000
 
@@ -54,12 +50,8 @@ _MOST_STEPS = 1000
 class JointMosaic:
     """The model of a camera with a mosaic, for one family of patterns.
 
-    Attributes
-    ----------
-    lefts, rights
-        (lines, m, n) and (lines, m', n') factors of each line; m and m' are even.
-    weights
-        (4, lines) responses of the pixels of each plane of :data:`PLANES` to each line.
+    ``lefts`` (lines, m, n) and ``rights`` (lines, m', n') are the factors of each line, with even m and m';
+    ``weights`` (4, lines) are the responses of each plane to each line.
     """
 
     lefts: FloatArray
@@ -86,14 +78,12 @@ class JointMosaic:
         return len(self.lefts), self.lefts.shape[2], self.rights.shape[2]
 
     def frame(self, images: FloatArray, row: int, column: int) -> FloatArray:
-        """Return the (m, m') frame of ``images`` (lines, n, n') under pattern (``row``, ``column``)."""
         rows, columns = np.flatnonzero(self.P_L[:, row]), np.flatnonzero(self.P_R[:, column])
         lit = images[:, rows[:, None], columns] * self.P_L[rows, row][:, None] * self.P_R[columns, column]
         seen = self.lefts[:, :, rows] @ lit @ self.rights[:, :, columns].transpose(0, 2, 1)
         return np.asarray((behind(self.weights, seen.shape[1:]) * seen).sum(axis=0))
 
     def gather(self, frame: FloatArray, row: int, column: int) -> FloatArray:
-        """Apply the adjoint of :meth:`frame` to a ``frame`` (m, m'); return (lines, n, n')."""
         rows, columns = np.flatnonzero(self.P_L[:, row]), np.flatnonzero(self.P_R[:, column])
         seen = behind(self.weights, frame.shape) * frame
         lit = self.lefts[:, :, rows].transpose(0, 2, 1) @ seen @ self.rights[:, :, columns]
@@ -149,7 +139,6 @@ class JointMosaic:
 
 
 def behind(weights: FloatArray, shape: Sequence[int]) -> FloatArray:
-    """Return the response (lines, m, m') of each pixel of a sensor of an even ``shape`` (m, m') to each line."""
     return np.tile(weights.T.reshape(-1, 2, 2), (1, shape[0] // 2, shape[1] // 2))
 
 
@@ -157,8 +146,8 @@ def behind(weights: FloatArray, shape: Sequence[int]) -> FloatArray:
 
 
 CHART = "ColorChecker N Ohta"
-"""Name, in colour-science, of N. Ohta's measured spectra of the ColorChecker's 24 patches, 380 to 780 nm in steps of
-5 nm, which scenes/colour_checker has, too."""
+"""Name, in colour-science, of N. Ohta's measured spectra of the ColorChecker's 24 patches, as in
+scenes/colour_checker."""
 _OBSERVER, _WHITE = "CIE 1931 2 Degree Standard Observer", "D65"
 
 
@@ -172,10 +161,7 @@ class Chart:
     xyz: FloatArray
 
     def at(self, wavelengths_nm: Sequence[float]) -> FloatArray:
-        """Interpolate the reflectances (patches, lines) linearly at ``wavelengths_nm``, as Mitsuba does.
-
-        MitsimError for a wavelength outside the measured range.
-        """
+        """Interpolate the reflectances (patches, lines) linearly at ``wavelengths_nm``, as Mitsuba does."""
         first, last = self.wavelengths_nm[0], self.wavelengths_nm[-1]
         outside = next((wave for wave in wavelengths_nm if not first <= wave <= last), None)
         if outside is not None:
@@ -213,7 +199,7 @@ def white_xyz() -> FloatArray:
 
 
 def daylight(wavelengths_nm: npt.ArrayLike) -> FloatArray:
-    """Return the power of D65 at ``wavelengths_nm`` in steps of 5 nm, 300 to 780, relative to that at 560 nm."""
+    """Return the power of D65 at ``wavelengths_nm`` (multiples of 5, 300 to 780), relative to that at 560 nm."""
     light = _colour().SDS_ILLUMINANTS[_WHITE]
     return np.asarray(light[np.asarray(wavelengths_nm, dtype=np.float64)], dtype=np.float64) / 100
 
@@ -228,15 +214,10 @@ class ColourModel:
 
     @classmethod
     def of_lines(cls, wavelengths_nm: Sequence[float]) -> ColourModel:
-        """Fit the fixed model of lines at ``wavelengths_nm`` on the spectra of the chart.
-
-        MitsimError for lines outside the chart's spectra.
-        """
         return cls.fit(wavelengths_nm, chart().at(wavelengths_nm), f"{CHART}, spectra at the lines")
 
     @classmethod
     def fit(cls, wavelengths_nm: Sequence[float], patches: npt.ArrayLike, fitted_on: str) -> ColourModel:
-        """Fit the model to (24, lines) finite reflectances of the chart's patches, by least squares in XYZ."""
         values = np.asarray(patches, dtype=np.float64)
         expected = len(chart().names), len(wavelengths_nm)
         if values.shape != expected or not np.isfinite(values).all():
@@ -253,7 +234,6 @@ class ColourModel:
         return cls(tuple(map(float, wavelengths_nm)), np.asarray(even + free.T @ basis.T), fitted_on)
 
     def xyz(self, reflectances: npt.ArrayLike) -> FloatArray:
-        """Convert ``reflectances`` (..., lines) to (..., 3) CIE XYZ under D65 without clipping."""
         return np.asarray(np.asarray(reflectances, dtype=np.float64) @ self.matrix.T)
 
     def summary(self) -> dict[str, Any]:
@@ -266,7 +246,6 @@ def linear_srgb(xyz: npt.ArrayLike) -> FloatArray:
 
 
 def delta_e(xyz: npt.ArrayLike, reference: npt.ArrayLike) -> FloatArray:
-    """Return the colour difference CIE Delta E 2000 of ``xyz`` (..., 3) to a ``reference`` (..., 3) under D65."""
     colour = _colour()
     # CIELAB ends at black, so negative noise has no colour.
     labs = (

@@ -50,7 +50,6 @@ def solve_iteratively(
     iterations: int = 500,
     watch: Watch | None = None,
 ) -> Solution:
-    """Solve the normal equations of all ``frames`` (patterns, rows, columns) by conjugate gradients."""
     camera.check_frames(frames)
     target = camera.correlate(frames)
     return conjugate_gradients(
@@ -69,8 +68,7 @@ def conjugate_gradients(
 ) -> Solution:
     """Solve (``normal`` + lambda) X = ``target`` (Hestenes and Stiefel 1952).
 
-    The preconditioner ``inverse`` is symmetric, positive, and near the inverse of normal + lambda. The iterations end
-    at the relative residual ``tolerance``, after ``most`` steps, or when ``watch`` returns True.
+    The preconditioner ``inverse`` is symmetric and positive. Steps end early when ``watch`` returns True.
     """
     lam = check_lambda(lam)
     image, left = np.zeros_like(target), target
@@ -136,7 +134,6 @@ class Classes:
         return self._join(classes)
 
     def factorise(self, lam: float) -> FactorisedClasses:
-        """Return all classes at ``lam``, ready for any number of scenes."""
         lam = check_lambda(lam)
         if not self.factorised:
             return FactorisedClasses(self, lam, None)
@@ -227,8 +224,6 @@ class Classes:
 
 @dataclass(frozen=True, eq=False)
 class FactorisedClasses:
-    """Classes at one ``lam`` with their Cholesky factors, or None where conjugate gradients solve them."""
-
     classes: Classes
     lam: float
     factors: list[FloatArray] | None

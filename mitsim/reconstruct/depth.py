@@ -1,15 +1,13 @@
 """Depth of the scene as a whole or for each projector pixel, by the least unexplained energy.
 
 *One depth.* The energy ||Y||^2 - sum_ij ||U_Li^T Y_ij U_Rj||^2, which no lambda changes, has a narrow valley at the
-true depth, and others where dots of period k see their neighbours' light. So depths are tried in steps of a pixel of
-parallax, every valley that may be the lowest is followed to its bottom, and valleys that chance or the model's own
-misfit may have raised are reported as alternatives. A few hundred vectors span the columns of all depths.
+true depth, and others where dots of period k see their neighbours' light. So every valley that may be the lowest is
+followed to its bottom, and valleys that chance or the model's misfit may have raised are reported as alternatives.
 
 *A depth for each pixel.* Every frame is first reconstructed at the calibrated depth as if all pixels along the
 baseline were lit, which shows where each dot's light arrives. Then the model is linear in (X, X o d), d a change of
 1/z, and each Gauss-Newton step, with the d of neighbours pooled, is one closed-form solve for each frame, whose normal
-matrix is (L^T L) o (R^T R). Last, single pixels beside an edge take the depth on its other side where that explains
-more. Depths whose parallax spans more than a period of the dots are ambiguous.
+matrix is (L^T L) o (R^T R). Depths whose parallax spans more than a period of the dots are ambiguous.
 """
 
 from __future__ import annotations
@@ -52,16 +50,12 @@ _LAMBDA = 1e-3
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another depth [mm] that explains the measurements as well, and its residual beyond the best (rms, relative)."""
-
     mm: float
     difference: float
 
 
 @dataclass(frozen=True)
 class Depth:
-    """Depth whose factors are used; ``error_mm`` is its standard error or the distance to an alternative."""
-
     mm: float
     error_mm: float | None = None
     doubt: str = ""
@@ -80,11 +74,7 @@ class Depth:
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """Depths [mm] by projector pixel, and their ``image`` (n, n').
-
-    ``confidence`` is 1 less the light at the second place over that at the first. ``part`` is that of the sensor whose
-    measurements count, and ``smoothing`` the variance of the factors' noise over that of the calibrated ones.
-    """
+    """Depths [mm] by projector pixel, and their ``image`` (n, n')."""
 
     image: FloatArray
     mm: FloatArray
@@ -117,7 +107,6 @@ class DepthMap:
         return np.asarray(self.confidence >= _RELIABLE)
 
     def misfit(self, noise: FrameNoise, factor_energy: float | None, print_energy: float) -> Misfit:
-        """Return the misfit of the measurements at these depths, over the sensor as a whole."""
         spare = 1 - 2 * self.image.size / self.data  # a reflectance and a depth for each pixel
         variance = float(noise.variance.mean()) * self.data * spare
         expected = variance + self.part * (noise.rendering + self.smoothing * (factor_energy or 0.0))
@@ -142,12 +131,10 @@ _LEFT_OUT = 1e-6
 class CommonBasis:
     """Frames of a capture, and factors of any depth within a range, on a basis that depths share.
 
-    ``frames`` are single measurements on the bases, and ``stack`` (K, r, K', r') is all in one array. ``energy``
-    counts where all depths are known; no depth explains its part ``outside``.
+    ``stack`` (K, r, K', r') has all measurements; no depth explains the part ``outside`` of their ``energy``.
     """
 
     def __init__(self, shots: Capture, factors: Factors, shifts: tuple[float, float]) -> None:
-        """Read all ``shots``; ``shifts`` are the least and largest change of 1/z [1/mm]."""
         parallax, self.patterns, self._centre = parallax_of(factors), shots.patterns, factors.manifest.centre
         sensor = len(factors.left), len(factors.right)
         self.sides = [FactorOfDepths(side, parallax, axis) for axis, side in enumerate((factors.left, factors.right))]
@@ -191,10 +178,6 @@ class CommonBasis:
         return len(self.patterns[0]), len(self.patterns[1])
 
     def side(self, axis: int, shift: float | FloatArray, margin: int = 0) -> FloatArray:
-        """Return the factor (r, n) of an ``axis`` on its basis, with 1/z changed by ``shift`` [1/mm].
-
-        A ``margin`` adds as many columns a side, of the outermost pixels at other depths.
-        """
         columns = self._columns(axis, shift)
         if margin:
             before, beyond = (self._columns(axis, away / self.sides[axis].edges) for away in (-margin, margin))
@@ -219,8 +202,8 @@ _STEP = 0.5
 def chance_difference(difference: float, variance: float, unknowns: int) -> float:
     """Return the energy by which noise may make the residuals of two models differ.
 
-    Light of energy D (``difference``) that the wrong model does not explain meets noise of variance v: 4 v D. Noise
-    that only one of the models takes up has the variance 4 v^2 times the ``unknowns``, or less.
+    Light of energy D that the wrong model does not explain meets noise of variance v: 4 v D. Noise that only one model
+    takes up has at most the variance 4 v^2 times the ``unknowns``.
     """
     return CHANCE * float(np.sqrt(4 * variance * max(difference, 0.0) + 4 * variance**2 * unknowns))
 
@@ -359,7 +342,6 @@ class _Search:
             yield left, shift
 
     def beyond(self, shift: float) -> Iterator[tuple[float, float]]:
-        """Yield valleys beyond the range, whole periods of the dots from the best ``shift`` or beside it at an end."""
         for end, tried, step in zip(self.ends, self.tried, (-self._period, self._period), strict=True):
             if tried == end:
                 continue
@@ -397,7 +379,6 @@ _STEPS, _STEP_POOLED = 4, 3.0
 _ROUNDS, _BESIDE = 4, 5
 _SURE = 25.0
 _RIVAL, _ASTRAY = 2.0, 0.05
-"""Starts that leave less than twice the best one's energy may place at most this part half a period beside it."""
 _RELIABLE = 0.5
 SPARE = 2.0
 _MEDIAN = 5
@@ -494,7 +475,6 @@ def _refine(pixels: PixelDepths, shift: FloatArray, offset: float, width: float,
 
 
 def _sharpen(pixels: PixelDepths, shift: FloatArray) -> FloatArray:
-    """Give single pixels the nearest, farthest or median depth around them where that explains clearly more."""
     solved = pixels.solve(shift)
     for _ in range(_ROUNDS):
         others = [of(shift, _BESIDE) for of in (minimum_filter, maximum_filter, median_filter)]
@@ -523,8 +503,6 @@ class Solved(NamedTuple):
 
 
 class PixelDepths:
-    """Model with a depth for each projector pixel."""
-
     def __init__(self, basis: CommonBasis, limit: float, step: float) -> None:
         self._basis = basis
         self._shifts = np.linspace(-limit, limit, max(2 * int(np.ceil(limit / step)) + 1, len(_CUBIC)))
@@ -553,7 +531,6 @@ class PixelDepths:
         return float(solved.left_over / max(self._basis.data - 2 * solved.image.size, 1))
 
     def final(self, shift: FloatArray, solved: Solved) -> Solved:
-        """Return the image at the lambda of its own residual: variance of a datum over the mean square of pixels."""
         ideal = self.variance(solved) / max(float(np.square(solved.image).mean()), np.finfo(float).tiny)
         return self.solve(shift, min(ideal, _LARGEST * self._scale))
 
@@ -573,10 +550,7 @@ class PixelDepths:
         return image, moved
 
     def gains(self, shift: FloatArray, image: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
-        """Return the energy (others, n, n') that each pixel alone explains more at other changes of 1/z.
-
-        Pixels of a frame hardly share measurements, so that each is judged with all else fixed.
-        """
+        """Return the energy (others, n, n') that each pixel alone explains more at other changes of 1/z."""
         explained = np.zeros((1 + len(others), *shift.shape))
         for frame, lit, left, right in self._columns_of_frames(shift):
             rest = frame - (left * image[lit][:, None]).T @ right
@@ -618,11 +592,7 @@ _NEIGHBOURHOOD = 2.0
 
 
 class Arrivals:
-    """Places where light arrives, by pixel and change of 1/z [1/mm] between two ``ends``.
-
-    ``pixel`` is the change that moves light by one projector pixel, ``width`` the distinguishable changes, and
-    ``reach`` the largest tried one. The dots' period may limit the range.
-    """
+    """Places where light arrives, by pixel and change of 1/z [1/mm] between two ``ends``."""
 
     def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
         if not all(map(_are_dots, shots.patterns)):
@@ -664,10 +634,6 @@ class Arrivals:
         return np.stack(images).reshape(*counts, *images[0].shape)
 
     def most(self, offset: float) -> tuple[FloatArray, FloatArray]:
-        """Return changes of 1/z by pixel where most light arrives, and the confidence.
-
-        ``offset`` is the middle of the displacements [projector pixels].
-        """
         count = 2 * int(np.ceil(self.width / self.pixel / _STEP / 2)) + 1
         shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
         light = np.stack([self._arriving(shift) for shift in shifts])

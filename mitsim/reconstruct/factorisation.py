@@ -39,26 +39,17 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Slab:
-    """Contribution of one pattern index: ``matrix`` (m, c) and the ``columns`` (c of them) of W that it fills."""
-
     columns: slice | IndexArray
     matrix: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """Factorised side of the model.
+    """Factorised side of the model: right singular vectors ``basis`` (n, r) and singular values (r,) of B.
 
-    Attributes
-    ----------
-    basis, singular
-        Right singular vectors V (n, r) of B, and its singular values (r,), numerically zero ones exactly 0.
-    data_rows
-        Independent data rows: m K, less K once frames are centred.
-    dual : (n, r) array
-        V' with B = U S V'^T; None if V' is the basis, which is then orthonormal.
-    spread
-        Condition of the matrix that the basis is made with, which magnifies rounding.
+    Numerically zero singular values are exactly 0. ``data_rows`` is m K, less K once frames are centred. ``dual`` (n,
+    r) is V' with B = U S V'^T, None if V' is the basis. ``spread`` is the condition of the matrix that makes the
+    basis, which magnifies rounding.
     """
 
     basis: FloatArray
@@ -96,7 +87,6 @@ class Side:
 
     @property
     def condition(self) -> float:
-        """cond(A) = (largest / smallest singular value of B)^2; inf when rank deficient."""
         if self.rank < self.scene_size:
             return float("inf")
         return float((self.singular.max() / self.singular.min()) ** 2)
@@ -120,10 +110,10 @@ class Side:
 
 
 def pattern_blocks(patterns: FloatArray) -> tuple[IndexArray, ...]:
-    """Return the groups of scene pixels between which P P^T vanishes, the connected components of its nonzero pattern.
+    """Return the groups of scene pixels between which P P^T vanishes, sorted by their first pixel.
 
-    Whole-number ``patterns`` P (n, K) are multiplied in integers, so that orthogonal rows give an exact zero. Otherwise
-    two pixels are separated only if no pattern lights both. Groups are sorted by their first pixel.
+    Whole-number ``patterns`` P (n, K) are multiplied in integers, so that orthogonal rows give an exact zero.
+    Otherwise two pixels are separated only if no pattern lights both.
     """
     kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
     whole = np.rint(kinds)
@@ -151,7 +141,6 @@ def group_pixels(patterns: FloatArray) -> tuple[Group, ...]:
 
 
 def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], centred: bool = False) -> Side:
-    """Factorise one side, ``phi`` (m, n) under ``patterns`` (n, K), by an SVD of B, block by block."""
     sensor, scene = phi.shape
     parts = [_block_svd(phi[:, group.pixels], group) for group in groups]
     singular = np.concatenate([part[1] for part in parts])

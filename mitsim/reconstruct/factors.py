@@ -39,7 +39,6 @@ SEPARABLE_RESIDUAL = 0.01
 UNKNOWN_NOISE = 0.05
 
 NOISE_MODEL = 0.2
-"""Part of the stated noise that may be left unexplained: an error of 4 % in its variance."""
 
 LARGEST_ERROR = 0.1
 _NUMBERS_AT_ONCE = 2**15
@@ -52,18 +51,11 @@ _TURNS, _TURNED = 30, 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Estimated factors and their quality.
+    """Estimated factors Phi_L (m, n), Phi_R (m', n), in the square root of the frames' unit, and their quality.
 
-    Attributes
-    ----------
-    left, right
-        Phi_L (m, n), Phi_R (m', n), in the square root of the frames' unit.
-    separability_residual, unexplained
-        sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses, and its part beyond the stated noise.
-    condition
-        Larger cond(Phi)^2 of the two; inf when rank deficient.
-    noise, predicted_error
-        Root mean square of Y_i - u_i v^T [frame unit], and the relative error (Frobenius) of factors by such noise.
+    ``separability_residual`` is sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2), and ``unexplained`` its part beyond
+    stated noise. ``noise`` is the rms of Y_i - u_i v^T [frame unit], and ``predicted_error`` the relative error by
+    such noise.
     """
 
     left: FloatArray
@@ -86,11 +78,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class ResponseFit:
-    """Contribution of one response to :class:`StripeSums`: least-squares u_i or w_i in Y_i = u_i common^T.
-
-    ``ambient`` (3,) is light that the mask does not cast: even, tilted along the response's vector, and tilted along
-    the common one. ``light`` (m,) is the projected sum of the response's two frames, or None.
-    """
+    """Contribution of one response to :class:`StripeSums`: least-squares u_i or w_i in Y_i = u_i common^T."""
 
     vector: FloatArray
     misfit: float
@@ -103,8 +91,8 @@ class ResponseFit:
 class StripeSums:
     """Running sums over the responses of one side, which continue to the same bits after being saved.
 
-    ``common`` is v (k,) of Y_i = u_i v^T or, for vertical stripes, a of Y_i^T = w_i a^T. ``vectors`` (m, N) are u_i or
-    w_i, and ``lights`` (m, N) the projected sums of each response's two frames, (m, 0) where they are unknown.
+    ``common`` is v of Y_i = u_i v^T or, for vertical stripes, a of Y_i^T = w_i a^T. ``lights`` (m, N) are the
+    projected sums of each response's two frames, (m, 0) where they are unknown.
     """
 
     side: str
@@ -181,7 +169,6 @@ def stripe_sums(
 
 
 def upright(response: FloatArray, light: npt.ArrayLike) -> FloatArray:
-    """Return a uniform ``response``, with its sign turned if its uncentred ``light`` is negative."""
     negative = np.sum(light) < -_NEGATIVE * np.abs(light).sum()
     return -response if negative else response
 
@@ -199,10 +186,9 @@ def estimate_factors(
 ) -> Estimate:
     """Estimate the factors of a separable camera from its responses to striped light.
 
-    ``horizontal`` and ``vertical`` are the responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T, each the difference of
-    two captures; ``H`` (n, N) has orthogonal rows of +-1, and a column 0 of +1 unless ``uniform`` (m, m'), the
-    response under all light, is given. ``noise`` is the rms of a response's noise, None if unknown. Raises MitsimError
-    for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
+    Responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T are differences of two captures; ``H`` (n, N) has orthogonal
+    rows of +-1, and a column 0 of +1 unless the response ``uniform`` is given. ``noise`` is a response's rms. Raises
+    MitsimError for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
     """
     signs = np.asarray(H, dtype=np.float64)
     if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
@@ -235,7 +221,6 @@ def factors_of_sums(
     stated_noise: float | None = None,
     extra: tuple[float, float] = (0.0, 0.0),
 ) -> Estimate:
-    """Return the factors of complete sums; ``extra`` is the squared error of each side's vectors beyond their noise."""
     v, a = left.common, right.common
     count = signs.shape[1]
     phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
@@ -296,7 +281,7 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     """Return the relative Frobenius error of a factor by independent noise of each datum.
 
     u_i = Y_i v / |v|^2 has variance noise^2 / |v|^2 a number, with |v| the ``common_norm``, and U H^T / N averages N
-    (``count``) of them. The error of v enters at second order and as a common scale, and is neglected.
+    (``count``) of them. The error of v is neglected, because it is of second order.
     """
     deviation = noise / (np.sqrt(count) * common_norm)
     norm = float(np.linalg.norm(factor))
@@ -307,8 +292,6 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
 
 
 class AmbientLight:
-    """Even light and light tilted along either side in responses u v^T, measured across the ``common`` vector v."""
-
     def __init__(self, common: FloatArray, length: int) -> None:
         self._places, even = np.linspace(-1, 1, length), np.ones(length)
         shapes = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))], axis=1)
@@ -337,7 +320,6 @@ def decibels(part: float) -> float:
 
 
 def squared_condition(phi: FloatArray, values: FloatArray | None = None) -> float:
-    """Return cond(phi)^2 of a factor ``phi`` (m, n) of known singular ``values``; inf when it is rank deficient."""
     values = np.asarray(np.linalg.svd(phi, compute_uv=False)) if values is None else values
     lost = phi.shape[0] < phi.shape[1] or values[-1] <= _rounding(phi, values)
     return float("inf") if lost else float((values[0] / values[-1]) ** 2)
@@ -346,7 +328,7 @@ def squared_condition(phi: FloatArray, values: FloatArray | None = None) -> floa
 def rank_above_noise(phi: FloatArray, error: float, values: FloatArray | None = None) -> int:
     """Return the number of singular ``values`` of ``phi`` (m, n) above rounding and noise of a relative ``error``.
 
-    The squared norm of m numbers of noise is chi-square; the limit is three standard deviations above its mean.
+    The limit is three standard deviations above the mean of chi-square of m degrees.
     """
     if not phi.any():
         return 0
@@ -364,9 +346,9 @@ def _rounding(phi: FloatArray, values: FloatArray) -> float:
 
 
 def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a (m,) and v (n,) whose product is the largest part of rank one of a uniform response ``mean`` (m, n).
+    """Return a (m,) and v (n,) whose product is nearest to a uniform response ``mean`` (m, n).
 
-    Power iteration is used unless it does not converge, because an SVD takes half a minute at 2048 x 2048.
+    Power iteration is tried first, because an SVD takes half a minute at 2048 x 2048.
     """
 
     def unit(vector: FloatArray) -> FloatArray:

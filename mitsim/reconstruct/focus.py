@@ -3,20 +3,18 @@
 *Depth.* A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate s = u (1 - d/z) + d
 tau, and projector pixel i lights it at tau = A_i + B_i / z, B_i being the baseline. So the factor of depth z is the
 calibrated one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_i - u)(1/z - 1/z_0) at the
-board. Beyond the window no column was calibrated, but sensor pixels further on saw the same part of the mask in a
-column within, at u + v and tau - v (1/d - 1/z_0) for any v. Rows at the sensor's edge without such a column are left
-out of frames and factors. Each pixel keeps the brightness that it had at z_0.
+board. Beyond the window, sensor pixels further on saw the same part of the mask in a column within, at u + v and tau -
+v (1/d - 1/z_0) for any v. Rows at the sensor's edge without such a column are left out.
 
 *Between columns.* Sensor row u + k sees in column i what row u sees at i + k s, s being the columns that one sensor
-pixel's step makes up for. So each row uses the numbers of its neighbours too, and a cubic spline with knots finer than
-columns is fitted to all of them.
+pixel's step makes up for. So a cubic spline with knots finer than columns is fitted to neighbouring rows.
 
 *Margin.* A wall beside the window scatters light of directions that no projector pixel has. Cells beyond the window
-cast the shadow of the window's edge, moved along the sensor, so that no calibration needs to light them. They count as
-lit in every pattern, which keeps the model separable.
+cast the shadow of the window's edge, moved along the sensor, and count as lit in every pattern, so that the model
+stays separable.
 
-*Global light* is the same in all frames under shifting dots (Nayar, Krishnan, Grossberg and Raskar 2006). With P_ij the
-patterns,
+*Global light* is the same in all frames under shifting dots (Nayar, Krishnan, Grossberg and Raskar 2006). With P_ij
+the patterns,
 
     Y_ij = Phi_L (P_ij o X) Phi_R^T + F,        F = Phi_L H_L g H_R^T Phi_R^T
 
@@ -26,7 +24,8 @@ on each side and A = (sum_i U_i)^T Q, the least squares of all K frames over X a
     K f - A_L^T (A_L f A_R^T) A_R = Q_L^T (sum_ij Y_ij) Q_R - A_L^T W A_R
 
 An eigenvalue of the left side over K is the part of a mode of F that lit pixels do not explain: 0 under uniform light,
-near 1 where the dots' shadows leave gaps. Global light that changes from frame to frame stays in X."""
+near 1 where the dots' shadows leave gaps.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +49,6 @@ from mitsim.reconstruct.solver import Prepared
 
 _NEIGHBOURS = 4
 _DEGREE = 4
-"""Degree of the polynomial of brightness over columns: cos^4 of 8.5 degrees is a parabola to 1e-4."""
 _PAIRS = 32
 _HIDDEN = 0.5
 LEAST_PART = 0.5
@@ -86,8 +84,6 @@ class DerivedCapture(Capture):
 
 @dataclass(frozen=True, eq=False)
 class MovedFactors:
-    """Factors of a depth or of a wider window, on the sensor's ``rows`` and ``columns`` where they are known."""
-
     factors: Factors
     rows: slice
     columns: slice
@@ -131,7 +127,6 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
 
 
 def widen_factors(factors: Factors, cells: int) -> MovedFactors:
-    """Return ``factors`` with ``cells`` more columns a side, on the part of the sensor where these are known."""
     parallax, sides = parallax_of(factors), (factors.left, factors.right)
     if cells > (most := min(factor.shape[1] for factor in sides)):
         raise ArgumentError("margin", f"{cells}: give at most {most}, the projector's pixels a side")
@@ -154,7 +149,6 @@ def widen_factors(factors: Factors, cells: int) -> MovedFactors:
 
 
 def light_margin(shots: Capture, cells: int) -> Capture:
-    """Return ``shots`` with patterns that always light a margin of ``cells``."""
     if any(shot.sign for shot in shots.manifest.patterns.captures):
         raise MitsimError(
             f"margin {cells}: {shots.name} shows patterns of -1, as differences of two frames, in which what is lit "
@@ -178,8 +172,7 @@ def parallax_of(factors: Factors) -> Parallax:
 def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float, float, float]:
     """Return projector pixels of parallax: two for a change of 1/z by 1/mm, one for a step along the sensor by 1 mm.
 
-    The first two are at the window's first and last edge. ``axis`` is 0 for rows and 1 for columns, ``count`` the
-    number of projector pixels along it.
+    The first two are at the window's first and last edge.
     """
     window, edges = (parallax.row_tan, parallax.row_mm) if axis == 0 else (parallax.column_tan, parallax.column_mm)
     pixel = (window[1] - window[0]) / count
@@ -192,7 +185,7 @@ def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float
 class FactorOfDepths:
     """A calibrated ``factor`` (m, n) of the left (``axis`` 0) or right side (1), and how it moves with depth.
 
-    A change of 1/z by 1/mm moves the light of each pixel by ``edges`` (n,), and what a sensor pixel sees by at most
+    A change of 1/z by 1/mm moves the light of each pixel by ``edges`` (n,), and a sensor pixel's view by at most
     ``reach`` projector pixels.
     """
 
@@ -222,7 +215,6 @@ class FactorOfDepths:
         return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
 
     def beyond(self, margin: int) -> tuple[FloatArray, slice]:
-        """Return the factor with ``margin`` more columns a side, and the sensor rows where all of them are known."""
         rows, count = self.factor.shape
         column = np.arange(-margin, count + margin)
         row, within, known = self._sources(np.broadcast_to(column, (rows, column.size)))
@@ -231,7 +223,6 @@ class FactorOfDepths:
         return shadows, _whole(known)
 
     def hidden_part(self, shift: float) -> FloatArray:
-        """Return the part (n,) of each column's light that the field stop blocks."""
         return np.asarray(1 - self._transmission(self._source_columns(shift)).mean(axis=0))
 
     def noise(self, shift: float) -> float:
@@ -318,8 +309,6 @@ _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
 class ColumnSpline:
-    """Spline of a ``factor`` (m, n) between its columns, whose shadow moves by ``step`` columns from row to row."""
-
     def __init__(self, factor: FloatArray, step: float) -> None:
         rows, count = factor.shape
         self._last, reach = (count - 1) * _SPLINE_KNOTS, min(_SPLINE_ROWS, (rows - 1) // 2)
@@ -369,10 +358,7 @@ _LEAST_EIGENVALUE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Light ``common`` (m, m') of all frames, and the ``image`` (n, n') that it looks like under uniform light.
-
-    ``eigenvalues`` are the part of each mode that lit pixels do not explain, smallest first.
-    """
+    """Light ``common`` (m, m') of all frames, and the ``image`` (n, n') that it looks like under uniform light."""
 
     common: FloatArray
     image: FloatArray
@@ -389,9 +375,8 @@ def separate(
 ) -> Separation:
     """Return the global light of frames under shifting dots.
 
-    ``seen`` are the factors (m, n + 2 w), (m', n' + 2 w') with w columns beside the window, ``patterns`` P_L (n, K)
-    and P_R (n', K'), ``weights`` W (r, r') and ``total`` the sum (m, m') of all frames. Raises MitsimError for uniform
-    light, +-1 patterns or centred factors, under which global light looks like an image.
+    ``seen`` are the factors with columns beside the window. Raises MitsimError for uniform light, +-1 patterns or
+    centred factors, under which global light looks like an image.
     """
     if model.centre or any((side < 0).any() for side in patterns):
         raise MitsimError("separation: takes dots before a mask that is not centred; use dots:K")

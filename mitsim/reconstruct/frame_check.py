@@ -52,10 +52,9 @@ _UNMOVED, _SHARED = 0.3, 0.25
 class PictureCheck:
     """Comparison of each of the K frames of a run of shifting dots with the picture that the others show.
 
-    ``frame_of`` (n, n') is the number of the shot that lights each pixel, ``periods`` are the pixels between dots, and
-    ``noise`` (n, n') is the image's variance by the frames' noise. ``power`` (K,) is relative to the mean;
-    ``predicted`` is the standard error of predicted pixels; ``foreign`` and ``disturbed`` (K,) are robust deviations
-    of the whole frame, and of its worst window. They exist only if the picture is large enough (``decides``).
+    ``frame_of`` (n, n') is the number of the shot that lights each pixel; ``foreign`` and ``disturbed`` (K,) are
+    robust deviations of the whole frame and of its worst window. Results exist only if the picture is large enough
+    (``decides``).
     """
 
     def __init__(self, image: FloatArray, frame_of: IndexArray, periods: Sequence[int], noise: FloatArray) -> None:
@@ -128,7 +127,6 @@ class PictureCheck:
         return np.asarray(np.sqrt(variance))
 
     def _disturbance(self, moved: FloatArray, periods: Sequence[int], common: float) -> FloatArray:
-        """Return the largest deviation (K,) of the mean of a window of each frame, alone and with up to three later."""
         cells = [
             place // each for place, each in zip(np.unravel_index(self._pixels, self._shape), periods, strict=True)
         ]
@@ -156,12 +154,11 @@ class PictureCheck:
     def _fit(
         self, image: FloatArray, changes: Sequence[FloatArray], prior: float, learned: Sequence[float] = ()
     ) -> tuple[FloatArray, FloatArray]:
-        """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n').
+        """Return how far each frame is off by each of the ``changes`` (n, n') of an ``image``, with errors.
 
-        Returns the parameters and their standard errors by the sandwich estimator (Huber 1967), because differences
-        are not normal. Least squares are reweighted by Cauchy's weights, because edges of the print are outliers; with
-        ``learned`` scales the stencil is fitted, too. It has no negative weights, because these imitate a lamp that
-        flickers in the period of the dots.
+        The errors are those of the sandwich estimator (Huber 1967), because differences are not normal. Least squares
+        are reweighted by Cauchy's weights, because edges of the print are outliers. The stencil has no negative
+        weights, because these imitate a lamp that flickers in the period of the dots.
         """
         own, target = self._pairs(image, self._some), image.ravel()[self._some]
         # The same change of all frames is a change of the picture, and is held at zero.
@@ -218,7 +215,6 @@ _TURNED, _SIDE = 0.5, 0.3
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
 _FOREIGN, _DISTURBED = 6.5, 7.5
 _FLICKERS, _POWER = 15.0, 0.01
-"""Scatter of powers over its error, and least scatter, reported as flicker; regular textures imitate smaller ones."""
 _FEWEST_PAIRS, _FEWEST_FRAMES, _MOST_NUMBERS = 4, 3, 3e7
 _DOTS = "under dots each scene pixel is in one frame, so that only the picture shows a change of lamp, camera or scene."
 _LEAKING = "Light of the room cancels. A projector that leaks it since it was calibrated darkens the image as much."
@@ -230,8 +226,6 @@ _OUTLIER, _DIMMED = 6.5, 0.02
 
 @dataclass(frozen=True)
 class FrameFault:
-    """Shots (numbered from 0) that do not fit the others, and the part of their light, rms, by which they differ."""
-
     kind: str
     numbers: tuple[int, ...]
     files: tuple[str, ...]
@@ -246,8 +240,6 @@ class FrameFault:
 
 
 class FrameCheck:
-    """Tests the frames of accumulated ``data``; ``beside`` is the energy of rendering, the factors' noise and print."""
-
     def __init__(self, data: Accumulation, sums: Residuals, lam: float, ratio: float, beside: float) -> None:
         self._data, self._sums, self._beside = data, sums, beside
         self._variance, self._signed = ratio * data.noise.variance, data.noise.shots == 2
@@ -276,7 +268,6 @@ class FrameCheck:
     # ---- Tests of single frames
 
     def _alone(self) -> Iterator[FrameFault]:
-        """Report a run without light, frames that are equal to the last bit, and single frames that are clipped."""
         noise, count = self._data.noise, len(self._shots)
         if abs(float(noise.means.sum())) < CHANCE * float(np.sqrt(noise.variance.sum() / self._sums.squares.size)):
             yield self._fault("dark", range(count), "holds no light" if count == 1 else "hold no light")
@@ -288,7 +279,6 @@ class FrameCheck:
                 yield self._fault("clipped", [self._number[shot]], f"has {readings} readings at its largest number")
 
     def _unlike_model(self) -> Iterator[FrameFault]:
-        """Compare each frame with the prediction of the others by the model."""
         sums, count, noise = self._sums, self._variance.size, self._variance
         share = self._beside * sums.shots / max(float(sums.shots.sum()), TINY)
         tests = [(sums.leave_out - noise * sums.free - share, noise * np.sqrt(2 * sums.free))]
@@ -371,7 +361,6 @@ class FrameCheck:
         yield from self._powers(power, error, [self._number[(*pattern, 0)] for pattern in patterns], CHANCE)
 
     def _powers(self, power: FloatArray, error: FloatArray, of: Sequence[int], errors: float) -> Iterator[FrameFault]:
-        """Name shots of another power than the rest, or all of them if the powers of most differ."""
         scatter, middle = robust_scatter(power), float(np.median(power))
         single = np.abs(power - middle) > np.maximum(_OUTLIER * np.maximum(error, scatter), _DIMMED)
         if single.any() and single.sum() <= max(1, _MOST_BAD * len(power)):

@@ -281,8 +281,6 @@ _COPIES = 4
 
 
 class KnownFrames:
-    """Frames, scenes and noise of a list of captures; ``noises`` are NaN where the run does not state its sensor."""
-
     def __init__(self, captures: KnownCaptures, aged: Mapping[str, Factors] | None = None) -> None:
         self.exposures, self.noises, self.saturated, self.frames = list[Exposure](), list[float](), list[str](), 0
         self.sums: dict[str, str] = {}
@@ -323,14 +321,12 @@ class KnownFrames:
                     self.saturated.append(name)
 
     def noise(self, number: int, misfit: FloatArray) -> float:
-        """Return the stated noise variance of an exposure, or estimate it from second differences of the ``misfit``."""
         if np.isfinite(self.noises[number]):
             return self.noises[number]
         guess = float(np.mean(np.square(np.diff(np.diff(misfit, 2, 0), 2, 1)))) / _OF_DIFFERENCES**2
         return guess / _differences_of_turned(misfit.shape, self.prepared)
 
     def misfit(self, models: Iterable[tuple[FloatArray, float]]) -> tuple[float, float, float]:
-        """Return explained part, rms part that neither models nor noise explain, and mean of misfit over noise."""
         excess = energy = total = 0.0
         ratios = []
         for number, (each, (model, error)) in enumerate(zip(self.exposures, models, strict=True)):
@@ -352,11 +348,7 @@ class KnownFrames:
 
 
 def _differences_of_turned(shape: tuple[int, ...], how: Preparation) -> float:
-    """Return the noise that second differences show over the true noise, after turning by bilinear interpolation.
-
-    A pixel that is r of one neighbour and 1 - r of the other has r^2 + (1 - r)^2 of the noise. Its second differences,
-    as of (r, 1 - 3 r, 3 r - 2, 1 - r), have less.
-    """
+    """Return the noise that second differences show over the true noise, after turning by bilinear interpolation."""
     angle, crop = np.radians(how.turn_deg), how.crop or Crop()
     pivot = (np.array(shape) - 1) / 2 if how.turn_about == "centre" else np.array([-crop.row, -crop.column])
     y, x = np.arange(shape[0])[:, None] - pivot[0], np.arange(shape[1]) - pivot[1]
@@ -538,7 +530,6 @@ class _Shadow:
         return float(best.x)
 
     def move_by(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
-        """Return the factor moved by so many ``pixels`` (m, n), its slope, and where the shadow is known."""
         place = self._place + pixels
         within = (place >= self._first) & (place <= self._last)
         place = np.clip(place, self._first, self._last)
@@ -588,7 +579,6 @@ class _AgedCamera:
         return found
 
     def first_guess(self, name: str) -> FloatArray:
-        """Return the move, in whole pixels, and the gains that make frames most alike."""
         some = self._read.exposures[:: -(-len(self._read.exposures) // _STARTED)]
         still = {line: self.moved(line, np.zeros(3)) for line in self._factors}
         shape = some[0].frame.shape

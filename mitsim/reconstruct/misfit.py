@@ -3,18 +3,16 @@
 A run either fits its model at the level of its noise, or it is flagged, with the place and with the readings of the
 data that restore the fit. Four measurements decide, in this order:
 
-1. Noise: second differences of the residuals measure the noise of the frames (:mod:`mitsim.reconstruct.residuals`). Too
-   much and too little are flagged as noise, apart from energy that is unexplained.
-2. Energy: the residuals' energy beyond that of the noise, of the calibration's error, of rendering and of print finer
-   than a scene pixel, for the whole sensor, its tiles, rows, columns and pixels, and in time.
-3. Frames: each frame against what the others predict of it (:mod:`mitsim.reconstruct.frame_check`).
+1. Noise: second differences of the residuals (:mod:`mitsim.reconstruct.residuals`).
+2. Energy: the residuals' energy beyond that of noise, calibration error, rendering and print finer than a scene pixel,
+   for the whole sensor, its tiles, rows, columns and pixels, and in time.
+3. Frames: each frame against the prediction of the others (:mod:`mitsim.reconstruct.frame_check`).
 4. Readings, if one of these is off: turned frames, shots in another order, tone curves, scale, lag, and a light that is
-   the same in all frames (:mod:`mitsim.reconstruct.residuals`).
+   the same in all frames.
 
-*Defective pixels.* A pixel that reads nothing of the light, or more than it, is off in every frame, and its neighbours
-are not. A separable solver cannot weigh single pixels, so their readings are replaced by what the model tells of them
-from all others: setting y - r / (1 - h) at a datum of leverage h leaves an image as if it had not been measured.
-Pixels that share frames are set in rounds, each of which leaves the part h of the step before.
+*Defective pixels.* A defective pixel is off in every frame, and its neighbours are not. A separable solver cannot
+weigh single pixels, so their readings are replaced by the prediction from all others: setting y - r / (1 - h) at a
+datum of leverage h leaves an image as if it had not been measured. Pixels that share frames are set in rounds.
 """
 
 from __future__ import annotations
@@ -54,10 +52,7 @@ from mitsim.reconstruct.uncertainty import Propagation
 
 _SPREADS = 7.0
 _AROUND, _CROWD = 3, 0.35
-"""Pixels to each side that a pixel is compared with, and the largest part of these 7 x 7 that may be off."""
 _MOST, _LEAKS = 0.02, 0.1
-"""Largest defective part of a sensor, and limit of a pixel's energy by a neighbour's reading: 0.03 at 0.4 of its side.
-"""
 _LEAST_VARIANCE, _MOST_VARIANCE = 1e-3, 4.0
 _ROUNDS, _PLACES_SHOWN = 8, 5
 
@@ -115,7 +110,6 @@ class LeftOut(DerivedCapture):
 
 
 def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defects | None:
-    """Return pixels that are off in all measurements of ``data``, by their residuals ``squares`` (m, m'), or None."""
     noise, prepared, count = data.noise, data.prepared, data.noise.variance.size
     mean = noise.light / count
     variance = ratio * noise.of(mean, noise.shots)
@@ -128,7 +122,6 @@ def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defec
 
 
 def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects | None:
-    """Return pixels whose residual exceeds noise and that of their neighbours, or None where there are none."""
     mean = float(variance.mean()) or 1.0
     ratio = squares / np.clip(variance, _LEAST_VARIANCE * mean, _MOST_VARIANCE * mean)
     limit, typical, most, width = _limit(count), (1 - 2 / (9 * count)) ** 3, float(ratio.max()), 2 * _AROUND + 1
@@ -154,8 +147,7 @@ def _limit(count: int) -> float:
 
 
 UNEXPLAINED = 3.5e-3
-"""Part of the measurements, rms, that may be unexplained: prints leave up to 3e-3; 2 mm off 400 leaves 4.2e-3 or more.
-"""
+"""Unexplained part of the measurements, rms, at most: prints leave up to 3e-3; 2 mm off 400 leaves 4.2e-3 or more."""
 GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
 _LAMBDA_BESIDE = 1e-3
 _SHOWN, _MOSTLY = 4, 0.5
@@ -163,8 +155,6 @@ _IN_RANGE, _COMMON_IMAGE = 1e-6, 0.01
 
 
 class Cause(Enum):
-    """Measurement that flags an image; the value is its name in words, and the remedy."""
-
     NOISE = (
         "the frames' noise",
         "check gain, read noise and black level of the camera file, and that the numbers are raw",
@@ -185,24 +175,11 @@ class Cause(Enum):
 class Misfit:
     """Part of the measurements that the model does not explain, and its cause.
 
-    Attributes
-    ----------
-    chi_square, unexplained
-        Energy of the residual over the expected energy; root of the excess beyond print, relative to the measurements.
-    tiles, worst_tile
-        (rows, columns) chi-square of each tile of the sensor, and the largest unexplained part of a tile.
-    stated
-        Whether the noise of sensor and calibration were stated; otherwise only gross misfit is flagged.
-    noise, gain
-        Measured over stated noise, None of frames that are too small; and the stated gain [DN per electron].
-    predicted
-        Part that the calibration predicts of ``unexplained``, because its factors lack it; None if unknown.
-    detail
-        Part of the measurements, rms, by print finer than a scene pixel; no part of ``unexplained``.
-    common
-        Relative change of the image, rms, by light that is the same in all frames.
-    limits
-        Questions that the frames leave undecided.
+    ``chi_square`` is the residual's energy over the expected one, by tile in ``tiles``; ``unexplained`` is the rms of
+    the excess beyond print, relative to the measurements, of which the calibration predicts ``predicted``. Print finer
+    than a scene pixel (``detail``) is no part of it. Without ``stated`` noise only gross misfit is flagged. ``noise``
+    is measured over stated noise, ``gain`` the camera's stated gain [DN per electron], and ``common`` the relative
+    change of the image by light that all frames share.
     """
 
     chi_square: float
@@ -349,7 +326,6 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
 
 
 def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:
-    """Return frames at fault of a scene of several depths, of which the model fits a part."""
     beside = data.noise.rendering + (data.factor_energy(image) or 0.0) + print_energy(data.model, image)
     return FrameCheck(data, Residuals(data), lam, 1.0, beside).faults()
 
@@ -357,9 +333,7 @@ def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[Fr
 def _common_light(data: Accumulation, sums: Residuals, stated: float, beside: float) -> FloatArray | None:
     """Return the light (m, m') that is the same in all measurements; None if chance or factor errors explain it.
 
-    It must have more energy than the factors' errors, which are common to all frames, and most of the residual beyond
-    them and the ``stated`` noise. The light is even (a wrong black level), or that of an even scene (a lamp in the
-    room).
+    The light is even (a wrong black level), or that of an even scene (a lamp in the room).
     """
     prepared, count = data.prepared, data.noise.variance.size
     if data.noise.shots == 2 or count < 2:
@@ -395,7 +369,6 @@ def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -
 def weigh(
     energies: tuple[FloatArray, ...], factors_stated: bool, noise: FrameNoise, print_energy: float
 ) -> tuple[Misfit, float]:
-    """Return the misfit, without its cause, and the energy that is unexplained."""
     residual, energy, expected, pixels = energies
     beyond = residual - expected - print_energy * pixels / pixels.sum()
     excess = float(beyond.sum())

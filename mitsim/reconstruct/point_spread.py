@@ -1,22 +1,19 @@
 """Image within bounds from frames, patterns and a measured point spread function.
 
 A camera whose scene points all cast one light h, each shifted by its place (:mod:`mitsim.reconstruct.convolution`),
-sees Y_i = crop(h * (P_i o X)). Over all X within bounds
+sees Y_i = crop(h * (P_i o X)). Minimised over all X within bounds is
 
     P(X) = 1/2 sum_i ||Y_i - crop(h * (P_i o X))||^2 + weight TV(X) + ridge / 2 ||X||^2
 
-is minimised.
+**Scene.** Under uniform light the scene is everything that can put light on the sensor: frames of m pixels and h of k
+have m + k - 1 scene pixels a side. The image is its middle, as large as the sensor. Under patterns the scene is
+theirs, and dark beyond.
 
-**Scene.** Under uniform light it is everything that can put light on the sensor: frames of m pixels and h of k have m +
-k - 1 scene pixels a side. The image is the middle of it, as large as the sensor; the rest takes up light from outside.
-Under patterns the scene is theirs, and dark beyond.
-
-**Method.** Passes of a few steps of conjugate gradients in the pixels that bounds leave free, each followed by a
-projection on the bounds (Moré and Toraldo, SIAM J. Optim. 1, 1991). |H|^2 spans seven decades, so that steps are
-preconditioned by a division by |H|^2 + mu and start from the image at half the size. TV is quadratic where slopes are
-below a thousandth of the peak over a pixel, and in each pass replaced by the quadratic that touches it. The iterations
-end where the last half of all steps has lowered the objective by at most ``tolerance`` of itself (Strakos and Tichy,
-ETNA 13, 2002).
+**Method.** Passes of a few steps of conjugate gradients in the pixels that bounds leave free are each followed by a
+projection on the bounds (Moré and Toraldo, SIAM J. Optim. 1, 1991). Because |H|^2 spans seven decades, steps are
+preconditioned by a division by |H|^2 + mu and start from the image at half the size. TV is quadratic for small slopes,
+and in each pass replaced by the quadratic that touches it. The iterations end where the last half of all steps has
+lowered the objective by at most ``tolerance`` of itself (Strakos and Tichy, ETNA 13, 2002).
 
 **Gap.** With r the frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that pushes against bounds alone,
 and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the bounds, no farther than R = ||X||
@@ -27,17 +24,15 @@ from X,
 with g = A^T (r + e) + ridge X + div Q - N, where |g| > ridge R; otherwise |g|^2 / (2 ridge) replaces the last two
 terms. d is a few steps of conjugate gradients on A^T A d = -g.
 
-**Weight.** Blocks of sensor pixels are left out, the image of the rest is made, and the light that it sends to these
-blocks is compared with theirs. Where the lambda that predicts them best asks for clearly more noise than the frames
-have, the model is wrong by as much, and the weight follows from that error in place of the noise.
+**Weight.** Blocks of sensor pixels are held out and predicted from the image of the rest. Where the best lambda asks
+for clearly more noise than the frames have, the weight follows from that model error in place of the noise.
 
-**Fit.** A frame has fewer pixels than the scene, so that any point spread function fits it with some image. A wrong one
+**Fit.** Any point spread function fits a frame with some image, because the scene has more pixels, but a wrong one
 needs a negative or rough image. So the least of
 
     1/2 ||A X - Y||^2 + w TV(X),    X >= 0
 
-is compared with that of the same light mirrored and turned, which has the same spectrum and thus the same power to
-explain frames.
+is compared with that of the same light mirrored and turned, which has the same spectrum.
 """
 
 from __future__ import annotations
@@ -61,7 +56,6 @@ from mitsim.reconstruct.solvers import Prior, lengths, slopes_adjoint, slopes_of
 Array = npt.NDArray[Any]
 
 _MU = 10.0
-"""mu over the mean of |H|^2."""
 _COARSE_STEPS, _LEAST_SIDE = 60, 32
 _SMOOTH = 1e-3
 _FIRST_SMOOTH, _SHARPENED = 10.0, 0.3
@@ -81,10 +75,9 @@ _HUGE = 1e30
 class ShiftedLight:
     """Camera whose scene points all cast one pattern of light ``psf`` (k, k').
 
-    ``patterns`` are P_L (n, K) and P_R (n', K'), or None for uniform light of all that reaches the sensor. ``seen``
-    (m, m') is 1 for pixels that count, 0 for held-out ones. ``scene``, ``whole`` and ``origin`` are the scene's size,
-    that of its light, and the first lit pixel on the sensor; ``window`` is the part of the scene that is the image.
-    ``grid`` is the size of transforms, such that light that wraps round lands beside the sensor.
+    ``patterns`` are P_L (n, K) and P_R (n', K'), or None for uniform light. ``seen`` (m, m') is 0 for held-out pixels.
+    ``scene`` and ``whole`` are the sizes of the scene and of its light, whose first pixel is ``origin`` on the sensor;
+    ``window`` is the part of the scene that is the image. Light that wraps round ``grid`` lands beside the sensor.
     """
 
     psf: FloatArray
@@ -128,7 +121,6 @@ class ShiftedLight:
 
     @classmethod
     def of(cls, psf: FloatArray, n: int, sensor: tuple[int, int] | None = None) -> ShiftedLight:
-        """Return a camera before an evenly lit scene of ``n`` x ``n`` pixels, whose sensor gets all light."""
         if n < 1:
             raise MitsimError(f"scene of {n} pixels a side; give at least 1")
         rows, columns = (size + n - 1 for size in psf.shape)
@@ -149,7 +141,6 @@ class ShiftedLight:
             )
 
     def image_of(self, scene: Array) -> Array:
-        """Return the frames (K K', m, m') of a ``scene`` (n, n')."""
         frames = np.empty((self.count, *self.sensor), self.precision)
         rows, columns = self._crop
         for frame, light in zip(frames, self._lights, strict=True):
@@ -173,7 +164,7 @@ class ShiftedLight:
         return total
 
     def half_size(self) -> ShiftedLight | None:
-        """Return the camera at half the size, or None under patterns, with held-out pixels, and if too small."""
+        """Return the camera at half the size; None under patterns, with held-out pixels, or if too small."""
         small = min(*self.psf.shape, *self.sensor) // 2 < _LEAST_SIDE
         return None if small or self.patterns is not None or self.seen is not None else self.reduce(2)
 
@@ -366,10 +357,10 @@ def _dot(first: Array, second: Array) -> float:
 
 
 class Minimum(NamedTuple):
-    """Image near the minimum: the whole scene (n, n'), and the steps at full size.
+    """Image (n, n') of the whole scene near the minimum.
 
-    ``fall`` is the relative fall of the objective in the last half of the steps, or the promise of the last pass if
-    larger; ``gap`` bounds the objective's excess over its minimum, over the objective.
+    ``fall`` is the objective's relative fall in the last half of the steps; ``gap`` bounds its excess over the
+    minimum.
     """
 
     image: Array
@@ -380,7 +371,6 @@ class Minimum(NamedTuple):
 
 
 def minimise(light: ShiftedLight, frames: Array, prior: Prior, iterations: int, tolerance: float) -> Minimum:
-    """Minimise P, until the fall is at most ``tolerance`` or after ``iterations`` steps at full size."""
     state, spent, fall = _descend(_start(light, frames, prior), iterations, tolerance)
     return Minimum(state.image, spent, state.objective, fall, state.gap() / max(state.objective, _NOTHING))
 
@@ -465,7 +455,6 @@ _BLOCKS, _KEPT = 12, 8
 _HALVES = range(-16, 7)
 _TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
 _MODEL_ERROR, _ROUGH, _LEFT = 0.01, (3.0, 0.3), 4.0
-"""Least relative error of a model; TV's two weights; chi-square above which the second one is used."""
 _ALIKE = 0.9
 _BETTER, _EQUAL = 0.85, 0.98
 """Cost ratios of the best turned copy below which it is recommended, and below which the light is wrong."""
@@ -476,10 +465,7 @@ _GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
 
 
 def frame_noise(frame: Array) -> float:
-    """Return the noise of a ``frame`` by the median of its mixed second differences; 0 for fewer than 3 x 3 pixels.
-
-    Light of a few sharp lines does not change that median (Immerkaer, Comput. Vis. Image Underst. 64, 1996).
-    """
+    """Return the noise by mixed second differences (Immerkaer, Comput. Vis. Image Underst. 64, 1996)."""
     if min(frame.shape) < 3:
         return 0.0
     bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
@@ -498,7 +484,7 @@ def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, in
 def frame_error(light: ShiftedLight, frames: Array) -> float:
     """Return the deviation of ``frames`` (K K', m, m') from the light that a model explains.
 
-    It is their noise or, under uniform light, the noise whose ridge predicts held-out pixels best, if clearly more.
+    It is their noise or, if clearly larger, the noise whose ridge predicts held-out pixels best.
     """
     mean = float(frames.mean())
     if mean <= 0:
@@ -528,10 +514,7 @@ def frame_error(light: ShiftedLight, frames: Array) -> float:
 
 
 def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Literal["ridge", "weight"]) -> Prior:
-    """Return ``prior`` with an automatic ridge or weight of TV.
-
-    Raises MitsimError for frames without light, and for a ridge under patterns.
-    """
+    """Return ``prior`` with an automatic ridge or weight of TV."""
     if kind == "weight":
         return replace(prior, weight=_WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power))
     if light.patterns is not None:
@@ -546,10 +529,8 @@ def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Lite
 class PointSpreadFit:
     """Fit of frames to a point spread function.
 
-    ``unexplained`` is the residual beyond noise, rms, over the frames. ``gain`` is the cost of the best turned or
-    mirrored copy (``reading``) over that of the light as given, None where all are alike. ``off`` is the distance
-    [rows, columns] from the middle of the picture to the light's centre. Noise that is not ``stated`` was measured
-    from the frames.
+    ``gain`` is the cost of the best turned or mirrored copy (``reading``) over that of the light as given, None where
+    all are alike. ``off`` is the distance [rows, columns] from the middle of the picture to the light's centre.
     """
 
     chi_square: float
@@ -613,7 +594,6 @@ class PointSpreadFit:
 
 
 def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> PointSpreadFit:
-    """Return the fit of ``frames`` to ``light``; ``variance`` is their mean noise variance, None if not stated."""
     small, seen, factor = _shrink(light, frames)
     rows, columns = (max(size // 16, 1) for size in seen.shape[1:])
     strips = [strip for frame in seen for strip in np.array_split(frame, rows)]

@@ -129,7 +129,6 @@ class Reconstruction(Solution):
         return tuple(f"Not decided: {limit['words']}" for limit in self.misfit.limits) if self.misfit else ()
 
     def summary(self) -> dict[str, Any]:
-        """Return the entries of result.json."""
         return {
             "lambda": self.lam,
             "rank": self.rank,
@@ -243,10 +242,7 @@ def _check_stored(more: object) -> None:
 
 
 def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:
-    """Return True if ``folder`` contains an image that may be replaced, False if it contains none.
-
-    Raises MitsimError for an image of other inputs than ``asked`` unless ``overwrite`` is on.
-    """
+    """Return True if ``folder`` contains an image that may be replaced, False if it contains none."""
     if not holds_image(folder):
         return False
     if not overwrite:
@@ -255,10 +251,6 @@ def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool)
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """Return the contents of result.json of a finished image in ``folder``.
-
-    Raises MitsimError where the image is unfinished, or its files have changed.
-    """
     result = read_json(folder / RESULT_FILE)
     if not isinstance(result, dict) or result.get("status") == _INCOMPLETE:
         raise MitsimError(f"{folder / RESULT_FILE}: holds no result of a finished image; reconstruct it again")
@@ -405,7 +397,6 @@ def check_image(shots: Capture, factors: Factors, request: ImageRequest) -> tupl
 def _judge(
     data: Accumulation, solution: Solution, depths: DepthMap | None, lam: float | Literal["auto"]
 ) -> tuple[Accumulation, Solution, Misfit | None]:
-    """Return the misfit, and data and solution without defective pixels where frames fit better without them."""
     if depths:
         image = depths.image
         misfit = depths.misfit(data.noise, data.factor_energy(image), print_energy(data.model, image))

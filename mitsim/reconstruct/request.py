@@ -34,8 +34,6 @@ def method_names() -> str:
 
 
 def _two(name: str, rule: str, low: float | None = None, high: float | None = None) -> Callable[[str], Any]:
-    """Return a function that reads the two numbers of LOW:HIGH; ends may be left out where they have a default."""
-
     def read(text: str) -> tuple[float, float]:
         first, colon, last = text.partition(":")
         try:
@@ -152,7 +150,6 @@ class ImageRequest(Options):
         return self.focus in ("auto", "map")
 
     def check_point_spread(self, reduce: int) -> None:
-        """Refuse options that a point spread function does not have, and a ``reduce`` that is no number of pixels."""
         if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:
             raise ArgumentError("reduce", f"{reduce}: give a whole number, 1 to {MOST_REDUCED}")
         for name, neutral in (("focus", None), ("margin", 0)):
@@ -167,7 +164,6 @@ class ImageRequest(Options):
             )
 
     def inputs(self, shots: Capture, factors: Factors) -> dict[str, Any]:
-        """Return all that decides an image: these options, and fingerprints of its ``shots`` and ``factors``."""
         asked: dict[str, Any] = {
             "run": shots.fingerprint,
             "calibration": factors.fingerprint,
@@ -181,8 +177,6 @@ class ImageRequest(Options):
 
 
 class ImageKeys(TypedDict, total=False):
-    """Keywords of :class:`ImageRequest`, without lambda and method."""
-
     focus: float | Literal["auto", "map"] | None
     margin: int
     depth_range: tuple[float, float] | None
@@ -221,7 +215,6 @@ _READ_S, _ADD_S, _JUDGE_S = 3.5e-8, 1.5e-8, 2e-8
 """Seconds for a pixel of a frame, on one processor: read, added up, and compared with the model."""
 _SHOT_S = 4e-3
 _PRODUCT_S = 6e-10
-"""Seconds for a multiplication of an SVD, of which one of (m, c) takes dozens times m c^2."""
 _PLAIN_S = 0.05
 
 
@@ -234,7 +227,6 @@ class ImageCost:
 
 
 def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
-    """Predict the time and memory of the Tikhonov image of ``shots`` by ``factors``, at the calibrated depth."""
     pixels = float(len(factors.left) * len(factors.right))
     count, (left, right) = len(shots.manifest.patterns.captures), shots.patterns
     measured = left.shape[1] * right.shape[1]
@@ -254,13 +246,11 @@ def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
 
 
 def keeps_frames(shots: Capture, factors: Factors) -> bool:
-    """Return True if the measurements of ``shots`` are so few that they are kept instead of read twice."""
     left, right = shots.patterns
     return bool(left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= KEPT_NUMBERS)
 
 
 def slab_numbers(shots: Capture, factors: Factors, whole: bool = False) -> float:
-    """Return the count of numbers in the factors and in all slabs that they are factorised into."""
     sides = zip((factors.left, factors.right), shots.patterns, strict=True)
     return float(
         sum(

@@ -5,17 +5,15 @@ depends on no lambda. With noise of variance v in all data, its mean square at a
 diagonal of H.
 
 *Noise.* Second differences along rows and along columns hardly see smooth light that the model lacks. Their mean
-square over 36 v, less the part that H takes, is the ratio of measured to stated noise. The median over tiles of single
-frames ignores a few wrong frames or places. Numbers that were divided by a gain that is wrong by the factor rho have
-the noise rho (y + dark) + rho^2 read^2 at the light y, so that the slope of the noise over the light is rho times the
-stated one.
+square over 36 v, less the part that H takes, is the ratio of measured to stated noise. Numbers that were divided by a
+gain that is wrong by the factor rho have the noise rho (y + dark) + rho^2 read^2 at the light y, so that the slope of
+the noise over the light is rho times the stated one.
 
 *Map.* Energies by tile, row, column and pixel are each divided by their own robust scatter, so that a general fault
-does not hide a local one, and sensors of uneven response raise no alarm.
+does not hide a local one.
 
-*Other readings* of a run's frames are turned frames, shots in another order, numbers with a tone curve, and lag. Each
-is fitted by the same model on a part of the sensor that is large enough to decide. Its misfit is the energy that the
-model leaves in the numbers as they were read: for light g(y) of numbers y, the model H g(y) is mapped back by the
+*Other readings* of a run's frames are turned frames, shots in another order, numbers with a tone curve, and lag, each
+fitted by the same model on a part of the sensor. For light g(y) of numbers y, the model H g(y) is mapped back by the
 inverse of g, so that all misfits are compared with the same noise. All readings that fit as well as the best one
 within noise are offered, because a symmetric camera cannot decide between them.
 """
@@ -65,8 +63,6 @@ _STEPS = {
 
 @dataclass(frozen=True)
 class Reading:
-    """A reading of the data that restores the fit, and the part of the measurements, rms, that it ``left``."""
-
     words: str
     left: float = 0.0
     order: str | None = None
@@ -76,7 +72,6 @@ class Reading:
 
 
 def multiple(factor: int, chi_square: float) -> Reading | None:
-    """Return the reading of numbers that were multiplied by a ``factor``, if the ``chi_square`` shows it."""
     if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
         return None
     bits = "" if factor & (factor - 1) else f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
@@ -84,12 +79,10 @@ def multiple(factor: int, chi_square: float) -> Reading | None:
 
 
 def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[IndexArray]]:
-    """Return the scene rows and the scene columns that are lit alike, group by group, of ``patterns`` P_L and P_R."""
     return [[group.pixels for group in group_pixels(side)] for side in patterns]
 
 
 def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatArray) -> bool:
-    """Return True if pixels that are lit alike have a negative reflectance in the mean, where noise is averaged."""
     sigma = prepared.sigma
     image = prepared.image(weights * sigma / (np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2 + TINY))
     means = np.array([[image[np.ix_(rows, columns)].mean() for columns in groups[1]] for rows in groups[0]])
@@ -97,10 +90,7 @@ def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatA
 
 
 def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Reading, ...]:
-    """Return the readings that restore the fit of a run, the best first; empty if none does.
-
-    ``beside`` is the energy of all measurements that rendering, calibration and print add.
-    """
+    """Return the readings that restore the fit of a run, the best first; empty if none does."""
     run = _Part(data)
     if run.prepared.spare <= 0:
         return ()
@@ -177,12 +167,10 @@ class _Part:
         return [np.ascontiguousarray(frame, dtype=np.float64) for frame in frames]
 
     def misfit(self, shots: Sequence[FloatArray]) -> float:
-        """Return the energy that the model leaves of ``shots``; infinite where the image is negative in the mean."""
         weights, energy = self._weights(shots)
         return float("inf") if negative(self.prepared, self._groups, weights) else energy - sum_of_squares(weights)
 
     def _weights(self, shots: Sequence[FloatArray]) -> tuple[FloatArray, float]:
-        """Return W (r, r') of all measurements, and their energy; of a signed pattern, of the halves' difference."""
         weights, energy = np.zeros_like(self.prepared.sigma), 0.0
         frames: dict[tuple[int, int], FloatArray] = {}
         for capture, light in zip(self._captures, shots, strict=True):
@@ -195,7 +183,6 @@ class _Part:
         return np.where(self.prepared.sigma > 0, weights, 0.0), energy
 
     def _bent_misfit(self, logarithm: float, shots: Sequence[FloatArray]) -> float:
-        """Return the misfit, in numbers as they were read, of light that is a power of them, exp(``logarithm``)."""
         exponent, spare = float(np.exp(logarithm)), self.prepared.spare
         top = max(float(shot.max()) for shot in shots) + self._dark or 1.0
 
@@ -220,12 +207,9 @@ TINY = 1e-300
 _TILES = 8
 _NOISE_TILE, _NOISE_TILES = 16, 1500
 _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
-"""Relative differences of noise, and of its slope, that are flagged, and the error up to which a slope is known."""
 _STRUCTURE, _CORRELATED = 0.5, (70 / 36) ** 2
-"""Energy of structure over noise up to which residuals are white; sum of squared correlations of second differences."""
 _PAIR_ROWS, _SAMPLE = 96, 20_000
 _BRIGHT, _ALIKE = 50.0, 1e-3
-"""Energy of a half over its noise from which it is not black; relative determinant below which halves are alike."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
 
 
@@ -234,8 +218,6 @@ _PLACE, _PLACE_ENERGY = 7.0, 0.02
 
 @dataclass(frozen=True)
 class NoiseTest:
-    """Measured noise of the frames over the stated noise, and the gain that it shows over the stated one."""
-
     ratio: float
     error: float
     gain: float
@@ -244,8 +226,8 @@ class NoiseTest:
     def off(self, noise: FrameNoise, whole: float, stated: float, beside: float) -> bool:
         """Return True if the noise differs from the stated one.
 
-        Energy and second differences must agree, because structure adds to the energy, and the error of rendering may
-        be stated too large. Where read noise is not stated, only the slope over the light is compared.
+        Energy and second differences must agree, because structure adds to the energy, and rendering errors may be
+        overstated.
         """
         if not noise.stated:
             return self.gain_error < _SLOPE_KNOWN and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error
@@ -271,27 +253,23 @@ class Place(NamedTuple):
 class Residuals:
     """Sums over the residuals of all measurements, from one reading of all frames.
 
+    Sums over the sensor are (tiles, tiles) or (m, m'), sums over patterns (K, K').
+
     Attributes
     ----------
-    energy, residual, pixels
-        (tiles, tiles) sums of the squares of measurements and of residuals, and numbers of pixels.
-    squares, total
-        (m, m') sums of the squares of residuals of each sensor pixel, and of the residuals.
     leave_out
-        (K, K') e^T (I - H_kk)^-1 e of a pattern's residual e, its difference from the prediction of all others.
-    shots, free, fitted
-        (K, K') energy of shots, data that other patterns predict too, and product of residual and model.
+        e^T (I - H_kk)^-1 e of a pattern's residual e, its difference from the prediction of all others.
+    free, fitted
+        Data of a pattern that others predict too, and product of its residual and model.
     powers
-        By signed pattern, (2,) relative power of its halves beyond that of the other pairs, and the standard errors;
-        infinite where a half is as good as black, or as the other.
+        By signed pattern, relative power of its halves beyond the other pairs', and standard errors, which are
+        infinite where a half is black or equals the other.
     rest, compared
-        (K, K') energy of the differences of these sums that no power explains, and number of its data.
+        Energy of the differences of these sums that no power explains, and number of its data.
     side
-        (K, K') correlation of that rest with the residual: 1 if the first half is wrong, -1 if the second is.
+        Correlation of that rest with the residual: 1 if the first half is wrong, -1 if the second is.
     contrast
-        (K, K') difference of the halves' light over their sum.
-    same, clipped
-        Shots by a number that equal frames share, and readings at a shot's largest number.
+        Difference of the halves' light over their sum.
     """
 
     def __init__(self, data: Accumulation, light: FloatArray | None = None) -> None:
@@ -415,7 +393,6 @@ class Residuals:
         return np.asarray(noise + rendering + beside * self.pixels / self.pixels.sum())
 
     def places(self, ratio: float) -> list[Place]:
-        """Return tiles, rows, columns and pixels that fit worse than the rest of the sensor, the worst first."""
         count = self.noise.variance.size
         taken = [sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in self._sides]
         freedom = np.maximum(count - np.outer(*taken), 1e-3)

@@ -1,22 +1,20 @@
 """Check of a calibration session by measurement, and the error that its faults leave in the factors.
 
-Three redundancies hold for every good session. The two frames of a pair add up to one frame for all patterns. The
-responses of one side are the shadow of one moving mask. Both sides share the lamp and the time. Therefore the sum s_k
-of each pair, projected on the common vector as its response u_k is, is fitted over the sensor's rows (or columns) y
-and in time::
+In every good session, the two frames of a pair add up to one frame for all patterns, the responses of one side are the
+shadow of one moving mask, and both sides share lamp and time. Therefore the sum s_k of each pair, projected on the
+common vector as its response u_k is, is fitted over the sensor's rows (or columns) y and in time::
 
     s_k = s + c_k u + d_k u_k + l u_(k-1) + m_k u' + a_k + b_k y
 
-with s the side's usual sum and u the response to uniform light. c is the lamp's power, d the unequal power of the two
-frames, l the lag, m the camera's motion in pixels, and a, b the ambient light. Only three repairs change the factors:
-the sign of a response is turned, one frame of a pair replaces both, and responses are divided by the lamp's power.
-Each is accepted if the moving shadow, estimated afterwards, agrees. Every other fault is refused or counts in the
-stated error.
+with s the side's usual sum, u the response to uniform light, c the lamp's power, d the unequal power of the two
+frames, l the lag, m the camera's motion in pixels, and a, b the ambient light. Only three repairs change the factors,
+each accepted if the moving shadow agrees afterwards: a response's sign is turned, one frame replaces a pair, and
+responses are divided by the lamp's power. Every other fault is refused or counts in the stated error.
 
 *The moving shadow.* Column j + 1 of a factor is column j moved by ``step`` pixels. At each spatial frequency the
-columns are therefore a phase that grows with j, times an amplitude that varies slowly (falloff, obliquity): a
-polynomial of j. Detail finer than the pixels is aliased and moves at a step of its own. The part of the columns
-outside these modes is zero but for noise, so that each pattern's vector u_i = Phi h_i can be compared with all others.
+columns are therefore a phase that grows with j, times a polynomial of j (falloff, obliquity). Detail finer than the
+pixels is aliased. The part of the columns outside these modes is zero but for noise, so that each pattern's vector u_i
+= Phi h_i can be compared with all others.
 """
 
 from __future__ import annotations
@@ -38,11 +36,9 @@ from mitsim.reconstruct.solver import robust_scatter
 _MOVES = (0, -1), (1, -1), (-1, -1), (2, -1)
 """Turns and sign of the frequencies that pixels alias to k in [0, pi]; masks of two pixels a feature need them."""
 _DEGREE = 3
-"""Degree of the polynomial: falloff and obliquity are even and smooth."""
 _LINES = 8
 _FREQUENCIES = 64
 _FARTHEST = 0.6
-"""Largest part of the sensor that the shadow may move by, from the first scene line to the last."""
 _ENOUGH = 16, 40
 _PREDICTED = 0.15
 """Limit of the relative squared deviation of a tenth of the patterns: 0.03 with three exchanged pairs of 32."""
@@ -54,28 +50,24 @@ ComplexArray = npt.NDArray[np.complex128]
 
 
 class MovingShadow:
-    """Deviation of patterns' vectors from the vectors that the other patterns predict.
+    """Deviation of patterns' ``vectors`` (m, N) from those that the other patterns predict.
 
     Parameters
     ----------
-    vectors, signs
-        (m, N) u_i, and (n, N) H.
     unknown
         Patterns whose vectors are replaced by those that fit the others best.
 
     Attributes
     ----------
-    deviations, unlike
-        (N,) mean squared deviation from the prediction, in units of the median pattern's, and over the vector's square.
-    shares, sure
-        (N,) part of its vector by which each pattern disagrees, and the same in standard errors: 0 if it is right, 2 if
-        its sign is wrong, 1 if it has nothing in common with the prediction.
-    by_turning
-        (N,) decrease of all deviations if the sign of one pattern is turned.
-    predicts
-        Whether patterns are predicted; the shadows of few lines have little in common.
-    lines
-        (n,) squared deviation of each column from the prediction, over the mean square of columns.
+    deviations, unlike : (N,) arrays
+        Squared deviation from the prediction, in units of the median pattern's, and over the vector's square.
+    shares, sure : (N,) arrays
+        Disagreeing part of a vector, and the same in standard errors: 0 if right, 2 if its sign is wrong, 1 if
+        unrelated.
+    by_turning : (N,) array
+        Decrease of all deviations if the sign of one pattern is turned.
+    lines : (n,) array
+        Squared deviation of each column from the prediction, over the mean square of columns.
     """
 
     def __init__(self, vectors: FloatArray, signs: FloatArray, unknown: Sequence[int] = ()) -> None:
@@ -127,10 +119,6 @@ def shadow_step(factor: FloatArray) -> float:
 
 
 def _spectra(columns: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Return (frequencies, n) spectra of ``columns`` (m, n), and the frequencies' angles a pixel.
-
-    Columns fade out at the ends, where another shadow comes in, and have no mean light, because it does not move.
-    """
     taper = np.square(np.sin(np.pi * (np.arange(len(columns)) + 0.5) / len(columns)))
     spectra = np.fft.rfft((columns - taper @ columns / taper.sum()) * taper[:, None], axis=0)[1:]
     stride = -(-len(spectra) // _FREQUENCIES)
@@ -171,12 +159,10 @@ both."""
 _FOREIGN = 0.5, 15.0, 15.0
 """Limits of a foreign pattern: good ones have 0.25 at 6 (64 patterns), swapped ones about 1 at 23 and 30."""
 _UNEXPLAINED = 0.05
-"""Part of a response's energy, beyond noise, that no separable camera explains."""
 _TURNED = 0.7
 _LINE = 0.15
 """Limit of a line's squared deviation over the mean square: good cameras of 32 lines reach 0.003."""
 _DARK, _LIT = (0.02, 0.3), 0.1
-"""Light of a dead sensor row over its neighbours' at most, and their light over the median row's at least."""
 _NAMED = 12
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
 _LAMP = "the lamp's power changes; use a steadier one"
@@ -196,11 +182,7 @@ def frame_words(half: Half) -> str:
 
 @dataclass(frozen=True)
 class SessionConditions:
-    """Order, names and known defects of a session's frames.
-
-    ``saturated`` sessions have pairs that add up to less and are flagged instead of refused. ``unsteady`` lamps are
-    neither divided out nor reported. ``wrong`` maps frames that are known to be wrong to the reason.
-    """
+    """Order, names and known defects of a session's frames."""
 
     order: Sequence[Half]
     name: Callable[[Half], str] = frame_words
@@ -213,9 +195,8 @@ class SessionConditions:
 class SessionFault:
     """One mended pattern or frame; a manifest has it with these keys.
 
-    ``sign`` is None for both frames, ``kind`` is ``exchanged``, ``power`` or ``replaced``, and ``cost`` is the
-    relative error of the factor that remains beyond the noise. ``other`` is always None (older manifests have a frame
-    here).
+    ``kind`` is ``exchanged``, ``power`` or ``replaced``, and ``cost`` the relative error of the factor that remains
+    beyond the noise. ``sign`` is None for both frames; ``other`` is None, except in older manifests.
     """
 
     frames: list[str]
@@ -235,17 +216,10 @@ class SessionFault:
 
 @dataclass
 class CheckedSession:
-    """Sums of a session after the check.
+    """Sums of a session after the check; the same objects that came in where nothing was mended.
 
-    Attributes
-    ----------
-    sums
-        Of horizontal and vertical stripes; the same objects that came in where nothing was mended.
-    lamp
-        None if the projector is steady. ``drift`` over the session and ``flicker`` from frame to frame, as parts of its
-        power; ``drift_cost``, ``flicker_cost``, ``remaining``: relative errors of the factors without and with repair.
-    doubts, extra
-        Sentences on errors that are not mended, and the squared error of each side's vectors beyond their noise.
+    ``lamp`` has the ``drift`` over the session, the ``flicker`` from frame to frame (parts of its power), and relative
+    errors of the factors; None if the projector is steady. ``extra`` is the squared error of each side's vectors.
     """
 
     sums: tuple[StripeSums, StripeSums]
@@ -265,7 +239,7 @@ class CheckedSession:
 def check_session(sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> CheckedSession:
     """Check a session, make repairs that a check afterwards confirms, and add remaining errors to the stated error.
 
-    Raises MitsimError for faults that cannot be mended, with the frames that do not fit, or "all frames".
+    Raises MitsimError for faults that cannot be mended, with the frames that do not fit.
     """
     return _Check(sums, signs, taken).result()
 
@@ -278,8 +252,7 @@ def _shrunk(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return ``values`` shrunk to 0 by their ``variances``, the remaining squared errors, and the shared variance.
 
-    The prior of each is the variance, at ``least`` so much, that all ``good`` values have beyond their noise. Nothing
-    is changed where that is insignificant, and values that are significant by themselves are kept.
+    The variance of the ``good`` values beyond their noise is the prior; nothing changes where it is insignificant.
     """
     beyond, pooled = np.square(values) - variances, 0.0
     middle = max(float(np.median((beyond / variances)[good])), 0.0)
@@ -325,7 +298,6 @@ class _Side:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
     def add_motion(self, places: FloatArray, variances: FloatArray, times: FloatArray) -> None:
-        """Count ``places`` (N,) [pixels] that differ from either end of the session beyond ``variances``."""
         few, late = max(2, len(times) // 8), np.argsort(times)
         ends = np.array([np.median(places[late[:few]]), np.median(places[late[-few:]]), -self.place])
         away = np.square(np.append(places, ends[2]) - np.median(places)) / np.append(variances, 2 * variances.max())
@@ -338,7 +310,6 @@ class _Side:
             self.add(f"camera or mask move by {np.ptp(ends):.2g} pixels; fasten them", energy)
 
     def fit_sums(self) -> tuple[FloatArray, ...]:
-        """Return misfit, squared errors, power, place and imbalance of pairs, and the variances of these three."""
         shapes = self.shapes
         if not self.sums.centre:
             shapes = np.stack([*shapes, np.ones_like(self.uniform), np.linspace(-1, 1, len(self.uniform))])
@@ -413,7 +384,6 @@ class _Check:
     # ---- what the sums of pairs show of lamp, lag, bend, motion and ambient light ------------------------------------
 
     def _correct_pairs(self) -> bool:
-        """Fit the sums of pairs, correct responses, count the rest as errors; return False if saturated."""
         bad, excess, *measured = np.stack([own.fit_sums() for own in self.sides], axis=1)
         if self.taken.saturated and bad.any():
             return False
@@ -524,7 +494,6 @@ class _Check:
     # ---- the moving shadow -------------------------------------------------------------------------------------------
 
     def _use_one_frame(self, own: _Side, index: int) -> None:
-        """Replace a response by twice one of its frames less the usual sum, if the moving shadow agrees."""
         known = {half[2]: why for half, why in self.taken.wrong.items() if half[:2] == (own.side, index)}
         reason = f"is wrong: {next(iter(known.values()))}" if known else "the two do not add up to what others do"
         apart = np.abs(self.times[own.axis] - self.times[own.axis, index]) + ~self.good[own.axis]
@@ -606,7 +575,6 @@ class _Check:
     # ---- the result --------------------------------------------------------------------------------------------------
 
     def _judge(self) -> None:
-        """Report significant errors, the largest first; refuse the session for a tenth or for wrong frames."""
         found, sides = self.found, self.sides
         energies = {
             why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for own in sides for why in own.extras

@@ -1,21 +1,21 @@
 """Factors as codes seen through shifts, fitted to frames of known pictures.
 
-A mask before a sensor casts the same shadow from every direction, shifted. So a side's factor is an unknown code c on a
-grid of sensor pixels, seen from scene pixel i through a shift::
+A mask before a sensor casts the same shadow from every direction, shifted. So a side's factor is an unknown code c on
+a grid of sensor pixels, seen from scene pixel i through a shift::
 
     Phi[u, i] = sum_k b_k(i) c_k(u + o + s i)
 
 with s the sensor pixels that one scene pixel shifts the shadow by, o the place of this frame's pixels (planes of a
-Bayer sensor lie half a pixel apart), and b_k polynomials over the scene, b_0 = 1. Several terms describe a code that
-changes smoothly over the scene, for example by falloff, a lens or a mask of some thickness.
+Bayer sensor lie half a pixel apart), and b_k polynomials over the scene, b_0 = 1, for falloff or thick masks.
 
-*Alternating least squares.* With Z = X Phi_R^T a frame is Y = Phi_L Z, and Phi_L is linear in its codes. Left and right
-take turns until the misfit is constant. A code's numbers have an independent prior of variance 1 / alpha, estimated
-from the frames (MacKay 1992, Neural Computation 4, 415): alpha = gamma / |c|^2, where gamma = tr N (N + alpha)^-1 is
-the number of parameters that the frames determine, and (N + alpha)^-1 is their covariance.
+*Alternating least squares.* With Z = X Phi_R^T a frame is Y = Phi_L Z, linear in the codes of Phi_L; left and right
+take turns. A code's numbers have an independent prior of variance 1 / alpha, estimated from the frames (MacKay 1992,
+Neural Computation 4, 415): alpha = gamma / |c|^2, where gamma = tr N (N + alpha)^-1 is the number of parameters that
+the frames determine, and (N + alpha)^-1 is their covariance.
 
 *Start.* A frame's spectrum is Y(f, g) = C_L(f) C_R(g) X(-s f, -s' g), up to the sensor's edges. Y over X is a product
-of two vectors only for the right orientation and scale of the scene."""
+of two vectors only for the right orientation and scale of the scene.
+"""
 
 from __future__ import annotations
 
@@ -51,11 +51,7 @@ TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """Frame (m, m') [electrons/s], and the light (n, n') that it shows: a picture times its pattern.
-
-    Frames of one ``group`` are held out together. Each sensor ``plane`` has a gain, and its pixels an ``offset`` (down
-    and to the right, 0 to below 1 pixel).
-    """
+    """Frame (m, m') [electrons/s], and the light (n, n') that it shows: a picture times its pattern."""
 
     scene: FloatArray
     frame: FloatArray
@@ -68,7 +64,6 @@ class Exposure:
 
 
 def plane_offsets(how: Preparation) -> dict[str, tuple[float, float]]:
-    """Return the offset of each plane of a mosaic in frames of a preparation ``how`` [pixels of a plane]."""
     cell = np.empty((2, 2), dtype=object)
     for name, place in planes_of(how.mosaic or BGGR).items():
         cell[place] = name
@@ -85,8 +80,6 @@ class Shape:
 
 @dataclass(eq=False)
 class Side:
-    """Geometry of one side: ``sensor`` and ``scene`` pixels, ``scale``, ``terms``, and whether it is centred."""
-
     sensor: int
     scene: int
     scale: float
@@ -118,10 +111,6 @@ class Side:
         return centre_columns(phi) if self.centre else phi
 
     def normal(self, offset: float, gram: FloatArray, product: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return normal matrix and right-hand side of the codes.
-
-        ``gram`` (n, n) and ``product`` (m, n) are the sums of Z Z^T and Y Z^T over the noise's variance.
-        """
         spread, w, k = self.spread(offset), self.width, self.terms
         flat = spread.reshape(self.scene, k * w)
         block = (flat.T @ gram @ flat).reshape(k, w, k, w)
@@ -147,18 +136,7 @@ _VAGUE, _SMALLEST, _LARGEST = 1e-3, 1e-9, 1e6
 
 @dataclass(frozen=True, eq=False)
 class Codes:
-    """Fitted codes (terms, length) of both sides, with the gain of each plane.
-
-    Attributes
-    ----------
-    variances, explained
-        Mean square of the residual of each frame, and mean explained part of the frames' energy.
-    errors, seen_errors
-        Standard deviation of a number of each factor, rms, undetermined numbers included; and independent errors that
-        change frames of these scenes as much.
-    told
-        Numbers of each side's codes that the frames determine.
-    """
+    """Fitted codes (terms, length) of both sides, with the gain of each plane."""
 
     sides: tuple[Side, Side]
     codes: tuple[FloatArray, FloatArray]
@@ -197,10 +175,6 @@ class Codes:
 def fit_codes(
     exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS
 ) -> Codes:
-    """Fit the codes of both sides to ``exposures``, from the code ``start`` of columns or that of the spectra.
-
-    Raises MitsimError for frames or scenes without light.
-    """
     sizes = zip(exposures[0].frame.shape, exposures[0].scene.shape, shape.scales, strict=True)
     left, right = (Side(sensor, scene, scale, shape.terms, shape.centre) for sensor, scene, scale in sizes)
     sides = left, right
@@ -268,7 +242,6 @@ def fit_codes(
 def _solve_side(
     own: Side, sums: Mapping[float, Sequence[FloatArray]], before: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return the codes of a side, their alphas, the covariance, and the number of determined parameters."""
     matrix: FloatArray = np.zeros((own.terms * own.length,) * 2)
     right: FloatArray = np.zeros(len(matrix))
     for place, (gram, product) in sums.items():
@@ -291,7 +264,6 @@ def _solve_side(
 
 
 def fit_gains(exposures: Sequence[Exposure], models: Sequence[FloatArray], planes: Sequence[str]) -> dict[str, float]:
-    """Return the gain of each of the ``planes`` that brings ``models`` of the frames nearest to these."""
     above, below = dict.fromkeys(planes, 0.0), dict.fromkeys(planes, 0.0)
     for each, model in zip(exposures, models, strict=True):
         above[each.plane] += float(np.vdot(model, each.frame))
@@ -344,10 +316,7 @@ def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
 
 @dataclass(frozen=True)
 class Pose:
-    """Orientation and scales [sensor pixels / scene pixel] of scenes before the camera.
-
-    ``margin`` is the explained part of the energy beyond that of the best other orientation; None: not compared.
-    """
+    """Orientation and scales [sensor pixels / scene pixel] of scenes before the camera."""
 
     orientation: str
     scales: tuple[float, float]

@@ -13,9 +13,9 @@ is X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. The rounding erro
 where lambda_rel = lambda / (max s_L^2 max s_R^2). The paper's Q = sum (Phi_L^T Y Phi_R) o P in place of W would give
 eps / lambda_rel (docs/decisions.md).
 
-*Correlated neighbours.* The penalty lambda ||X||^2 darkens large even areas of noisy images. With the covariance
-rho^|p - p'| along rows and columns (a separable first-order Markov field; Jain, Fundamentals of Digital Image
-Processing, 1989, chapter 2), X = F_L Z F_R^T with independent Z, so that the SVD of S V^T F keeps the closed form.
+*Correlated neighbours.* With the covariance rho^|p - p'| along rows and columns (a separable first-order Markov field;
+Jain, Fundamentals of Digital Image Processing, 1989, chapter 2), X = F_L Z F_R^T with independent Z, so that the SVD
+of S V^T F keeps the closed form.
 
 *Lambda.* Coefficient W_ij is kept by the share sigma_ij^2 / (sigma_ij^2 + lambda). Where the model explains the
 frames, lambda minimises an unbiased estimate of the image's error. Elsewhere the image must also be stable when lambda
@@ -56,7 +56,6 @@ RISK_POWER = 0.5
 MISFIT_RATIO = 1.2
 """Limit of noise outside the range over noise inside: prints have 0.92 to 1.02, depth and gloss 1.4 and more."""
 _TAKEN, _TAKEN_RISE = 30.0, 4
-"""Limit of the energy that lambda removes, over the noise outside, and the power of the noise ratio that raises it."""
 _EXPONENTS = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
 _FELT = 100.0
 _FAINT, _FEWEST = 2.0, 20
@@ -66,16 +65,9 @@ _FAINT, _FEWEST = 2.0, 20
 class DiagonalProblem:
     """Inverse problem in its diagonal basis.
 
-    Attributes
-    ----------
-    sigma, projected : (r, r') arrays
-        Singular values of the whole model, exact zeros beyond its rank, and data W on the left singular vectors.
-    energy, data_count
-        Squared norm and number of all independent data.
-    halves
-        ``projected`` by quarters of the sensor, which show its noise; None assumes white noise.
-    struck : (r, r') array
-        Part of ``projected`` that is known to be neither image nor noise, up to its sign.
+    ``sigma`` (r, r') are the singular values, exact zeros beyond the rank, and ``projected`` (r, r') the data W, of
+    which ``struck`` is known to be neither image nor noise, up to its sign. ``halves`` show the noise; None assumes
+    white noise.
     """
 
     sigma: FloatArray
@@ -102,7 +94,7 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) 
     """Return an unbiased estimate of the weighted squared error of the image at ``lam``, up to a constant.
 
     With kept shares k, coefficient (k W / sigma) has the expected squared error (1 - k)^2 x^2 + k^2 noise / sigma^2,
-    and (W^2 - noise) / sigma^2 estimates x^2 without bias. Terms that lambda does not change are omitted.
+    and (W^2 - noise) / sigma^2 estimates x^2 without bias.
     """
     measured = problem.sigma > 0
     sigma, data = problem.sigma[measured], np.square(problem.projected[measured])
@@ -113,17 +105,13 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) 
 
 
 def movement(problem: DiagonalProblem, lam: float) -> float:
-    """Return ||lambda dX / dlambda||^2 of the Tikhonov image X (quasi-optimality, Tikhonov and Glasko 1965).
-
-    The criterion needs no noise level and holds for errors of any spectrum.
-    """
+    """Return ||lambda dX / dlambda||^2 of the image, which needs no noise level (Tikhonov and Glasko 1965)."""
     kept = problem.kept_share(lam)
     measured = kept > 0
     return float(np.sum(np.square((kept * (1 - kept) * problem.projected)[measured] / problem.sigma[measured])))
 
 
 def noise_variance(problem: DiagonalProblem) -> float:
-    """Return the mean noise variance of one datum from the energy outside the model's range."""
     spare = problem.data_count - np.count_nonzero(problem.sigma)
     if spare <= 0:
         raise MitsimError("there are no more data than unknowns, so noise cannot be told; give lambda as a number")
@@ -132,7 +120,6 @@ def noise_variance(problem: DiagonalProblem) -> float:
 
 
 def is_misfit(problem: DiagonalProblem) -> bool:
-    """Return True if the energy outside the model's range exceeds what the noise within it explains."""
     if not problem.halves:
         return False
     chance = 3 * MEDIAN_SPREAD / float(np.sqrt(2 * np.count_nonzero(problem.sigma)))
@@ -142,8 +129,7 @@ def is_misfit(problem: DiagonalProblem) -> bool:
 def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
     """Return the noise variance of each number (r, r') of ``problem.projected``, or of all.
 
-    It is the noise outside the model's range or, where larger, that of the sensor's halves, because noise of the
-    factors is within the range alone. Where the model does not explain the frames, the halves decide.
+    It is the noise outside the model's range or, where larger or without a fit, that of the sensor's halves.
     """
     white, halves = noise_variance(problem), problem.halves
     if not halves:
@@ -179,8 +165,8 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
 def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
     """Return the lambda in the unit of sigma^2 that minimises :func:`risk_score`, but at least ``problem.least``.
 
-    Where the model does not explain the frames, that lambda is a lower bound, and the image that :func:`movement`
-    finds steadiest is used. Raises MitsimError without more data than unknowns, or without a signal.
+    Where the model does not explain the frames, the steadiest image above that lambda is used (:func:`movement`).
+    Raises MitsimError without more data than unknowns, or without a signal.
     """
     noise = coefficient_noise(problem)
     if problem.energy == 0:
@@ -194,7 +180,6 @@ def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
 
 
 def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:
-    """Return a sentence if ``lam`` is an end of its search range and the image depends on that end, else nothing."""
     lowest, highest = problem.scale * 10.0 ** np.array([_EXPONENTS[0], 0.0])
     if lam >= highest:
         return ("Automatic lambda is the largest that is tried: the frames show hardly more than noise.",)
@@ -207,10 +192,7 @@ def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:
 
 
 def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
-    """Return the rising lambda at which the image moves least, as far as misfit explains what lambda removes.
-
-    Where the constant term is centred away the image turns black, so that movement counts relative to the image.
-    """
+    """Return the rising lambda at which the image moves least, as far as misfit explains the removed energy."""
     moved = np.array([movement(problem, lam) for lam in lambdas])
     if len(moved) > 1 and moved[-1] < moved[-2]:
         for number, lam in enumerate(lambdas):
@@ -250,8 +232,6 @@ _SIGNIFICANT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """Quarters (2, 2, r, r') of W in the diagonal basis by halves of both sides of the sensor."""
-
     quarters: FloatArray
     left: Side
     right: Side
@@ -312,14 +292,11 @@ ROUNDING_LIMIT = 0.01
 _ROUNDING_UNITS = 110 * float(np.finfo(np.float64).eps)
 """Rounding before magnification: 2 x 49 eps neglected by LAPACK's dbdsqr and 12 of products; 44 in 5500 models."""
 _SMALLEST, _LARGEST = 1e-30, 1e30
-"""Limits of the largest number of a factor or pattern, so that a product of eight is a normal number."""
 _UNSEEN = 1e-60
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Factorised model for any number of scenes; ``light`` is the mean over pixels of summed squared patterns."""
-
     left: Side
     right: Side
     centre: bool
@@ -331,8 +308,8 @@ class Prepared:
     def least_lambda(self) -> float:
         """Lambda at which the stated noise of the factors alone outweighs the image.
 
-        Independent errors of deviation s_L in Phi_L add noise of variance n s_L^2 x^2 sigma_R^2 to a datum whose
-        column has the singular value sigma_R, for n scene pixels of mean square x^2 (times ``light``).
+        Errors of deviation s_L in Phi_L add noise of variance n s_L^2 x^2 sigma_R^2 to a datum of singular value
+        sigma_R, for n scene pixels of mean square x^2 (times ``light``).
         """
         sides = zip((self.left, self.right), (self.right, self.left), self.noise, self.light, strict=True)
         return max(
@@ -353,7 +330,6 @@ class Prepared:
 
     @property
     def lost(self) -> tuple[int, str]:
-        """Number of directions of the image that are not measured, and the limit that they are below."""
         sides = zip((self.left, self.right), self.stated or (), strict=False)
         told = [min(side.rank, side.pattern_count * rank) for side, rank in sides] or [self.rank]
         limit = "rounding" if math.prod(told) == self.rank else "the calibration's noise"
@@ -436,16 +412,10 @@ class Prepared:
     ) -> Solution:
         """Return the Tikhonov solution of the added ``frames``.
 
-        Parameters
-        ----------
-        lam
-            Lambda >= 0 in the unit of (Phi_L Phi_R)^2, or "auto" (:func:`automatic_lambda`). 0 gives the
-            pseudo-inverse, in
-            which singular values below max(rows, columns) eps of the largest of their side count as zero.
-        explained, lack
-            Used by "auto": False if the factors are known not to explain the camera; known part of the frames beside
-            the
-            image, (r, r') in the diagonal basis and as energy beyond it.
+        ``lam`` is >= 0 in the unit of (Phi_L Phi_R)^2, or "auto" (:func:`automatic_lambda`); 0 gives the
+        pseudo-inverse, in which singular values below max(rows, columns) eps of the largest count as zero. ``lack`` is
+        a known part of the frames beside the image, (r, r') in the diagonal basis and as energy beyond it, which
+        "auto" treats as noise.
         """
         problem, flags = self.problem(frames), tuple[str, ...]()
         if isinstance(lam, str):
@@ -515,10 +485,9 @@ def prepare(
 ) -> Prepared:
     """Factorise the model of a camera (Phi_L, Phi_R) and a pattern family (P_L (n, K), P_R (n', K')).
 
-    ``centre`` removes row and column means of factors and frames: the constant term of a FlatCam mask (1 + m m^T)/2
-    vanishes if the mask covers all that the sensor sees. Elsewhere the leak is (C Phi_1) X (C Phi_1)^T / 2, with Phi_1
-    the shadow of the mask's outline. Raises MitsimError if shapes do not fit, values cannot be squared, or no light is
-    seen.
+    ``centre`` removes row and column means, so that the constant term of a FlatCam mask (1 + m m^T)/2 vanishes if the
+    mask covers all that the sensor sees; else the leak is (C Phi_1) X (C Phi_1)^T / 2, with Phi_1 the shadow of its
+    outline. Raises MitsimError if shapes do not fit, values cannot be squared, or no light is seen.
     """
     factors = [_matrix("left factor", left), _matrix("right factor", right)]
     patterns = [_matrix("patterns P_L", P_L), _matrix("patterns P_R", P_R)]
@@ -570,8 +539,6 @@ _LARGEST_SUM = 1e100
 
 
 class Accumulator:
-    """Sums over frames for the solver: W by quarters of the sensor, and the energy of the frames."""
-
     def __init__(self, prepared: Prepared) -> None:
         left, right = prepared.left, prepared.right
         self.prepared = prepared
@@ -643,7 +610,6 @@ class Accumulator:
 
 
 def project_frames(left: Side, right: Side, frames: FloatArray) -> FloatArray:
-    """Return W of all ``frames`` (K, m, K', m') at once, without halves, energy and checks, in half the time."""
     total = np.zeros((len(left.singular), len(right.singular)))
     for slab, own in zip(left.slabs, frames, strict=True):
         seen = (slab.matrix.T @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])

@@ -60,8 +60,8 @@ _SINGLE = float(np.finfo(np.float32).eps) ** 2 / 2
 def automatic_weight(problem: DiagonalProblem) -> float:
     """Return the root of the noise variance times Tikhonov's automatic lambda as the weight for a ``problem``.
 
-    With noise of variance v and slopes distributed as exp(-slope / b), the likeliest image has the weight v / b.
-    Automatic lambda is v over the mean square of the image, whose root stands for b.
+    With noise of variance v and slopes distributed as exp(-slope / b), the likeliest image has the weight v / b, and
+    the root of v over automatic lambda estimates b.
     """
     return float(np.sqrt(noise_variance(problem) * automatic_lambda(problem)))
 
@@ -98,7 +98,6 @@ def solve_tv(
     tolerance: float = 1e-4,
     bounds: Bounds | None = None,
 ) -> Solution:
-    """Return the total-variation solution of the added frames."""
     problem = prepared.problem(frames)
     lam = automatic_weight(problem) if weight == "auto" else check_lambda(weight)
     return _Minimum(prepared, problem, Prior(weight=lam, bounds=bounds or Prior.bounds)).find(iterations, tolerance)
@@ -112,7 +111,6 @@ def solve_nonnegative(
     tolerance: float = 1e-4,
     bounds: Bounds | None = None,
 ) -> Solution:
-    """Return the Tikhonov solution of the added frames among images within bounds."""
     problem = prepared.problem(frames)
     ridge = automatic_lambda(problem) if lam == "auto" else check_lambda(lam)
     prior = Prior(ridge=ridge, bounds=bounds or (0.0, math.inf))
@@ -122,8 +120,6 @@ def solve_nonnegative(
 
 
 class _Minimum:
-    """The image of a diagonal ``problem`` that is most likely by its data and a ``prior``."""
-
     def __init__(self, prepared: Prepared, problem: DiagonalProblem, prior: Prior) -> None:
         self.prepared, self.problem, self.prior = prepared, problem, prior
 
@@ -304,7 +300,7 @@ Patterns = tuple[FloatArray, FloatArray]
 class Solver(Protocol):
     """Solver of images: prepared once for a camera and its patterns, and applied to any number of scenes.
 
-    Images of a ``linear`` one have an uncertainty for each pixel; ``whole`` slabs have all coefficients.
+    Images of a ``linear`` solver have an uncertainty for each pixel.
     """
 
     linear: bool
@@ -317,9 +313,7 @@ class Solver(Protocol):
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
-    ) -> Solution:
-        """Return the image of one scene from all its added ``frames``."""
-        ...
+    ) -> Solution: ...
 
 
 class Tikhonov(Solver):

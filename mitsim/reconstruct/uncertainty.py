@@ -5,11 +5,10 @@ Independent noise of variance v in all data leaves
 
     var X = (V_L o V_L) (v G o G) (V_R o V_R)^T
 
-Taking the variance of frame (i, j) as a product of its means by sensor row and column, v_ij = r_ij c_ij^T / mean, v
-becomes sum_ij ((U_Li o U_Li)^T r_ij) ((U_Rj o U_Rj)^T c_ij)^T / mean. (For patterns whose blocks share no row, such as
-``random``, correlations between coefficients are neglected.) The noise N of a frame that is subtracted from all others
-adds (sum_i U_Li)^T N (sum_j U_Rj) to W. With G = sum_k g_k h_k^T its image is exactly sum_k A_k N B_k^T, A_k = V_L
-diag(g_k) (sum_i U_Li)^T.
+With the variance of frame (i, j) as a product of its means by sensor row and column, v_ij = r_ij c_ij^T / mean, v
+becomes sum_ij ((U_Li o U_Li)^T r_ij) ((U_Rj o U_Rj)^T c_ij)^T / mean. Correlations between coefficients, of ``random``
+patterns, are neglected. The noise N of a frame that is subtracted from all others adds (sum_i U_Li)^T N (sum_j U_Rj)
+to W. With G = sum_k g_k h_k^T its image is sum_k A_k N B_k^T, A_k = V_L diag(g_k) (sum_i U_Li)^T.
 
 *Noise of factors.* Independent errors of deviation s_L are the same in all frames. With Q = X V_R S_R they change the
 image by V_L [G o (T Q)] V_R^T to first order, where T = sum_i U_Li^T d_L diag(p_i) has independent numbers of variance
@@ -17,24 +16,20 @@ s_L^2 rho[a, p], rho[a, p] = ||sum_i P_L[p, i] U_Li[:, a]||^2. So
 
     var X[p, q] = s_L^2 sum_a V_L[p, a]^2 sum_p' rho[a, p'] (sum_b G[a, b] Q[p', b] V_R[q, b])^2
 
-and likewise with the sides exchanged, where G is a sum of a few products of a row and a column. Where V is not
-orthonormal, V makes the image and its dual responds to light.
+and likewise with the sides exchanged. Where V is not orthonormal, V makes the image and its dual responds to light.
 
-*Print* within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its light g / 12
-pixels off the centre. Finer print follows from the disagreement of the sensor's halves
-(:mod:`mitsim.reconstruct.accumulation`). *Rendering* has errors by projector pixel, which are kept as the image is.
-*Regularisation* removes lambda x / (sigma^2 + lambda) of each coefficient x, as large as the scene's energy there.
+*Print* within a projector pixel: a ramp of slope g a pixel has its light g / 12 pixels off the centre; finer print
+follows from the disagreement of the sensor's halves (:mod:`mitsim.reconstruct.accumulation`). *Regularisation* removes
+lambda x / (sigma^2 + lambda) of each coefficient x, as large as the scene's energy there.
 
 *The scene's spectrum.* A scene is a mean m, and stationary detail, whose cosine coefficients are independent with a
 variance S of frequency. Coefficient (a, b) of the diagonal basis, whose vectors have the cosines C_L and C_R and whose
 image of ones is c, is m c_ab and detail of the mean square e = sum_kl C_L[k, a]^2 S[k, l] C_R[l, b]^2. Its datum has
-the variance sigma^2 e + noise about sigma m c. So m follows from all data by weighted least squares. S is linear, in
-the logarithm of frequency, between octaves, separately for frequencies along rows and columns, where prints have most
-of their edges, and between these. S maximises the data's likelihood with a prior: log S falls with the square of
-frequency, as spectra of photographs do (Field, J. Opt. Soc. Am. A 4, 1987), apart from a normal process that is
-correlated over octaves. So S continues beyond the data as the last determined octaves, and then as photographs do. Its
-error follows from the curvature of the likelihood (Laplace's method) and from the fit of such a spectrum (Birge's
-ratio).
+the variance sigma^2 e + noise about sigma m c. S is linear, in the logarithm of frequency, between octaves, separately
+for frequencies along rows, along columns and between. S maximises the data's likelihood with a prior: log S falls with
+the square of frequency, as spectra of photographs do (Field, J. Opt. Soc. Am. A 4, 1987), apart from a normal process
+that is correlated over octaves. Its error follows from the curvature of the likelihood (Laplace's method) and from the
+fit of such a spectrum (Birge's ratio).
 """
 
 from __future__ import annotations
@@ -79,9 +74,8 @@ _FARTHEST = 3.0
 class Spectrum:
     """Mean and power spectrum of a scene.
 
-    ``even`` (r, r') are the coefficients of an image of ones, ``log_power`` (J,) log S at all nodes, ``shares`` (J, r,
-    r') mean squares of coefficients by a unit of S, and ``departure`` is the misfit of data to S over chance, at least
-    1.
+    ``even`` (r, r') are the coefficients of an image of ones, ``log_power`` is log S (J,) at all nodes, and ``shares``
+    (J, r, r') are mean squares of coefficients by a unit of S. ``departure`` is the misfit of data to S over chance.
     """
 
     mean: float
@@ -153,7 +147,6 @@ def _bands(size: int) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.
 
 
 def _nodes(down: FloatArray, across: FloatArray) -> tuple[FloatArray, float]:
-    """Return weights (J, r, c) at all frequencies but the mean's, and the octaves between nodes."""
     rows, columns = down[:, None], across
     least = min(down[1] if len(down) > 1 else 1.0, across[1] if len(across) > 1 else 1.0)
     octave = np.log2(np.maximum(np.hypot(rows, columns) / least, 1.0))
@@ -167,7 +160,6 @@ def _nodes(down: FloatArray, across: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _group(seen: FloatArray, shares: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return means (groups, J) of sigma^2 times shares over similar coefficients, counts, and their squared data."""
     octaves = len(shares) // 2
     whole = np.maximum(shares.sum(axis=0), 1e-300)
     middle, along = (np.arange(len(shares)) % octaves) @ shares / whole, shares[:octaves].sum(axis=0) / whole
@@ -313,10 +305,7 @@ class Propagation:
 
     @cached_property
     def terms(self) -> tuple[FloatArray, FloatArray]:
-        """Factors g (r, k) and h (r', k) of whose products G is the sum, except ``_LOST`` of its energy.
-
-        Each product removes the row and the column of the largest remaining number, in a tenth of the time of an SVD.
-        """
+        """Factors g (r, k) and h (r', k) of whose products G is the sum; a tenth of an SVD's time."""
         rest, energy = self.gain.copy(), float(np.square(self.gain).sum())
         rows, columns = list[FloatArray](), list[FloatArray]()
         while not rows or np.square(rest).sum() > _LOST * energy:
@@ -363,11 +352,7 @@ class Propagation:
         return np.asarray(np.einsum("pkl,qkl->pq", *products, optimize=True))
 
     def of_regularisation(self, problem: DiagonalProblem, variance: float) -> tuple[FloatArray, float]:
-        """Return the mean square (n, n') of what lambda removes from the image, and the factor of its error.
-
-        A coefficient's mean square follows from its datum and from the scene's spectrum, weighted by their errors.
-        ``variance`` replaces the measured one if there are no more data than unknowns.
-        """
+        """Return the mean square (n, n') of the detail that lambda removes, and the factor of its error."""
         told_by_data = problem.data_count > np.count_nonzero(problem.sigma)
         noise = coefficient_noise(problem) if told_by_data else variance
         spectrum = scene_spectrum(self.model.sides, problem, noise)
@@ -428,8 +413,8 @@ class Propagation:
 def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0) -> Uncertainty:
     """Compute the standard uncertainty of a ``solution`` that is linear in its frames.
 
-    ``chi_square`` is the energy of the residual over that of the stated noise. Where it is far from 1, the residual
-    replaces the stated noise of the frames.
+    Where ``chi_square``, residual over stated noise, is far from 1, the residual replaces the stated noise of the
+    frames.
     """
     noise, image, manifest = data.noise, solution.image, data.factors.manifest
     problem, lack = data.prepared.problem(data.frames), data.lack(image)
@@ -479,7 +464,6 @@ def _of_factor(
 
 
 def _responses(side: Side, kinds: FloatArray) -> FloatArray:
-    """Return rho (r, c), the squared norm of sum_i P[p, i] U_i[:, a], for kinds of pixels with P[p] in ``kinds``."""
     stack = np.zeros((len(side.singular), side.pattern_count, side.sensor_size))
     for index, slab in enumerate(side.slabs):
         stack[slab.columns, index] = slab.matrix.T
