@@ -567,7 +567,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (10, 1853),
     "planner": (6, 1905),
-    "reconstruct": (23, 6960),
+    "reconstruct": (23, 6959),
     "report": (9, 2220),
     "scene": (8, 1739),
     "sensor": (5, 1191),
