@@ -33,12 +33,11 @@ from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 
 _MOST_BYTES = 1 << 28
 _SAME_CAMERA = 0.02
-"""Relative difference of two calibrations' models above which they belong to two cameras: four times that of two
-sessions of 512 frames."""
+"""Relative difference of models that indicates another camera: four times that of two sessions of 512 frames."""
 _OTHER_NOISE = 1.5
-"""Factor by which the noise may lie outside the range of the training; half an exposure gives 1.4."""
+"""Allowed factor of the noise outside the training's range; half an exposure gives 1.4."""
 _NO_NOISE = 1e-14
-"""Part of the frames' energy that counts as noise where there is none: rounding of single precision."""
+"""Part of the frames' energy that counts as noise: rounding of single precision."""
 _PATTERNS = ("P_L", "P_R")
 
 
@@ -104,7 +103,6 @@ class LearnedSolver(Solver):
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """Return the image of the frames; raise MitsimError if it is not finite."""
         problem = prepared.problem(frames)
         variance = datum_variance(problem)
         like = next(self.network.parameters())

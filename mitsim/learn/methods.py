@@ -36,8 +36,7 @@ from mitsim.reconstruct.solver import Accumulator, Prepared
 # -------- Network
 
 LEVELS = (1, 2, 4, 6)
-"""Channels of each level over those of the first. Each level halves the pixels along an axis, so that all but the last
-need the same arithmetic."""
+"""Channels of each level over those of the first."""
 WAYS = 8
 
 
@@ -111,8 +110,7 @@ def has_half(device: torch.device) -> bool:
 # -------- Camera
 
 BIN = 4
-"""Sensor pixels along an axis of one bin, for networks that read frames: 47 um of the shipped camera. Frames under 49
-patterns then need 3 MB a pair."""
+"""Sensor pixels along an axis of one bin, so that frames under 49 patterns need 3 MB a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,9 +215,8 @@ def _bin(values: FloatArray) -> FloatArray:
 
 _GREY = 0.5
 _START = 60.0
-"""Inverse variance of pictures about grey before the first step: drawn pictures have a deviation of 0.13."""
+"""Inverse variance of drawn pictures about grey."""
 _LEAST_ERROR = 1e-5
-"""Squared error below which a picture gains nothing: 50 dB."""
 
 
 class Method(nn.Module):
@@ -424,7 +421,6 @@ class Critic:
         return found - adversary * self.adversary(images).mean() if adversary else found
 
     def learn(self, images: Tensor, truths: Tensor) -> None:
-        """Compute the gradients by which the adversary separates images from truths: a hinge loss of each patch."""
         self.optimiser.zero_grad()
         if self._weights[1]:
             found = self.adversary(torch.cat([truths, images.detach()]))

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 WHITE = 255
-"""Code of a picture that is reflectance 1."""
 _LIGHTS_KEPT = 32
 """Lights of shards in memory, some 10 MB each."""
 Frames = npt.NDArray[np.float32]
@@ -199,7 +198,6 @@ class PrintLight:
 
     @property
     def few(self) -> bool:
-        """True if the mask's shadow is a sum of few terms, which a file can hold."""
         return all(part.optics.terms is not None for part in self.parts)
 
     def frames_of(self, reflectance: FloatArray) -> ExpectedFrames:
@@ -245,7 +243,6 @@ Pair = tuple[dict[str, Any], Sequence[str]]
 
 
 def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, light: PrintLight | None) -> None:
-    """Write the file of a shard as a whole, with the light of its pairs unless each has frames."""
     with whole_hdf5(path) as file:
         file.attrs.update({"configuration_sha256": digest, "speckle": speckle})
         if light is not None:

@@ -68,11 +68,11 @@ from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.transport.records import Bundle
 
 SHARD = 100
-"""Most pairs of a shard: an interruption loses a minute, and light is kept once for a hundred pairs."""
+"""Most pairs of a shard, because an interruption then loses a minute."""
 _PICTURE_S = 3e-6
 _PAIR_BYTES, _FRAME_BYTES = 4, 4
 _SHADOW_BYTES = 40
-"""Bytes of the stored shadow for a pixel of the frame's sides and a pixel of the projector's; measured 27 to 30."""
+"""Bytes of the stored shadow per pixel of the frame's and projector's sides; measured 27 to 30."""
 _FORMED = 0.5
 """Time to form a pair's frames over that of a capture; measured 0.4 to 0.6."""
 
@@ -120,7 +120,6 @@ class WhitePrints:
         return np.asarray(self.white * (self.shares @ reflectance.ravel()).reshape(self.white.shape))
 
     def rendered_light(self, bench: Apparatus, family: PatternFamily) -> PrintLight:
-        """Return the light by the classes of a family, before the mask of a bench."""
         light = self.light.behind(bench)
         simulation, estimate, pixels = light.simulation, light.groups[0], bench.n**2
         lighting, unit, parts = family.lighting, electrons_per_joule(bench), list[PrintPart]()
@@ -174,9 +173,9 @@ def electrons_per_joule(bench: Apparatus) -> float:
 
 Codes = npt.NDArray[np.uint8]
 _OVER = 2
-"""Points per pixel and axis of a drawn picture; four show no difference, because edges are soft."""
+"""Points per pixel and axis of a drawn picture."""
 _RADII = 0.015, 0.35
-"""Smallest and largest leaf over the side: two pixels of 128, and a third of the picture."""
+"""Smallest and largest leaf over the side."""
 _POWERS = 1.6, 3.2
 """Power by which the number of leaves falls with their radius; natural pictures have about 3 (Lee, Mumford and Huang,
 2001), portraits fewer small leaves."""
@@ -295,7 +294,6 @@ class FolderPictures:
 
     @cached_property
     def source(self) -> str:
-        """Number, folder and digest of the files."""
         digest = hashlib.sha256()
         for path in self.files:
             digest.update(f"{path.name} {check_plain(path, 'picture').st_size}\n".encode())

@@ -17,10 +17,9 @@ from mitsim.devices.session import Drift
 # -------- Pairs
 
 MOST_PAIRS = 10**6
-"""Most pairs of a request: within five digits of shards."""
 CALIBRATION = "calibration"
 Between = Annotated[tuple[float, float], Field(strict=False)]
-"""Least and largest number of an even distribution."""
+"""Bounds of an even distribution."""
 
 
 class Variation(Configuration):
@@ -53,7 +52,7 @@ class Variation(Configuration):
         return value
 
     def draw(self, seed: int, group: int) -> dict[str, float]:
-        """Return the numbers that are drawn for bench number ``group`` under a ``seed``, by `table.name`."""
+        """Return the drawn numbers of bench number ``group``, by `table.name`."""
         rng = stream(seed, "bench", group)
         tables = {"scene": self.scene, "mask": self.mask}
         ranges = {f"{table}.{name}": limits for table, each in tables.items() for name, limits in each.items()}
@@ -88,7 +87,6 @@ class PairsRequest(PairOptions):
     """Request of each pair's frames; its seed is the root of all streams."""
 
     def check(self) -> None:
-        """Refuse a request that cannot be served with a MitsimError, before any work."""
         capture, vary = self.capture, self.vary
         if capture.seconds is not None or capture.noise_fraction is not None:
             raise ArgumentError("seconds", "pairs share their light; give an accuracy")
@@ -138,7 +136,6 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
 UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
     "unrolled", "refined", "flatnet", "plug-and-play", "preprocessed",
 )  # fmt: skip
-"""Names of the classes of :mod:`mitsim.learn.methods`."""
 _LARGEST_BATCH, _LONGEST, _LARGEST_WEIGHT = 256, 1_000_000, 100
 """Largest batch, number of steps (ten days of the smallest network on two processors), and weight of a loss beside the
 squared error."""
@@ -170,7 +167,6 @@ class Training(Schedule):
     """One of :data:`METHODS`."""
 
     def model_post_init(self, _: object) -> None:
-        """Refuse what no network is trained by."""
         if self.method not in METHODS:
             near = near_name(str(self.method), METHODS)
             raise MitsimError(f"method {self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")

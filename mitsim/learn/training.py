@@ -35,18 +35,17 @@ from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.solvers import SOLVERS
 
 _PART, _MOST = 16, 48
-"""One photograph in 16 chooses the best step, and one judges, up to 48 pairs each: their mean PSNR is then known to 0.5
-dB."""
+"""One photograph in 16 chooses the best step, and one judges, up to 48 pairs each."""
 _LOOKS = 20
 _PATIENCE = 6
 _GAIN_DB = 0.01
 _RISING = 0.15
-"""Part of the steps over which the learning rate rises; then it falls as a cosine to 0."""
+"""Part of the steps over which the learning rate rises."""
 _DECAY, _BETAS, _LONGEST_GRADIENT = 1e-4, (0.9, 0.99), 1.0
 """Options of AdamW, and the norm to which gradients are cut, because the first steps would diverge otherwise."""
 _BASE_BYTES, _CHANNEL_BYTES, _HALF = 6e8, 100.0, 0.6
-"""Memory of torch; memory of a pixel with its gradient for each channel of the first level (76 to 96 measured); and its
-part in half precision (0.55 measured)."""
+"""Bytes of torch; bytes per pixel and channel of the first level (76 to 96 measured); and the part in half precision.
+"""
 _FRAME_PIXELS = 8
 _LOOK = 0.05
 _UNFINISHED = ".unfinished"
@@ -138,7 +137,6 @@ class Trainer:
         self.teaching, self.choosing, self.judging = part_photographs(photographs, self.request.seed)
 
     def is_over(self) -> bool:
-        """Return True if all steps are taken, or if the last judgements show no gain."""
         psnr = [value for _, value in self.curve]
         gone = max(psnr[:-_PATIENCE], default=-math.inf) > max(psnr[-_PATIENCE:]) - _GAIN_DB
         return self.taken >= self.request.steps or gone
@@ -155,13 +153,11 @@ class Trainer:
         job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.taken / steps)
 
     def choose(self) -> None:
-        """Judge the network by the pairs that choose, and keep its weights if it is the best so far."""
         self.curve.append((self.taken, self.judge(self.choosing)))
         if self.curve[-1][1] >= max(value for _, value in self.curve):
             self.best = weights_of(self.network)
 
     def save(self, path: Path, digest: str) -> None:
-        """Write the state after a judgement, from which an interrupted training continues."""
         state = {"step": self.taken, "curve": self.curve, "best": self.best, "network": weights_of(self.network)}
         critic = self.critic.state() if self.critic else {}
         write_tensors(path, {"digest": digest, **state, "optimiser": self.optimiser.state_dict(), "critic": critic})

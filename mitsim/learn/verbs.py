@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 
 def check_torch() -> None:
-    """Raise MitsimError if torch is not installed."""
     if find_spec("torch") is None:
         raise MitsimError("torch is not installed, which networks need; type: pip install 'mitsim[learn]'")
 

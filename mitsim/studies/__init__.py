@@ -6,9 +6,7 @@ The study NAME is the module ``mitsim.studies.NAME_study``, or one of :data:`SHA
 from __future__ import annotations
 
 OF_NO_SCENE = ("twin",)
-"""Studies whose bench is None."""
 OF_CAPTURES = ("learned", "twin")
-"""Studies of real captures (`--data`)."""
 PAPER = (
     "patterns",
     "distance",

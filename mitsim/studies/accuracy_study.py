@@ -1,12 +1,9 @@
 """Time and error of captures at several accuracies, of each part of their light, and of the reference, on one scene.
 
-Every error is relative to the *judge*, a factored answer with its own seed, every effect of the scene and, where its
-time allows, more anchors, layers and cells than the plans. The judge's own noise is subtracted, because independent
-squares add.
-
-*run*: a whole `mitsim capture`. *part*: the error without an effect, or with anchors, layers or cells reduced to one,
-and the time that this part costs. *surfaces*: the same for light over 2, 3, 4 and more surfaces. *reference*: one frame
-of the scene's own integrator; time for all frames, and samples for another error, are extrapolated.
+Every error is relative to the *judge*, a factored answer with its own seed and every effect of the scene. The judge's
+own noise is subtracted, because independent squares add. *run*: a whole `mitsim capture`. *part*: the error without an
+effect, or with anchors, layers or cells reduced to one, and the time that this part costs. *surfaces*: the same for
+light over 2, 3, 4 and more surfaces. *reference*: one frame of the scene's own integrator, extrapolated to all frames.
 """
 
 from __future__ import annotations
@@ -68,26 +65,21 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 ACCURACIES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
-"""Two steps a decade, from a first look to far below the sensor's noise."""
 QUOTED = 1e-3
-"""Default accuracy of a capture."""
 SAMPLES = (16, 64)
-"""Samples per pixel of the reference."""
 LONGEST_S = 30.0
-"""Predicted seconds above which a run, or a step of the reference, is not measured."""
+"""Predicted seconds above which a run, or a step of the reference, is skipped."""
 PART_S, JUDGE_S = 1.5, 12.0
 """Predicted seconds of light with all parts, and of the judge's."""
 _REPEATS, _REPEATED_S = 3, 5.0
 """Repeats of work that takes at most so many seconds; longer work is timed once."""
 _ALIKE = 0.1
-"""Relative difference of two single runs of the same work on an idle machine."""
 _FINER, _STEP = 10.0, 1.25
 """The judge's noise is a tenth of the quoted accuracy where time allows, and grows by this factor otherwise."""
 RUN, PART, REFERENCE, PARENT = "factored", "part", "reference", "interreflection"
 ORDERS = {"2 surfaces": (2, 2), "3 surfaces": (3, 3), "4 surfaces": (4, 4), "5 or more": (5, MOST)}
-"""Orders of light by row; little light is left beyond four surfaces."""
 _FEWER = 4
-"""Factor by which fewer samples determine the effect of an order, because it is traced alone."""
+"""Factor of samples that an order saves because it is traced alone."""
 
 # -------- A scene and its patterns, with what the pilot measured of them
 
@@ -111,14 +103,13 @@ class Probe:
 
     @cached_property
     def few_shots(self) -> Labels:
-        """Numbers of at most eight evenly spread shots, among which common changes differ by few percent."""
+        """Return at most eight evenly spread shots."""
         return np.unique(np.linspace(0, len(self.family.shots) - 1, 8).astype(np.int64))
 
     def plan(self, accuracy: float) -> Plan:
         return explain_plan(accuracy, self.pilot_result, SceneFacts.of(self.bench))
 
     def finest(self, plan: Plan) -> Plan:
-        """Return a ``plan`` with every effect, and one step finer in each number."""
         ladders, now = self.pilot_result.ladders, plan.settings
         anchors, layers, cells, followed, occluded = (
             next((finer for finer in ladders[name] if finer > count), count)
@@ -137,9 +128,7 @@ class Probe:
         return replace(plan, settings=settings)
 
     def within(self, plan: Plan, seconds: float) -> tuple[Plan, float]:
-        """Return the ``plan`` with the least noise within the predicted ``seconds``, or else of its own accuracy, and
-        its time.
-        """
+        """Return the ``plan`` with the least noise within the predicted ``seconds``, if possible, and its time."""
         accuracy = plan.accuracy / _FINER
         while True:
             choice = predicted_candidate(accuracy, self.pilot_result, plan.settings, {})
@@ -150,7 +139,6 @@ class Probe:
     def trace(
         self, plan: Plan, seed: int, bench: Apparatus | None = None, target: Target | None = None
     ) -> SampledLight:
-        """Return the light of a ``plan`` by classes of projector pixels."""
         return trace_light(
             bench or self.bench, plan, self.family.lighting, seed, Sampling(by_pixel=False, target=target)
         )
@@ -182,7 +170,6 @@ class Judge:
 
     @classmethod
     def trace(cls, probe: Probe, seconds: float = JUDGE_S) -> Judge:
-        """Return the best answer within the predicted ``seconds``."""
         plan, seed = probe.plan(probe.accuracy), probe.seed + 1
         finest, work = probe.within(probe.finest(plan), seconds)
         if work > seconds:  # the plan's own numbers then; what they leave is stated with the judge
@@ -217,13 +204,11 @@ class Judge:
 
 
 def repeated(work: Callable[[], float]) -> list[float]:
-    """Return the seconds of each repeat of ``work``, which returns its own."""
     seconds = [work()]
     return seconds + [work() for _ in range(_REPEATS - 1) if seconds[0] <= _REPEATED_S]
 
 
 def spread(seconds: Sequence[float]) -> dict[str, Value]:
-    """Return the columns of a repeated time."""
     return {
         "seconds": median(seconds), "least_s": min(seconds), "most_s": max(seconds), "repeats": len(seconds)
     }  # fmt: skip
@@ -291,7 +276,6 @@ def measure_run(judge: Judge, accuracy: float, opening_s: float) -> Iterator[dic
 
 
 def measure_parts(judge: Judge) -> Iterator[dict[str, Value]]:
-    """Yield a row for each part of the light, the one that changes most first."""
     probe, found = judge.probe, []
     full = full_plan(probe)
     whole = repeated(_light_of(probe, probe.bench, full))
@@ -323,7 +307,7 @@ def _part_row(
 
 
 def full_plan(probe: Probe) -> Plan:
-    """Return the plan at the probe's accuracy with all parts on, and samples that take at most :data:`PART_S`."""
+    """Return the plan with all parts on, and samples that take at most :data:`PART_S`."""
     plan = probe.plan(probe.accuracy)
     now, finer = plan.settings, probe.finest(plan).settings
     counted = ("anchors", "followed_anchors", "occluded_anchors", "subdivision")
@@ -346,7 +330,7 @@ def _light_of(probe: Probe, bench: Apparatus, plan: Plan) -> Callable[[], float]
 
 
 def measure_surfaces(judge: Judge, settings: Settings) -> Iterator[dict[str, Value]]:
-    """Yield a row for each order of light, if the plan follows light over several surfaces.
+    """Yield a row for each order of light over several surfaces.
 
     The time of an order is that of following light to this order less that to the order before.
     """
@@ -360,7 +344,7 @@ def measure_surfaces(judge: Judge, settings: Settings) -> Iterator[dict[str, Val
         return traced_again(replace(judge.light, seed=probe.seed, samples=samples), simulation, "orders")
 
     def looks(fewest: int, most: int) -> FloatArray:
-        """Return (REPLICATES, shots, m, m') frames of some shots by light of some orders alone."""
+        """Return (REPLICATES, shots, m, m') frames by light of some orders alone."""
         fewer = {name: max(1, count // _FEWER) for name, count in samples.items()}
         light = light_of(OfOrders(bench, settings, fewest, most), fewer)
         each = [reduce(add, light.groups[look::REPLICATES]) / (GROUPS // REPLICATES) for look in range(REPLICATES)]
@@ -389,7 +373,7 @@ def measure_surfaces(judge: Judge, settings: Settings) -> Iterator[dict[str, Val
 
 
 def measure_reference(judge: Judge) -> Iterator[dict[str, Value]]:
-    """Yield rows that compare one frame of the reference with light that has the same effects."""
+    """Yield rows that compare one frame of the reference with light of the same effects."""
     probe, shots = judge.probe, judge.probe.family.shots
     index, predicted_s = len(shots) // 2, 0.0
     answer, _ = stack_frames(judge.of_reference().frames(probe.family.lighting.shots([index]), probe.seed + 1))
@@ -415,7 +399,6 @@ def at_once(expected: ExpectedFrames) -> float:
 
 
 def with_samples(settings: Settings, samples: int) -> Settings:
-    """Return ``settings`` with ``samples`` of a projector pixel and of a cell in each group's first round."""
     each = {name: samples / 8 if row.anchors else float(samples) for name, row in PASSES.items() if name != "sharp"}
     return replace(settings, samples={**settings.samples, **each})
 
@@ -454,9 +437,7 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _derive(results: Results) -> Results:
-    """Return results with the column ``on_front`` for runs that no other run beats in both time and error, and a row of
-    the reference at the error of the quoted run.
-    """
+    """Add the column ``on_front`` for runs that no other run beats, and the reference at the quoted run's error."""
     runs = [row for row in results.rows if row["estimator"] == RUN and not row["extrapolated"]]
     front = pareto_front([(float(str(row["seconds"])), float(str(row["error"]))) for row in runs])
     rows = [{**row, "on_front": (row["seconds"], row.get("error")) in front} for row in results.rows]
@@ -479,7 +460,7 @@ def _reaching(row: dict[str, Any], error: float) -> dict[str, Any]:
 
 
 def _kept(rows: DataFrame) -> tuple[str, bool | None]:
-    """Judge whether each run keeps its accuracy, with room for the judge's own error and for sampling."""
+    """Judge whether each run keeps its accuracy, with room for the judge's error and for sampling."""
     rows = rows[rows["error"].notna()]
     over = [row["error"] / math.hypot(row["accuracy"], row["judge_error"]) for row in rows.to_dict("records")]
     return (f"error over accuracy at most {max(over):.2f}", max(over) <= 1.25) if over else ("not measured", None)
@@ -491,7 +472,7 @@ def _unbiased(rows: DataFrame) -> tuple[str, bool]:
 
 
 def _faster(rows: DataFrame) -> tuple[str, bool | None]:
-    """Judge how much longer than the quoted run's transport and optics the reference takes for the same error."""
+    """Judge how much longer than the quoted run the reference takes for the same error."""
     quoted = choose_rows(rows, {"estimator": RUN, "accuracy": QUOTED, "extrapolated": False}).to_dict("records")
     slow = choose_rows(rows, {"estimator": REFERENCE}).to_dict("records")
     if not quoted or not slow:

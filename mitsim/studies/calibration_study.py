@@ -1,15 +1,14 @@
 """Limits of a calibration session, and of an image that is made with its factors, on one bench.
 
-*entries*, *singular*: factors of noisy frames against those of expected frames, beside predicted errors. *causes*:
-residual of a separable camera without one cause. *models*: factors of models fitted to a few frames. *shadows*:
-diffraction at the mask. *losses*: cost of each source in one image.
+*entries*, *singular*: factors of noisy frames against those of expected frames. *causes*: residual of a separable
+camera without one cause. *models*: factors of models fitted to a few frames. *shadows*: diffraction at the mask.
+*losses*: cost of each source in one image.
 
-The squared error E of the image is the sum of parts V. Parts of noise are expected values of a perturbation of the
-solver with a fixed lambda (:mod:`mitsim.studies.causes`). Parts of the scene's light that the factors lack (detail
-inside projector pixels, depth, light over several surfaces) follow from noiseless frames without one cause after
-another, less the part that lambda alone removes. The rest of E is unexplained and may belong to any source. Noise is
-drawn once, so that every V scatters by chance. A source costs ``10 log10(E / (E - V))``, the gain of the image without
-the source; these decibels do not add up. A drift that adds the squared error A costs ``10 log10((E + A) / E)``.
+The squared error E of the image is the sum of parts V. Parts of noise follow from a perturbation of the solver with a
+fixed lambda (:mod:`mitsim.studies.causes`). Parts of the scene's light that the factors lack follow from noiseless
+frames without one cause after another, less the part that lambda alone removes. The rest of E is unexplained and may
+belong to any source. A source costs ``10 log10(E / (E - V))``, the gain of the image without the source; these decibels
+do not add up. A drift that adds the squared error A costs ``10 log10((E + A) / E)``.
 """
 
 from __future__ import annotations
@@ -72,7 +71,6 @@ Row = dict[str, Value]
 
 CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"
 RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
-"""Sampling of simulated light; the solver's regularisation; and the part without a named cause."""
 ERROR_SOURCES = MappingProxyType(
     {
         causes.DETAIL: "detail inside projector pixels",
@@ -84,11 +82,10 @@ ERROR_SOURCES = MappingProxyType(
         causes.BLACK_LEVEL: "light that black pixels leak",
     }
 )
-"""Effects of the scene's light that factors lack, in the order of their removal."""
+"""Effects that factors lack, in the order of their removal."""
 SURE = 3.0
-"""Standard errors from which the unexplained part is not chance (1 of 370 normal studies)."""
+"""Standard errors from which the unexplained part is not chance."""
 _LEAST_LEFT = 1e-9
-"""Least part of an image's error that is left without a source: 90 dB."""
 
 
 @dataclass(frozen=True)
@@ -134,10 +131,6 @@ class Budget:
 
 
 def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[LossRow], list[str]]:
-    """Return rows of noise, scene, drifts and the unexplained rest, and reasons why some drifts were not predicted.
-
-    ``clear`` are the factors of the session ``lit`` without noise.
-    """
     budget = _budget(stand, lit, clear)
     measured, explained = squared_error(stand.before_db), sum(part.square for part in budget.parts.values())
     found = [
@@ -153,7 +146,7 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[Los
 
 
 def _drifts(stand: DriftStand, budget: Budget, measured: float) -> tuple[list[LossRow], list[str]]:
-    """Return rows of drifts for the ``measured`` squared error, and reasons why some were not predicted.
+    """Return rows of drifts, and reasons why some were not predicted.
 
     The model's drift does not move light that the model lacks. Therefore the uncertainty is all that the model's error
     and the rest have in common, and chance.
@@ -240,11 +233,7 @@ def _square(error: FloatArray) -> float:
 
 
 def gain_without(part: float, measured: float, explained: float, deviation: float = 0.0) -> tuple[float, float]:
-    """Return the gain of an image without a source [dB], and its standard error.
-
-    ``part`` and ``deviation`` are the source's predicted squared error and its chance; ``measured`` and ``explained``
-    are the image's squared error and its prediction from all sources.
-    """
+    """Return the gain of an image without a source [dB], and its standard error, from squared errors."""
     most = max(measured, explained)
     lost = _decibels(part / most)
     chance = abs(_decibels((part + deviation) / most) - lost)
@@ -319,21 +308,17 @@ def as_built(bench: AnyBench) -> AnyBench:
 
 
 OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}
-"""Placement errors of a mask that is glued on by hand, under a microscope."""
+"""Placement errors of a mask that is glued on by hand."""
 _MODEL_FRAMES = (2, 16)
 _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
-"""Effects of which frames are formed again in the same light; for others light is traced again."""
 _PROFILE_MM, _SAID_DB = 0.7, 0.005
-"""Half of the range of a point's shadow that is kept: a dozen mask features; least loss that is drawn."""
+"""Half range of a point's shadow: a dozen mask features; least loss that is drawn."""
 
 
 def measure_session(
     bench: Bench, recipe: SessionRecipe, patterns: str, seed: int, accuracy: float
 ) -> tuple[list[Row], dict[str, FloatArray]]:
-    """Return the rows of a session and of an image with its factors, and maps of the factors' errors.
-
-    The session is taken without the drift of its ``recipe``, whose cost is predicted.
-    """
+    """Return rows of a session without its ``recipe``'s drift, and of an image, and maps of the factors' errors."""
     job, family = Job(), bench.family(patterns, seed)
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), seed)
@@ -374,7 +359,6 @@ def _factors(lit: LitSession, estimate: Estimate) -> Factors:
 
 
 def fit_models(lit: LitSession, stand: DriftStand) -> tuple[list[Row], list[str]]:
-    """Return rows of images with models fitted to a few frames, from a wrong plan, and reasons why some failed."""
     rows: list[Row] = []
     refused, planned = [], as_built(lit.session.bench)
     for model, wanted in product(get_args(Model), _MODEL_FRAMES):
@@ -395,9 +379,7 @@ def fit_models(lit: LitSession, stand: DriftStand) -> tuple[list[Row], list[str]
 
 
 def compare_shadows(bench: Bench) -> list[Row]:
-    """Return rows of the mask's shadow in each light against the geometric one, and of a point's shadow relative to the
-    open sensor's irradiance.
-    """
+    """Return rows of the mask's shadow in each light, and of a point's shadow relative to the open sensor."""
     cameras = {name: IdealCamera(bench, bench.geometry.mask, spectrum) for name, spectrum in lights(bench).items()}
     rows: list[Row] = [{"kind": "shadows", **shadow_row(name, cameras)} for name in cameras]
     places = np.asarray(bench.geometry.centres(0))
@@ -413,9 +395,7 @@ def compare_shadows(bench: Bench) -> list[Row]:
 
 @single_threaded_blas()
 def judge_session(lit: LitSession, noisy: Estimate, clean: Estimate) -> tuple[list[Row], dict[str, FloatArray]]:
-    """Return rows of the errors of ``noisy`` factors against ``clean`` ones and their prediction, and maps (m, n) of
-    the errors in predicted deviations.
-    """
+    """Return errors of ``noisy`` factors beside their prediction, and maps (m, n) in predicted deviations."""
     rows, maps = [session_cost(lit, noisy, clean)], {}
     pairs = zip(FACTORS, SIDES, (clean.left, clean.right), (noisy.left, noisy.right), strict=True)
     for name, side, exact, found in pairs:
@@ -469,9 +449,7 @@ def singular_rows(exact: FloatArray, found: FloatArray, deviation: FloatArray) -
 
 
 def session_cost(lit: LitSession, noisy: Estimate, clean: Estimate) -> Row:
-    """Return the row of a session: frames, seconds without read-out, expected photoelectrons and photons, and
-    separability residuals with noise and without.
-    """
+    """Return the frames, seconds without read-out, photoelectrons, photons and separability residuals of a session."""
     recipe, order = lit.session.recipe, len(lit.session.order)
     lit_s = sum(lit.exposures_s) * recipe.repeats
     # Shots of uniform light: both of a pair together are one.
@@ -489,7 +467,6 @@ def session_cost(lit: LitSession, noisy: Estimate, clean: Estimate) -> Row:
 
 
 def residuals(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[Row]:
-    """Yield rows of the separability residual without each cause, and of the part that noise adds."""
     whole, simulation, session = clean.separability_residual, lit.light.simulation, lit.session
 
     def without(session: Session, light: SampledLight) -> float:
@@ -547,7 +524,6 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 _SHOWN_DEVIATIONS = 4.0
-"""Range of the maps [deviations]: one of 16 000 entries lies beyond."""
 _TABLES = {
     "losses": ("What an image loses", "of source amount lost_db error_db squared_error deviation"),
     "session": (

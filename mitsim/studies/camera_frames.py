@@ -27,10 +27,9 @@ from mitsim.studies.emva_options import Procedure
 # -------- Simulated frames, and what closed forms expect of frames
 
 _TO = 1.15
-"""Light of the brightest step relative to saturation, so that the largest variance is inside."""
 _DARK_STEPS = 6
 _DARK_FILL, _DARK_ELECTRONS = 0.4, 2000.0
-"""Dark electrons at the longest exposure: a fraction of saturation, or enough to determine a current to a permille."""
+"""Dark electrons at the longest exposure: a fraction of saturation, or enough for a permille."""
 _LONGEST_S = 10.0
 _FILLED_BY_DARK = 0.01
 _DITHERED, _CLEAR = 0.6, 8.0
@@ -126,7 +125,6 @@ class Frames:
         )  # fmt: skip
 
     def expect(self) -> Session:
-        """Return the statistics that closed forms expect, with the given nonuniformity."""
         pairs, (m, n), stacks = [self.expected_pair(index) for index in range(len(self.light))], self.shape, []
         for index in (self.dark, self.bright):
             still, parts = self.parts(index, 0.0), self.parts(index)
@@ -263,23 +261,18 @@ def _draw_stacks(frames: Frames, expected: Session, rng: np.random.Generator) ->
 _LEAST_SIDE = 16
 _SURE = 6.0
 _UNEQUAL = 0.1
-"""Standard deviation of the light in a set that indicates a lamp off or another exposure."""
 _WHITE = 0.02
 """Correlation of neighbours' noise that charge between pixels may cause."""
 _OUT, _SWAPPED = 0.02, 1.5
 """Relative response from which a set is reported, and from which frames are refused."""
 _MIXED, _SCALED, _PEAK = 0.1, 0.99, 0.6
-"""Limits of refusals: correlation of neighbours' noise, amplitude of a pattern in the codes, and the least fraction of
-the brightest signal with the largest variance."""
+"""Limits of refusals: neighbours' correlation, a pattern in the codes, and the brightest signal's least fraction."""
 _COMB, _EVEN, _STEADY, _STRAIGHT, _STILL, _DARK_CUT, _DEAD = 0.05, 0.03, 0.01, 0.05, 0.1, 0.01, 0.01
-"""Limits of remarks: pattern in the codes, unevenness (EMVA 1288 4.0), scatter of the light, misfits of a variance and
-of a dark mean [DN], unexplained dark readings at 0, and dead pixels."""
+"""Limits of remarks, among them unevenness (EMVA 1288 4.0), misfits of a variance and of a dark mean [DN]."""
 _FLOATS = 9
-"""Arrays of the frame's size in double precision that a set needs."""
 
 
 def read_sets(flats: FlatFrames, job: Job) -> list[Alike]:
-    """Compute the statistics of every set; MitsimError if the frames show nothing of the camera."""
     where = f"frames {flats.folder}"
     shape = image_size(flats.folder / flats.sets[0].files[0], flats.wanted)
     if min(shape) < _LEAST_SIDE:
@@ -294,7 +287,7 @@ def read_sets(flats: FlatFrames, job: Job) -> list[Alike]:
 
 
 def read_again(flats: FlatFrames, shape: tuple[int, int], places: Places | None = None) -> list[Alike]:
-    """Compute the statistics of every set, with the pixel at `places` (M, N) read in place of each pixel."""
+    """Compute the statistics with the pixel at `places` (M, N) read in place of each pixel."""
     bits = flats.listed.bits
     largest = math.inf if bits is None else 2.0**bits - 1
 
@@ -331,7 +324,6 @@ def _names(flats: FlatFrames) -> list[str]:
 
 
 def _faults(flats: FlatFrames, taken: Sequence[Alike]) -> Iterator[str]:
-    """Yield reasons why the frames show nothing of the camera."""
     seen = dict[bytes, str]()
     for listed, each in zip(flats.sets, taken, strict=True):
         for name, digest in zip(listed.files, each.digests, strict=True):

@@ -1,19 +1,12 @@
 """Studies of the paper on the camera: the mask's distance, the sensor's pixels, the resolution, and depth.
 
 *distance*, section IV-C and figure 5: the mask at 500 to 2000 um, and on to where diffraction ends the shadow.
-
-*binning*, section V-D and its supplement: 512 to 64 pixels a side, the last two with fewer data than unknowns in a
-single frame. Frames are averaged after capture.
-
-*resolution*, section V-C and figure 11: bars of 0.13 to 0.6 line pairs a mm under 9, 16 and 49 patterns, and the
-slanted edge of ISO 12233. The paper's contrast (I_max - I_min) / (I_max + I_min) is 0.2 to 0.5 by noise alone: it is in
-the table as `contrast_of_extremes`; figure and verdicts use the contrast at the bars' own frequency. Pixels of the
-image are 0.9375 mm, so that it shows at most 0.533 line pairs a mm.
-
-*depth*, section V-A and the limitations: "our method is robust to small variations in depth", with camera and projector
-co-located. Parallax moves each projector pixel's light by B (1/z - 1/z_0), with the baseline B. Idealised: a plane
-beside the calibrated distance, any baseline. Rendered: the shipped devices, 60 mm, with the sheet moved, and its depth
-neglected, found, or calibrated; and scenes of many depths, one found for each projector pixel.
+*binning*, section V-D: frames averaged after capture to 512 to 64 pixels a side. *resolution*, section V-C and figure
+11: bars and the slanted edge of ISO 12233. The paper's contrast (I_max - I_min) / (I_max + I_min) is 0.2 to 0.5 by
+noise alone; verdicts use the contrast at the bars' own frequency. *depth*, section V-A: parallax moves each projector
+pixel's light by B (1/z - 1/z_0), with the baseline B. Idealised: a plane beside the calibrated distance, any baseline.
+Rendered: the shipped devices, 60 mm, with the sheet moved, and its depth neglected, found, or calibrated; and scenes of
+many depths.
 """
 
 from __future__ import annotations
@@ -36,12 +29,10 @@ from mitsim.studies.framework.studio import Image, Studio, finding, image_arrays
 
 _FAMILIES, _SHOWN = ("uniform", "dots:5", "dots:7"), ("uniform", "dots:7")
 _STABLE_DB = 3.0
-"""Loss of an image that still counts as stable: its squared error doubles."""
 
 # -------- The distance of the mask
 
 _COMPARABLE_DB = 1.0
-"""Least visible difference: a fifth of the squared error."""
 
 DISTANCE = Study(
     "distance",
@@ -75,7 +66,7 @@ DISTANCE = Study(
 # -------- The number of sensor pixels
 
 _FINE, *_, _COARSE = BINNINGS = (1, 2, 4, 8)
-"""Pixels a side that are averaged: the paper's 512 to 64 pixels a side."""
+"""Pixels a side that are averaged."""
 
 
 def _binning_measure(studio: Studio, point: Point) -> Found:
@@ -116,14 +107,13 @@ BINNING = Study(
 # -------- The resolution
 
 PAIRS_A_MM = (0.13, 0.17, 0.21, 0.26, 0.35, 0.43, 0.52, 0.6)
-"""The paper's groups 20 to 5, and one that pixels of 0.9375 mm cannot resolve."""
 _FINEST = 0.52
 _RESOLVED = 0.1
 """Contrast above which bars are resolved: the eye's limit for a print."""
 _SEEN, _BESIDE = slice(16, -16), slice(8, -8)
-"""Evaluated pixels, without the margin beside the other half's bars or beyond the print."""
+"""Evaluated pixels, without margins."""
 _SHOWN_CYCLES, _SHOWS = 0.35, 0.4
-"""Frequency [cycles a pixel] up to which the truth must show bars, and its least contrast."""
+"""Highest frequency [cycles a pixel] and least contrast of bars in the truth."""
 
 
 def _resolution_measure(studio: Studio, point: Point) -> Found:
@@ -139,7 +129,7 @@ def _resolution_measure(studio: Studio, point: Point) -> Found:
     own = float(frequency) * pixel_mm
 
     def halves(picture: FloatArray) -> list[tuple[FloatArray, int]]:
-        """Return the bars of each half without the margins, and the axis along which they lie."""
+        """Return the bars of each half without margins, and their axis."""
         left, right = np.split(picture, 2, axis=1)
         return [(left[_SEEN, _BESIDE], 0), (right[_SEEN, _BESIDE], 1)]
 
@@ -208,7 +198,6 @@ RESOLUTION = Study(
 
 _BINS = 4
 _LEAST_STEP = 0.05
-"""Least step of reflectance that counts as an edge."""
 
 
 def contrast(image: FloatArray, axis: int) -> float:
@@ -274,15 +263,13 @@ def _centroid(weights: FloatArray, places: FloatArray) -> float:
 
 CALIBRATED_MM = 400.0
 _BESIDE_MM = (395.0, 405.0)
-"""Small variations of depth: the bag's folds."""
 DEPTHS_MM = (360.0, 380.0, 395.0, CALIBRATED_MM, 405.0, 420.0, 440.0)
-"""A tenth of the distance either way, as in the shipped scenes with depth."""
 BASELINES_MM = (0.0, 15.0, 60.0, 150.0, 300.0)
-"""From co-located, over a pico projector that touches the camera, to the other side of a bench."""
+"""From co-located to the other side of a bench."""
 ALONG = {"columns": (0.0, -1.0), "rows": (-1.0, 0.0), "both": (-(0.5**0.5), -(0.5**0.5))}
-"""Unit vectors of the baseline; that of the shipped devices is along the columns."""
+"""Unit vectors of the baseline."""
 DEEP = {"cards": ("dots:7", "dots:7x14"), "cookie_bag": ("dots:7", "dots:7x16")}
-"""Scenes of many depths, and patterns whose period is too short for their parallax, and long enough."""
+"""Scenes of many depths, and patterns of a period too short and long enough for their parallax."""
 NONE, AUTO, MAP, OWN = ("none", "auto", "map", "own calibration")
 _FOCUSED = {NONE: "factors as calibrated", AUTO: "depth found (--focus auto)", OWN: "calibrated at its own depth"}
 

@@ -110,7 +110,7 @@ _MOVED = frozenset({KEYSTONE, DEPTH, DETAIL, DEFOCUS})
 _FURTHER = frozenset({"interreflection", "mirrors", "ambient"})
 _WHOLE = "pixels that are lit all over"
 _POINTS = 2
-"""Points per side of a cell that represent even light; a keystone leaves 1e-3 of the cells uneven."""
+"""Points per side of a cell that represent even light."""
 _SIMULATIONS = 4
 _IN_PLACE = 1e-3
 """Tolerated distance from the aligned plane [projector pixels], because float32 leaves 1e-4."""
@@ -141,7 +141,6 @@ class Ablation:
         return cls(light, truth.reflectance.ravel() * truth.board_flux, truth.board_flux)
 
     def without(self, off: frozenset[str]) -> SampledLight:
-        """Return the light without the effects ``off``; effects that the light does not have are ignored."""
         off &= frozenset(self.effects)
         if not off:
             return self.light
@@ -324,7 +323,7 @@ def _present(light: SampledLight) -> dict[str, bool]:
 
 
 def _off_plane(light: SampledLight) -> bool:
-    """Return True if light of some projector pixel is seen beside its place on the aligned plane."""
+    """Return True if some light is seen beside its place on the aligned plane."""
     bench, simulation = light.bench, light.simulation
     path_samples = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
     size = [(last - first) / bench.n for first, last in bench.windows]
@@ -346,7 +345,6 @@ def _even(path_samples: PathSamples, pixels: int) -> PathSamples:
 
 
 def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_array:
-    """Return ``sharp`` light averaged over all anchors of the sensor."""
     if simulation.settings.sharp is None:
         return sharp
     bundle = simulation.grids["sharp"].bundle
@@ -375,16 +373,14 @@ def _weigh(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
 
 
 def reform(light: SampledLight, absent: frozenset[str]) -> SampledLight:
-    """Return the ``light`` with frames formed without the effects ``absent``, which need no new tracing."""
+    """Return the ``light`` with frames formed without the effects ``absent``."""
     simulation = light.simulation
     settings = replace(simulation.settings, effects=simulation.settings.effects - absent)
     return replace(light, simulation=Simulation(simulation.bench, settings))
 
 
 def ablations(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str, Settings]]:
-    """Yield the name of each present effect of expected frames with ``settings`` without it, then each number above one
-    with ``settings`` in which it is one.
-    """
+    """Yield the name of each present effect, or number above one, and ``settings`` without it."""
     for name in sorted(present & names(lambda effect: effect.in_frames)):
         yield name, replace(settings, effects=settings.effects - {name})
     if settings.anchors > 1:
@@ -628,7 +624,6 @@ class LinearImage:
         return weights
 
     def variance(self, scene: FloatArray, noise: Noise) -> float:
-        """Return the sum of the variances of all numbers of the image of a ``scene`` (n, n')."""
         units = self.units(scene)
         return self._energy(sum((getattr(noise, name) * unit for name, unit in units.items()), np.zeros((1, 1))))
 

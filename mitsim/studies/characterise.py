@@ -34,9 +34,8 @@ from mitsim.studies.framework.panels import Part, build_findings, text_table
 
 CAMERA_FILE = "camera.toml"
 MOST_OFF = 5.0
-"""Standard errors from which a figure is off."""
 _BIASED, _MISLEADS = 0.5, 1.0
-"""Standard errors of the procedure's own bias from which a figure is compared with its expected value, and flagged."""
+"""Standard errors of the procedure's own bias from which the expected value is compared, and a figure flagged."""
 _DUST = 1e-10
 _OF_FIELDS = "name", "unit", "set", "found", "standard_error", "deviations"
 _WHOLE = 1e4
@@ -60,7 +59,6 @@ FIGURES: Mapping[str, tuple[str, str]] = {
     **{f"prnu_{part}": (f"PRNU1288.{part}", "%") for part in SPLIT},
 }
 _VARIANCES = "dsnu", "prnu", "row_noise"
-"""Prefixes of the figures that are found as variances."""
 _UNITS = {
     "gain_dn_per_e": "DN/e-", "quantum_efficiency": "e-/photon", "e_per_s": "e-/s", "_dn": "DN", "_e": "e-", "": "1"
 }  # fmt: skip
@@ -68,7 +66,7 @@ _UNITS = {
 
 
 def figures_set(frames: Frames) -> dict[str, float]:
-    """Return the figures that the camera of some frames is set to; variances of those found as variances."""
+    """Return the figures that the camera is set to; variances of those found as variances."""
     sensor, brightest, current = frames.sensor, int(frames.light.argmax()), mean_dark_current(frames.sensor)
     alive, light = 1 - sensor.dead_pixels, float(frames.light[brightest])
     # At no exposure if the light varies by exposure.
@@ -91,7 +89,7 @@ def figures_set(frames: Frames) -> dict[str, float]:
 
 
 def fields_set(model: SensorModel) -> dict[str, float | None]:
-    """Return the measured fields of a camera file, as a model sets them for its superpixels."""
+    """Return the measured fields of a camera file, for its superpixels."""
     offsets, responses = (np.roll(parts, -1).tolist() for parts in (model.offset_parts, model.response_parts))
     defects = ("hot_pixels", "hot_dark_current_e_per_s", "dead_pixels")
     return {
@@ -158,7 +156,7 @@ def row_of(frames: Frames, name: str, given: float, found: FloatArray, sessions:
 
 
 def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
-    """Compare the camera that was found with the model that took the frames, if it is known."""
+    """Compare the camera that was found with the known model."""
     rows, transfer, given = [], found.transfer, {} if model is None else fields_set(model)
     values = {**fields_set(found.sensor), "full_well_e": found.sensor.full_well_e}
     errors = dict(found.errors)
@@ -292,7 +290,7 @@ class Characterisation:
 
 
 def figures_of(done: Characterisation) -> Mapping[str, Figure]:
-    """Draw the plots by file name, without those of figures that the frames do not show."""
+    """Draw the plots by file name."""
     rows, what = {row.name: row for row in done.rows}, "camera found" if done.real else "closed form"
     gain, black = rows["system_gain"].found, done.frames.sensor.superpixel_black_level_dn
 
@@ -350,10 +348,7 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
 def characterise(
     sensor: SensorModel, procedure: Procedure | None = None, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Run EMVA 1288's procedure on simulated frames of a camera.
-
-    `output` is a folder for page, plots, JSON and the camera file: new, empty, or of an earlier characterisation.
-    """
+    """Run EMVA 1288's procedure on simulated frames of a camera, in a new, empty or earlier folder `output`."""
     procedure, job = procedure or Procedure(), job or Job()
     frames = Frames.of(sensor, procedure)
     bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
@@ -372,7 +367,7 @@ def characterise(
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Measure a real camera by its frames under even light and in the dark (`mitsim.devices.framelist.load_flats`)."""
+    """Measure a real camera by its frames under even light and in the dark."""
     job, facts = job or Job(), listed.listed
     stated = {name: getattr(facts, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
 

@@ -1,13 +1,10 @@
 """Colours of a ColorChecker: Delta E 2000 of each patch to its spectrum in D65, by patterns and ways to see colour.
 
-The *floor* needs no camera: it is the error of the matrix from reflectances at the projector's lines to XYZ. Frames are
-rendered, with the sensor's noise, a calibration and a solve for each line. *One calibration for all*: the middle line's
-factors serve all lines. *D65*: a lamp of daylight shines on the chart, and its frame is subtracted. *Mosaic*: all lines
-are shown at once, behind colour filters, and images are solved with the best lambda.
-
-Each line has its own bench; the light of all lines is traced on the same paths. The brightest pixel fills the well in
-every frame. The noise of the subtracted daylight frame is common to all frames, so that it adds up in the mean over a
-region; it is therefore the mean of as many shots as there are patterns.
+The *floor* needs no camera: it is the error of the matrix from reflectances at the projector's lines to XYZ. *One
+calibration for all*: the middle line's factors serve all lines. *D65*: a lamp of daylight shines on the chart, and its
+frame is subtracted. *Mosaic*: all lines are shown at once, behind colour filters. The noise of the subtracted daylight
+frame is common to all frames, so that it adds up in the mean over a region; it is therefore the mean of as many shots
+as there are patterns.
 """
 
 from __future__ import annotations
@@ -70,9 +67,8 @@ DAYLIGHT_RADIANCE = 117.0
 FULL_LX = 2.97 * 205.0
 """Illuminance of that light: 2.97 W/m^2 at the chart's middle, and 205 lm/W of D65 from 380 to 780 nm."""
 FILTERS, ARRAY = "ov5647", "RGGB"
-"""Camera file with the measured curves of the filters, and their array."""
 _COARSE = tuple(float(relative) for relative in np.logspace(-9, -3, 7))
-"""Lambdas of the joint solve, relative to its largest eigenvalue; the best is refined by half a decade."""
+"""Lambdas of the joint solve, relative to its largest eigenvalue."""
 Shots = Sequence[tuple[FloatArray, int, int]]
 """Measured frames (m, m') [electrons/s], with the row and column of their pattern."""
 
@@ -91,7 +87,6 @@ class LitLine:
 
 
 def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
-    """Light a scene with each line of its projector, and calibrate its camera in each."""
     colours = SpectralBench.of(_open(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
     request = Request.of(accuracy=setup.accuracy, seed=seed)
     plan = plan_request(colours.whole, request)
@@ -190,7 +185,7 @@ def mosaic_shots(lines: Sequence[LitLine], family: PatternFamily, seed: int) -> 
 
 
 def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, shots: Shots, way: str) -> LineImages:
-    """Solve the images of all lines by one of :data:`mitsim.core.manifests.WAYS`, with the best lambda for the truth.
+    """Solve the images of all lines by one of :data:`mitsim.core.manifests.WAYS`, with the best lambda.
 
     MitsimError for demosaicing without colour-demosaicing.
     """
@@ -230,10 +225,7 @@ def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
 def daylit_images(
     line: LitLine, light: tuple[FloatArray, float], lux: float, patterns: str, seed: int
 ) -> list[Solution]:
-    """Solve one exposure of a line beside daylight of ``lux``, by Tikhonov's and by Markov's regularisation.
-
-    ``light`` is the irradiance and wavelength of :func:`daylight_frame`.
-    """
+    """Solve an exposure of a line beside daylight, by Tikhonov's and by Markov's regularisation."""
     bench, family = line.lit.bench, line.lit.bench.family(patterns, seed)
     lamp = lux / FULL_LX * electrons_from_irradiance(light[0], 1.0, bench.sensor, light[1])
     unit = Exposer(bench.devices, 1.0, 0)
@@ -252,7 +244,7 @@ def daylit_images(
 
 
 def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
-    """Return the exposure time [s] at which the brightest pixel fills the default part of the full well."""
+    """Return the exposure time [s] that fills the default part of the full well."""
     brightest = max(float(rate.max()) for rate in rates) + sensor.superpixel_dark_current_e_per_s
     return float(Exposure().fraction * sensor.superpixel_full_well_e / brightest)
 
@@ -274,7 +266,6 @@ def _measured(
 
 OWN, ONE, D65, MOSAIC = "one line at a time", "one calibration for all lines", "beside D65", "mosaic, "
 GOAL = 0.5
-"""Delta E that 49 dots may add to the floor's mean."""
 _SHOWN = "dots:7"
 
 
@@ -347,7 +338,6 @@ def judge_colours(
 
 
 def _added(claim: str, **where: Any) -> Gain:
-    """Return the claim that patches' Delta E exceed the floor by at most :data:`GOAL`."""
     return Gain(f"{claim} at most {GOAL:g} to the floor's mean Delta E 2000", {}, {}, where=where, column="delta_e",
                 other_column="floor", unit="", at_least=-np.inf, at_most=GOAL)  # fmt: skip
 

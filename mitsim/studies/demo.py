@@ -33,7 +33,7 @@ from mitsim.studies.framework.campaign import DEMO_FOLDERS, DEMO_PAGE, study_fol
 
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
 _SECOND_SHOWN = 0.4
-"""Part of a family's shots before its second example, which should neither repeat nor mirror the first."""
+"""Part of a family's shots before its second shown example."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,6 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
 
 
 def _compare(lit: LitScene, factors: Factors, name: str, shots: Capture | None) -> FamilyResult:
-    """Reconstruct a family in both models at equal peak, and rendered under each exposure convention."""
 
     def recover(frames: Unexposed, seconds: float) -> Recovery:
         solution = frames.solve(seconds)
@@ -259,7 +258,6 @@ def _page(
 
 
 def doubts(family: FamilyResult) -> tuple[str, ...]:
-    """Return reasons why a family's image is flagged: its frames do not fit, or its error exceeds any reflectance."""
     found, rendered = [], family.rendered
     if rendered and rendered.trust and rendered.trust.cause:
         # Rank and condition, which the sentences after the first state, are no warning.
@@ -273,6 +271,6 @@ def doubts(family: FamilyResult) -> tuple[str, ...]:
 
 
 def scene_line(path: Path) -> str:
-    """Return the name of the scene's folder, and the first sentence of the comment that opens the file, if any."""
+    """Return the scene's name, and the first sentence of the comment that opens its file."""
     name, (sentence, _) = path.resolve().parent.name, opening_words(path)
     return f"{name}: {sentence}" if sentence else name

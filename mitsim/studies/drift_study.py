@@ -1,13 +1,9 @@
 """Loss of an image by each kind of drift between calibration and capture, measured and predicted [dB].
 
-*Measured*: frames of the traced light through the camera after the drift are exposed with noise, and solved with the
-factors from before the drift, by the lambda chosen without the drift, and by a lambda of their own.
-
-*Predicted* (:mod:`mitsim.studies.causes`): from the same factors and the closed-form shadow of the paper's model before
-and after the drift, with the truth, the mean noise of a datum and, for lamps, the frame of their light; without
-simulated frames, drawn noise or solutions.
-
-Amounts are those of a recipe's table [drift] (``--recipe``, by default calibration/drift.toml), or those of ``--over``.
+*Measured*: noisy frames of the traced light through the camera after the drift, solved with the factors from before it,
+by the lambda chosen without the drift and by a lambda of their own. *Predicted* (:mod:`mitsim.studies.causes`): from
+the same factors and the closed-form shadow of the paper's model, with the truth, the mean noise of a datum and, for
+lamps, the frame of their light.
 """
 
 from __future__ import annotations
@@ -73,14 +69,12 @@ if TYPE_CHECKING:
 
 AMBIENT, SESSION = "ambient frame", "session"
 OFFSETS = "offset nonuniformity"
-"""Differences of pixels' readings without light, including dark current."""
 _SPLITS = 4
-"""Rounds that find the common response of rows and columns; each reduces the rest by (s2 / s1)^2 of the map's largest
-singular values."""
+"""Rounds of the fit of rows' and columns' response; each leaves (s2 / s1)^2 of the map's singular values."""
 _STEP_MM = 5e-4
-"""Shift over which a shadow's slope is computed either way: a twentieth of a pixel."""
+"""Shift for a shadow's slope: a twentieth of a pixel."""
 _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
-"""Places [deviations] and weights of the Gauss-Hermite rule that is exact for a normal law up to the fifth power."""
+"""Gauss-Hermite rule that is exact up to the fifth power: places [deviations] and weights."""
 
 
 # -------- A drift between calibration and capture: its measured and its predicted effect
@@ -101,9 +95,7 @@ class Prediction:
 
     @property
     def predicted_error_db(self) -> float:
-        """Return the change of the loss if the image without drift is as predicted, too, because the model's omissions
-        may have any share in the added error.
-        """
+        """Return the change of the loss if the image without drift is as predicted, too."""
         return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
 
 
@@ -121,7 +113,6 @@ class Outcome(Prediction):
 
     @property
     def lost_auto_db(self) -> float:
-        """Return the measured loss where the solver chooses lambda again."""
         return self.before_db - self.auto_db
 
 
@@ -148,8 +139,7 @@ class DriftStand:
     def outcome(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> Outcome:
         """Return the effect of a drift; MitsimError for a drift that the bench cannot have.
 
-        ``session`` are factors of a session that drifted by it, ``lit`` is the scene in light of a moved projector;
-        with None both are those from before the drift.
+        ``session`` are factors that drifted, ``lit`` is the scene in light of a moved projector.
         """
         scene, model = lit or self.lit, self._model
         if session is not None:
@@ -166,7 +156,6 @@ class DriftStand:
         return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto, image=images[0])
 
     def predict(self, drift: Drift) -> Prediction:
-        """Return the predicted effect of a ``drift``; MitsimError for one that the bench cannot have."""
         return Prediction(
             self.before_db, *(self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
         )
@@ -177,7 +166,6 @@ class DriftStand:
 
     @property
     def flags(self) -> dict[str, Value]:
-        """Return reasons why the image without a drift is flagged, by its solution, its light or its factors."""
         others = (*self.lit.light.warnings, *self.lit.light.unreached, *self.factors.warnings)
         return flags_of(self._before.status, others=others)
 
@@ -208,7 +196,7 @@ class DriftStand:
 
     @property
     def electrons(self) -> float:
-        """Expected photoelectrons of all frames without a drift, on the whole sensor."""
+        """Expected photoelectrons of all frames, on the whole sensor."""
         exposer = self._frames.exposer(self.exposure_s)
         return float(sum(exposer.electrons(frame).sum() for frame in self._expected))
 
@@ -234,7 +222,6 @@ class DriftStand:
         return scale * found[0], scale * found[1]
 
     def expected_image(self, drift: Drift) -> Expected:
-        """Return the image that the model expects after a ``drift``; MitsimError as :meth:`predict`."""
         image, changed = self.linear, self._frame_changes(drift)
         if drift.session_ramp or drift.session_flicker:
             left, right = self.session_mixes(drift)
@@ -245,13 +232,13 @@ class DriftStand:
 
     @cached_property
     def fixed(self) -> Mapping[str, FloatArray]:
-        """Contribution of each difference of the sensor's pixels to the image (n, n)."""
+        """Contribution of each pixel's difference to the image (n, n)."""
         still = self.linear.expected_image(self.lit.truth).image
         alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
         return {name: self.linear.expected_image(self.lit.truth, each).image - still for name, each in alone.items()}
 
     def clear(self, factors: Factors, light: SampledLight) -> FloatArray:
-        """Return the image (n, n) of noiseless frames of a ``light``, by ``factors`` and the lambda without a drift."""
+        """Return the image (n, n) of noiseless frames of a ``light``, by the lambda without a drift."""
         return LitScene(light).rendered_frames(factors, self.family, self.seed).clear(self.linear.lam)
 
     @cached_property
@@ -261,7 +248,6 @@ class DriftStand:
 
     @cached_property
     def noises(self) -> Mapping[str, Noise]:
-        """Noise by source: sources of the frames by name, ``ambient frame`` and ``session``."""
         frames = self._frames.noises(self.exposure_s)
         found = {name: Noise(datum=variance) for name, variance in frames.items() if name != NONUNIFORMITY}
         if takes_ambient_frame("auto", self.family, self._expected):
@@ -274,7 +260,7 @@ class DriftStand:
         return found
 
     def _frame_changes(self, drift: Drift) -> Changed:
-        """Return the changes of the frames by a ``drift``, to first order where several things drift at once."""
+        """Return the changes of the frames by a ``drift``, to first order."""
         count = self.family.left.shape[1], self.family.right.shape[1]
         black = self.lit.light.simulation.physics.black_level
         ramp = levels(self.seed, "power", len(self.family.shots), drift.power_ramp).reshape(*count, -1)
@@ -301,9 +287,7 @@ class DriftStand:
 
     @cached_property
     def _response(self) -> FloatArray | None:
-        """Relative differences (m, m') of pixels' responses from the factors, which already contain those common to a
-        row or column.
-        """
+        """Relative differences (m, m') of pixels' responses from the factors."""
         response = specimen(self.lit.bench.sensor, self.lit.bench.geometry.frame_shape).response
         if response is None:
             return None
@@ -325,7 +309,7 @@ class DriftStand:
         return frame if own.dark_e_per_s is None else frame + own.dark_e_per_s - sensor.superpixel_dark_current_e_per_s
 
     def _gains(self, drift: Drift, source: str, rms: float) -> Gains:
-        """Return gains of a ``source`` from frame to frame: a flicker of ``rms``, and cosine and sine of its ripple."""
+        """Return gains from frame to frame: a flicker of ``rms``, and cosine and sine of its ripple."""
         found: list[float | FloatArray] = [rms] if rms else []
         if source in drift.ripples:
             amplitude, hertz = drift.ripples[source]
@@ -339,9 +323,7 @@ class DriftStand:
         return self.linear.scatter(self.lit.truth, self._frame_changes(drift), error) / error.size**2
 
     def _terms(self, drift: Drift) -> SeparableTerms:
-        """Return the terms that a ``drift`` of mask or projector adds to the camera's operator, in the unit of its
-        factors.
-        """
+        """Return the terms that a ``drift`` of mask or projector adds to the camera's operator."""
         bench = self.lit.bench
         best = IdealCamera(bench, bench.geometry.mask, self._spectrum).factors
         at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
@@ -374,7 +356,7 @@ class DriftStand:
         return found
 
     def _shift(self, by_mm: float) -> SeparableTerms:
-        """Return the shadow with every profile shifted ahead, as by a mask that moved back."""
+        """Return the shadow of a mask that moved back."""
         back = Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)
         return self._shadow(drift_mask(self.lit.bench, back))
 
@@ -406,17 +388,16 @@ def _weigh(parts: list[tuple[SeparableTerms, float]]) -> SeparableTerms:
 # -------- Each kind of drift alone: the decibels that it costs
 
 _SEEDS = 4
-"""Seeds of noise and random drifts: their standard error is then known to 40 %."""
+"""Seeds of noise and random drifts."""
 _LAMPS = ("lamp", "lamp_flicker", "lamp_ripple")
 _RIPPLES = "power_ripple", "lamp_ripple"
 _LAMP_SCENE, _LAMP = "lamp_bench", "11.7"
-"""Scene with a lamp beside the projector, a tenth as bright on the sheet, for drifts of lamps by default."""
+"""Default scene of lamps' drifts, whose lamp is a tenth as bright on the sheet as the projector."""
 _LINES = {"lost_db": "measured", "predicted_lost_db": "predicted"}
 _LOST = "PSNR lost [dB]"
 _ERRORS = {"predicted_lost_db": "predicted_error_db"}
 _BEFORE = "without the drift"
 _SHOWN = 4
-"""Number of shown kinds, the most costly first: images that lose less than a decibel look alike."""
 AGREE_DB = 0.5
 """Largest useful difference [dB] between predicted and measured loss."""
 
@@ -487,14 +468,13 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
 
 
 def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
-    """Return the scene in light of a projector that moved, by the plan of its light before, because another plan's
-    errors would pass for the drift's.
+    """Return the scene in light of a moved projector, by the same plan, because another plan's errors would count as
+    drift.
     """
     return LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan))
 
 
 def _by_kind(results: Results) -> Results:
-    """Return results whose rows name kind and amount, and the first amount of a kind."""
     first, rows = dict[Value, Value](), list[dict[str, Value]]()
     for row in results.rows:
         kind, amount = str(row["kind"]), float(str(row["amount"]))

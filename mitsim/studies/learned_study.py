@@ -1,18 +1,16 @@
 """Learned methods on rendered frames: their gain over the best classical image, by training set and test condition.
 
 Paper, section "Deep Network-based Denoising vs Reconstruction": on simulated frames learned methods look best; on real
-ones FlatNet fails under uniform light, a U-Net removes artefacts and resolves no more; under coded light all do well;
-"catastrophic results in case of any mismatch". Here frames are rendered where the paper's are real. A gain is of each
-print, over the classical image of the same frames with the highest PSNR.
+ones FlatNet fails under uniform light; under coded light all do well; "catastrophic results in case of any mismatch".
+Here frames are rendered where the paper's are real. A gain is of each print, over the classical image of the same
+frames with the highest PSNR.
 
-With `--data DIR`, the study is one of real captures of a FlatCam. The factors of codes learned from one capture
-(:mod:`mitsim.studies.twin_study`) are a twin, whose frames of drawn pictures with white noise teach networks. The other
-capture is then reconstructed and compared with the authors' image, because no truth is known.
+With `--data DIR`, factors of codes learned from one real capture of a FlatCam (:mod:`mitsim.studies.twin_study`) make
+the frames that teach networks. The other capture is reconstructed and compared with the authors' image, because no
+truth is known.
 
-The bench of rendered frames is the middle of the shipped photograph: its camera and 64 x 64 of its projector pixels on
-a sheet half as wide, so that directions are as hard to distinguish and a training step takes a quarter of the time. The
-other conditions are those of other studies (`depth`, `drift`, an exposure of a tenth, `reflectivity`, `ambient`). The
-study needs torch and hours, and therefore is no part of `mitsim study all`.
+The bench of rendered frames is the middle of the shipped photograph, 64 x 64 projector pixels, so that a training step
+takes a quarter of the time. The study needs torch and hours, and therefore is no part of `mitsim study all`.
 """
 
 from __future__ import annotations
@@ -84,18 +82,15 @@ if TYPE_CHECKING:
 
 SIDE = 64
 _CANVAS_PIXELS, _CANVAS_MM = 3 * SIDE, 180.0
-"""Width of the projector's picture, whose last third is the window, so that pixels keep the photograph's 0.9375 mm at
-400 mm."""
+"""Width of the projector's picture, whose last third is the window of the photograph's pixels."""
 _SHEET_MM = 64.0
 DEPTH, DRIFT, DIM, GLOSS, AMBIENT = "depth", "drift", "dim", "gloss", "ambient"
 MISMATCHES = (DEPTH, DRIFT, GLOSS, AMBIENT)
-"""Conditions that a calibration does not include; the noise of dim frames is stated by the capture."""
+"""Conditions that a calibration does not include."""
 PLACES = {RENDERED: (IDEALISED, RENDERED, DRIFT, DIM), DEPTH: (DEPTH,), GLOSS: (GLOSS,), AMBIENT: (AMBIENT,)}
-"""Conditions that share their light, by place."""
 _DEPTH_MM = 405.0
-"""Distance of a sheet 5 mm behind the calibrated distance."""
 _DRIFT_UM = 4.0
-"""Motion of the mask down the rows: the image moves by 0.9 pixels, as much as by 5 mm of depth along the columns."""
+"""Motion of the mask down the rows, which moves the image by 0.9 pixels."""
 _DIM = 0.1
 _COAT = """<bsdf type="roughplastic" id="sheet_bsdf">
             <string name="distribution" value="ggx"/>
@@ -236,7 +231,6 @@ def case_of(studio: Studio, setup: Setup, condition: str, patterns: str, seed: i
 
 
 def calibrated(studio: Studio, setup: Setup, seed: int) -> Factors:
-    """Return the factors that a session at the calibrated distance estimates, with noise from ``seed``."""
     return studio.factors(place_setup(studio, setup.with_print(None), RENDERED), seed)
 
 
@@ -253,13 +247,12 @@ class Budget:
 
 
 FULL = Budget(pairs=256, steps=800, groups=16)
-"""About a minute of a processor per training, because there are a hundred; `mitsim train` takes 20 times as much."""
+"""About a minute of a processor per training."""
 QUICK = Budget(pairs=16, steps=6, groups=2)
-"""First look in about a minute; such networks show nothing."""
+"""First look; such networks show nothing."""
 VARIED, ELSEWHERE, PICTURES = "varied", "elsewhere", "pictures"
 TRAININGS = (IDEALISED, RENDERED, VARIED)
 _ELSEWHERE_MM = 1.0
-"""Distance of another camera's mask from its sensor: half of this one's."""
 
 
 @dataclass(frozen=True)
@@ -308,7 +301,6 @@ class School:
         return model, seconds
 
     def _store(self, training: str, patterns: str) -> PairStore:
-        """Return the pairs of a set, which are made once; interrupted work is resumed."""
         from mitsim.learn.pair_store import PairStore, read_pairs_manifest
         from mitsim.learn.pairs import make_pairs
 
@@ -342,7 +334,7 @@ class School:
         return own.with_parameters(mask_distance=_ELSEWHERE_MM) if training == ELSEWHERE else own
 
     def _factors(self, training: str, patterns: str = "uniform") -> Factors:
-        """Return the calibration of a training set; idealised pairs have their own exact factors."""
+        """Return the calibration of a training set."""
         if training == IDEALISED:
             return load_calibration(self._store(training, patterns).folder / "calibration")
         if training == ELSEWHERE:
@@ -350,7 +342,7 @@ class School:
         return calibrated(self.studio, self.setup, self.seed)
 
     def factors_for(self, case: Case) -> Factors:
-        """Return the factors of a ``case`` with the identity of the bench's camera, which networks check."""
+        """Return the factors of a ``case`` with the bench's camera identity, which networks check."""
         identity = self._factors(RENDERED).manifest.camera
         status = Status(Verdict.CALIBRATED, "Factors of a test case")
         manifest = CalibrationManifest(
@@ -364,16 +356,14 @@ class School:
 FAMILIES = ("uniform", "dots:4", "dots:7")
 _TRAININGS = 3
 NONE, AUTOMATIC, BEST = "none", "automatic", "best"
-"""Training of classical images, and their weights: automatic, or that of the highest PSNR, which needs the truth."""
 CLASSICAL = (TIKHONOV, MARKOV, TV, NONNEGATIVE)
 _AROUND = tuple(float(weight) for weight in np.logspace(-0.75, 2.0, 12))
-"""Weights of iterative methods over the automatic one, up to where the best lies under a mismatch."""
+"""Weights of iterative methods over the automatic one."""
 _DETAIL_PIXELS = 1.5
-"""Deviation of the blur that separates detail, which is above an eighth of a cycle a pixel."""
+"""Blur [pixels] that separates detail."""
 
 
 def cells(seeds: Sequence[int], families: Sequence[str], quick: bool) -> list[Cell]:
-    """Return all networks to train, the quickest first; two methods and sets if ``quick``."""
     methods = (REFINED, UNROLLED) if quick else (REFINED, FLATNET, UNROLLED)
     kinds = [*product(TRAININGS[:2] if quick else TRAININGS, families, methods)]
     if not quick:
@@ -385,7 +375,6 @@ def cells(seeds: Sequence[int], families: Sequence[str], quick: bool) -> list[Ce
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    """Return points of classical images, which keep the frames of a print, and then of all networks."""
     check_torch()
     seed, setup = scope.seeds[0], scope.setup
     if scope.data is not None:
@@ -459,7 +448,6 @@ def scores(image: FloatArray, truth: FloatArray) -> dict[str, Value]:
 
 
 def classical_rows(case: Case) -> Iterator[tuple[dict[str, Value], FloatArray]]:
-    """Yield scores and images of all classical methods at their automatic and best weight."""
     from mitsim.learn.learned_solver import beyond_noise
 
     prepared = case.prepare()
@@ -482,7 +470,7 @@ def classical_rows(case: Case) -> Iterator[tuple[dict[str, Value], FloatArray]]:
 
 
 def _with_correlation(prepared: Prepared, sums: Accumulator) -> tuple[Prepared, Accumulator]:
-    """Return the model and rotated sums for images whose neighbouring pixels are alike."""
+    """Return the model and rotated sums for correlated neighbouring pixels."""
     other = prepared.with_correlation()
     turns = []
     for before, after in ((prepared.left, other.left), (prepared.right, other.right)):
@@ -503,7 +491,7 @@ def network_row(model: LearnedSolver, factors: Factors, case: Case) -> tuple[dic
     """Return scores, flags and image of a network with a calibration's ``factors``.
 
     An image is flagged for frames that it does not reproduce (``flag_image``), frames that no image gives
-    (``flag_frames``; ``misfit`` is 1 for either), another camera or calibration, and unknown noise.
+    (``flag_frames``), another camera or calibration, and unknown noise.
     """
     from mitsim.learn.learned_solver import beyond_noise
 
@@ -525,12 +513,11 @@ AUTHORS, REAL, SIMULATED = "authors' image", "real", "simulated"
 _TAUGHT = "gb"
 """Plane whose factors teach networks; those of the others differ by half a pixel and a gain."""
 _MARGIN = 1.5
-"""Factor by which the noise range exceeds the known capture's, so that a usual capture is not flagged."""
+"""Factor by which the noise range exceeds the known capture's."""
 _COLOURS = (("r",), ("gb", "gr"), ("b",))
 _BACK = {"transposed, mirrored": "transposed, upside down", "transposed, upside down": "transposed, mirrored"}
-"""Orientations whose inverse is another one."""
 TEACHING = {"pairs": 192, "steps": 300, "batch": 2}
-"""Pictures, steps and batch of a training of 256 x 256 pixels, which takes minutes of a processor."""
+"""Pictures, steps and batch of a training."""
 
 
 def _captures(data: str) -> Mapping[str, tuple[Path, Path]]:
@@ -541,17 +528,14 @@ def _captures(data: str) -> Mapping[str, tuple[Path, Path]]:
 
 
 def twin_camera(measured: Measured, learned: Learned) -> tuple[tuple[FloatArray, FloatArray], Prepared]:
-    """Return the factors of a ``measured`` plane by ``learned`` codes, and their factorised model."""
     sides = learned.codes.factors(measured.offset, measured.plane)
     rows, columns = (np.ones((side.shape[1], 1)) for side in sides)
     return sides, prepare(*sides, rows, columns, centre=True)
 
 
 def noise_range(planes: Sequence[Measured], learned: Learned) -> tuple[float, float]:
-    """Return the range of standard deviations of white noise in the twin's frames [DN of the taught plane].
-
-    It extends from the noise of the known ``planes`` to their whole unexplained part, each over its plane's gain, and a
-    factor :data:`_MARGIN` beyond.
+    """Return the range of the twin's white noise [DN of the taught plane]: the noise of known ``planes`` to their whole
+    unexplained part, over each plane's gain.
     """
     gains = learned.codes.gains
     scales = [abs(gains[_TAUGHT] / gains[each.plane]) for each in planes]
@@ -561,10 +545,7 @@ def noise_range(planes: Sequence[Measured], learned: Learned) -> tuple[float, fl
 
 
 def twin_sums(prepared: Prepared, noise: tuple[float, float], truths: FloatArray, seed: int) -> Sums:
-    """Return the sums of idealised frames of ``truths`` (N, n, n), 0 to 1, with white noise.
-
-    Logarithms of the ``noise`` of a datum [DN] are drawn evenly between two ends.
-    """
+    """Return the sums of idealised frames of ``truths`` (N, n, n), 0 to 1, with white noise."""
     from mitsim.learn.training import Sums
 
     weights, deviations = [], []
@@ -612,8 +593,7 @@ def _image(prepared: Prepared, frame: FloatArray, method: str, network: Any) -> 
 def transfer(data: str, held_out: str, seed: int) -> Found:
     """Return rows and images of a capture ``held_out``, by codes and networks of the others in the folder ``data``.
 
-    A row has the correlation with the authors' image and the unexplained part of the frame, for a plane's real frame
-    and for a simulated frame of the taught plane. MitsimError for files that are no such captures.
+    MitsimError for files that are no such captures.
     """
     planes = read_captures(_captures(data), seed)
     known = [each for each in planes if each.capture != held_out]
@@ -655,8 +635,8 @@ def transfer(data: str, held_out: str, seed: int) -> Found:
 
 
 def compare(results: Results) -> Results:
-    """Add columns: PSNR and correlation of detail less those of the best classical image (``gain_db``,
-    ``detail_gain``), PSNR less that of a calibrated bench (``below_db``), and ``network``.
+    """Add ``gain_db`` and ``detail_gain`` over the best classical image, ``below_db`` below a calibrated bench, and
+    ``network``.
     """
     rows = results.frame
     if "weight" not in rows:
@@ -678,7 +658,6 @@ def compare(results: Results) -> Results:
 def _gains(
     claim: str, training: str, condition: str, patterns: str, method: Any = (REFINED, FLATNET, UNROLLED), **more: Any
 ) -> Level:
-    """Return the claim that the gain of every training lies in a range, for each method."""
     where = {"training": training, "condition": condition, "patterns": patterns, "method": method}
     return Level(
         claim, **{"where": where, "column": "gain_db", "each": "method", "every": "seed", "optional": True, **more}

@@ -118,11 +118,10 @@ PATTERNS = Study(
 FRAMES = 49
 ONE, MANY, DOTS = SHARED = ("1 uniform", "49 uniform", "49 dots")
 _LAW_WITHIN = 0.1
-"""Relative difference of law and measurement: one draw scatters by 1 %, and the noise of dots is not white."""
+"""Relative difference of law and measurement: one draw scatters by 1 %."""
 
 
 def _exposure_measure(studio: Studio, point: Point) -> Found:
-    """Expose all frames for the time in which a uniform one fills the well to its default part."""
     bench, name = studio.bench(point.setup), str(point["patterns"])
     ones, count = np.ones((bench.n, 1), np.int8), 1 if name == ONE else FRAMES
     family = bench.family("dots:7") if name == DOTS else PatternFamily(name, ones.repeat(count, axis=1), ones)
@@ -167,9 +166,9 @@ EXPOSURE = Study(
 # -------- Ambient light
 
 RADIANCES = WEAK, _, AS_BRIGHT, BRIGHTER, STRONG = ("1.17", "11.7", "117", "1170", "11700")
-"""Radiance of the scene's lamp [W m^-2 sr^-1], from a hundredth to a hundred times the projector's light."""
+"""Radiance of the scene's lamp [W m^-2 sr^-1]."""
 _PERCENTILES = (1.0, 99.0)
-"""Percentiles of a dynamic range, because the noise of single pixels is no signal."""
+"""Bounds of a dynamic range, because the noise of single pixels is no signal."""
 _BETTER, _OTHER = "hadamard:8", "dots:8"
 _by_lamp = partial(Lines, "lamp", "radiance of the lamp [W m$^{-2}$ sr$^{-1}$]", facet="", log=True)
 
@@ -243,7 +242,7 @@ PIXELS, SENSOR, INTERREFLECTION, SATURATION, REST = ERROR_SOURCES = (
 )  # fmt: skip
 _ADDED = SENSOR, INTERREFLECTION, SATURATION
 _DARK = 1e-3
-"""Reflectance below which a pixel of the twin is a shadow, whose scale is only sampling noise."""
+"""Reflectance of shadows, whose scale is only sampling noise."""
 
 
 @single_threaded_blas()
@@ -278,7 +277,6 @@ def split(frames: Unexposed, twin: LitScene, seconds: float) -> tuple[Solution, 
 
 
 def direct_of(light: SampledLight) -> SampledLight:
-    """Return a ``light`` without light over several surfaces."""
     names = "indirect", "indirect_residual"
     groups = (each.with_light({name: sparse.csr_array(each[name].shape) for name in names}) for each in light.groups)
     return replace(light, groups=tuple(groups))
@@ -301,20 +299,17 @@ def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
 CARD, BLADE, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
 SHAPES = {"plate": {"shape": "rectangle", "z": "400"}, "ball": {"shape": "sphere", "z": "440"}}
 ROUGHNESSES = {"plate": (1.0, 0.3, 0.1, 0.03, 0.003, 0.001), "ball": (1.0, 0.3, 0.1, 0.03)}
-"""Roughness of GGX lobes. At 0.01 lobes are neither wide enough for a few anchors nor sharp enough to be aimed at, so
-that light takes minutes."""
+"""Roughness of GGX lobes; at 0.01 lobes are too narrow for anchors and too wide to be aimed at, so that light takes
+minutes."""
 GLOSS_FAMILIES = ("uniform", "dots:7")
 AS_MATT = "as the matt scene"
-"""Exposure time of the twin, with which highlights saturate."""
 EXPOSURES = (EQUAL_PEAK, AS_MATT)
 _TRUTHS = ("matt paint", "apparent")
 _KEPT_AS = "{patterns}, {exposure}"
 _GREY = 0.5
 _ROUNDING = 1e-12
-"""Mean square of an error that is rounding."""
 _PLAIN_DB = 20.0
 _ACCURACY = 3e-3
-"""Accuracy of the light: a tenth of the artefacts that matter."""
 
 
 def _measure_gloss(studio: Studio, point: Point) -> Found:

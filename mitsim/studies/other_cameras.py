@@ -1,24 +1,18 @@
 """Studies of cameras that the paper compares with: a mask that moves in place of the light, and a diffuser for a mask.
 
 *multishot*, section IV-D: the mask moves by -15 to +15 of its features on a grid of k x k places, with as many frames
-as dots of period k (the paper does not name the axes). A line of 49 places is idealised only, because it would take 49
-calibrations. Frames through a mask at rest share the error of one calibration.
-
-SweepCam (Hua, Nakamura, Asif & Sankaranarayanan, TPAMI 2020) moves the mask instead of the light. Moved by a along the
-rows and by b along the columns, a separable mask casts Y_ab = Phi_L(a) X Phi_R(b)^T. All frames of a grid side by side
-are therefore one frame of a separable camera,
+as dots of period k. SweepCam (Hua, Nakamura, Asif & Sankaranarayanan, TPAMI 2020) moves the mask instead of the light.
+Moved by a along the rows and by b along the columns, a separable mask casts Y_ab = Phi_L(a) X Phi_R(b)^T. All frames of
+a grid side by side are therefore one frame of a separable camera,
 
     [Y_ab]_ab = [Phi_L(a)]_a X [Phi_R(b)]_b^T,
 
-which :mod:`mitsim.reconstruct.solver` solves exactly. Light is traced up to the mask, so that one scene's light serves
-all places.
+which :mod:`mitsim.reconstruct.solver` solves exactly.
 
-*convolutional*, section V-E and figure 12: a DiffuserCam under uniform light and 4 to 49 dots. A convolutional camera
-has "no simple closed form", and its iterative reconstruction takes ten times as long as the separable one. The point
-spread function is that of a rendered diffuser (:mod:`mitsim.transport.plugins.diffuser`) and, with `-D psf=FILE`, also
-a measured one. The sensor gets all light; the speed of both solvers is also measured on a sensor that ends where the
-picture does. Lambda is the best one. Times are CPU seconds on one thread, and equal error is an error within 1 % of the
-direct solution's.
+*convolutional*, section V-E and figure 12: a DiffuserCam under uniform light and 4 to 49 dots, with the point spread
+function of a rendered diffuser (:mod:`mitsim.transport.plugins.diffuser`) or a measured one (`-D psf=FILE`). The sensor
+gets all light; speed is also measured on a sensor that ends where the picture does. Times are CPU seconds on one
+thread, at an error within 1 % of the direct solution's.
 """
 
 from __future__ import annotations
@@ -75,7 +69,6 @@ Places = Mapping[float, Pair]
 
 
 def move_mask(bench: Apparatus, row_mm: float, column_mm: float) -> Apparatus:
-    """Return a bench with a moved mask, only for use with traced light."""
     offset = {"mask_offset_row": row_mm, "mask_offset_column": column_mm}
     return replace(bench, devices=replace(bench.devices, camera=bench.geometry.model_copy(update=offset)))
 
@@ -96,10 +89,9 @@ def ideal_places(bench: Apparatus, places_mm: Iterable[float], board_flux: float
 def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, accuracy: float = 1e-3) -> Places:
     """Return factors as sessions with the mask at each place estimate them, all in one board's light.
 
-    One session a place suffices, because a mask that has moved along both axes determines the left factor of its row
-    and the right one of its column. The sessions are rendered without the sensor's noise, whose effect on factors is
-    added in closed form (:func:`mitsim.reconstruct.factors.predicted_error`), because noisy frames take four times as
-    long.
+    A mask that has moved along both axes determines the left factor of its row and the right one of its column. The
+    sensor's noise is added to factors in closed form (:func:`mitsim.reconstruct.factors.predicted_error`), because
+    noisy frames take four times as long.
     """
     recipe, job = load_recipe(), Job()
     session = Session(bench, recipe, seed)
@@ -126,9 +118,8 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
 def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float], Frame]) -> Places:
     """Return factors whose products hold between places as well.
 
-    A session does not determine how its product, and its sign, is shared between left and right. One frame of the board
-    in uniform light through the mask at each place's row and the first one's column does (``white``, at row and column
-    [mm]).
+    A session does not determine how its product and sign are shared between left and right. One uniform frame of the
+    board through the mask at each place's row and the first one's column (``white``) does.
     """
     first, found = next(iter(factors)), {}
     for place, (left, right) in factors.items():
@@ -167,7 +158,6 @@ class MovedMask:
         return self.lit.uniform_s(self.model) / (len(places) if exposure == EQUAL_TOTAL else 1)
 
     def solve(self, rows_mm: Sequence[float], columns_mm: Sequence[float], seconds: float) -> Solution:
-        """Solve one exposure of ``seconds`` at each place of a grid, at automatic lambda."""
         left = np.concatenate([self.side(0, place) for place in rows_mm])
         right = np.concatenate([self.side(1, place) for place in columns_mm])
         uniform = np.ones((self.lit.bench.n, 1))
@@ -199,7 +189,6 @@ GRIDS = {2: (0, 6), 3: (0, 3, 6), 4: (0, 2, 4, 6), 7: tuple(range(7))}
 UNIFORM, SWEPT, LINE, DOTS = "uniform frames", "SweepCam", "SweepCam, along rows alone", "shifting dots"
 _FRAMES = 49
 _COUNTS_DB = 0.5
-"""Least gain that counts: a tenth of the squared error."""
 
 
 def _multishot_measure(studio: Studio, point: Point) -> Found:
@@ -288,26 +277,22 @@ MULTISHOT = Study(
 MEASURED, TRACED = "measured", "rendered"
 WHOLE, CROPPED = "all light", "cropped"
 PERIODS = (1, 2, 3, 4, 5, 7)
-"""The paper's numbers of patterns: 1 to 49."""
 _N = 128
 _REDUCE, _SHAPE, _PITCH_MM = 4, (300, 400), 4 * 5.86e-3
 """Binning, shape and pitch of the public picture (1200 x 1600); the traced one is as large."""
 WHITE_W_M2, WAVELENGTH_NM = 0.3, 550.0
-"""Irradiance of a white scene's light at one point: the paper's projector (0.14 W over 120 mm square at 400 mm) on a
-bare sensor, 9.7 W m^-2 / pi x 0.0144 m^2 / 0.16 m^2; in green. Exposure follows the peak, so that both only determine
-the dark current."""
+"""Irradiance of a white scene's light at one point of a bare sensor [W m^-2], 9.7 / pi x 0.0144 m^2 / 0.16 m^2, from
+the paper's projector (0.14 W over 120 mm square at 400 mm), in green. Exposure follows the peak, so that both only
+determine the dark current."""
 _LEAST_LAMBDA = 1e-9
-"""Smallest lambda of the search over the largest of S: shot noise of full wells needs 1e-7."""
 _BEYOND_DB = 2.0
-"""Fall of PSNR below the best that ends the search, from large lambda to small."""
 _FINER = (0.5, 0.25)
-"""Further steps of the search [decades]: a quarter of a decade changes PSNR by 0.1 dB at most."""
+"""Further steps of the search [decades]."""
 _EQUAL_ERROR, _EQUAL_ANSWER = 1.01, 1e-6
 """Factor of equal error against the truth (0.09 dB), and relative difference of equal answers."""
 _LOOSE, _TIGHT = 1e-6, 1e-12
-"""Residuals at which conjugate gradients within the direct solver end, for either."""
+"""Residuals at which inner conjugate gradients end, for either."""
 _MOST_STEPS = 1000
-"""Most iterations: equal answers took 170."""
 
 
 def take(
@@ -334,7 +319,7 @@ def take(
 
 
 def best_image(classes: Classes, frames: FloatArray, truth: FloatArray) -> tuple[Solution, float]:
-    """Return the direct solution nearest to the truth over lambda, to a quarter of a decade, and its PSNR [dB]."""
+    """Return the direct solution nearest to the truth over lambda, and its PSNR [dB]."""
     projected = classes.project(frames)
 
     def solve(lam: float) -> tuple[Solution, float]:
@@ -357,11 +342,8 @@ def best_image(classes: Classes, frames: FloatArray, truth: FloatArray) -> tuple
 def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorModel, seed: int) -> dict[str, float]:
     """Time conjugate gradients on all frames and the direct solver, from the same frames at equal peak [CPU seconds].
 
-    ``whole`` is the camera with a sensor that gets all light, whose best lambda both solvers use. Return ``prepare_s``
-    once for a camera, dots and lambda; ``direct_s`` and ``iterative_s`` for every image, to equal error;
-    ``direct_exact_s`` and ``iterative_exact_s`` to equal answers; ``iterations`` and ``iterations_exact``; ``psnr_db``
-    of the direct solution; the relative ``difference``. MitsimError if the iterations do not converge to the direct
-    solution.
+    ``whole`` is the camera with a sensor that gets all light, whose best lambda both solvers use. ``_exact`` times are
+    to equal answers, the others to equal error. MitsimError if the iterations do not converge to the direct solution.
     """
     camera, clock = classes.camera, time.process_time
     family = parse_patterns(f"dots:{classes.k}", len(truth))
@@ -381,7 +363,6 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
     steps, start = 0, clock()
 
     def watch(image: FloatArray) -> bool:
-        """Note when the iterations reach the error of the exact image, and its values."""
         nonlocal steps
         steps, spent = steps + 1, clock() - start
         if relative_error(image, truth) <= enough:
@@ -459,7 +440,6 @@ def _convolutional_measure(studio: Studio, point: Point) -> Found:
 
 
 def _times(rows: DataFrame, column: str, over: str, least: float) -> tuple[str, Holds]:
-    """Judge whether a ``column`` of seconds is at least ``least`` times another; patterns serve as repeats."""
     times = rows[column].astype(float) / rows[over].astype(float)
     ends = dict.fromkeys(f"{float(f'{each:.2g}'):g}" for each in (times.min(), times.max()))
     # Seconds vary by factors.

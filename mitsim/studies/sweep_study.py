@@ -48,10 +48,9 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def axis_of(setup: Setup, knob: str) -> tuple[str, str]:
-    """Return the name of a knob with its unit, and its meaning.
+    """Return the name of a knob with its unit, and its meaning, from the comment beside its ``<default>``.
 
-    The comment beside the ``<default>`` of a parameter states the meaning. A unit is first in the comment, or in square
-    brackets.
+    A unit is first in the comment, or in square brackets.
     """
     if knob in NO_SCENE:
         own = {"accuracy": "relative rms error of the light [1]", "seed": "of the noise [1]"}
@@ -68,7 +67,6 @@ def axis_of(setup: Setup, knob: str) -> tuple[str, str]:
 
 
 def _knobs(results: Results) -> list[str]:
-    """Return the varied knobs in the order of the command; the first knob if none was varied."""
     knobs = list(dict(results.scope.sweep))
     return [name for name in knobs if len(distinct(results.frame, name)) > 1] or knobs[:1]
 

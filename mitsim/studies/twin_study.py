@@ -1,15 +1,13 @@
 """Real captures of two lensless cameras, compared with simulations of these cameras.
 
 *FlatCam*. The codes of the mask are learned from the other captures and their authors' images
-(:mod:`mitsim.reconstruct.shifted_codes`), so that every frame is a prediction. The authors' image of the scene is put
-on an evenly lit sheet, and a camera with a mask of the transmission (1 + c_r(row) c_c(column)) / 2 captures it, without
-diffraction, because the learned codes contain it. Noise is estimated from a capture's own fine structure. The
-unexplained part is divided by cause.
+(:mod:`mitsim.reconstruct.shifted_codes`), so that every frame is a prediction. The authors' image is put on an evenly
+lit sheet, and a camera with a mask of the transmission (1 + c_r(row) c_c(column)) / 2 captures it, without diffraction,
+because the learned codes contain it.
 
 *DiffuserCam*. Caustics of a random relief differ in every draw, so that statistics are compared. The slopes of a normal
-relief move light by d (n - 1) grad h (:mod:`mitsim.transport.plugins.diffuser`). The relief's correlation length and
-rms move of light are fitted, with a blur (point source, pixels and diffraction) and an even part of the light (haze),
-by landing rays of small slopes on a grid; the compared light is traced by Mitsuba.
+relief move light by d (n - 1) grad h (:mod:`mitsim.transport.plugins.diffuser`). The relief's correlation length, rms
+move, blur and haze are fitted by landing rays of small slopes on a grid; the compared light is traced by Mitsuba.
 """
 
 from __future__ import annotations
@@ -59,9 +57,8 @@ _RAW = 1024, 1280
 PITCH_MM = 0.0106
 """Width of a plane's pixels: twice 5.3 um. Frames do not depend on it."""
 EXPOSURE_S = 0.01
-"""Arbitrary exposure time, because frames before noise are compared after scaling."""
 _BLOCK, _SMOOTH = 48, 31
-"""Side of the blocks whose noise and mean are compared, and of the square that gives a pixel's mean light [pixels]."""
+"""Side of the blocks of noise, and of the square of a pixel's mean light [pixels]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +136,6 @@ class Recipe:
         return {name: np.asarray(numbers[places[name][0] :: 2, places[name][1] :: 2] / factor) for name in PLANES}
 
     def place(self, plane: FloatArray) -> FloatArray:
-        """Return a whole ``plane`` turned and cut as a frame."""
         how = self.how.model_copy(update={"channel": None, "mosaic": None, "divide_by": 1})
         return Preparer.of(how, self.digital, Wanted()).frame(Path(), plane).astype(np.float64)
 
@@ -214,7 +210,6 @@ class Learned:
 
     @classmethod
     def of(cls, planes: Sequence[Measured]) -> Learned:
-        """Return the codes that ``planes`` of known scenes determine."""
         names = list(dict.fromkeys(each.capture for each in planes))
         exposures = [each.exposure(group=names.index(each.capture)) for each in planes]
         pose = find_pose(exposures)
@@ -228,10 +223,8 @@ class Learned:
 # -------- The simulated camera
 
 _MASK_MM, _SHEET_MM = 10.0, 1000.0
-"""Sensor to mask and to sheet. Frames determine only the product of the mask's distance and an angle. At these
-distances the scene ends at 4 degrees, where light falls by 1 %."""
+"""Sensor to mask and to sheet. Frames determine only the product of the mask's distance and an angle."""
 _ACCURACY = 1e-3
-"""Accuracy of frames, whose coded part (a thirtieth) is then good to 2 to 5 %."""
 _WIDER = 1.05
 _SCENE = Template("""<scene version="3.0.0">
 <integrator type="path"><integer name="max_depth" value="2"/></integrator>
@@ -306,9 +299,8 @@ def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> Floa
 CAUSES = ("row and column means", "explained", "scale", "smooth field", "mask's code", "scene's image", "noise", "rest")
 """Parts of a measured frame's energy, in the order of their removal."""
 _DEGREE = 3
-"""Degree of the polynomials of a smooth field."""
 _LAMBDAS = np.geomspace(1e-6, 1e2, 49)
-"""Weights of the scene's correction, relative to the square of its largest singular value."""
+"""Weights of the scene's correction over its largest singular value squared."""
 
 
 def column_of(cause: str) -> str:
@@ -370,9 +362,7 @@ def _parts(measured: Measured, codes: Codes, expected: FloatArray, gain: float) 
 
 
 def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, float]:
-    """Return the part of a ``rest`` that is smooth light or a smooth gain of the ``expected`` frame, and its number of
-    parameters.
-    """
+    """Return the smooth light or gain in a ``rest``, and its number of parameters."""
     sides = [legvander(np.linspace(-1, 1, count), _DEGREE).astype(np.float64) for count in rest.shape]
     degrees = [each for each in product(range(_DEGREE + 1), repeat=2) if 0 < sum(each) <= _DEGREE]
     shapes: list[FloatArray] = [np.outer(sides[0][:, row], sides[1][:, column]) for row, column in degrees]
@@ -387,8 +377,8 @@ def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, f
 def _scene_correction(
     rest: FloatArray, factors: tuple[FloatArray, FloatArray], level: float
 ) -> tuple[FloatArray, float]:
-    """Return the frame of a correction of the scene, by Tikhonov with the weight of least risk, and the number of
-    parameters that it fits to noise of variance ``level``.
+    """Return the frame of a correction of the scene, by Tikhonov with the weight of least risk, and its effective
+    number of parameters.
     """
     (left, first, _), (right, second, _) = (np.linalg.svd(each, full_matrices=False) for each in factors)
     seen, strength = left.T @ rest @ right, np.square(np.outer(first, second))
@@ -415,26 +405,23 @@ def correlation(first: FloatArray, second: FloatArray) -> float:
 # -------- A DiffuserCam's point spread function, and diffusers with its statistics
 
 _REDUCE = 4
-"""Binning of the picture."""
 SPREAD_MM = _REDUCE * 5.86e-3
-"""Width of binned pixels of the shipped sensor; all lengths are proportional to it."""
+"""Width of binned pixels; all lengths are proportional to it."""
 CORRELATIONS_MM, MOVES_MM = np.geomspace(0.15, 0.45, 8), np.geomspace(0.05, 0.25, 8)
-"""Trial correlation lengths and rms moves of light, in steps as wide as fits to single diffusers scatter."""
+"""Trial correlation lengths and rms moves of light."""
 BLURS, HAZES = np.linspace(0.0, 2.0, 11), np.linspace(0.0, 0.5, 11)
-"""Trial standard deviations of the blur [pixels], and even parts of the light."""
+"""Trial blurs [pixels] and even parts of the light."""
 _SEEDS, TRACED = 2, 6
-"""Diffusers at each point of the grid, and traced diffusers."""
 _RAYS = 1280, 2048
-"""Rays per side, of the fit and of the traced light: 20 and 50 a pixel."""
+"""Rays per side, of the fit and of the traced light."""
 _LOWEST, _HIGHEST, _BANDS = 1 / 70, 0.4, 14
 """Bands of the radial spectrum, from a few caustic cells to the noise of rays [cycles / pixel]."""
 _EDGES = np.geomspace(_LOWEST, _HIGHEST, _BANDS + 1)
 FREQUENCIES = np.sqrt(_EDGES[1:] * _EDGES[:-1])
 _LIT, _SURE = 0.2, 12.0
-"""Part of the brightest smoothed light that counts as lit, and the width of the smoothing [pixels]."""
+"""Part of the brightest smoothed light that counts as lit; width of the smoothing [pixels]."""
 _MARGIN_MM = 1.2
 _SLOPE = 0.1
-"""Slope of the reliefs from which rays are landed; their moves are scaled."""
 
 
 class Spread(NamedTuple):
@@ -506,8 +493,8 @@ def land(relief: Relief, move_mm: float, count: int, seed: int) -> FloatArray:
 
 
 def fit(measured: FloatArray, grid: FloatArray) -> tuple[int, int, float, float]:
-    """Return indices on the ``grid`` (correlations, moves, bands), blur and haze of the spectrum most like the
-    ``measured`` one (bands,), by logarithms, because each band scatters by some tenths of itself.
+    """Return indices on the ``grid`` (correlations, moves, bands), blur and haze of the most similar spectrum (bands,),
+    by logarithms, because each band scatters by some tenths of itself.
     """
     damped = np.exp(-np.square(2 * np.pi * FREQUENCIES * BLURS[:, None]))  # of power
     best = (np.inf, 0, 0, 0.0, 0.0)
@@ -547,10 +534,9 @@ def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[Fl
 # -------- The study
 
 _DIFFUSER, _SHOWN, _BRIGHT = "diffuser", 160, 3.0
-"""Value of the column capture; shown part of a frame [pixels]; standard deviations from grey to white."""
+"""Value of the column capture; shown pixels; standard deviations from grey to white."""
 _RENDERED = 0.1
-"""Relative error of a simulated frame from which a twin is not reliable, because its energy (a hundredth) equals the
-parts of some causes."""
+"""Relative error of a simulated frame from which a twin is not reliable."""
 
 
 def _points(scope: Scope) -> list[Point]:

@@ -1,14 +1,10 @@
 """From the paper's idealised model of a scene to its rendered frames, one effect at a time: the cost of each in dB.
 
-An effect is measured in three ways: *alone*, added to the idealised model; *in order*, added after all effects before
-it, so that the steps add up to the whole; *left out* of the whole. The paper has no such figure.
-
-Effects of the scene are removed from its light (:mod:`mitsim.studies.causes`). The camera adds *saturation*,
-*quantisation* and *calibration noise* (of the factors). Shot noise, read noise and dark current are always on, because
-the paper's model has them. The exposure is that of equal peak with the effects on.
-
-Images are made with the *model assumed*, the exact factors of the idealised camera, and with the *model calibrated*,
-factors of a session with the same effects.
+An effect is added *alone* to the idealised model, *in order* after all effects before it, or *left out* of the whole.
+Effects of the scene are removed from its light (:mod:`mitsim.studies.causes`). Shot noise, read noise and dark current
+are always on, because the paper's model has them. The exposure is that of equal peak. Images are made with the *model
+assumed*, the exact factors of the idealised camera, and with the *model calibrated*, factors of a session with the same
+effects.
 """
 
 from __future__ import annotations
@@ -54,16 +50,13 @@ EFFECTS = (
     causes.INTERREFLECTION, causes.MIRRORS, causes.GLOSS, causes.AMBIENT, causes.BLACK_LEVEL,
     causes.DEFOCUS, causes.SPECKLE, SATURATION, CALIBRATION_NOISE, QUANTISATION, causes.RENDER_NOISE,
 )  # fmt: skip
-"""Order in which effects are added: devices, scene, light, camera, simulation."""
 ASSUMED, CALIBRATED = MODELS = ("assumed", "calibrated")
 _IN_SESSIONS = frozenset({causes.FALLOFF, causes.DIFFRACTION, causes.KEYSTONE, causes.DEFOCUS})
-"""Effects that change the expected frames of a session; the black level is a factor for all frames."""
+"""Effects that change the expected frames of a session."""
 _ROOM = 1024.0
 """Full wells of a sensor without saturation: a power of two changes no other number."""
 _LARGEST_ADC, _CODES = 24, 2**32
-"""Most bits of an ADC without saturation, and codes that a frame can hold."""
 _SURE = 6.0
-"""Deviations of noise by which the brightest pixel stays below saturation."""
 
 
 class Sessions:
@@ -88,11 +81,9 @@ class Sessions:
 
     @cached_property
     def noisy(self) -> Factors:
-        """Factors of the real session, equal to those of `bench.calibrate`."""
         return Factors.of(estimate(self._lit, Job())[0], self.manifest)
 
     def factors(self, off: frozenset[str], noise: bool) -> Factors:
-        """Return the factors of a session without the effects ``off``, with or without its ``noise``."""
         found, whole = self._estimate(off), self._estimate(frozenset())
         if not noise:
             return Factors.of(found, self.manifest)
@@ -144,7 +135,6 @@ class Levels:
         self.effects = tuple(name for name in EFFECTS if name in scene_ablation.effects or own.get(name, False))
 
     def images(self, on: frozenset[str]) -> Mapping[str, Solution]:
-        """Reconstruct the scene by each model, with the effects ``on`` that the scene has."""
         off, light = frozenset(self.effects) - on, self.lit.light
         sensor, fraction = sensor_without(light.bench.sensor, off), Exposure().fraction
         fraction = fraction / _ROOM if SATURATION in off else fraction
@@ -172,7 +162,7 @@ def sensor_without(sensor: SensorModel, off: frozenset[str]) -> SensorModel:
 
 
 def fills_well(sensor: SensorModel, speckle: float) -> bool:
-    """Return True if light at equal peak, under ``speckle`` of some contrast, can saturate a ``sensor``."""
+    """Return True if light at equal peak, under ``speckle``, can saturate a ``sensor``."""
     well, largest = sensor.superpixel_full_well_e, sensor.largest_dn
     if largest is not None:
         well = min(well, (largest - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
@@ -236,7 +226,7 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def ends(way: str, effect: str) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the effects that are on without an ``effect`` and with it, by one ``way``."""
+    """Return the effects that are on without an ``effect`` and with it."""
     if way == ALONE:
         return frozenset(), frozenset({effect})
     if way == LEFT_OUT:

@@ -120,7 +120,7 @@ class StudyResult:
 
 
 def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figure]:
-    """Write the ``figures`` that show anything to a ``folder``, and return them; MitsimError on failure."""
+    """Write the ``figures`` that show anything, and return them; MitsimError on failure."""
     from mitsim.report.plots import tells  # not in processes that measure
 
     drawn = {file: figure for file, figure in figures.items() if tells(figure)}
@@ -140,12 +140,10 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 # -------- The folder of a study
 
 POINTS, KEPT = "points", "kept"
-"""Folders of measured points, and of objects that points share."""
 DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
 
 
 def check_study_folder(output: Path | str, name: str) -> None:
-    """Refuse an ``output`` that :func:`study_folder` would refuse, before slow imports."""
     check_output(output, overwrite=_is_earlier(Path(output), name))
 
 
@@ -186,7 +184,6 @@ class Store:
         return self._file(point).is_file()
 
     def save(self, point: Point, found: Found) -> None:
-        """Save the findings of a ``point``; MitsimError on failure."""
         import numpy as np
 
         rows = np.frombuffer(json.dumps([dict(row) for row in found.rows]).encode(), dtype=np.uint8)
@@ -194,7 +191,6 @@ class Store:
             np.savez_compressed(file, allow_pickle=False, **{"rows": rows, **found.arrays})  # type: ignore[arg-type]
 
     def load(self, point: Point) -> Found:
-        """Return the findings of a ``point``; MitsimError when the file is damaged."""
         from mitsim.core.arrays import read_npz
 
         path = self._file(point)
@@ -213,7 +209,6 @@ class Store:
             ) from error
 
     def take(self, other: Path) -> None:
-        """Copy the points in an ``other`` folder that this one lacks."""
         for file in sorted(other.glob("*.npz")):
             if not (self.folder / file.name).exists():
                 check_plain(file)
@@ -233,7 +228,7 @@ Batch = tuple[Point, ...]
 
 
 def batches(points: Sequence[Point], kept: bool = False) -> list[Batch]:
-    """Return batches of ``points`` that share light; single points if the shared objects are ``kept`` in files."""
+    """Return batches of ``points`` that share light."""
     if kept:
         return [(point,) for point in points]
     return [tuple(group) for _, group in groupby(points, key=lambda point: point.setup)]
@@ -283,19 +278,8 @@ def run_experiment(
 ) -> StudyResult:
     """Measure the points that are not measured yet, and write table, claims, figures and page.
 
-    Parameters
-    ----------
-    study
-        name of an experiment; ``all`` for those of the paper, each in its own folder, on one page.
-    scope, where
-        scene and size, and where the points are measured; None: all of them here.
-    output
-        new or empty folder, or that of an earlier run of the same study, which is resumed.
-
-    Raises
-    ------
-    MitsimError
-        for another name, an output that holds something else, and anything that a point refuses.
+    ``output`` is a new or empty folder, or that of an earlier run of the same study, which is resumed. MitsimError for
+    another study's name, an output that holds something else, and anything that a point refuses.
     """
     job, where = job or Job(), where or Where()
     if study == ALL:
@@ -348,12 +332,8 @@ def _check_data(points: Sequence[Point]) -> None:
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> StudyResult:
     """Join ``parts``, folders of the same study, in the folder ``output``.
 
-    ``experiment`` is the module of a user's own study, because no module is imported only since a file names it.
-
-    Raises
-    ------
-    MitsimError
-        for parts of different or unknown studies, parts that hold none, and an output that holds something else.
+    ``experiment`` is the module of a user's own study. MitsimError for parts of different or unknown studies, parts
+    that hold none, and an output that holds something else.
     """
     started, heads = time.perf_counter(), [_head(Path(part)) for part in parts]
     if not heads:
@@ -392,7 +372,6 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
 
 
 def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResult]) -> StudyResult:
-    """Run every experiment of the paper in its own folder, and write one page of all claims."""
     with study_folder(output, ALL) as folder:
         _write_head(folder, ALL, ALL, scope, status="incomplete")
         found = [each(name, folder / name) for name in PAPER]
@@ -434,7 +413,6 @@ def _campaign(study: str, experiment: Study, scope: Scope, output: Path | str) -
 def _finish(
     study: str, experiment: Study, scope: Scope, points: Sequence[Point], store: Store, seconds: float
 ) -> StudyResult:
-    """Write table, claims, figures and page if no point is missing; ``seconds`` is the time of measuring."""
     from mitsim.studies.framework.panels import Section, build_page
 
     folder, there, name = store.folder.parent, sum(map(store.has, points)), experiment.name
@@ -511,9 +489,7 @@ class _LazyStudio:
 
 
 def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
-    """Measure a ``point`` of the experiment ``name`` in this process's studio; ``shared`` is a folder of common
-    objects.
-    """
+    """Measure a ``point`` of the experiment ``name`` in this process's studio."""
     return find_experiment(name).measure(cast("Studio", _LazyStudio(shared)), point)
 
 
@@ -583,7 +559,6 @@ class _Worker:
 
 
 def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
-    """Measure every batch point by point, until the parent is gone; ``folders`` are temporary and shared."""
     tempfile.tempdir, shared = folders
     warnings.showwarning = lambda message, *_: say_note(str(message))
     with suppress(EOFError, OSError, KeyboardInterrupt):
@@ -597,9 +572,9 @@ def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
 
 
 def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tuple[Point, Found]]:
-    """Yield the findings of all points from the Dask cluster at an ``address``, a batch a task.
+    """Yield the findings of all points from the Dask cluster at an ``address``.
 
-    MitsimError without the package ``distributed``, without a scheduler, and as :func:`in_processes`.
+    MitsimError without the package ``distributed`` or a scheduler, and as :func:`in_processes`.
     """
     try:
         from distributed import Client, as_completed
@@ -619,7 +594,6 @@ def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tu
 
 
 def _batch(name: str, batch: Batch) -> tuple[list[Found], str]:
-    """Measure a batch; return its findings, and the reason why it ended early."""
     found = []
     for point in batch:
         try:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"
 _CONFIDENCE = 0.95
 Holds = bool | None
-"""None for a claim that is not decided."""
 Where = Mapping[str, Any] | str
 """Values by column that choose rows: a value, a sequence of values, or a predicate; a text is the value of the column
 patterns."""
@@ -59,7 +58,6 @@ def measured(value: Any) -> bool:
 
 
 def distinct(rows: DataFrame, column: str) -> list[Any]:
-    """Return the values of a ``column`` in the order of first use, without None."""
     return list(rows[column].dropna().drop_duplicates()) if column in rows else []
 
 
@@ -72,17 +70,8 @@ def mean_of(
 ) -> Mean:
     """Return the mean of a column with its standard error, over prints, or over seeds where there is one print.
 
-    Parameters
-    ----------
-    minus, minus_column
-        rows of the same prints and seeds, whose values are subtracted, and their column if its name differs.
-    error_column
-        column of an error that all rows share, added in quadrature.
-
-    Raises
-    ------
-    MitsimError
-        if no print (or seed) that the rows, or both tables, share has a number.
+    ``minus`` are rows of the same prints and seeds, whose values are subtracted; ``error_column`` is an error that all
+    rows share, added in quadrature. MitsimError if no shared print (or seed) has a number.
     """
     from pandas import Series, to_numeric
 
@@ -111,10 +100,7 @@ def mean_of(
 
 
 def within(quantity: Mean, low: float = -math.inf, high: float = math.inf) -> Holds:
-    """Return whether a quantity lies in a range, by Student's interval with one degree of freedom less than values.
-
-    A single value decides nothing.
-    """
+    """Return whether a quantity lies in a range, by Student's interval; a single value decides nothing."""
     if quantity.of < 2:
         return None
     from scipy.special import stdtrit
@@ -137,7 +123,6 @@ def verdict(holds: Holds) -> str:
 
 
 def verdict_at(places: Mapping[str, Holds]) -> str:
-    """Return the verdict on a claim that was judged at several ``places``, such as exposures."""
     holding = [name for name, holds in places.items() if holds]
     if len(holding) in (0, len(places)):
         # Undecided at one place and failing at another: the claim may still hold at the first.
@@ -148,7 +133,6 @@ def verdict_at(places: Mapping[str, Holds]) -> str:
 
 
 def value_name(column: str, value: Any) -> str:
-    """Return the words for a ``value`` of a ``column`` in claims and figures."""
     if column == "patterns" and str(value).partition(":")[0] in FAMILIES:
         return in_text(str(value))
     return f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
@@ -196,11 +180,9 @@ class Statement:
     models: tuple[str, str, str] = ("model", IDEALISED, RENDERED)
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        """Return figures, whether the claim holds for some ``rows``, and the margin to the range's nearest end."""
         raise NotImplementedError
 
     def judge(self, results: Results) -> list[Claim]:
-        """Return the claim, or one for each value of ``each``, with figures and verdict."""
         rows = choose_rows(results.frame, self.where)
         if rows.empty:
             if self.optional:
@@ -217,7 +199,7 @@ class Statement:
 
     @property
     def _compared(self) -> frozenset[str]:
-        """Columns that choose the compared rows, so that the claim is not judged for each of their values."""
+        """Columns that choose the compared rows."""
         return frozenset()
 
     def _judge(self, rows: DataFrame, claim: str) -> Claim:

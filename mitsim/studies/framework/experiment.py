@@ -104,7 +104,6 @@ class Point:
         return dict(self.values)[name]
 
     def row(self, **measured: Value) -> dict[str, Value]:
-        """Return a row of the table: everything that varies, and the ``measured`` values."""
         return {"picture": self.setup.picture, **dict(self.setup.parameters), **dict(self.values), **measured}
 
     @property
@@ -154,7 +153,6 @@ class Scope:
         return self.choose(tuple(dict.fromkeys((*self.seeds, *three))), self.seeds)
 
     def choose(self, everything: Sequence[Any], few: Sequence[Any]) -> tuple[Any, ...]:
-        """Return ``few`` where the study is quick, otherwise ``everything``."""
         return tuple(few if self.quick else everything)
 
 
@@ -212,7 +210,6 @@ class Axes:
 
 IMAGE = "image"
 TRUTH = "truth"
-"""Name of the error-free image of a point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,14 +247,12 @@ class Results:
         return replace(self, rows=tuple(self.frame.assign(**columns).to_dict("records")))
 
     def array(self, row: Mapping[str, Value], name: str = IMAGE) -> FloatArray | None:
-        """Return the array ``name`` of a ``row``."""
         return self.arrays.get((str(row.get("point")), name))
 
 
 # -------- What a study declares
 
 KNOBS = "{knobs}"
-"""Names of a sweep's knobs in its title."""
 HEADS = "Paper", "Idealised", "Rendered"
 
 
@@ -386,7 +381,6 @@ def check_study(name: str) -> None:
 
 @cache
 def _load_file(path: str) -> Any:
-    """Execute a file once, and return its module."""
     found = importlib.util.spec_from_file_location(f"mitsim_study_{Path(path).stem}", path)
     assert found is not None and found.loader is not None, "a file of Python has a loader"
     module = importlib.util.module_from_spec(found)
@@ -406,7 +400,6 @@ MEASURES = {
     "lambda": ("lambda", "lambda, weight of the regularisation [(electrons/s)²]"),
     "seconds": ("seconds", "time of the solution [s]"),
 }
-"""Column of the table and axis, by the names on the command line."""
 NO_SCENE = ("patterns", "exposure", "seed", "accuracy", "method")
 """Knobs of a sweep that are no parameters of the scene."""
 OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason", *(c for c, _ in MEASURES.values())}
@@ -488,9 +481,7 @@ def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> fl
 TEST_IMAGES = ("astronaut", "camera", "chelsea", "coffee", "coins", "rocket", "page", "brick")
 QUICK_IMAGES = ("chelsea", "page")
 PRINT_MM = 128.0
-"""Width of the photograph's sheet, which carries the print."""
 SIDE = 512
-"""Pixels a side: four per projector pixel."""
 
 
 def picture(name: str) -> npt.NDArray[np.uint8]:

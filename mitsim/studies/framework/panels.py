@@ -88,7 +88,6 @@ class Panel:
     errors: Mapping[str, str] = field(default_factory=dict)
 
     def draw(self, results: Results) -> dict[str, Figure]:
-        """Return the figures by file name; a panel without rows has none."""
         rows = choose_rows(results.frame, self.where)
         drawn: dict[str, Figure | None] = {}
         for value in distinct(rows, self.each) if self.each else [""]:
@@ -120,7 +119,6 @@ class Panel:
         return value_name(column, value)
 
     def combinations(self, rows: DataFrame, by: Columns) -> list[dict[str, Any]]:
-        """Return the combinations of the values of some columns of ``rows``, in the order of the table."""
         columns = [by] if isinstance(by, str) else list(by)
         lacking = [each not in rows or bool(rows[each].isna().any()) for each in columns]
         values = [[*distinct(rows, each), *([None] if no else [])] for each, no in zip(columns, lacking, strict=True)]
@@ -283,7 +281,6 @@ def _mean_text(rows: DataFrame, column: str) -> str:
 
 
 _MOST_SHOWN = 6
-"""Images along either side of a grid: more would be too small on a page."""
 
 
 @dataclass(frozen=True)
@@ -344,7 +341,6 @@ Cell = tuple[FloatArray, FloatArray | None, str]
 
 
 def _cells(results: Results, rows: DataFrame, where: Where, array: str, caption: str) -> list[Cell]:
-    """Return the first image of the ``rows`` that ``where`` chooses, if it was kept."""
     for row in choose_rows(rows, where).to_dict("records"):
         image = results.array(row, array.format(**row))
         if image is not None:
@@ -356,13 +352,12 @@ def _cells(results: Results, rows: DataFrame, where: Where, array: str, caption:
 
 
 def _few(items: Sequence[Any]) -> list[Any]:
-    """Return at most :data:`_MOST_SHOWN` of the ``items``, evenly spread, with both ends."""
     count = min(len(items), _MOST_SHOWN)
     return [items[int(place)] for place in np.linspace(0, len(items) - 1, count).round()]
 
 
 def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], title: str) -> Figure:
-    """Draw images with their truths: in a first column where each row has one truth, else in rows above the images."""
+    """Draw images with their truths, in a first column where each row has one truth, else in rows above."""
     from mitsim.report.plots import image_grid
 
     truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
@@ -479,7 +474,6 @@ class Section:
 
 
 def tally(claims: Sequence[Claim]) -> str:
-    """Return the number of ``claims`` that hold; an empty text without claims."""
     part, open_ = "confirmed in part", "not decided"
     counts = Counter(
         each if each in (CONFIRMED, NOT_CONFIRMED) else part if each.startswith(CONFIRMED) else open_
@@ -490,11 +484,10 @@ def tally(claims: Sequence[Claim]) -> str:
 
 
 _IMAGE = "point", "psnr_db", "exposure", "model", "picture", "condition", "method", "weight"
-"""Columns that identify one image."""
 
 
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
-    """Return a warning with the number of flagged images of the study ``name``, and the reasons."""
+    """Return a warning with the number of flagged images and the reasons."""
     # An image may have many rows, such as a transfer function's.
     rows = {tuple(map(row.get, _IMAGE)): row for row in results.rows if row.get("flagged") is not None}
     found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]
@@ -523,7 +516,7 @@ def build_findings(
     name: str, titles: tuple[str, str], where: str, parts: Sequence[Part], pictures: Mapping[str, tuple[str, int]],
     warnings: Sequence[str] = (),
 ) -> str:  # fmt: skip
-    """Return the page of findings that are no table of points as HTML; ``titles`` are title and message."""
+    """Return the page of findings that are no table of points as HTML."""
     return page_of([Section(name, *titles, where, pictures, tuple(parts), warnings=tuple(warnings))], titles[0])
 
 

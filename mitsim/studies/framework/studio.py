@@ -66,7 +66,6 @@ class Image:
     def of(
         cls, frames: Unexposed, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1
     ) -> Image:
-        """Return the image of one exposure; arguments as of :meth:`mitsim.report.lit_scene.Unexposed.solve`."""
         solution = frames.solve(seconds, lam, binning)
         quality, shots = frames.lit.quality(solution.image), len(frames.family.shots)
         return cls(solution.image, quality, solution.lam, shots, seconds, flags_of(solution.status))
@@ -84,7 +83,7 @@ class Image:
 
 
 def flags_of(*statuses: Status, misfit: Misfit | None = None, others: Iterable[str] = ()) -> dict[str, Value]:
-    """Return the columns `flagged` and `reason` of an image; ``others`` are warnings of the objects it was made of."""
+    """Return the columns `flagged` and `reason` of an image."""
     cause = f", {misfit.reason}" if misfit and misfit.flagged and misfit.cause else ""
     reasons = [f"{each.verdict.value}{cause}" for each in statuses if not each.verdict.good]
     flags = [text for each in statuses for text in each.flags]
@@ -168,7 +167,6 @@ class Studio:
         return self.once("light", 1, setup, make)
 
     def factors(self, setup: Setup, seed: int) -> Factors:
-        """Return the factors that a session with the devices of a ``setup`` estimates, with noise from ``seed``."""
         bench = self.bench(setup)
         name = f"{bench.devices_digest[:16]}-{seed}"
 
@@ -179,7 +177,6 @@ class Studio:
         return self.once("factors", 4, name, make)
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
-        """Return frames of a pattern family before any exposure; arguments as of :meth:`image`."""
         factors = self.factors(setup, seed) if model == RENDERED else None  # first: a mask may have none
         lit = self.lit_scene(setup)
         family = lit.bench.family(patterns, seed) if isinstance(patterns, str) else patterns
@@ -197,16 +194,8 @@ class Studio:
     ) -> Image:
         """Return the image of a scene; a rendered one is exposed and reconstructed as a user's own frames are.
 
-        Parameters
-        ----------
-        seed
-            seed of the frames' and the calibration's noise.
-        model
-            one of :data:`mitsim.report.MODELS`.
-        exposure
-            one of :data:`mitsim.report.CONVENTIONS`, or ``DIM``.
-        focus, method
-            of rendered frames, as of :func:`mitsim.reconstruct`.
+        ``model`` is one of :data:`mitsim.report.MODELS`, ``exposure`` one of :data:`mitsim.report.CONVENTIONS` or
+        ``DIM``.
         """
         frames = self.frames(setup, model, patterns, seed)
         if model != RENDERED:
@@ -242,10 +231,7 @@ class Studio:
 
 
 def finding(studio: Studio, point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
-    """Return the findings of a point in one row of the ``measured`` columns.
-
-    The ``image`` is kept for a few prints, with the truth.
-    """
+    """Return the findings of a point in one row; the ``image`` is kept for a few prints, with the truth."""
     kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
     arrays = image_arrays(image, studio.lit_scene(point.setup).truth) if kept and image is not None else {}
     return Found((point.row(**measured),), arrays)
@@ -256,15 +242,11 @@ def image_arrays(image: FloatArray, truth: FloatArray) -> dict[str, FloatArray]:
 
 
 def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Return named ``arrays`` in single precision, because a page shows no more."""
     return {name: array.astype("float32") for name, array in arrays.items()}
 
 
 def measure_image(studio: Studio, point: Point, shown: Collection[str] | None = None) -> Found:
-    """Return the quality of the image at a point with model, patterns, exposure and seed.
-
-    Images are kept of the patterns ``shown``, or of all if it is None.
-    """
+    """Return the quality of the image at a point; images are kept of the patterns ``shown``, or of all."""
     values = dict(point.values)
     patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
     method = str(values.get("method", TIKHONOV))
