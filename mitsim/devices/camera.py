@@ -1,4 +1,4 @@
-"""Geometry of a lensless camera: from the numbers of a scene's sensor to its pixel grid, mask and shadow factors.
+"""Geometry of a lensless camera: pixel grid, mask and shadow factors from the numbers of a scene's sensor.
 
 Coordinates are index coordinates (``s_row = -y``, ``s_col = -x``) in mm, centred on the optical axis.
 """
@@ -174,7 +174,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def axes_alike(self) -> bool:
-        """Return True if pixels are square, and columns equal rows in number and offset."""
         return self.pitches[0] == self.pitches[1] and np.array_equal(self.centres(0), self.centres(1))
 
     @property
@@ -184,12 +183,10 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def half_width(self) -> float:
-        """Return half the sensor's longer side [mm]."""
         return max(self.half_sides)
 
     @property
     def half_sides(self) -> tuple[float, float]:
-        """Return half the sensor's height and half its width [mm]."""
         (rows, columns), (row, column) = self.shape, self.pitches
         return rows * row / 2, columns * column / 2
 
@@ -225,14 +222,12 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def mask_reach(self) -> float:
-        """Return the visible distance from the mask's centre [mm]."""
         seen = self.half_width + (self.mask_distance + self.mask_thickness) * self.tan_half_fov
         leaning = 1 + self.tan_half_fov * sum(map(abs, self.mask_tilt))
         return (seen + max(self.pitches) + max(map(abs, self.mask_offset))) * leaning
 
     @property
     def centred(self) -> bool:
-        """Return True if a separable solver subtracts row and column means."""
         return self.build_mask().centred
 
     @property
@@ -241,7 +236,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def mask_tilt(self) -> tuple[float, float]:
-        """Return the slopes of the mask's distance along rows and columns."""
         made = self.mask_plate.flaws.tilt_mrad if self.mask_plate else (0.0, 0.0)
         lean = self.mask_lean_mrad or (0.0, 0.0)
         return math.tan((made[0] + lean[0]) * 1e-3), math.tan((made[1] + lean[1]) * 1e-3)
@@ -265,7 +259,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         return None if many else (by_column, by_row)
 
     def tilt_left_out(self, waves: bool) -> bool:
-        """Return True if the mask's tilt is neglected in its shadow."""
         return any(self.mask_tilt) and self.tilt_nodes(waves) is None
 
     @property
@@ -280,11 +273,9 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         return len(self.build_mask().terms) * math.prod(self.tilt_nodes(waves=False) or (1,))
 
     def is_correlated(self, waves: bool) -> bool:
-        """Return True if frames are correlations with a shadow on a raster."""
         return self.is_drawn(waves) or (self.mask_fft and self.may_be_drawn(waves))
 
     def may_be_drawn(self, waves: bool) -> bool:
-        """Return True if both sums of terms and correlations work."""
         mask = self.build_mask()
         still = self.mask_motion is None and not any(self.mask_tilt) and self.pitches[0] == self.pitches[1]
         return still and not (waves or self.is_drawn(waves)) and mask.crosses is None
@@ -297,7 +288,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def few_wave_terms(self) -> bool:
-        """Return True if waves behind the mask are a sum of few terms."""
         return self.diffracts and not self.is_drawn(waves=True) and not any(self.mask_tilt) and self.mask_motion is None
 
     @property
@@ -319,12 +309,10 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
 
 def side_of(shape: tuple[int, int]) -> float:
-    """Return the side in pixels of a square with the area of ``shape``."""
     return shape[0] if shape[0] == shape[1] else math.sqrt(shape[0] * shape[1])
 
 
 def centred_edges(count: int, pitch: float) -> FloatArray:
-    """Return the (count + 1,) edges of equal cells about zero."""
     return np.asarray((np.arange(count + 1, dtype=np.float64) - count / 2) * pitch)
 
 

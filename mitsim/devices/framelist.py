@@ -63,7 +63,6 @@ def _refusal(folder: Path, text: str) -> MitsimError:
 
 
 def _check_files(folder: Path, names: Iterable[str]) -> None:
-    """Raise MitsimError for a name that is listed twice or missing in the ``folder``."""
     seen = set[str]()
     for name in names:
         if name in seen:
@@ -160,12 +159,7 @@ class FrameList(Configuration):
 
 @dataclass(frozen=True, eq=False)
 class SessionFrames:
-    """Frames of a real session, each of which is in the folder once.
-
-    ``shots`` has the frames by side, number of the pattern, sign, exposure and repeat. ``preparer`` makes frames of
-    the
-    files' numbers; None if nothing is done to them.
-    """
+    """Frames of a real session by side, number of the pattern, sign, exposure and repeat, each once in the folder."""
 
     folder: Path
     listed: FrameList
@@ -212,11 +206,9 @@ class SessionFrames:
 
     @property
     def pairs(self) -> bool:
-        """Return True if a +-1 pattern is the difference of two frames."""
         return self.listed.signed_capture == "pair"
 
     def repeats_of(self, half: Half, exposure: int = 0) -> tuple[StripeFile, ...]:
-        """Return all repeats of one ``half`` at one ``exposure`` of the ladder."""
         return tuple(self.shots[(*half, exposure, repeat)] for repeat in range(self.listed.repeats))
 
     @cached_property
@@ -225,12 +217,10 @@ class SessionFrames:
 
     @cached_property
     def order(self) -> list[Half]:
-        """Return the halves of patterns in the order of the list."""
         keys = [(f.side, f.index, f.sign) for f in self.listed.frames or self.shots.values()]
         return list(dict.fromkeys(keys))
 
     def frame_name(self, half: Half) -> str:
-        """Return the file names that show a ``half``, and the half."""
         files = [shot.file for key, shot in self.shots.items() if key[:3] == half]
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""
         return f"{files[0]}{more} ({_words((*half, 0, 0))})"
@@ -474,12 +464,7 @@ class KnownList(Configuration):
 
 @dataclass(frozen=True, eq=False)
 class KnownCaptures:
-    """A list whose runs and pictures exist.
-
-    ``lines`` are planes that every run has in folders of their own (None without them), ``manifests`` those of the
-    first
-    run by line.
-    """
+    """A list whose runs and pictures exist, and manifests of the first run by line (``lines``; None without them)."""
 
     path: Path
     listed: KnownList
@@ -535,7 +520,6 @@ def preparation_of(manifest: RunManifest, place: Path | str) -> Preparation:
 def _difference(
     manifests: dict[str, RunManifest], known: dict[str, RunManifest], run: str, first: str, path: Path
 ) -> str:
-    """Return how a ``run`` differs from the ``first``: in lines, camera, or pixels."""
     if [*manifests] != [*known]:
         names = [", ".join(name for name in each if name) or "no" for each in (manifests, known)]
         return f"{run} has {names[0]} planes, but {first} has {names[1]}; give runs of one kind"

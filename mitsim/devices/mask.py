@@ -56,7 +56,6 @@ class Dust(ByValue):
         self._hold(centres_mm=np.array(self.centres_mm, dtype=np.float64))
 
     def turn(self, quarters: int) -> Dust:
-        """Return the dust on a mask that ``numpy.rot90`` turns by ``quarters``."""
         row, column = self.centres_mm.T
         for _ in range(quarters % 4):
             row, column = -column, row
@@ -154,7 +153,6 @@ class Mask(ByValue):
 
     @property
     def centred(self) -> bool:
-        """Return True if a separable solver subtracts row and column means."""
         return self.kind == "flatcam"
 
     @property
@@ -164,7 +162,6 @@ class Mask(ByValue):
 
     @property
     def amplitude(self) -> Mask:
-        """Return the mask itself, because roots of 0 and 1 are 0 and 1."""
         return self
 
     @property

@@ -150,10 +150,10 @@ class MaskProfile(Configuration):
         """Return the light behind a phase mask as a plate: brightness relative to light without a mask.
 
         A point at depth z0 lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask at distance d.
-        The
-        picture distributes the light that goes through the aperture's area. Raises MitsimError for a picture that
-        cannot be
-        read or is too large, and a point that is not beyond the mask.
+
+        Raises
+        ------
+        MitsimError for a picture that cannot be read or is too large, and a point that is not beyond the mask.
         """
         path, distance = folder / str(self.file), self.psf_distance_mm or 0.0
         if distance <= mask_distance_mm:
@@ -241,12 +241,10 @@ _BORDER = 16
 def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> FloatArray:
     """Return the point spread function in a picture (PNG, TIFF, NPY, OpenEXR), with sum 1.
 
-    Colours are averaged, the median along the edges is subtracted as background, ``reduce`` x ``reduce`` pixels are
-    averaged, and negative values become zero. Rows and columns that remain at the far edges are left out.
-
-    Raises MitsimError for a file that is no picture, has a palette or is too large (more than ``most`` pixels per
-    side),
-    a ``reduce`` that does not fit, or no light above the background.
+    Colours are averaged, the median along the edges is subtracted, ``reduce`` x ``reduce`` pixels are averaged, and
+    negative values become zero. Raises MitsimError for a file that is no picture, has a palette or more than
+    ``most`` pixels
+    per side, for a ``reduce`` that does not fit, and without light above the background.
     """
     path = Path(path)
     size = image_size(path, _PICTURE)

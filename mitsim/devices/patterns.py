@@ -64,14 +64,12 @@ class Lighting:
 
     @classmethod
     def uniform(cls, n: int) -> Lighting:
-        """Return one shot with all ``n`` x ``n`` pixels fully lit."""
         import numpy as np
 
         return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
 
     @property
     def lit(self) -> float:
-        """Return the mean part of all pixels that a shot lights."""
         return float(self.weights.mean(axis=0)[self.labels].mean())
 
     def shots(self, chosen: list[int] | npt.NDArray[np.int64]) -> Lighting:
@@ -101,7 +99,6 @@ class PatternFamily:
         return tuple(Shot(*place) for place in places)
 
     def light(self, shot: Shot) -> FloatArray:
-        """Return the (n, n) fraction of full power in one ``shot``."""
         import numpy as np
 
         pattern = np.outer(self.left[:, shot.row], self.right[:, shot.column]).astype(np.float64)
@@ -109,7 +106,7 @@ class PatternFamily:
 
     @cached_property
     def lighting(self) -> Lighting:
-        """Return the finest partition of pixels that are always lit alike, and every shot's light."""
+        """Return the finest partition of pixels that are always lit alike, and each shot's light."""
         import numpy as np
 
         _, row = np.unique(self.left, axis=0, return_inverse=True)
@@ -147,7 +144,6 @@ def way_to(order: int) -> Way:
 
 
 def hadamard_orders(limit: int) -> list[int]:
-    """Return the orders up to ``limit`` that :func:`hadamard_matrix` can build."""
     return [order for order in range(1, limit + 1) if _way(order)]
 
 
@@ -266,23 +262,11 @@ def pattern_family(
 ) -> Callable[[Callable[[PatternAxis], PatternFactor]], Callable[[PatternAxis], PatternFactor]]:
     """Register a function from a :class:`PatternAxis` to its (n, K) factor of 0/1 or +-1 as a pattern family.
 
-    Parameters
-    ----------
-    *forms
-        Names: ``NAME``, or ``NAME:K``, and ``NAME:RxC`` as well where rows and columns may differ.
-    label
-        Name in reports; the name itself if not given.
-    random
-        True if it takes a seed.
-    signed
-        Returns True if patterns of a K take the value -1.
-    check
-        Raises MitsimError for a K that it does not have.
-
-    Raises
-    ------
-    ValueError
-        For a name that is taken.
+    ``forms`` are its names: ``NAME``, or ``NAME:K``, and ``NAME:RxC`` as well where rows and columns may differ.
+    ``label``
+    is the name in reports. ``random`` families take a seed. ``signed`` returns True if patterns of a K take the
+    value -1, and
+    ``check`` raises MitsimError for a K that does not exist. A name that is taken raises ValueError.
     """
     name = forms[0].partition(":")[0]
     if name in FAMILIES:
@@ -343,7 +327,6 @@ def random_binary(axis: PatternAxis) -> PatternFactor:
 
 
 def pattern_names() -> str:
-    """Return the names of all families for messages."""
     *most, last = (form for family in FAMILIES.values() for form in family.forms)
     return f"{', '.join(most)} or {last}"
 
@@ -351,9 +334,7 @@ def pattern_names() -> str:
 def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
     """Return family and periods of the patterns ``text``, for ``n`` projector pixels per side (None: any number).
 
-    Raises MitsimError for an unknown family, a K that is not a whole number or outside 1..n, and a Hadamard matrix
-    of an
-    unknown order.
+    Raises MitsimError for an unknown family or Hadamard order, and a K that is not a whole number or outside 1..n.
     """
     name, colon, size = text.partition(":")
     family = FAMILIES.get(name)
@@ -383,7 +364,6 @@ def takes_seed(text: str) -> bool:
 
 
 def shot_count(text: str) -> int:
-    """Return the number of shots of the patterns ``text``, two for each with -1."""
     family, periods = read_name(text)
     return periods[0] * periods[-1] * (2 if any(map(family.signed, periods)) else 1)
 
@@ -408,17 +388,15 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
 def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.NDArray[np.int64]]:
     """Return orders in which the frames of a run may have been taken, by name, as permutations p.
 
-    If the frames were taken in that order, shot k of ``patterns.captures`` is frame p[k] of those at hand. Captures
-    are
-    ``row-major``; ``column-major`` loops over rows inside columns, and ``reversed`` starts at the end. Sylvester's
-    Hadamard
-    patterns also have ``sequency`` (Walsh) and ``dyadic`` (Paley) order on both axes, and ``natural`` order, a
-    synonym of
-    row-major. In signed pairs, + precedes - except for ``halves-exchanged`` (- before +), ``plus-first`` (all +
-    before all
-    -) and ``minus-first``, which also follow another order, as in ``sequency,plus-first``. Two names may have the
-    same
-    permutation. ``taken`` is the order that `mitsim import --order` applied to the frames at hand.
+    Shot k of ``patterns.captures`` is then frame p[k] of those at hand. Captures are ``row-major``; ``column-major``
+    loops
+    over rows inside columns. Sylvester's Hadamard patterns also have ``sequency`` (Walsh), ``dyadic`` (Paley) and
+    ``natural``
+    order. In signed pairs, + precedes - except for ``halves-exchanged`` (- before +), ``plus-first`` (all + before
+    all -) and
+    ``minus-first``, which also follow another order, as in ``sequency,plus-first``. Two names may have the same
+    permutation.
+    ``taken`` is the order that `mitsim import --order` applied to the frames at hand.
     """
     import numpy as np
 

@@ -50,22 +50,10 @@ _GRIDS = 4
 class Plate(ByValue):
     """A square plate of square features, each with its own transmission; MitsimError for values out of range.
 
-    Attributes
-    ----------
-    feature_mm
-        Side of one feature.
-    values
-        (N, N) transmission of power, 0 to 1, read-only.
-    words
-        Description for messages and manifests.
-    lines_mm
-        (N + 1,) coordinates of the lines between features that are not equal.
-    flaws
-        Other flaws.
-    irradiance
-        True if values are the light behind it, of any finite size, which includes waves.
-    averaged
-        Features along a sensor pixel, over which light is always averaged: finer structure makes no terms.
+    ``values`` (N, N) are transmissions of power, read-only, or of any size with ``irradiance``: the light behind the
+    plate,
+    which includes waves. ``lines_mm`` (N + 1,) separate features that are not equal. Light is always averaged over
+    ``averaged`` features, the side of a sensor pixel. ``words`` describe the plate in manifests.
     """
 
     feature_mm: float
@@ -92,7 +80,6 @@ class Plate(ByValue):
 
     @cached_property
     def digest(self) -> str:
-        """Return the SHA-256 of the transmissions, and of uneven lines."""
         digest = hashlib.sha256(np.ascontiguousarray(self.values).tobytes())
         if self.lines_mm is not None:
             digest.update(self.lines_mm.tobytes())
@@ -128,7 +115,6 @@ class Plate(ByValue):
 
     @property
     def open_part(self) -> float:
-        """Return the mean transmission without dust."""
         width = np.diff(self.lines) / self.extent_mm
         return float(width @ self.values @ width)
 
@@ -201,7 +187,6 @@ class Plate(ByValue):
 
     @property
     def many(self) -> bool:
-        """Return True if there are too many terms for a sum."""
         return self.most_terms > _MOST_DECOMPOSED
 
     @cached_property
@@ -211,7 +196,6 @@ class Plate(ByValue):
 
     @cached_property
     def residuals(self) -> tuple[float, float]:
-        """Return the relative rms residual of the best separable term, with and without means of rows and columns."""
         width = None if self.lines_mm is None else np.diff(self.lines_mm)
         centred = self.values - np.average(self.values, axis=0, weights=width)
         centred -= np.average(centred, axis=1, weights=width)[:, None]
@@ -219,7 +203,6 @@ class Plate(ByValue):
 
     @property
     def centred(self) -> bool:
-        """Return True if a separable solver does better without the means of rows and columns."""
         plain, without = self.residuals
         return without < plain
 
@@ -230,7 +213,6 @@ class Plate(ByValue):
 
     @cached_property
     def amplitude(self) -> Plate:
-        """Return the plate of the roots of the transmissions, without phase."""
         return self if self.binary else replace(self, values=np.sqrt(self.values))
 
     @cached_property
@@ -239,18 +221,15 @@ class Plate(ByValue):
 
     @property
     def mirrored(self) -> tuple[bool, bool]:
-        """Return True for each axis along which the plate is its own mirror image."""
         even = self.lines_mm is None or np.array_equal(self.lines_mm, -self.lines_mm[::-1])
         return tuple(even and np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
 
     @cached_property
     def symmetric(self) -> bool:
-        """Return True if rows equal columns."""
         return np.array_equal(self.values, self.values.T)
 
     @property
     def uneven_part(self) -> float:
-        """Return the part that determines the whole by symmetry."""
         return float(0.5 ** (sum(self.mirrored) + self.symmetric))
 
     @property
@@ -281,7 +260,6 @@ class Plate(ByValue):
 
     @property
     def cover(self) -> int:
-        """Return the side, in features, of the smallest centred square that holds the mounted mask."""
         return int(np.ceil(self.flaws.reach(self.extent_mm) / self.feature_mm))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
@@ -328,7 +306,7 @@ def within(plate: Plate, reach_mm: float) -> Plate:
 def _distinct(
     values: FloatArray, lines: FloatArray | None = None
 ) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
-    """Return the distinct rows and columns of ``values``, weighted by their number and widths between uneven ``lines``.
+    """Return the distinct rows and columns of ``values``, weighted by number and by widths between uneven ``lines``.
 
     The result has the (N,) index of the distinct row and column of each, roots of their weights, (rows, 1) and
     (columns,),
@@ -350,13 +328,12 @@ def _distinct(
 class LargestTerms:
     """Terms of large ``values`` (N, N) that hold means over squares of ``averaged`` values per side up to 1e-4, rms.
 
-    With S the means along an axis, at most a third of a square apart, and U sigma W^T the singular vectors of S V S^T
-    that are kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T (Nystroem's approximation).
-    Vectors
-    come from a sketch in random directions (Halko, Martinsson and Tropp, SIAM Review 53, 217, 2011). ``sizes`` are
-    numbers
-    of terms that are tried in order. ``left_out`` is the rms part of the means, above 1e-4 where ``count`` is too
-    small.
+    With S the means along an axis, and U sigma W^T the largest singular vectors of S V S^T, the terms are
+    V S^T W sigma^-1 U^T S V (Nystroem's approximation). Vectors come from a sketch in random directions (Halko,
+    Martinsson
+    and Tropp, SIAM Review 53, 217, 2011). ``sizes`` are tried in order; ``left_out`` is the rms part of the means
+    that is
+    missing, above 1e-4 where ``count`` is too small.
     """
 
     def __init__(self, values: FloatArray, averaged: int = 1, sizes: Sequence[int] = _SKETCHES) -> None:
@@ -401,7 +378,6 @@ class LargestTerms:
 
 
 def _beyond_one(values: FloatArray, lines: FloatArray | None) -> float:
-    """Return the relative rms part of ``values`` that the best separable product leaves."""
     *_, weighted = _distinct(values, lines)
     total = np.linalg.norm(weighted)
     if not total:

@@ -36,7 +36,6 @@ class Spectrum(ByValue):
 
     @property
     def mean(self) -> Spectrum:
-        """Return all photons at their mean wavelength."""
         return Spectrum(np.array([np.sum(self.wavelengths_nm * self.weights)]), np.ones(1))
 
 
@@ -71,7 +70,6 @@ class Lines:
 
     @property
     def shining(self) -> Lines:
-        """Return the lines that have power, shortest first."""
         power: dict[float, float] = {}
         for wavelength, share in sorted(zip(self.wavelengths_nm, self.shares, strict=True)):
             if share > 0:
@@ -237,7 +235,6 @@ class ProjectorModel(Configuration):
 
     @property
     def black_level(self) -> float:
-        """Return the light of a black pixel, relative to a white one."""
         return 1 / self.contrast_ratio
 
     @property
@@ -268,7 +265,6 @@ class ProjectorModel(Configuration):
         return Lines(self.wavelengths_nm or (self.effective_wavelength_nm,), tuple(share / total for share in shares))
 
     def at(self, wavelength_nm: float) -> ProjectorModel:
-        """Return a projector of one line."""
         alone = {"wavelengths_nm": (wavelength_nm,), "radiant_shares": (1.0,), "effective_wavelength_nm": wavelength_nm}
         return self.model_copy(update=alone)
 
@@ -289,7 +285,6 @@ class ProjectorModel(Configuration):
 
     @property
     def spectrum(self) -> Spectrum:
-        """Return the photons at each line: power times wavelength."""
         wavelengths = np.array(self.lines.wavelengths_nm)
         photons = np.array(self.radiant_shares or (1.0,)) * wavelengths
         return Spectrum(wavelengths, photons / photons.sum())
@@ -322,17 +317,11 @@ Band = tuple[float, float]
 class Response(ByValue):
     """Response of a camera's pixels, or of those under filters of one colour, to light of each wavelength.
 
-    Attributes
-    ----------
-    counts
-        (k,) electrons a photon times the wavelength [nm], evenly over :data:`SPECTRA_NM`; outside ``range_nm`` with
-        the
-        efficiency of the end.
-    beyond_nm
-        For a curve beyond Mitsuba's spectra: integral of efficiency and wavelength beyond, over its value at the end
-        [nm].
-    planes
-        Numbers, row by row, of its pixels in each 2 x 2; all for a camera without a mosaic.
+    ``counts`` (k,) are electrons a photon times the wavelength [nm], evenly over :data:`SPECTRA_NM`; outside
+    ``range_nm`` with
+    the efficiency of the end. ``beyond_nm`` is the integral of efficiency and wavelength beyond Mitsuba's spectra,
+    over its
+    value at the end. ``planes`` are the numbers of its pixels in each 2 x 2.
     """
 
     counts: FloatArray
@@ -391,20 +380,13 @@ class Response(ByValue):
 
 @dataclass(frozen=True, eq=False)
 class CountedLamps(ByValue):
-    """A scene's lamps as its camera counts them.
+    """A scene's lamps as its camera counts them, in four ``bands`` [nm] of each response.
 
-    Attributes
-    ----------
-    responses
-        Responses of the pixels, one for each colour of filters.
-    bands
-        Separated wavelengths [nm], four of each response.
-    spectra, shares
-        Per band: wavelengths of diffraction, and (bands,) part of the counts.
-    unknown
-        Largest part of the light that would count if the efficiency did not end, and that is in no frame.
-    units
-        Wavelength [nm] and irradiance [W m^-2] for a count of 1, per line of the projector.
+    ``spectra`` are the wavelengths of diffraction, and ``shares`` the part of the counts, per band. ``unknown`` is
+    the largest
+    part of the light that would count if the efficiency did not end. ``units`` are wavelength [nm] and irradiance [W
+    m^-2] for
+    a count of 1, per line of the projector.
     """
 
     responses: tuple[Response, ...]
@@ -423,7 +405,6 @@ class CountedLamps(ByValue):
         return slice(response * MOST_LINES, (response + 1) * MOST_LINES)
 
     def units_of(self, lines: Lines) -> tuple[float, ...]:
-        """Return the irradiance [W m^-2] of each line for a count of 1."""
         known = dict(self.units)
         return tuple(known[wavelength] for wavelength in lines.wavelengths_nm)
 

@@ -245,7 +245,6 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def frame_shape(self) -> tuple[int, int] | None:
-        """Return rows and columns of superpixels; None for those of the scene's film."""
         if self.rows is None or self.columns is None:
             return None
         return self.rows // self.binning, self.columns // self.binning
@@ -282,13 +281,11 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def response_parts(self) -> tuple[float, float, float]:
-        """Return the relative standard deviations of a superpixel's response by pixel, row and column."""
         line = math.sqrt(self.binning)
         return self.prnu_pixel / self.binning, self.prnu_row / line, self.prnu_column / line
 
     @property
     def _readings(self) -> tuple[float, float]:
-        """Return the factors by which a superpixel has a pixel's own noise, and one that a row shares."""
         return (1.0, 1.0) if self.binning_on_chip else (float(self.binning), self.binning**1.5)
 
     @property
@@ -314,23 +311,19 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def superpixel_crosstalk(self) -> float:
-        """Return the part of a superpixel's even light that its neighbours get."""
         return self.crosstalk / self.binning
 
     @property
     def superpixel_row_noise_e(self) -> float:
-        """Return the standard deviation of the noise of a row of superpixels [electrons]."""
         return self.row_noise_e * self._readings[1]
 
     @property
     def superpixel_reading_noise_e(self) -> float:
-        """Return the standard deviation of a superpixel's reading with its row's noise [electrons]."""
         own = self.superpixel_read_noise_e
         return math.hypot(own, self.superpixel_row_noise_e) if self.row_noise_e else own
 
     @property
     def full_well_dn(self) -> float:
-        """Return the unrounded digital number of a full superpixel; inf without a full well."""
         full = self.superpixel_full_well_e
         bent = full * (1 + sum(self.linearity)) if self.linearity else full
         return bent * self.gain_dn_per_e + self.superpixel_black_level_dn
@@ -423,7 +416,6 @@ def sensor_table(path: Path | str) -> Table:
 
 
 def digital_of(sensor: SensorModel, exposure_s: float) -> Digital:
-    """Return the conversion of digital numbers of the binned ``sensor`` to electrons a second."""
     full = sensor.full_well_dn
     largest = math.inf if sensor.largest_dn is None else float(sensor.largest_dn)
     end = min(full if math.isinf(full) else float(math.floor(full)), largest)

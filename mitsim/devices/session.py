@@ -49,7 +49,6 @@ class BoardShape(Configuration):
 
     @property
     def words(self) -> str:
-        """Return the board in words, without parts that are zero."""
         parts = [] if self.size_mm is None else [f"{self.size_mm:g} mm a side"]
         parts += [f"bow {self.bow_mm:g} mm"] if self.bow_mm else []
         if self.tilt_row_deg or self.tilt_column_deg:
@@ -186,7 +185,6 @@ class Drift(Configuration):
 
     @property
     def mask_mm(self) -> tuple[float, float, float]:
-        """Return the motion of the mask along rows, columns and axis [mm]."""
         axis = self.mask_axis_um + self.gap_um_per_k * self.temperature_k
         return self.mask_rows_um / 1e3, self.mask_columns_um / 1e3, axis / 1e3
 
@@ -398,7 +396,7 @@ class Modelling:
 
         They are uniform light, then ever finer stripes (by their ``changes`` of sign), because a mask's fringes
         change the
-        deep shadows of coarse stripes least. ``pairs`` and ``repeats`` give the frames of a pattern.
+        deep shadows of coarse stripes least.
         """
         shots = max(self.frames // repeats, 2)
         most = shots // 2 if pairs else max(shots - 2, 1)
@@ -410,6 +408,5 @@ class Modelling:
 
 
 def frames_of(chosen: Sequence[tuple[Side, int]], pairs: bool, repeats: int) -> int:
-    """Return the number of frames of the ``chosen`` patterns."""
     sides = len({side for side, _ in chosen})
     return repeats * (2 * len(chosen) if pairs else len(chosen) + sides)

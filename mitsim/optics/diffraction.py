@@ -131,7 +131,6 @@ def edge_wave(x: FloatArray) -> ComplexArray:
 
 @cache
 def fast_length(least: int) -> int:
-    """Return the first number from ``least`` without prime factors above 11."""
     left, length = 0, least - 1
     while left != 1:
         length += 1
@@ -161,9 +160,7 @@ def wave_profiles(
 ) -> tuple[list[tuple[float, FloatArray]], float, float]:
     """Return (weight, (cells,) profile) of each term of a point source's shadow, and start and step [mm] of the grid.
 
-    The intensity is a function of the mask coordinate between ``low_mm`` and ``high_mm``, not yet averaged over
-    pixel and
-    cell. The tan-angle ``tau`` matters for thick masks.
+    The intensity is a function of the mask coordinate; ``tau`` matters for thick masks.
     """
     shadow = _of_fields(shadow)
     light = _Propagation.of(shadow, wavelength_nm)
@@ -182,12 +179,10 @@ def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
 
 
 def narrowest_mm(wavelength_nm: float) -> float:
-    """Return the least mean width [mm] of openings for which waves are computed."""
     return _NARROWEST * wavelength_nm * 1e-6
 
 
 def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
-    """Raise MitsimError if the openings are too narrow for scalar waves."""
     if mask.opening_mm < narrowest_mm(wavelength_nm):
         least = f"{wavelength_nm:.0f} nm needs {narrowest_mm(wavelength_nm):.3g}, half a wavelength"
         problem = f"mask: its openings are {mask.opening_mm:.3g} mm wide, and diffraction of {least}"

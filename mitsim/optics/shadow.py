@@ -1,22 +1,22 @@
 """Geometric shadow of a mask: mean transmissions from sensor pixels and directions, as separable terms.
 
 The ray from sensor coordinate u toward tau = x/z, which meets the scene at depth z, crosses the mask plane (distance
-d) at s = u (1 - d/z) + d tau. The mean over a pixel and a cell is the profile weighted by a trapezoid, the
-convolution
-of two boxes. Its integral over each feature is a difference of a piecewise quadratic function, so that the mean is
-exact. (A second cumulative sum of the profile would cancel in float64.) Profiles with uneven or blurred features are
-handled by :mod:`mitsim.optics.edge_profile`.
+d) at s = u (1 - d/z) + d tau. The mean over a pixel and a cell is the profile weighted by a trapezoid. Its integral
+over
+each feature is a difference of a piecewise quadratic function, so that the mean is exact. (A second cumulative sum of
+the profile would cancel in float64.)
 
-The entrance face of a thick mask is ``thickness`` further from the sensor than the exit. For a point source at
-(tau z, z), a ray that leaves through s entered at::
+The entrance face of a thick mask is ``thickness`` further from the sensor. For a point source at (tau z, z), a ray
+that
+leaves through s entered at::
 
     s' = s (1 - thickness / (z - d)) + thickness tau / (1 - d/z)
 
 Therefore each direction has its own clear profile M(s) M(s') on the exit face. A cell takes that of its centre.
 
 A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. A mask that is
-tilted along the axis, at distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t),
-times sqrt(1 + a^2) along it. All coordinates are centred index coordinates in mm.
+tilted, at distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t), times
+sqrt(1 + a^2). All coordinates are centred index coordinates in mm.
 """
 
 from __future__ import annotations
@@ -55,7 +55,6 @@ class Directions(ByValue):
 
     @classmethod
     def cells(cls, edges: npt.ArrayLike) -> Directions:
-        """Return the equal cells between ``edges`` (c + 1,)."""
         array = np.asarray(edges, dtype=np.float64)
         width = float(array[-1] - array[0]) / (len(array) - 1)
         return cls((array[:-1] + array[1:]) / 2, width)
@@ -63,22 +62,12 @@ class Directions(ByValue):
 
 @dataclass(frozen=True, eq=False)
 class ShadowGeometry:
-    """Sensor, mask and depth of one shadow; raises MitsimError for a depth that is not beyond the mask.
+    """Sensor, mask and depth of one shadow [mm]; raises MitsimError for a depth that is not beyond the mask.
 
-    Attributes
-    ----------
-    pixel_centres_mm, columns_mm
-        (m,) sensor coordinates; those of columns if they differ from those of rows.
-    active_mm
-        Length of the active part of a pixel, over which the shadow is averaged.
-    distance_mm, thickness_mm
-        Distance from the sensor to the exit face, d, and thickness of the mask.
-    depth_mm
-        Distance from the sensor to the scene, z; ``inf`` is allowed.
-    offset_mm
-        (row, column) of the mask's centre.
-    tilt
-        For rows and columns: growth of the mask's distance with the coordinate, and its excess at the centre [mm].
+    ``pixel_centres_mm`` (m,) serve both axes without ``columns_mm``. ``distance_mm`` is that to the exit face, d, and
+    ``depth_mm`` that to the scene, z, which may be ``inf``. ``tilt`` has, for rows and columns, the growth of the
+    mask's
+    distance with the coordinate, and its excess at the centre.
     """
 
     mask: Mask | Plate
@@ -150,7 +139,6 @@ class ShadowGeometry:
         return [a * b for a in weights for b in weights] if self.thickness_mm else weights
 
     def clear(self, profiles: Sequence[FloatArray], tau: float) -> list[Steps]:
-        """Return the part of ``profiles`` that both faces leave clear toward ``tau``."""
         faces = [Steps.between(profile, self.mask.lines, self.mask.blur_mm) for profile in profiles]
         if not self.thickness_mm:
             return faces

@@ -53,23 +53,13 @@ def shadow_terms(
     spectrum: Spectrum | None = None,
     places: Places | None = None,
 ) -> SeparableTerms:
-    """Return the shadow of directions at one depth as separable terms [(left (m, r), right (m', c)), ...].
+    """Return the shadow of directions at one depth [mm] as separable terms [(left (m, r), right (m', c)), ...].
 
     Each value is the mean over a pixel's active area times the fill factor, because irradiance is per pixel area. The
-    angular response belongs to the light and is not included.
-
-    Parameters
-    ----------
-    geometry
-        The camera.
-    rows, columns
-        Directions along the two axes, r and c of them.
-    depth
-        Distance of the scene [mm].
-    spectrum
-        Lines of a wave-optical shadow, each with its own terms; None for a geometric shadow.
-    places
-        Increasing rows and columns of the frame; None for all.
+    angular response belongs to the light and is not included. ``spectrum`` has the lines of a wave-optical shadow,
+    each with
+    its own terms, and is None for a geometric one. ``places`` are increasing rows and columns of the frame; None for
+    all.
     """
     shadow, waves = ShadowGeometry.of(geometry, depth, places), spectrum is not None
     if geometry.is_drawn(waves):
@@ -271,7 +261,6 @@ def relative_difference(terms: SeparableTerms, reference: SeparableTerms) -> flo
 
 
 def centre_terms(terms: SeparableTerms) -> SeparableTerms:
-    """Return the ``terms`` of frames without means of rows and columns."""
     return [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
 
 
@@ -301,11 +290,11 @@ _KEPT = 12
 class Placement:
     """Positions of mask and projector, and brightness of the board.
 
-    ``mask_distance`` and the shifts of the mask's centre beyond the camera's own offset are in mm. ``mask_rotation``
-    runs
-    from rows toward columns [rad]. ``magnification`` scales the projector's window, whose shift is a tangent.
-    ``gain`` is
-    in electrons per second that a projector pixel makes on a sensor pixel without the mask.
+    Shifts and distance of the mask are in mm, and ``mask_rotation`` runs from rows toward columns [rad].
+    ``magnification``
+    scales the projector's window, whose shift is a tangent. ``gain`` is in electrons per second from a projector
+    pixel on a
+    sensor pixel without the mask.
     """
 
     mask_distance: float

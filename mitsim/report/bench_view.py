@@ -64,7 +64,6 @@ _SMALL_GAP: dict[str, Any] = {"textcoords": "offset points"}
 
 
 def view(bench: Apparatus) -> BenchView:
-    """Lay out a ``bench`` and render its previews."""
     layout = layout_of(bench)
     return BenchView(bench, layout, previews(bench, layout))
 
@@ -81,7 +80,6 @@ class BenchView:
 
     @cached_property
     def facts(self) -> dict[str, str]:
-        """Distances and sizes in words, by name."""
         bench, layout, geometry = self.bench, self.layout, self.bench.geometry
         height, width = self._window_mm
         aligned, n = geometry.scene_distance, bench.n
@@ -128,7 +126,6 @@ class BenchView:
         return self.layout.obstacles
 
     def summary(self) -> dict[str, Any]:
-        """Return the JSON of the command line without the file's name."""
         layout, geometry = self.layout, self.bench.geometry
         surfaces = [
             {
@@ -170,7 +167,6 @@ class BenchView:
     # ---- As a drawing ----
 
     def figure(self) -> Figure:
-        """Draw the plans from above and from the side, the camera enlarged, both previews, and the facts."""
         with rc_context(_STYLE):
             figure = Figure(figsize=(13, 8.6), layout="constrained")
             FigureCanvasAgg(figure)
@@ -186,7 +182,6 @@ class BenchView:
 
     @property
     def _parts(self) -> list[tuple[str, tuple[float, float], Callable[[Axes], None]]]:
-        """Return name and size [inches] of each part, and the function that draws it."""
         seen = "From the camera, without its mask"
         return [
             ("From above", _PLAN_INCHES, lambda axes: self._plan(axes, 0)),
@@ -203,12 +198,10 @@ class BenchView:
 
     @cached_property
     def _end(self) -> float:
-        """Return the depth [mm] to which light is drawn."""
         return max(self.bench.geometry.scene_distance, self.layout.depths[1] if self.layout.depths else 0.0)
 
     @cached_property
     def _range(self) -> tuple[float, float]:
-        """Return the ends [mm] of both plans across z."""
         layout, reach = self.layout, self.bench.geometry.tan_half_fov * self._end
         lit = np.concatenate([[-reach, reach], layout.projector[:2], layout.window_at(self._end)[:, :2].ravel()])
         seen = [each.points[each.points[:, 2] < _BEHIND * self._end][:, :2].ravel() for each in layout.surfaces]
@@ -216,7 +209,6 @@ class BenchView:
         return max(float(every.min()), float(lit.min()) - room), min(float(every.max()), float(lit.max()) + room)
 
     def _has_room(self, points: FloatArray) -> bool:
-        """Return True if the plans show a part of the box around ``points`` (k, 3)."""
         (low, high), z = self._range, points[:, 2]
         inside = (points[:, :2].max(axis=0) >= low) & (points[:, :2].min(axis=0) <= high)
         return bool(inside.all() and z.min() <= _BEHIND * self._end and z.max() >= min(0.0, self.layout.projector[2]))
@@ -311,7 +303,6 @@ class BenchView:
     # ---- As a model that can be turned ----
 
     def model(self) -> Model:
-        """Build a figure of plotly."""
         from plotly import graph_objects
 
         layout, geometry, end = self.layout, self.bench.geometry, self._end

@@ -25,20 +25,11 @@ from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE
 class ColourImage:
     """Images of a scene at spectral lines, their colours, and how well both are known.
 
-    Attributes
-    ----------
-    images : (n, n', lines) array
-        Reflectances, 1 = the calibration's board, whose own reflectance is ``board``.
-    truth : (n, n', lines) array
-        Perfect images of the lines, relative to the board; None for a real camera.
-    chart
-        Place of a colour chart on which colours are fitted; MitsimError if it lies outside.
-    facts
-        How the images were found, in words.
-    solution, of_lines
-        Numbers of one solve for all lines, or of each line's, by the keys of the JSON.
-    inputs
-        Source of one solve for all lines: an image of other inputs is not replaced.
+    ``images`` and ``truth`` (n, n', lines) are reflectances relative to the calibration's ``board``. Colours are
+    fitted on a
+    ``chart``; MitsimError if it lies outside. ``solution`` and ``of_lines`` are numbers of one solve for all lines,
+    or of each
+    line's, by the keys of the JSON. An image of other ``inputs`` is not replaced.
     """
 
     lines: ColourManifest
@@ -145,7 +136,6 @@ class ColourImage:
         return rows
 
     def summary(self) -> dict[str, Any]:
-        """Return all but the pictures, by the keys of the command line's JSON."""
         channels = [
             {**line.model_dump(), **summary_of(self.qualities[line.name]), **self.of_lines.get(line.name, {})}
             for line in self.lines.channels

@@ -78,11 +78,9 @@ class Trust:
 
     @property
     def within(self) -> float:
-        """Return the part of the pixels whose truth lies in their 95 % interval."""
         return float(np.mean(self.error <= COVERED * self.uncertainty))
 
     def pictures(self) -> tuple[Picture, Picture]:
-        """Draw stated uncertainty and actual error on one scale."""
         largest = max(float(self.uncertainty.max()), float(np.percentile(self.error, _SHOWN_PERCENT)))
         scale = Scale(0.0, largest, "of the board's reflectance")
         stated, actual = (f"rms {reflectance(value)}" for value in (self.stated, self.actual))
@@ -260,5 +258,4 @@ def _finite(image: npt.ArrayLike, name: str) -> FloatArray:
 
 
 def _trouble(status: str) -> str:
-    """Return the first part of the solver's sentence, "" if solved."""
     return "" if status.startswith("Solved: ") else sentence(re.split(r"; |\. ", status)[0])

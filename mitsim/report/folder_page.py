@@ -142,7 +142,6 @@ def _write(folder: Path, shown: Shown) -> None:
 
 
 def _content(folder: Path) -> Shown:
-    """Collect what the page shows, by the kind of the folder's files."""
     lines = open_lines(folder, RUN, MOSAIC, CALIBRATION, IMAGE)
     if lines.colours and lines.colours.kind == IMAGE:
         return _of_colours(lines)
@@ -168,7 +167,6 @@ def _content(folder: Path) -> Shown:
 
 
 def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> Shown:
-    """Show a folder of several, one for each value of an ``axis``."""
     parts = {name: _content(folder / name) for name in names}
     first, *_, last = *parts.values(), *parts.values()
     return Shown(
@@ -186,7 +184,6 @@ def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> 
 
 
 def _of_run(lines: SpectralFolder) -> Shown:
-    """Show the frames of a run on one scale from the black level, and its truth."""
     shots = load_run(lines.folder)
     manifest, taken, black = shots.manifest, shots.manifest.patterns, np.float64(shots.manifest.digital.black_level_dn)
     accuracy = (manifest.plan or {}).get("accuracy")
@@ -194,7 +191,6 @@ def _of_run(lines: SpectralFolder) -> Shown:
     error, count = manifest.total_error_bound, len(taken.captures)
 
     def frame(name: str) -> FloatArray:
-        """Read a frame less the black level [DN]."""
         return np.asarray(shots.read(name)[0]["DN"] - black)
 
     first, columns = frame(taken.captures[0].file), max(count // shots.patterns[0].shape[1], 1)
@@ -254,7 +250,6 @@ def _of_calibration(folder: Path) -> Shown:
 
 
 def _tables(manifest: Any, folder: Path, known: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
-    """Return the tables of runs and calibrations; ``known`` are the first numbers."""
     files = [path for path in folder.iterdir() if path.is_file() and path.name != PAGE]
     sizes = f"{len(files)}, {size_text(sum(path.stat().st_size for path in files))}"
     numbers = {key: value for key, value in manifest.model_dump().items() if key not in _ELSEWHERE}
@@ -275,7 +270,6 @@ def _numbers(data: Any) -> dict[str, float]:
 
 
 def _of_image(folder: Path) -> Shown:
-    """Show an image with its truth, error, uncertainty, depth and misfit."""
     result = read_result(folder)
     image = finite_channel(read_frame(folder / IMAGE_FILE)[0], "reflectance", folder / IMAGE_FILE)
     quality, similar, warnings = result.get("psnr"), result.get("ssim"), result.get("warnings") or ()

@@ -64,7 +64,6 @@ class LitScene:
 
     @property
     def truth(self) -> FloatArray:
-        """(n, n) apparent reflectance."""
         return self.light.truth
 
     def quality(self, image: FloatArray) -> Quality:
@@ -84,7 +83,6 @@ class LitScene:
         return camera.frames(family, self.truth * self.board_flux, plane)
 
     def rendered_frames(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
-        """Return rendered frames with calibrated ``factors``."""
         sides = factors.left, factors.right
         return Unexposed(self, RENDERED, family, sides, factors.manifest.centre, seed)
 
@@ -106,7 +104,7 @@ class LitScene:
 
     @property
     def board_flux(self) -> float:
-        """Return the irradiance by a pixel of a white board on the sensor without the mask [W m^-2]."""
+        """Return the irradiance by a pixel of a white board without the mask [W m^-2]."""
         return float(self.light.apparent.board_flux.mean())
 
 
@@ -132,7 +130,6 @@ class Unexposed:
         return self.lit.expected_frames(self.model, self.family, self.plane)
 
     def seconds(self, exposure: str) -> float:
-        """Return the exposure time [s] of a frame by a convention."""
         if exposure in (EQUAL_PEAK, DIM):
             peak_e = Exposure().fraction * self.lit.bench.sensor.superpixel_full_well_e
             return peak_time(self.lit.bench, self.expected) * (DIM_E / peak_e if exposure == DIM else 1.0)
@@ -165,7 +162,6 @@ class Unexposed:
 
     @single_threaded_blas()
     def clear(self, lam: float) -> FloatArray:
-        """Solve the frames without noise."""
         model, exposer, expected = self.prepare(), self.exposer(1.0), self.expected
         off = exposer.electrons(expected.projector_off) if takes_ambient_frame("auto", self.family, expected) else 0.0
         sums, positive = model.accumulator(), np.zeros(())
@@ -182,7 +178,6 @@ class Unexposed:
         return Exposer(self.lit.bench.devices, seconds, self.seed, speckle)
 
     def noise(self, seconds: float) -> float:
-        """Return the standard deviation of a datum [electrons/s], rms over all frames."""
         return float(np.sqrt(sum(self.noises(seconds).values())))
 
     def noises(self, seconds: float) -> dict[str, float]:
@@ -205,7 +200,6 @@ class Unexposed:
 
 
 def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
-    """Return the exposure time [s] that fills the default part of the full well."""
     return Exposure().choose(bench.devices, peak_irradiance(expected))
 
 
@@ -259,12 +253,10 @@ class IdealCamera:
 
     @property
     def centre(self) -> bool:
-        """Return True if a solver subtracts row and column means."""
         return self._geometry.centred
 
     @cached_property
     def terms(self) -> SeparableTerms:
-        """Return the operator of projector pixels that shine evenly."""
         return self._terms(*self.directions)
 
     def points(self) -> SeparableTerms:
@@ -274,7 +266,6 @@ class IdealCamera:
 
     @cached_property
     def factors(self) -> Pair:
-        """Return the (pixels, n) factors of the nearest separable operator."""
         best = best_term(centre_terms(self.terms) if self.centre else self.terms)
         return best.left, best.right
 
@@ -317,7 +308,6 @@ class IdealCamera:
 
 
 def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
-    """Return the compared lights by name; None is light without diffraction."""
     edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
     return {
         GEOMETRIC: None,
@@ -330,11 +320,10 @@ def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
 def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> dict[str, str | int | float]:
     """Return relative rms differences of a mask in one ``light`` from its geometric shadow, among ``systems`` by light.
 
-    ``point_source`` and ``scene_pixel`` are differences of operators, for points and averaged over projector pixels,
-    and
-    ``factor`` that of a solver's factor. ``separability`` is the remainder of the operator without its best
-    separable term,
-    ``separability_centred`` the same after row and column means are subtracted.
+    ``point_source`` and ``scene_pixel`` compare operators, for points and averaged over projector pixels; ``factor``
+    compares
+    a solver's factors. ``separability`` is the remainder of the operator without its best separable term,
+    ``separability_centred`` the same without row and column means.
     """
     system, geometric = systems[light], systems[GEOMETRIC]
     factor, assumed = system.factors[0], geometric.factors[0]

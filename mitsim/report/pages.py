@@ -90,7 +90,6 @@ def round_to_error(value: float, error: float) -> str:
 
 
 def reflectance(value: float) -> str:
-    """Print an error in reflectance in four places."""
     return f"{value:.4f}" if value >= 1e-3 else scientific(value)
 
 
@@ -148,7 +147,6 @@ def stages_of(seconds: Mapping[str, float]) -> dict[str, float]:
 
 
 def total_of(seconds: Mapping[str, float]) -> float:
-    """Return the total of ``seconds``, stated or added up."""
     return seconds.get("total", math.fsum(seconds.values()))
 
 
@@ -199,12 +197,10 @@ class Scale:
         return cls(float(np.min(values)) if black is None else black, float(np.max(values)), unit)
 
     def levels(self, values: npt.NDArray[Any]) -> FloatArray:
-        """Return ``values`` with black at 0 and white at 1; all black if both are equal."""
         span = self.white - self.black
         return (np.asarray(values, dtype=np.float64) - self.black) / (span if span > 0 else np.inf)
 
     def words(self, values: npt.NDArray[Any]) -> str:
-        """State both ends, and the part of the ``values`` beyond them."""
         beyond = float(np.mean((values < self.black) | (values > self.white)))
         cut = f"; {beyond:.2g} of the pixels lie beyond" if beyond else ""
         black, white = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (self.black, self.white))
@@ -228,7 +224,6 @@ class Picture:
     def of(
         cls, name: str, title: str, values: npt.NDArray[Any], scale: Scale, about: str = "", wide: bool = False
     ) -> Picture:
-        """Draw numbers (rows, columns), enlarged or reduced by whole factors."""
         words = scale.words(values)
         caption = f"{about}: {words}" if about else words
         return cls(name, title, caption, png(scale.levels(values), LARGEST, SMALLEST), wide)
@@ -238,7 +233,6 @@ class Picture:
         return data_uri(self.data)
 
     def write(self, folder: Path) -> Path:
-        """Write the PNG to a ``folder``, whole or not at all."""
         path = folder / f"{self.name}.png"
         write_bytes(path, self.data)
         return path

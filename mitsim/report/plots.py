@@ -80,7 +80,6 @@ def curves(
     """
 
     def points(curve: Curve) -> FloatArray:
-        """Return (points, 3) numbers, finite means and standard errors, sorted."""
         found = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
         rows = np.array(found, dtype=np.float64).reshape(-1, 3)
         return rows[np.isfinite(rows[:, :2]).all(axis=1)]
@@ -124,7 +123,6 @@ def spans_decades(values: Iterable[float]) -> bool:
 
 
 def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
-    """Set ticks at ascending ``numbers`` whose labels do not overlap."""
     logarithmic = axes.get_xscale() == "log"
     places = np.log(numbers) if logarithmic else np.asarray(numbers, dtype=np.float64)
     inches = (places - places[0]) / np.ptp(places) * (COLUMN - 1.2)
@@ -259,7 +257,6 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 
 
 def _rows_height(names: Iterable[str]) -> float:
-    """Return the height [inches] of rows of bars."""
     lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in names]
     return ROW * len(lines) * (1 + 0.6 * (max(lines, default=1) - 1))
 
@@ -273,7 +270,6 @@ def line_style(index: int) -> dict[str, Any]:
 
 
 def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both") -> None:
-    """Set names of the axes with units, and a grid behind the data."""
     if x:
         axes.set_xlabel(x, fontsize=FONT)
     if y:
@@ -283,7 +279,6 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
 
 
 def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
-    """Draw a legend below a figure, in as many columns as fit its width."""
     names = list(labels)
     if not names:
         return
@@ -332,7 +327,6 @@ def panels_of(
     layout: Literal["constrained", "compressed"] = "constrained",
     **shared: Any,
 ) -> tuple[Figure, Any]:
-    """Return an empty figure with (rows, columns) axes."""
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     places: Any = figure.subplots(rows, columns, squeeze=False, **shared)
@@ -370,7 +364,6 @@ def draw_shot(
 
 
 def draw_sensed(sensed: Sensed, ax: Axes | None = None) -> Axes:
-    """Draw the digital numbers of a ``sensed`` frame."""
     title = f"{sensed.sensor.name}, exposure {sensed.exposure_s:.3g} s"
     return _draw(ax, sensed.digital, title, "digital number [DN]")
 
@@ -383,7 +376,6 @@ def draw_rendered(rendered: Rendered, ax: Axes | None = None) -> Axes:
 
 
 def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
-    """Draw the factor of a camera's rows (``left``) or columns (``right``)."""
     line = "row" if side == "left" else "column"
     title = f"{side.capitalize()} factor, of {line}s"
     axes = _draw(ax, getattr(factors, side), title, r"entry [$\sqrt{\mathrm{e^-/s}}$]")
@@ -409,7 +401,6 @@ def draw_image(
 
 
 def draw_plan(plan: Plan, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
-    """Draw the relative error that each effect would leave if it were off, or the predicted seconds."""
     if quantity == "error":
         errors = {f"{row.name} ({row.state})": row.error_if_off for row in plan.effects if row.error_if_off is not None}
         axes = _axes(ax, 0.7 + 0.36 * len(errors))

@@ -70,7 +70,6 @@ class Judged:
     truth: FloatArray | None = None
 
     def summary(self) -> dict[str, Any]:
-        """Return all but the images, by the keys of the JSON."""
         return {**summary_of(self.quality), **self.reconstruction.summary(), "output": self.output}
 
 
@@ -138,7 +137,6 @@ def reconstruct_psf(
 
 
 def _origin(job: Job | None, run: Path | str, calibration: Path | str | None = None) -> dict[str, Any]:
-    """Return entries of result.json for the command and the folders."""
     folders = {"run": run, "calibration": calibration}
     made_of = {name: str(Path(folder).absolute()) for name, folder in folders.items() if folder is not None}
     return {"command": job and job.command, MADE_OF: made_of}
@@ -213,7 +211,6 @@ class _Work(NamedTuple):
     job: Job
 
     def finish(self, folder: Path, **found: Any) -> ColourImage:
-        """Combine the images of all lines to one in colour, and write it."""
         known: dict[str, Any] = {
             "lines": self.lines,
             "board": self.board or 1.0,
@@ -226,7 +223,6 @@ class _Work(NamedTuple):
 
 
 def _solve_one_by_one(work: _Work, **options: Any) -> ColourImage:
-    """Solve each line of a run in a folder of its own, and write the image in colour."""
     lines, run, calibration, output, _, _, overwrite, job = work
     replaces = is_coloured(output) and (read_colours(output, IMAGE).names == lines.names or overwrite)
     with output_folder(output, overwrite=replaces) as folder:
@@ -266,7 +262,6 @@ def _solve_one_by_one(work: _Work, **options: Any) -> ColourImage:
 
 @single_threaded_blas()
 def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> ColourImage:
-    """Solve all lines from frames behind colour filters, and write the image in colour."""
     lines, run, calibration, output, board, _, overwrite, job = work
     check_joint(lam)
     check_way(way)
@@ -451,7 +446,6 @@ class Solver:
         self._sums = [model.accumulator() for model in self._models]
 
     def add(self, frame: FloatArray, row: int, column: int) -> None:
-        """Add the (m, m') ``frame`` [electrons/s] of pattern (``row``, ``column``)."""
         if self._joint:
             self._gathered += self._joint.gather(frame, row, column)
         if self._mosaic:

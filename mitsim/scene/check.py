@@ -51,24 +51,13 @@ _Type = mi.Properties.Type
 
 @dataclass(frozen=True)
 class CheckedScene:
-    """A scene of which Mitsuba may make objects.
+    """A scene of which Mitsuba may make objects, its files (the scene first), and allowed ranges ``limits`` by name.
 
-    Attributes
-    ----------
-    files
-        Files that it reads, the scene first.
-    limits
-        Allowed ranges of bitmaps and mesh attributes by name.
-    unfit
-        Estimators that must refuse the scene.
-    shapes, small_lamps
-        Tags of shapes, and of lamps that no path can hit, in order.
-    coloured, parting
-        Tags of objects that may depend on wavelength, and of dispersive glass.
-    own
-        Paths of files that a user names and mitsim prepares, with their parameters.
-    unread
-        Names of materials that meshes refer to, by path of the mesh.
+    ``shapes``, ``small_lamps`` (which no path can hit), ``coloured`` (may depend on wavelength) and ``parting``
+    (dispersive
+    glass) are tags in order. ``own`` are files that a user names and mitsim prepares. ``unread`` are names of
+    materials that
+    meshes refer to. ``unfit`` has the estimators that must refuse the scene.
     """
 
     outline: Outline

@@ -38,7 +38,6 @@ class Range:
     hint: str = ""
 
     def check(self, tag: Tag, name: str, numbers: Iterable[float]) -> None:
-        """Raise MitsimError for the first number that is not allowed."""
         for number in numbers:
             if not np.isfinite(number):
                 raise tag.refusal(name, number, "give a finite number")
@@ -148,13 +147,11 @@ _LACKED = {
 
 
 def references(props: mi.Properties) -> list[int]:
-    """Return the indices of the nodes to which ``props`` refer."""
     resolved = mi.Properties.Type.ResolvedReference
     return [props[name].index() for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118 - no dict
 
 
 def check_plugin(tag: Tag, plugin: str) -> None:
-    """Raise MitsimError if a ``plugin`` is not allowed."""
     allowed = PLUGINS.get(tag.name, "scene").split()
     if plugin not in allowed or (tag.name == "scene" and "version" not in tag.attributes):
         raise tag.refusal(
@@ -215,7 +212,6 @@ class Unfit:
 
     @classmethod
     def of(cls, outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
-        """Determine the reasons from the ``nodes`` of a scene, the root first."""
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         factored = _unfit_for_factored(outline, tree)

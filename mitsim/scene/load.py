@@ -38,14 +38,12 @@ _FLAT, _TURNED = ("Rectangle", "Disk"), 1e-6
 
 @dataclass(frozen=True)
 class LoadedScene:
-    """A scene ready for transport.
+    """A scene ready for transport; ``projector`` and ``grid`` are None only for ``render``.
 
     Attributes
     ----------
     files
         All files that Mitsuba read, the scene first.
-    camera, projector, grid
-        Mitsuba sensor (with ``geometry``), emitter and projector pixels; the last two are None only for ``render``.
     mirrors, glossy
         True if a surface reflects or refracts into single directions, or into lobes.
     shapes
@@ -59,7 +57,7 @@ class LoadedScene:
     one_way
         True if no surface sees another.
     sensor_note
-        Difference between the sensor of a camera file and the scene's; None if the scene's is used.
+        Difference between the sensor of a camera file and the scene's.
     in_view
         True if a projector shines directly on the sensor; such light is traced like that of mirrors.
     """
@@ -87,7 +85,6 @@ class LoadedScene:
 
     @property
     def pixels(self) -> ProjectorGrid:
-        """Return the projector's grid; raise MitsimError if there is none."""
         if self.grid:
             return self.grid
         found = [emitter for emitter in self.scene.emitters() if emitter.class_name() == "Projector"]
@@ -97,7 +94,6 @@ class LoadedScene:
 
     @cached_property
     def hairy(self) -> bool:
-        """Return True if a surface outside instances is hair."""
         return any(shape.bsdf() and holds_hair(shape.bsdf().flags()) for shape in self.scene.shapes())
 
     @cached_property

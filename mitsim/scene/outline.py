@@ -98,7 +98,6 @@ class Outline:
             raise MitsimError(f"{path}: {len(unknown)} parameters are unknown; it knows {known}:", *unknown)
 
     def tag(self, node: mi.parser.SceneNode, name: str = "") -> Tag:
-        """Return the tag of an object, or of its property ``name``."""
         key = node.file_index, node.offset
         return self._tags.get((*key, name)) or self._tags[(*key, "")]
 
@@ -246,7 +245,6 @@ def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the last sentence of an ``error`` of Mitsuba."""
     text = re.sub(r"\x1b\[[0-9;]*m|\[\w+\.cpp:\d+\] ", "", str(error))
     lines = [re.sub(r"\s+", " ", line).strip(" -*│╰╭─") for line in text.splitlines()]
     lines = [re.sub(r"^\d{4}-\d\d-\d\d [\d:]+ \w+ +\w* *\[[^\]]*\] *", "", line) for line in lines if line]

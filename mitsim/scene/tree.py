@@ -281,7 +281,6 @@ def prism(props: mi.Properties) -> Mesh:
 
 
 def ball(props: mi.Properties) -> Mesh:
-    """Return the mesh of a sphere in the world, of equal area."""
     v, u = np.meshgrid(np.linspace(0, 1, _RINGS + 1), np.linspace(0, 1, 2 * _RINGS + 1), indexing="ij")
     sine = np.sin(np.pi * v)
     normal = np.stack([sine * np.cos(2 * np.pi * u), sine * np.sin(2 * np.pi * u), np.cos(np.pi * v)], axis=-1)

@@ -32,20 +32,13 @@ _Place = tuple[int, float, float, tuple[int, int]]
 
 @dataclass(frozen=True)
 class ProjectorGrid:
-    """A window of n x n projector pixels in a canvas, and its position on the camera's aligned plane.
+    """A window of n x n projector pixels in a canvas (rows, columns), and its position on the camera's aligned plane.
 
-    Attributes
-    ----------
-    first_row, first_column
-        Canvas texel of the window's pixel (0, 0); fractional for a drifted picture.
-    canvas
-        (rows, columns) of the whole texture.
-    row_tan, column_tan
-        (first edge, last edge) of the window's bounding box as tan-angles y/z and x/z in index coordinates, on the
-        aligned
-        plane.
-    keystone
-        Largest deviation of the corners from that box in projector pixels; 0 for a shifted lens.
+    ``first_row`` and ``first_column`` are the texel of pixel (0, 0), fractional for a drifted picture. ``row_tan``
+    and
+    ``column_tan`` are (first edge, last edge) of the window's bounding box as tan-angles in index coordinates.
+    ``keystone`` is
+    the largest deviation of the corners from that box in projector pixels.
     """
 
     n: int
