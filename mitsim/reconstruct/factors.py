@@ -427,6 +427,7 @@ class Factors:
     @classmethod
     @check_arguments
     def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[SeparableTerm] = ()) -> Factors:
+        """Return the factors of an ``estimate`` with the ``manifest`` of its camera, and the terms that they lack."""
         left, right = _single(estimate.left), _single(estimate.right)
         own, other = (
             float(error * float(np.linalg.norm(side)) / np.sqrt(side.size))
@@ -456,16 +457,19 @@ class Factors:
 
     @property
     def sides(self) -> tuple[FloatArray, FloatArray]:
+        """Both factors, centred if frames are."""
         if not self.manifest.centre:
             return self.left, self.right
         return centre_columns(self.left), centre_columns(self.right)
 
     @property
     def ok(self) -> bool:
+        """Whether the status is good and there are no warnings."""
         return self.status.ok and not self.warnings
 
     @property
     def warnings(self) -> tuple[str, ...]:
+        """Warnings of the calibration."""
         return self.manifest.warnings
 
     @cached_property
@@ -482,6 +486,7 @@ class Factors:
 
     @check_arguments
     def write(self, folder: Path | str) -> Path:
+        """Write the files to a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         folder = Path(folder)
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
         if self.manifest.board_reflectance is not None:

@@ -129,6 +129,7 @@ class Reconstruction(Solution):
         return tuple(f"Not decided: {limit['words']}" for limit in self.misfit.limits) if self.misfit else ()
 
     def summary(self) -> dict[str, Any]:
+        """Return the entries of result.json."""
         return {
             "lambda": self.lam,
             "rank": self.rank,
@@ -180,6 +181,7 @@ class Reconstruction(Solution):
 
     @check_arguments
     def write(self, folder: Path | str, more: Mapping[str, Any] | None = None) -> Path:
+        """Write the files to a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         _check_stored(more)
         folder = Path(folder)
         remove_page(folder)

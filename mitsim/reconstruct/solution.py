@@ -51,6 +51,7 @@ class Status:
 
     @property
     def ok(self) -> bool:
+        """Whether the verdict is good and nothing was flagged before."""
         return self.verdict.good and not self.flags
 
     def __str__(self) -> str:
@@ -91,4 +92,5 @@ class Solution:
 
     @property
     def ok(self) -> bool:
+        """Whether the image can be used without a correction."""
         return self.status.ok
