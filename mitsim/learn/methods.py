@@ -220,8 +220,6 @@ _LEAST_ERROR = 1e-5
 
 
 class Method(nn.Module):
-    """Common part of the methods: the first image and the loss."""
-
     PASSES, WIDTH = 1, 24
     reads_frames, holds_camera = False, False
 
@@ -263,7 +261,7 @@ class Refined(Method):
 class FlatNet(Refined):
     """A trainable matrix on either side of least squares, and a U-Net after them, trained together.
 
-    This is FlatNet for separable cameras (Khan et al., arXiv 2010.15440), whose inverse begins at the factors' own.
+    This is FlatNet for separable cameras (Khan et al., arXiv 2010.15440).
     """
 
     holds_camera = True
@@ -304,7 +302,7 @@ class Unrolled(Method):
 class PlugAndPlay(Method):
     """A denoiser that learned from pictures alone, in the same splitting.
 
-    No frame teaches it, so it serves any camera (Zhang et al., arXiv 2008.13751).
+    The method is that of Zhang et al. (arXiv 2008.13751).
     """
 
     STEPS = 8
@@ -337,8 +335,6 @@ class PlugAndPlay(Method):
 
 
 class Denoiser(nn.Module):
-    """Denoiser of a plug-and-play network with the interface of `deepinv.models.Denoiser`."""
-
     def __init__(self, network: PlugAndPlay) -> None:
         super().__init__()
         self.network = network
@@ -351,8 +347,7 @@ class Denoiser(nn.Module):
 class Preprocessed(Refined):
     """A network on every frame, least squares of its output, and a U-Net after that.
 
-    This is modular reconstruction (Bezzam et al., arXiv 2502.01102). The network sees binned frames, and its change is
-    even over a bin.
+    This is modular reconstruction (Bezzam et al., arXiv 2502.01102); the network sees binned frames.
     """
 
     reads_frames, holds_camera = True, True

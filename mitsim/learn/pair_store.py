@@ -52,8 +52,6 @@ Frames = npt.NDArray[np.float32]
 
 
 class Shard(BaseModel):
-    """A file of pairs that share a bench."""
-
     model_config = ConfigDict(frozen=True)
 
     file: str = Field(pattern=r"^pairs_[0-9]{5}\.h5$")
@@ -67,7 +65,7 @@ class Shard(BaseModel):
 
 
 class PairsManifest(BaseModel):
-    """What the pairs are of, and how they are read."""
+    """Manifest of a store of pairs."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -138,7 +136,7 @@ class PairsManifest(BaseModel):
 
 
 class ModelManifest(Configuration):
-    """What a network was trained for, and how."""
+    """Manifest of a trained network."""
 
     format: int = Field(default=MODEL_FORMAT, ge=1, le=MODEL_FORMAT)
     """Version of this format."""
@@ -306,7 +304,6 @@ class PairStore:
 
     @property
     def photographs(self) -> Labels:
-        """Number (N,) of the photograph that each pair shows."""
         numbers = np.arange(len(self))
         files = re.match(r"([0-9]+) files of", self.manifest.pictures)  # stores that were made before files had numbers
         labels = self.manifest.photographs or (range(int(files[1])) if files else numbers)
@@ -366,7 +363,6 @@ class PairStore:
     @check_arguments
     @single_threaded_blas()
     def draw(self, index: int, seed: int) -> Frames:
-        """Return the frames of a pair with noise of another seed."""
         made, sensor = self.manifest, self.manifest.sensor_model
         rates, lamps, exposure_s, speckle = self._light_of(index)
         root, digital = integer(seed, "pair", index), digital_of(sensor, exposure_s)
@@ -383,7 +379,7 @@ class PairStore:
         return self._measurements((shoot(rate, *shot.names) for rate, shot in speckled), off)
 
     def _measurements(self, rates: Iterable[FloatArray], off: FloatArray | float) -> Frames:
-        """Return the difference of the halves of signed patterns, and other shots less the light `off`."""
+        """Return differences of signed patterns, and other shots less the light `off`."""
         found, shots = [], self.manifest.family.shots
         positive: FloatArray | float = 0.0
         for rate, shot in zip(rates, shots, strict=True):
@@ -394,7 +390,7 @@ class PairStore:
         return np.stack(found)
 
     def _light_of(self, index: int) -> tuple[Iterable[FloatArray], FloatArray, float, float]:
-        """Return the light of each shot and of the lamps [electrons/s], the exposure [s] and the speckle's contrast."""
+        """Return the light of each shot and of lamps [electrons/s], the exposure [s] and the speckle's contrast."""
         number = self._shard(index)
         if number not in self._lights:
             with self._file(self.manifest.shards[number]) as file:
@@ -413,7 +409,7 @@ class PairStore:
         return rates, expected.projector_off.irradiance, float(rows["exposure_s"]), speckle
 
     def facts(self, shard: Shard) -> tuple[FloatArray, int, list[str]]:
-        """Return the exposures (pairs,) [s], the number of saturated pairs, and the light's warnings of a shard."""
+        """Return the exposures (pairs,) [s], the number of saturated pairs, and warnings of a shard."""
         with self._file(shard) as file:
             return file["exposure_s"][:], int(file["saturated"][:].sum()), json.loads(file.attrs["warnings"])
 

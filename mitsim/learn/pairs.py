@@ -151,10 +151,7 @@ class WhitePrints:
 
 
 def picture_axes(light: SampledLight, bundle: Bundle) -> tuple[Labels, Labels]:
-    """Return the row and column of the picture's pixel in which each row and column of a bundle's cells lies.
-
-    Cells outside the projector's window get the nearest pixel.
-    """
+    """Return the row and column of the picture's pixel, or the nearest one, of each row and column of cells."""
     axes = zip((bundle.grid.rows, bundle.grid.columns), light.bench.windows_at(light.plan.settings.depth), strict=True)
     n = light.bench.n
     rows, columns = (
@@ -280,10 +277,7 @@ def _lay_stripes(canvas: FloatArray, rng: np.random.Generator) -> None:
 
 @dataclass(frozen=True)
 class FolderPictures:
-    """Grey pictures of the files in a folder, in the order of their names.
-
-    The first pictures are the middle squares of the files; further ones are drawn squares, turned and mirrored.
-    """
+    """Grey pictures of a folder's files in order: middle squares, then drawn squares, turned and mirrored."""
 
     folder: Path
     seed: int
@@ -306,7 +300,7 @@ class FolderPictures:
         return tuple(map(digests.index, digests))
 
     def draw(self, number: int, n: int) -> Codes:
-        """Cut a picture of n pixels along each axis; raise MitsimError for a file that is unreadable or smaller."""
+        """Cut a picture of n x n pixels; MitsimError for a file that is unreadable or smaller."""
         path = self.files[number % len(self.files)]
         grey = read_reflectance(path)
         whole = min(grey.shape)
@@ -330,8 +324,6 @@ class FolderPictures:
 
 
 class _Maker:
-    """Benches, their light and their pairs; the last bench and its light are kept."""
-
     def __init__(self, opening: Opening, asked: PairsRequest, job: Job) -> None:
         self._opening, self._asked, self._job = opening, asked, job
         self._groups, seed = asked.groups(), asked.capture.seed
@@ -354,11 +346,7 @@ class _Maker:
         return "" if self._asked.idealised else traced_anew(bench)
 
     def check(self, shards: Sequence[Shard]) -> None:
-        """Read all pictures and open all benches before any light is traced.
-
-        Raise MitsimError if one fails, or if only the bench's light, unlike the first one's, must be traced for each
-        picture.
-        """
+        """Read all pictures and open all benches before any light is traced; MitsimError if one fails."""
         if isinstance(self._pictures, FolderPictures):
             files = len(self._pictures.files)
             for number in {index % files for each in shards for index in range(each.first, each.first + each.count)}:
@@ -514,13 +502,8 @@ class _Maker:
 def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairStore, Cost]:
     """Make pairs of pictures on the prints of a scene in a folder, and return their predicted cost too.
 
-    Idealised pairs get their factors. A resumed store equals an uninterrupted one bit for bit.
-
-    Raises
-    ------
-    MitsimError
-        If the request cannot be served, the limits of time, memory or disk do not suffice, the scene has no print, or
-        the output cannot be written or is that of another request.
+    A resumed store equals an uninterrupted one bit for bit. MitsimError if the request cannot be served, limits do not
+    suffice, the scene has no print, or the output is that of another request.
     """
     asked.check()
     assert task.output is not None, "pairs are kept in a folder"

@@ -23,7 +23,7 @@ Between = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class Variation(Configuration):
-    """How benches vary: so many of them are drawn, each for an equal part of the pairs."""
+    """Variation of benches, each drawn for an equal part of the pairs."""
 
     groups: int = Field(ge=1, le=10_000)
     """Benches."""
@@ -62,8 +62,6 @@ class Variation(Configuration):
 
 
 class PairOptions(Options):
-    """Which pairs are made, beside the request of their frames."""
-
     VERB = "make_pairs"
 
     count: int = option(..., "pairs to make", metavar="N", ge=1, le=MOST_PAIRS)
@@ -81,8 +79,6 @@ class PairOptions(Options):
 
 
 class PairsRequest(PairOptions):
-    """Which pairs are wanted."""
-
     capture: Request
     """Request of each pair's frames; its seed is the root of all streams."""
 
@@ -115,8 +111,6 @@ class PairsRequest(PairOptions):
 
 
 class PairKeys(ExposureKeys, total=False):
-    """Keywords of :func:`mitsim.make_pairs`, beside the number of pairs."""
-
     idealised: bool
     pictures: Path | str | None
 
@@ -144,7 +138,7 @@ FEWEST_PAIRS, FEWEST_PHOTOGRAPHS = 8, 3
 
 
 class Schedule(Seeded):
-    """How a network is trained."""
+    """Settings of a training."""
 
     PANEL = QUALITY
 
@@ -159,7 +153,7 @@ class Schedule(Seeded):
 
 
 class Training(Schedule):
-    """Which network is trained, and how."""
+    """Request of a training."""
 
     VERB = "train"
 
@@ -176,8 +170,6 @@ class Training(Schedule):
 
 
 class TrainingKeys(SeedKeys, total=False):
-    """Keywords of :class:`Schedule`."""
-
     steps: int
     batch: int
     rate: float

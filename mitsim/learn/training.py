@@ -101,7 +101,7 @@ class Sums:
 
 
 def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, Labels]:
-    """Return the numbers of the pairs that teach, that choose the best step, and that give the stated PSNR.
+    """Return the numbers of the pairs that teach, that choose the best step, and that judge.
 
     All pairs of a photograph belong to one part, because a network that has learned one crop knows much of the next.
     """
@@ -222,7 +222,6 @@ class Trainer:
         return truths, replace(data, frames=torch.as_tensor(self.sums.frames[chosen]).to(self._like))
 
     def _turn(self, truths: Tensor, data: Data, random: np.random.Generator) -> tuple[Tensor, Data]:
-        """Turn the second half of a batch and its data, so that a store teaches as eight times as many pictures."""
         half = len(truths) // 2
         ways = [axis for axis in (-2, -1) if random.random() < 0.5]
         turned = truths[half:].flip(ways)
@@ -265,12 +264,7 @@ def weights_of(network: Method) -> dict[str, Tensor]:
 class Trained:
     """Result of a training.
 
-    Attributes
-    ----------
-    curve
-        Step, and mean PSNR [dB] after it of the pairs that choose the best step; the first before any step.
-    psnr_before_db, psnr_db
-        Mean PSNR of pairs that neither teach nor choose, before the first step and with the best weights.
+    ``curve`` has steps and mean PSNR [dB] of the pairs that choose; ``psnr_db`` is that of the pairs that judge.
     """
 
     model: LearnedSolver
@@ -298,11 +292,7 @@ def train_network(
     store: PairStore, factors: Factors, request: Training, output: Path | str, job: Job | None = None,
     resume: bool = False, sums: Sums | None = None,
 ) -> Trained:  # fmt: skip
-    """Train a network and write its file.
-
-    ``factors`` is the calibration of later reconstructions. ``output`` is the network's file, beside which the
-    resumable state lies until the end. ``sums`` are sums of these pairs with these factors if they were read before.
-    """
+    """Train a network for the calibration ``factors`` and write its file, beside which the resumable state lies."""
     job, output = job or Job(), Path(output)
     started = time.perf_counter()
     if len(store) < FEWEST_PAIRS:

@@ -86,8 +86,6 @@ _FEWER = 4
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A scene, a pattern family and a seed, whose pilot explores down to ``accuracy``."""
-
     bench: Apparatus
     family: PatternFamily
     seed: int
@@ -103,7 +101,6 @@ class Probe:
 
     @cached_property
     def few_shots(self) -> Labels:
-        """Return at most eight evenly spread shots."""
         return np.unique(np.linspace(0, len(self.family.shots) - 1, 8).astype(np.int64))
 
     def plan(self, accuracy: float) -> Plan:
@@ -192,7 +189,7 @@ class Judge:
         return {**measured, **judge, "sensor_noise": noise if np.isfinite(sensor.full_well_e) else None}
 
     def of_reference(self) -> SampledLight:
-        """Return the light without effects that the reference lacks, traced again where they have shaped it."""
+        """Return the light without effects that the reference lacks."""
         probe, plan, absent = self.probe, self.light.plan, names(lambda effect: not effect.in_reference)
         if not any(EFFECTS[name].retraced(Physics.of(probe.bench)) for name in absent & plan.settings.effects):
             return reform(self.light, absent)
@@ -330,10 +327,6 @@ def _light_of(probe: Probe, bench: Apparatus, plan: Plan) -> Callable[[], float]
 
 
 def measure_surfaces(judge: Judge, settings: Settings) -> Iterator[dict[str, Value]]:
-    """Yield a row for each order of light over several surfaces.
-
-    The time of an order is that of following light to this order less that to the order before.
-    """
     probe = judge.probe
     if PARENT not in probe.plan(probe.accuracy).settings.effects:
         return
@@ -373,7 +366,6 @@ def measure_surfaces(judge: Judge, settings: Settings) -> Iterator[dict[str, Val
 
 
 def measure_reference(judge: Judge) -> Iterator[dict[str, Value]]:
-    """Yield rows that compare one frame of the reference with light of the same effects."""
     probe, shots = judge.probe, judge.probe.family.shots
     index, predicted_s = len(shots) // 2, 0.0
     answer, _ = stack_frames(judge.of_reference().frames(probe.family.lighting.shots([index]), probe.seed + 1))
@@ -394,7 +386,6 @@ def measure_reference(judge: Judge) -> Iterator[dict[str, Value]]:
 
 
 def at_once(expected: ExpectedFrames) -> float:
-    """Return a target that any error meets, so that sampling stops after its first round."""
     return float("inf")
 
 
@@ -404,7 +395,6 @@ def with_samples(settings: Settings, samples: int) -> Settings:
 
 
 def one_line(bench: Apparatus) -> Apparatus:
-    """Return a ``bench`` whose projector has its effective wavelength alone."""
     model = bench.projector
     changes = {"wavelengths_nm": (model.effective_wavelength_nm,), "radiant_shares": (1.0,)}
     return replace(bench, devices=replace(bench.devices, projector=model.model_copy(update=changes)))
@@ -448,7 +438,6 @@ def _derive(results: Results) -> Results:
 
 
 def _reaching(row: dict[str, Any], error: float) -> dict[str, Any]:
-    """Return the ``row`` of the reference at another ``error``, which falls with the root of the samples."""
     more = (row["error"] / error) ** 2
     times = {name: row[name] * more for name in ("seconds", "least_s", "most_s")}
     setting = f"{float(row['setting'].split()[0]) * more:.0e} spp"

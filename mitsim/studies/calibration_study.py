@@ -90,10 +90,8 @@ _LEAST_LEFT = 1e-9
 
 @dataclass(frozen=True)
 class LossRow:
-    """Loss of an image [dB] by a ``source`` of noise, or by a drift of an ``amount``, and its standard error.
-
-    ``of`` is capture, session, scene, drift, solver or unexplained. ``squared_error`` is the source's, mean over the
-    image, below 0 where the image is worse without the source.
+    """Loss of an image [dB] by a ``source`` of noise or a drift of an ``amount``; ``squared_error`` is the source's,
+    mean over the image, negative where the image is worse without it.
     """
 
     of: str
@@ -114,16 +112,12 @@ class LossRow:
 
 @dataclass(frozen=True)
 class Share:
-    """Part of an image's squared error, mean over the image, and its standard deviation."""
-
     square: float
     deviation: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """Parts of one image's squared error by origin and source, all drawn noise, and (n, n') the ``steady`` error."""
-
     parts: dict[tuple[str, str], Share]
     scatter: Scatter
     drawn: Noise
@@ -204,7 +198,6 @@ def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> Budget:
 
 
 def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]:
-    """Yield noiseless images of the scene's light, and of it without one cause after another."""
     scene_ablation, off = Ablation.of(stand.lit.light), frozenset[str]()
     yield "", stand.clear(clear, stand.lit.light)
     for name in ERROR_SOURCES:
@@ -214,7 +207,7 @@ def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, Floa
 
 
 def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) -> dict[tuple[str, str], Share]:
-    """Return the shares of a scene's light by cause, and of lambda; ``sampled`` is the rendering noise."""
+    """Return the shares of a scene's light by cause, and of lambda."""
     exact, scene, found = scatter.solver, scatter.scene, {(SCENE, ERROR_SOURCES[causes.DETAIL]): Share(0.0)}
     (_, last), *others = seen.items()
     for name, image in others:
@@ -379,7 +372,6 @@ def fit_models(lit: LitSession, stand: DriftStand) -> tuple[list[Row], list[str]
 
 
 def compare_shadows(bench: Bench) -> list[Row]:
-    """Return rows of the mask's shadow in each light, and of a point's shadow relative to the open sensor."""
     cameras = {name: IdealCamera(bench, bench.geometry.mask, spectrum) for name, spectrum in lights(bench).items()}
     rows: list[Row] = [{"kind": "shadows", **shadow_row(name, cameras)} for name in cameras]
     places = np.asarray(bench.geometry.centres(0))
@@ -449,7 +441,6 @@ def singular_rows(exact: FloatArray, found: FloatArray, deviation: FloatArray) -
 
 
 def session_cost(lit: LitSession, noisy: Estimate, clean: Estimate) -> Row:
-    """Return the frames, seconds without read-out, photoelectrons, photons and separability residuals of a session."""
     recipe, order = lit.session.recipe, len(lit.session.order)
     lit_s = sum(lit.exposures_s) * recipe.repeats
     # Shots of uniform light: both of a pair together are one.
@@ -485,7 +476,7 @@ def residuals(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> It
 
 
 def residual_row(cause: str, residual: float, left: float) -> Row:
-    """Return the row of a ``cause``: ``part`` is the root of the difference of the squared residuals, signed."""
+    """Return the row of a ``cause`` with the signed root of the difference of squared residuals."""
     less = residual**2 - left**2
     return {"kind": "causes", "cause": cause, "residual": left, "part": float(np.copysign(np.sqrt(abs(less)), less))}
 

@@ -63,7 +63,6 @@ class Frames:
 
     @classmethod
     def of(cls, sensor: SensorModel, procedure: Procedure) -> Frames:
-        """Return the frames of a simulated camera; MitsimError if no light saturates it."""
         capacity, steps, pixels = capacity_of(sensor), procedure.steps, procedure.pixels
         hottest = sensor.dark_current_e_per_s + sensor.hot_dark_current_e_per_s
         hottest = sensor.binning**2 * sensor.dark_factor * hottest
@@ -386,10 +385,6 @@ def _altered(flats: FlatFrames, taken: Sequence[Alike], used: Sequence[Alike]) -
 
 
 def _responses(names: Sequence[str], taken: Sequence[Alike]) -> list[tuple[str, float, str]]:
-    """Return the sets whose response differs from the others: name, ratio, and the exposure that they fit.
-
-    Logarithms of responses follow a robust line over light, because a camera bends and a lamp drifts smoothly.
-    """
     dark = {each.exposure_s: each.mean for each in taken if not each.light}
     signals = np.array([each.mean - dark[each.exposure_s] for each in taken])
     light = np.array([each.light for each in taken])
@@ -415,7 +410,6 @@ def _responses(names: Sequence[str], taken: Sequence[Alike]) -> list[tuple[str, 
 
 
 def remarks(flats: FlatFrames, found: FoundCamera) -> tuple[str, ...]:
-    """Return each misfit of the sets to the camera that was found, with its size and effect."""
     transfer, pixels = found.transfer, found.pixels
     used = [
         (name, abs(off), taken)

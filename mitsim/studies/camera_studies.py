@@ -129,7 +129,6 @@ def _resolution_measure(studio: Studio, point: Point) -> Found:
     own = float(frequency) * pixel_mm
 
     def halves(picture: FloatArray) -> list[tuple[FloatArray, int]]:
-        """Return the bars of each half without margins, and their axis."""
         left, right = np.split(picture, 2, axis=1)
         return [(left[_SEEN, _BESIDE], 0), (right[_SEEN, _BESIDE], 1)]
 
@@ -201,20 +200,17 @@ _LEAST_STEP = 0.05
 
 
 def contrast(image: FloatArray, axis: int) -> float:
-    """Return (I_max - I_min) / (I_max + I_min) of bars along an ``axis``, averaged along them.
-
-    This is the paper's definition. It exceeds 1 where the least value is negative.
-    """
+    """Return the paper's (I_max - I_min) / (I_max + I_min) of bars along an ``axis``; above 1 for negative values."""
     profile = image.mean(axis=axis)
     high, low = float(profile.max()), float(profile.min())
     return (high - low) / (high + low)
 
 
 def modulation(image: FloatArray, axis: int, frequency: float) -> float:
-    """Return the contrast of bars along an ``axis`` at their own ``frequency`` [cycles a pixel].
+    """Return the contrast of bars along an ``axis`` at a ``frequency`` [cycles a pixel].
 
-    It is the amplitude over the mean of the fundamental of the profile across the bars, times pi / 4, because a square
-    wave of contrast c has a fundamental of 4 c / pi.
+    It is the fundamental's amplitude over the mean, times pi / 4, because a square wave of contrast c has a fundamental
+    of 4 c / pi.
     """
     profile = image.mean(axis=axis)
     phase = 2 * np.pi * frequency * np.arange(len(profile))
@@ -224,10 +220,11 @@ def modulation(image: FloatArray, axis: int, frequency: float) -> float:
 
 
 def slanted_edge(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the modulation transfer of an ``image`` of one edge, a few degrees off its columns, by frequency.
+    """Return the modulation transfer of an ``image`` of one edge, a few degrees off its columns, by frequency [cycles a
+    pixel].
 
-    Frequencies [cycles a pixel] end at half a cycle. The transfer is 1 at zero, and that of the bins and of the
-    difference in place of the derivative is divided out. MitsimError for an image without an edge.
+    The transfer of the bins and of the difference in place of the derivative is divided out. MitsimError without an
+    edge.
     """
     rows, columns = image.shape
     centres: FloatArray = np.arange(columns, dtype=np.float64) + 0.5

@@ -1,63 +1,52 @@
 """Effects of causes on light and on images: light without some of its effects, and expected errors of changed frames.
 
 **Light without effects** (:class:`Ablation`). Light without any effect is the paper's idealised model: an evenly lit
-sheet at the aligned distance that shows the truth, under the geometric shadow of the mask. Removing an effect means:
+sheet at the aligned distance that shows the truth, under the geometric shadow of the mask. Without
 
-- *falloff*: every projector pixel is as bright on a white board as their mean, and (in matt scenes only) the sensor
-  sees it everywhere as in the mean over the sensor.
-- *diffraction*, *black level*, *speckle*: neutral values (:data:`mitsim.bench.effects.EFFECTS`).
-- *keystone*: light lies where its projector pixel would, if the window filled its bounding box evenly.
-- *depth*: light lies where its ray from the projector meets the aligned plane.
-- *occlusion*: pixels that an edge hides from part of the sensor are as bright everywhere as in the mean over it.
-- *detail*: the light of a projector pixel is even over the pixel; with depth or defocus on, over its points that send
-  light (only where the plan has several cells per pixel).
-- *interreflection*, *mirrors*, *ambient*: no light over several surfaces, over mirrors, or from lamps.
-- *gloss*: every point of the sensor sees the mean over the sensor, in scenes with glossy surfaces (the falloff over the
-  sensor, below 1e-3 of the frames, goes as well). The truth shows that mean.
-- *defocus*: a pinhole replaces the projector's lens, and pixels are sharp.
-- *render noise*: each projector pixel has the flux that the truth states, without the sampling error of the light.
+- *falloff*, every projector pixel is as bright on a white board as their mean, in matt scenes at every sensor pixel;
+- *diffraction*, *black level*, *speckle*, values are neutral (:data:`mitsim.bench.effects.EFFECTS`);
+- *keystone*, light lies where its projector pixel would, if the window filled its bounding box evenly;
+- *depth*, light lies where its ray from the projector meets the aligned plane;
+- *occlusion* or *gloss*, every point of the sensor sees the mean over the sensor;
+- *detail*, the light of a projector pixel is even over the pixel, or over its points that send light;
+- *interreflection*, *mirrors*, *ambient*, light over several surfaces, over mirrors, or from lamps is absent;
+- *defocus*, a pinhole replaces the projector's lens, and pixels are sharp;
+- *render noise*, each projector pixel has the flux that the truth states.
 
-The truth is the same for all. Glare and the parts of the idealised model (response of pixels, thickness of the mask)
-are not removed. Glare and light of sharp lobes are not moved, and indirect light stays where it is seen.
+The truth is the same for all. Glare and light of sharp lobes are not moved, and indirect light stays where it is seen.
 
 **Images of changed frames** (:class:`LinearImage`). With lambda fixed the solver is linear, so that the expected
-squared error follows from the factors without forming frames. With B_L = [Phi_L diag(p_i)]_i = U_L S_L V_L^T (row
-blocks U_Li of U_L), and the same on the right, the image of frames Y_ij is
+squared error follows from the factors. With B_L = [Phi_L diag(p_i)]_i = U_L S_L V_L^T (row blocks U_Li of U_L), and the
+same on the right, the image of frames Y_ij is
 
     X^ = V_L [F o W] V_R^T,  W = sum_ij U_Li^T Y_ij U_Rj,  F = s_L s_R^T / (s_L^2 s_R^2^T + lambda).
 
-Changes of the frames affect W as follows:
+Changes of the frames affect W as follows (likewise on the right):
 
-* frames L (P_ij o X) R^T of other factors: W = G(L) X G(R)^T with ``G(L) = sum_i U_Li^T L diag(p_i)``; the solver's own
-  factors have G = S V^T;
+* frames L (P_ij o X) R^T of other factors: W = G(L) X G(R)^T with ``G(L) = sum_i U_Li^T L diag(p_i)``;
 * gains g_ij of frames: W = sum_ij g_ij G_i X G_j^T, with the terms G_i of G;
-* gains of rows, 1 + u_ij d with a vector d of the rows and u_ij of variance 1 from frame to frame: the square of each
-  frame's term of W with diag(d) L in place of L; a ripple of the light has two such d, cosine and sine;
+* gains of rows, 1 + u_ij d with u_ij of variance 1: the square of each frame's term with diag(d) L in place of L; a
+  ripple of the light has two such d, cosine and sine;
 * a frame E added to all: W = (sum_i U_Li)^T E (sum_j U_Rj);
-* pixels whose responses differ by R from those in the factors: W = sum_ij U_Li^T (R o Y_ij) U_Rj;
-* noise of variance v in each datum: variance v of each number of W, as U_L and U_R are orthonormal; in a frame that is
-  subtracted from all others v |sum_i U_Li|^2 |sum_j U_Rj|^2, column by column;
-* noise of variance nu^2 in each number of the left factor that the frames do not share: that of G is nu^2 |sum_i p_i(x)
-  U_Li|^2, and so on through the product; likewise on the right;
+* responses that differ by R from the factors: W = sum_ij U_Li^T (R o Y_ij) U_Rj;
+* noise of variance v in each datum: variance v of W, as U_L and U_R are orthonormal; in a frame that is subtracted from
+  all others v |sum_i U_Li|^2 |sum_j U_Rj|^2, column by column;
+* noise of variance nu^2 in each number of the left factor: that of G is nu^2 |sum_i p_i(x) U_Li|^2;
 * an error of variance e^2 in each scene pixel's light, equal in all frames: e^2 s_L^2 s_R^2^T;
-* columns x of the left factor times 1 + eta_x of variance eta^2: eta^2 sum_x (s_L V_L(x))^2 (X V_R S_R)(x)^2; likewise
-  on the right.
+* columns x of the left factor times 1 + eta_x of variance eta^2: eta^2 sum_x (s_L V_L(x))^2 (X V_R S_R)(x)^2.
 
 A pattern of +-1 is the difference of two frames (1 +- P) / 2: constant additions cancel, noise and flicker add up, and
-gains g+ and g- give (g+ + g-) / 2 of the pattern and (g+ - g-) / 2 of uniform light. The expected squared error of X^
-is that of its mean plus, as V is orthonormal, the sum of F^2 times these variances.
+gains g+ and g- give (g+ + g-) / 2 of the pattern and (g+ - g-) / 2 of uniform light. The expected squared error is that
+of the mean plus, as V is orthonormal, the sum of F^2 times these variances.
 
-Scatter of the squared error about its expectation: with b the error that is not noise and C the covariance of normal
-noise e, |b + e|^2 has the variance 2 tr(C^2) + 4 b^T C b. In the coefficients above, e = F o dW:
+With b the error that is not noise and C the covariance of normal noise e, |b + e|^2 has the variance 2 tr(C^2) + 4 b^T
+C b. In the coefficients above, e = F o dW:
 
-* noise of data and of the scene's light is independent between numbers of W, of variance v_kl: tr(C^2) = sum F_kl^4
-  v_kl^2; variances of independent kinds of noise add up;
+* independent noise of variance v_kl in W: tr(C^2) = sum F_kl^4 v_kl^2;
 * noise of variance nu_kx^2 of the left factor's G: row k of W sees scene pixel x through a_x = (X V_R S_R)(x), C_k =
   F_k o (sum_x nu_kx^2 a_x a_x^T) o F_k, hence tr(C_k^2) = nu_k^2^T (K_k o K_k) nu_k^2 with K_k(x, y) = sum_l F_kl^2
   a_xl a_yl; rows are assumed independent, as they are where patterns share no pixels;
-* columns of the left factor off by eta_x add one number each times s_k V_L(x, k) a_x: tr(C^2) = eta^4 sum_xy (sum_k
-  s_k^2 V_L(x, k) V_L(y, k) K_k(x, y))^2;
-* likewise for the right factor. b^T C b contains the square of sum_l F_kl b_kl a_xl with the same weights.
+* columns of the left factor off by eta_x: tr(C^2) = eta^4 sum_xy (sum_k s_k^2 V_L(x, k) V_L(y, k) K_k(x, y))^2.
 """
 
 from __future__ import annotations
@@ -214,8 +203,6 @@ class AblatedLight(SampledLight):
 
 
 class _AblationSimulation(Simulation):
-    """Simulation that accumulates light where it would be seen without the effects ``off``."""
-
     def __init__(self, bench: Apparatus, settings: Settings, direct: bool, off: frozenset[str]) -> None:
         super().__init__(bench, settings)
         self._only_direct, self._off, self._place = direct, off, _Place(bench)
@@ -479,20 +466,16 @@ class Changed:
 
     Attributes
     ----------
-    terms
-        added to the camera's own separable operator.
     gain, gain_apart
         (K, K') mean gains of the frames; for a difference of two frames, their mean gain and half their difference.
-    flicker
-        rms of independent gains of each frame: a number each, or (m,) numbers, by row.
+    flicker, added_flicker, added_common
+        rms of independent gains of each frame, of ``added`` in each frame, and in all: a number each, or (m,) by row.
     response
-        (m, m') relative error of each pixel's response in the factors; the same in every frame.
+        (m, m') relative error of each pixel's response in the factors.
     leak
         part of the light of all pixels that is in every frame.
-    added
-        (m, m') frame that is added to all frames.
-    added_gain, added_flicker, added_common
-        mean gain of ``added``; and rms of its further gains from frame to frame and for all frames alike.
+    added, added_gain
+        (m, m') frame that is added to all frames, and its mean gain.
     """
 
     terms: Terms = ()
@@ -509,20 +492,16 @@ class Changed:
 
 @dataclass(frozen=True)
 class Noise:
-    """Independent noise, as variances.
+    """Variances of independent noise.
 
     Attributes
     ----------
-    datum
-        of each datum of a frame; for a difference of two frames, of each of them.
-    ambient
-        of each datum of a frame that is subtracted from all others.
-    left, right
-        of each number of the factors that frames do not share.
+    datum, ambient
+        of each datum of every single frame, and of a frame that is subtracted from all others.
+    left, right, left_light, right_light
+        of each number of the factors, and of the gain of each column.
     light
         of each scene pixel's light, relative to a white board's, in all frames alike.
-    left_light, right_light
-        of the gain of each column of a factor.
     """
 
     datum: float = 0.0
@@ -588,7 +567,6 @@ class LinearImage:
         return sum(4 * float((off * term).sum()) ** 2 + 2 * self._energy(np.square(term)) ** 2 for term in terms)
 
     def _by_gains(self, scene: FloatArray, changed: Changed) -> Iterator[FloatArray]:
-        """Yield the contribution of each varying gain to W (r, r'), by its rms."""
         left, right = self.axes
         cameras = [(self.left, self.right), *changed.terms]
         lit = 1 + 2 * changed.leak

@@ -89,7 +89,6 @@ def figures_set(frames: Frames) -> dict[str, float]:
 
 
 def fields_set(model: SensorModel) -> dict[str, float | None]:
-    """Return the measured fields of a camera file, for its superpixels."""
     offsets, responses = (np.roll(parts, -1).tolist() for parts in (model.offset_parts, model.response_parts))
     defects = ("hot_pixels", "hot_dark_current_e_per_s", "dead_pixels")
     return {
@@ -110,10 +109,8 @@ def fields_set(model: SensorModel) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class Row:
-    """A figure, or a field of the camera that explains the frames; None if nothing is set.
-
-    `expected` is given if the procedure finds another figure than the set one. `deviations` and `bias` are in standard
-    errors.
+    """A figure, or a field of the camera that explains the frames, with `expected` if it differs from the set one;
+    `deviations` and `bias` are in standard errors.
     """
 
     name: str
@@ -156,7 +153,6 @@ def row_of(frames: Frames, name: str, given: float, found: FloatArray, sessions:
 
 
 def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
-    """Compare the camera that was found with the known model."""
     rows, transfer, given = [], found.transfer, {} if model is None else fields_set(model)
     values = {**fields_set(found.sensor), "full_well_e": found.sensor.full_well_e}
     errors = dict(found.errors)
@@ -290,7 +286,6 @@ class Characterisation:
 
 
 def figures_of(done: Characterisation) -> Mapping[str, Figure]:
-    """Draw the plots by file name."""
     rows, what = {row.name: row for row in done.rows}, "camera found" if done.real else "closed form"
     gain, black = rows["system_gain"].found, done.frames.sensor.superpixel_black_level_dn
 

@@ -38,20 +38,8 @@ _SECOND_SHOWN = 0.4
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Result of `mitsim demo`.
-
-    Attributes
-    ----------
-    psnr, psnr_ideal, exposure
-        PSNR [dB] by family at equal peak, rendered and idealised, and rendered by exposure convention.
-    gain_db, verdict
-        Gain of the main family over uniform light, as a number and in words.
-    mc_error, truth_error
-        Relative Monte Carlo error of the frames, and standard error of the truth.
-    trust
-        Stated and actual errors of each family's image.
-    seconds, kernels
-        Wall time and compiled kernels by stage.
+    """Result of `mitsim demo`: PSNR [dB] by family and exposure, relative errors of frames and truth, and time by
+    stage.
     """
 
     psnr: dict[str, float]

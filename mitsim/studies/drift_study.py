@@ -95,13 +95,12 @@ class Prediction:
 
     @property
     def predicted_error_db(self) -> float:
-        """Return the change of the loss if the image without drift is as predicted, too."""
         return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome(Prediction):
-    """Images with and without a drift: PSNR [dB] by the lambda from before it and by its own, and the (n, n) image."""
+    """Images with and without a drift, by the lambda from before it and by its own."""
 
     after_db: float
     auto_db: float
@@ -118,17 +117,7 @@ class Outcome(Prediction):
 
 @dataclass(frozen=True, eq=False)
 class DriftStand:
-    """A scene, a camera that was calibrated before any drift, and patterns.
-
-    Attributes
-    ----------
-    lit
-        the scene in its light.
-    factors, recipe
-        result and recipe of the session.
-    family, seed
-        the patterns, and seed of the noise and of random drifts.
-    """
+    """A scene, a camera that was calibrated before any drift, and patterns."""
 
     lit: LitScene
     factors: Factors
@@ -196,7 +185,6 @@ class DriftStand:
 
     @property
     def electrons(self) -> float:
-        """Expected photoelectrons of all frames, on the whole sensor."""
         exposer = self._frames.exposer(self.exposure_s)
         return float(sum(exposer.electrons(frame).sum() for frame in self._expected))
 
@@ -356,7 +344,6 @@ class DriftStand:
         return found
 
     def _shift(self, by_mm: float) -> SeparableTerms:
-        """Return the shadow of a mask that moved back."""
         back = Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)
         return self._shadow(drift_mask(self.lit.bench, back))
 
@@ -377,7 +364,6 @@ def _minus(terms: SeparableTerms) -> SeparableTerms:
 
 
 def _weigh(parts: list[tuple[SeparableTerms, float]]) -> SeparableTerms:
-    """Return the means of terms whose two factors vary independently, factor by factor."""
     found: SeparableTerms = []
     for index in range(len(parts[0][0])):
         left, right = (sum(weight * terms[index][side] for terms, weight in parts) for side in (0, 1))

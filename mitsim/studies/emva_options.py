@@ -35,8 +35,6 @@ class Procedure(Lit, Seeded):
 
 
 class ProcedureKeys(SeedKeys, total=False):
-    """Keywords of :class:`Procedure`, without the frames."""
-
     pixels: int
     steps: int
     wavelength: float

@@ -102,10 +102,7 @@ _PAINT = """<bsdf type="diffuse" id="sheet_bsdf">
 
 
 def place_setup(studio: Studio, setup: Setup, place: str) -> Setup:
-    """Return the setup of one of :data:`PLACES`, whose scene file is written to the shared folder.
-
-    MitsimError where a shipped scene lacks what is changed.
-    """
+    """Return the setup of one of :data:`PLACES`; MitsimError where a shipped scene lacks what is changed."""
     shipped = "lamp_bench" if place == AMBIENT else "photograph"
 
     def write(folder: Path) -> None:
@@ -142,14 +139,8 @@ class Case:
     ----------
     truth, left, right, rows, columns
         (n, n) apparent reflectance, (m, n) factors, patterns P_L and P_R.
-    centre
-        True where frames lose their means.
-    quarters, energy
-        sum of all frames (:class:`mitsim.reconstruct.solver.Accumulator`).
-    frame
-        (m, m') the frame itself if there is one, else empty.
-    basis
-        first row of the left singular vectors of the sum.
+    quarters, energy, basis
+        sum of all frames (:class:`mitsim.reconstruct.solver.Accumulator`), and first row of its singular vectors.
     unexplained
         rms part of the frames, beyond noise, that no image gives.
     """
@@ -193,10 +184,7 @@ class Case:
 
 
 def case_of(studio: Studio, setup: Setup, condition: str, patterns: str, seed: int) -> Case:
-    """Return the frames of a setup's print, exposed at equal peak, from a file that studios share.
-
-    ``seed`` is that of all noise.
-    """
+    """Return the frames of a setup's print, exposed at equal peak, from a shared file."""
 
     def write(path: Path) -> None:
         place = next(name for name, conditions in PLACES.items() if condition in conditions)
@@ -239,8 +227,6 @@ def calibrated(studio: Studio, setup: Setup, seed: int) -> Factors:
 
 @dataclass(frozen=True)
 class Budget:
-    """Pairs of a training set, steps of a training, and benches (``groups``) of a varied set."""
-
     pairs: int
     steps: int
     groups: int
@@ -257,8 +243,6 @@ _ELSEWHERE_MM = 1.0
 
 @dataclass(frozen=True)
 class Cell:
-    """A network to train: training set, patterns, method, and the ``seed`` of the training."""
-
     training: str
     patterns: str
     method: str
@@ -267,17 +251,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class School:
-    """Training of networks for the bench of a ``setup``, in the shared folder of a ``studio``."""
-
     studio: Studio
     setup: Setup
     seed: int
     budget: Budget
 
     def network(self, cell: Cell) -> tuple[LearnedSolver, float | None]:
-        """Return the network of a ``cell``, and the processor time of its training [s], or None if it resumed or
-        existed.
-        """
+        """Return the network of a ``cell``, and the time of its training [s], or None if it resumed or existed."""
         from mitsim.learn.learned_solver import read_network
         from mitsim.learn.training import train_network
 
@@ -334,7 +314,6 @@ class School:
         return own.with_parameters(mask_distance=_ELSEWHERE_MM) if training == ELSEWHERE else own
 
     def _factors(self, training: str, patterns: str = "uniform") -> Factors:
-        """Return the calibration of a training set."""
         if training == IDEALISED:
             return load_calibration(self._store(training, patterns).folder / "calibration")
         if training == ELSEWHERE:
@@ -342,7 +321,6 @@ class School:
         return calibrated(self.studio, self.setup, self.seed)
 
     def factors_for(self, case: Case) -> Factors:
-        """Return the factors of a ``case`` with the bench's camera identity, which networks check."""
         identity = self._factors(RENDERED).manifest.camera
         status = Status(Verdict.CALIBRATED, "Factors of a test case")
         manifest = CalibrationManifest(
@@ -571,7 +549,6 @@ def teach(method: str, prepared: Prepared, sums: Sums, seed: int) -> Any:
 
 
 def _image(prepared: Prepared, frame: FloatArray, method: str, network: Any) -> tuple[FloatArray, float]:
-    """Return the (n, n) image of a frame [DN], and the rms part of the frame that it leaves unexplained."""
     import torch
 
     from mitsim.learn.learned_solver import beyond_noise, datum_variance

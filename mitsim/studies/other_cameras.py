@@ -118,8 +118,8 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
 def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float], Frame]) -> Places:
     """Return factors whose products hold between places as well.
 
-    A session does not determine how its product and sign are shared between left and right. One uniform frame of the
-    board through the mask at each place's row and the first one's column (``white``) does.
+    A session leaves the split of its product, and its sign, open; uniform frames of the board through moved masks
+    (``white``) determine it.
     """
     first, found = next(iter(factors)), {}
     for place, (left, right) in factors.items():
@@ -168,7 +168,6 @@ class MovedMask:
             return model.solve(sums)
 
     def side(self, axis: int, place: float) -> FloatArray:
-        """Return a factor without means, place by place, as frames lose theirs."""
         factor = self.factors[place][axis]
         return centre_columns(factor) if self.lit.bench.geometry.centred else factor
 
@@ -383,7 +382,6 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
 
 
 def separable_seconds(bench: Apparatus, k: int) -> float:
-    """Time the separable closed form for dots of period ``k`` with prepared factors, which depends on sizes alone."""
     family, (left, right) = bench.family(f"dots:{k}"), IdealCamera(bench, bench.geometry.mask).factors
     model = prepare(left, right, family.left, family.right)
     frames = stream(0, "separable frames").random((k, k, len(left), len(right)))

@@ -63,20 +63,8 @@ _BLOCK, _SMOOTH = 48, 31
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """One plane of a capture.
-
-    Attributes
-    ----------
-    offset
-        place of the plane's pixels, down and to the right [pixels].
-    level
-        (m, m') the plane, turned and cut [DN].
-    noise
-        (m, m') drawn noise of the plane, without row and column means [DN].
-    scene
-        (n, n') the authors' image, 0 to 1.
-    gain, read_variance
-        gain [DN per electron], and variance without light [DN^2], of the raw plane.
+    """One plane of a capture: ``level`` and ``noise`` (m, m') [DN], the authors' image ``scene`` (n, n'), 0 to 1,
+    ``gain`` [DN per electron] and ``read_variance`` [DN^2] of the raw plane.
     """
 
     capture: str
@@ -97,15 +85,12 @@ class Measured:
         return centre_frame(self.level)
 
     def exposure(self, frame: FloatArray | None = None, group: int = 0) -> Exposure:
-        """Return this frame, or another ``frame`` of the plane, as input for a fit of codes."""
         return Exposure(self.scene, self.frame if frame is None else frame, group, self.plane, self.offset)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Contents of `calibration/flatcam.toml`: ``how`` files become frames, kind and number of bits, and ``n`` scene
-    pixels a side.
-    """
+    """Contents of `calibration/flatcam.toml`, with ``n`` scene pixels a side."""
 
     how: Preparation
     digital: Digital
@@ -120,7 +105,6 @@ class Recipe:
         return cls(how, validate(Digital, listed["digital"], f"list {path}"), listed["bits"], listed["n"])
 
     def planes(self, path: Path) -> dict[str, FloatArray]:
-        """Return the whole planes of the capture ``path`` [DN]; MitsimError for a file that is no capture."""
         numbers = read_image(path, Wanted("capture", mosaic=self.how.mosaic))
         if numbers.shape != _RAW:
             raise MitsimError(f"capture {path}: is {_size(numbers)}; give the raw frame, {_RAW[0]} x {_RAW[1]}")
@@ -140,7 +124,6 @@ class Recipe:
         return Preparer.of(how, self.digital, Wanted()).frame(Path(), plane).astype(np.float64)
 
     def scene(self, path: Path) -> FloatArray:
-        """Return the authors' image (n, n, 3), 0 to 1; MitsimError for another size."""
         image = read_image(path, Wanted("image", bits=(8,), colour=True))
         if image.shape != (self.n, self.n, 3):
             raise MitsimError(
@@ -154,10 +137,7 @@ def _size(values: Numbers) -> str:
 
 
 def read_captures(files: Mapping[str, tuple[Path, Path]], seed: int) -> list[Measured]:
-    """Return every plane of all captures; MitsimError for files that are no captures.
-
-    ``files`` are raw frame and authors' image, by the capture's name.
-    """
+    """Return every plane of all captures; MitsimError for files that are no captures."""
     recipe, found = Recipe.load(), []
     raw = {name: recipe.planes(frame) for name, (frame, _) in files.items()}
     offsets = plane_offsets(recipe.how)
@@ -377,8 +357,8 @@ def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, f
 def _scene_correction(
     rest: FloatArray, factors: tuple[FloatArray, FloatArray], level: float
 ) -> tuple[FloatArray, float]:
-    """Return the frame of a correction of the scene, by Tikhonov with the weight of least risk, and its effective
-    number of parameters.
+    """Return the frame of a correction of the scene, by Tikhonov with the weight of least risk, and its number of
+    parameters.
     """
     (left, first, _), (right, second, _) = (np.linalg.svd(each, full_matrices=False) for each in factors)
     seen, strength = left.T @ rest @ right, np.square(np.outer(first, second))
@@ -462,7 +442,6 @@ def read_spread(path: Path) -> FloatArray:
 
 
 def lit_square(light: FloatArray) -> FloatArray:
-    """Return the largest centred lit square of a point spread function."""
     smooth = ndimage.gaussian_filter(light, _SURE)
     lit = smooth > _LIT * smooth.max()
     ends = [np.flatnonzero(lit.any(axis=axis))[[0, -1]] for axis in (1, 0)]

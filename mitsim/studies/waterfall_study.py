@@ -60,8 +60,6 @@ _SURE = 6.0
 
 
 class Sessions:
-    """Calibration sessions with a bench's camera, with all of its effects or without some."""
-
     def __init__(self, bench: Apparatus, seed: int) -> None:
         self._session, job = Session(bench, load_recipe(), seed), Job()
         light = self._session.trace(self._session.plan(1e-3, job), job)
@@ -122,8 +120,6 @@ class Sessions:
 
 
 class Levels:
-    """Images of a scene with any of its effects, by ``sessions`` of its camera."""
-
     def __init__(self, lit: LitScene, scene_ablation: Ablation, sessions: Sessions, patterns: str, seed: int) -> None:
         self.lit, self._ablation, self._sessions = lit, scene_ablation, sessions
         self._patterns, self._seed = patterns, seed
@@ -172,7 +168,6 @@ def fills_well(sensor: SensorModel, speckle: float) -> bool:
 
 
 def _align(side: FloatArray, like: FloatArray) -> FloatArray:
-    """Return a ``side`` with the sign of ``like``, because both sides reversed are the same camera."""
     return side if np.vdot(side, like) >= 0 else -side
 
 

@@ -64,19 +64,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StudyResult:
-    """Result of a study, for the command line, programs and notebooks.
-
-    Attributes
-    ----------
-    rows
-        rows of its table.
-    warnings
-        reasons why it may not be trusted.
-    points, missing, seconds
-        measured points, those of other parts that are missing, and the time of measuring.
-    claims, figures, section
-        of a whole study: judged claims, files of figures, and its section of a page.
-    """
+    """Result of a study, for the command line, programs and notebooks; ``missing`` are points of other parts."""
 
     study: str
     output: str
@@ -120,7 +108,6 @@ class StudyResult:
 
 
 def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figure]:
-    """Write the ``figures`` that show anything, and return them; MitsimError on failure."""
     from mitsim.report.plots import tells  # not in processes that measure
 
     drawn = {file: figure for file, figure in figures.items() if tells(figure)}
@@ -149,11 +136,7 @@ def check_study_folder(output: Path | str, name: str) -> None:
 
 @contextmanager
 def study_folder(output: Path | str, name: str) -> Iterator[Path]:
-    """Hold the folder ``output`` of the study ``name`` while the context lasts.
-
-    The folder is new or empty, or holds an earlier study of that name, of which nothing is removed. MitsimError
-    otherwise.
-    """
+    """Hold the new, empty or earlier folder ``output`` of the study ``name``; MitsimError if it holds anything else."""
     with output_folder(output, overwrite=_is_earlier(Path(output), name)) as folder:
         yield folder
 
@@ -176,8 +159,6 @@ def _is_earlier(place: Path, name: str) -> bool:
 
 @dataclass(frozen=True)
 class Store:
-    """Findings of points in an existing ``folder``."""
-
     folder: Path
 
     def has(self, point: Point) -> bool:
@@ -259,9 +240,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Where:
-    """Part of the points, and local processes or the Dask scheduler that measure it; ``shared`` is a folder of plans
-    and calibrations that studies share.
-    """
+    """Part of the points, and local processes or the Dask scheduler that measure it."""
 
     shard: Shard = field(default_factory=Shard)
     jobs: int | None = None
@@ -315,7 +294,6 @@ def run_experiment(
 
 
 def _check_data(points: Sequence[Point]) -> None:
-    """Raise MitsimError for a point with fewer data than unknowns, so that no lambda can be chosen."""
     from mitsim.bench.layout import shortage  # here: it needs the renderer
 
     asked = {(replace(each.setup, picture=None, accuracy=Setup.accuracy), each["patterns"]) for each in points}
@@ -542,8 +520,6 @@ def in_processes(
 
 
 class _Worker:
-    """A process, the pipe to it, and the points that it has not answered."""
-
     def __init__(self, name: str, folders: tuple[str, str]) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()

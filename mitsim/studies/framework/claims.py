@@ -76,7 +76,6 @@ def mean_of(
     from pandas import Series, to_numeric
 
     def keys(table: DataFrame, by: str) -> Series[Any]:
-        """Return a column with "" for None, because pandas does not group by None."""
         return table[by].where(table[by].notna(), "") if by in table else table.index.to_series().map(lambda _: "")
 
     def level(table: DataFrame, name: str) -> Series[float]:
@@ -199,7 +198,6 @@ class Statement:
 
     @property
     def _compared(self) -> frozenset[str]:
-        """Columns that choose the compared rows."""
         return frozenset()
 
     def _judge(self, rows: DataFrame, claim: str) -> Claim:

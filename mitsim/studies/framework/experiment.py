@@ -71,12 +71,10 @@ class Setup:
     accuracy: float = 1e-3
 
     def with_parameters(self, **parameters: object) -> Setup:
-        """Return a setup with other values of some scene ``parameters``."""
         new = {**dict(self.parameters), **{name: f"{value}" for name, value in parameters.items()}}
         return replace(self, parameters=tuple(sorted(new.items())))
 
     def with_print(self, picture: str | None) -> Setup:
-        """Return a setup with another ``picture`` on its print."""
         return replace(self, picture=picture)
 
 
@@ -238,7 +236,7 @@ class Results:
 
     @cached_property
     def frame(self) -> DataFrame:
-        """Table with one measurement a row; values keep their types in JSON."""
+        """Table with one measurement a row."""
         from pandas import DataFrame  # here, because it takes half a second and processes that measure do without
 
         return DataFrame([dict(row) for row in self.rows], dtype=object)
@@ -354,10 +352,7 @@ def group_by_setup(points: Sequence[Point]) -> list[Point]:
 
 
 def find_experiment(name: str) -> Study:
-    """Return the study ``name``: a shipped one, or a user's file or dotted module.
-
-    MitsimError for another name, and for a module without a ``STUDY``.
-    """
+    """Return the study ``name``: a shipped one, or a user's file or dotted module; MitsimError for another."""
     check_study(name)
     module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
     try:
@@ -372,7 +367,7 @@ def find_experiment(name: str) -> Study:
 
 
 def check_study(name: str) -> None:
-    """Raise MitsimError for an unknown study ``name``, with the replacement of a former one."""
+    """Raise MitsimError for an unknown study ``name``."""
     if name in GONE:
         raise MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
     if name not in (*EXPERIMENTS, ALL) and "." not in name:
@@ -460,7 +455,6 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
 
 
 def check_drifts(sweep: Sweep) -> None:
-    """Raise MitsimError for a ``sweep`` of anything but kinds of drift and their amounts."""
     still = Drift(power_ripple_hz=1.0, lamp_ripple_hz=1.0)  # a recipe states them, which is not read yet
     for kind, texts in sweep:
         for text in texts:

@@ -126,7 +126,6 @@ class Panel:
         return [each for each in found if len(choose_rows(rows, each))]
 
     def parts(self, rows: DataFrame, by: Columns) -> dict[str, tuple[DataFrame, str]]:
-        """Return rows, and the column shown instead of the panel's own, by the name of each part of ``by``."""
         if isinstance(by, Mapping):
             return {name: (rows, column) for column, name in by.items() if column in rows}
         chosen = self.combinations(rows, by) if by else [{}]
@@ -357,7 +356,7 @@ def _few(items: Sequence[Any]) -> list[Any]:
 
 
 def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], title: str) -> Figure:
-    """Draw images with their truths, in a first column where each row has one truth, else in rows above."""
+    """Draw images with their truths."""
     from mitsim.report.plots import image_grid
 
     truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
@@ -382,8 +381,6 @@ def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a page: ``figures`` by file name, a table of ``rows`` of words, and ``notes`` on how to read them."""
-
     title: str
     lead: str = ""
     head: tuple[str, ...] = ()
@@ -408,23 +405,7 @@ def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page.
-
-    Attributes
-    ----------
-    name, title, message, detail
-        study, heading, first sentence, and the study's question or scene.
-    pictures
-        data URI and width [pixels] of the figures by file name.
-    parts, claims, heads
-        tables with their figures; judged claims and the heads of their figures.
-    warnings
-        reasons why the findings may not be trusted.
-    note, about, count, command
-        remarks on the figures; method; number of measurements; command that repeats them.
-    quick, prints
-        True for a few points; number of test images in means.
-    """
+    """One study on a page; ``pictures`` has data URI and width [pixels] of figures by file name."""
 
     name: str
     title: str
@@ -487,7 +468,6 @@ _IMAGE = "point", "psnr_db", "exposure", "model", "picture", "condition", "metho
 
 
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
-    """Return a warning with the number of flagged images and the reasons."""
     # An image may have many rows, such as a transfer function's.
     rows = {tuple(map(row.get, _IMAGE)): row for row in results.rows if row.get("flagged") is not None}
     found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]
@@ -516,7 +496,6 @@ def build_findings(
     name: str, titles: tuple[str, str], where: str, parts: Sequence[Part], pictures: Mapping[str, tuple[str, int]],
     warnings: Sequence[str] = (),
 ) -> str:  # fmt: skip
-    """Return the page of findings that are no table of points as HTML."""
     return page_of([Section(name, *titles, where, pictures, tuple(parts), warnings=tuple(warnings))], titles[0])
 
 

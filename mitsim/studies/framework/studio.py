@@ -37,21 +37,7 @@ Kept = TypeVar("Kept")
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One reconstruction and its quality.
-
-    Attributes
-    ----------
-    image, quality, lam
-        (n, n) reflectance, against the truth, and lambda.
-    shots, exposure_s
-        frames, and seconds of each.
-    flags
-        columns of :func:`flags_of`.
-    trust
-        unexplained part of the measurements, their chi-square, and the image's standard uncertainty, where known.
-    seconds
-        time of the solution of rendered frames.
-    """
+    """One reconstruction: (n, n) reflectance ``image``, its ``quality`` against the truth, and stated ``trust``."""
 
     image: FloatArray
     quality: Quality
@@ -83,7 +69,6 @@ class Image:
 
 
 def flags_of(*statuses: Status, misfit: Misfit | None = None, others: Iterable[str] = ()) -> dict[str, Value]:
-    """Return the columns `flagged` and `reason` of an image."""
     cause = f", {misfit.reason}" if misfit and misfit.flagged and misfit.cause else ""
     reasons = [f"{each.verdict.value}{cause}" for each in statuses if not each.verdict.good]
     flags = [text for each in statuses for text in each.flags]
@@ -110,7 +95,6 @@ class Studio:
         self._folder.cleanup()
 
     def folder(self, name: str) -> Path:
-        """Return a new temporary folder, replacing an earlier one of that ``name``."""
         place = Path(self._folder.name) / "own" / name
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir(parents=True)
@@ -122,7 +106,7 @@ class Studio:
         return place
 
     def made_once(self, kind: str, name: str, make: Callable[[Path], object]) -> Path:
-        """Return a shared file or folder, which ``make`` creates at a new path, whole or not at all."""
+        """Return a shared file or folder, which ``make`` creates whole or not at all."""
         place = self.shared_folder(kind) / name
         with FileLock(place.with_suffix(".lock")):
             if not place.exists():  # a studio may have been ended while it made it
@@ -216,7 +200,6 @@ class Studio:
         )
 
     def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """Return an object of a ``kind``, keeping the ``most`` recent for neighbouring points."""
         kept = self._kept.setdefault(kind, OrderedDict())
         if key not in kept:
             while len(kept) >= most:
