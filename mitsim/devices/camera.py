@@ -178,7 +178,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def frame_side(self) -> float:
-        """Return the side in pixels of a square of equal area; a whole number for square frames."""
         return side_of(self.frame_shape)
 
     @property
@@ -196,16 +195,13 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         return math.tan(math.radians(self.fov) / 2)
 
     def reach(self, depth: float) -> float:
-        """Return the largest tan-angle, from the sensor's centre, of points at ``depth`` [mm] that its edge sees."""
         return self.tan_half_fov + self.half_width / depth
 
     @property
     def pixel_edges(self) -> FloatArray:
-        """Return the (pixels + 1,) pixel edges along the sensor's longer side [mm]."""
         return centred_edges(*max(zip(self.shape, self.pitches, strict=True), key=math.prod))
 
     def centres(self, axis: int) -> FloatArray:
-        """Return the (m,) centres of a frame's rows (0) or columns (1) [mm]."""
         edges = centred_edges(self.shape[axis], self.pitches[axis])
         centres = np.asarray((edges[:-1] + edges[1:]) / 2)
         return centres if self.roi is None else centres[self.roi[axis] : self.roi[axis] + self.roi[axis + 2]]
@@ -215,7 +211,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         return self.mask_offset_row, self.mask_offset_column
 
     def build_mask(self) -> Mask | Plate:
-        """Return the mask in coordinates of its own centre; of a plate, the visible part."""
         if self.mask_plate is not None:
             return within(self.mask_plate, self.mask_reach)
         return mls_mask(cast("MaskKind", self.mask), self.mask_feature, self.mask_order)
@@ -242,14 +237,10 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def tilt_shift_mm(self) -> float:
-        """Return the largest shift of shadows by the tilt [mm]: t s tan(tilt) for a ray of slope t at s."""
         return self.tan_half_fov * self.mask_reach * sum(map(abs, self.mask_tilt))
 
     def tilt_nodes(self, waves: bool) -> tuple[int, int] | None:
-        """Return the nodes of rows and columns that form the shadow of a tilted mask (:mod:`mitsim.optics.terms`).
-
-        The value is None for an even mask, one that is drawn on a raster, and one that needs too many terms.
-        """
+        """Return the nodes of rows and columns for the terms of a tilted mask; None where none are used."""
         if not any(self.mask_tilt) or self.is_drawn(waves):
             return None
         farthest = self.tan_half_fov * self.mask_reach / min(self.pitches)
@@ -267,7 +258,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def mask_terms(self) -> int:
-        """Return the number of separable terms of the mounted mask; 1 without a closed form."""
         if self.is_drawn(waves=False):
             return 1
         return len(self.build_mask().terms) * math.prod(self.tilt_nodes(waves=False) or (1,))
@@ -304,7 +294,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         return self.pitches[0] * root, self.pitches[1] * root
 
     def angular_response(self, squared_tan: FloatArray) -> FloatArray:
-        """Return a pixel's response cos^n(theta) to rays of tan^2(theta)."""
         return np.asarray((1 + squared_tan) ** (-self.angular_exponent / 2))
 
 

@@ -1,7 +1,7 @@
 """Lists that a user writes about files of a real camera: its session, flat frames, known pictures, a chart.
 
-A list of frames is `session.toml` or `session.json` in their folder. If a session's list does not name its frames,
-the order of their names counts. Paths of a list of known pictures begin in its own folder. No frame is opened here.
+A list of frames is `session.toml` or `session.json` in their folder. Without named frames, the order of their names
+counts. Paths of a list of known pictures begin in its own folder.
 """
 
 from __future__ import annotations
@@ -159,8 +159,6 @@ class FrameList(Configuration):
 
 @dataclass(frozen=True, eq=False)
 class SessionFrames:
-    """Frames of a real session by side, number of the pattern, sign, exposure and repeat, each once in the folder."""
-
     folder: Path
     listed: FrameList
     shots: dict[Key, StripeFile]
@@ -173,11 +171,9 @@ class SessionFrames:
 
     @property
     def planes(self) -> tuple[str, ...]:
-        """Return the planes of a mosaic that are calibrated one by one; else "" alone."""
         return PLANES if self.listed.prepare.channel == ALL else ("",)
 
     def of_plane(self, name: str) -> SessionFrames:
-        """Return the session of one of the :attr:`planes`, which becomes part of the camera's identity."""
         if not name:
             return self
         prepare = self.listed.prepare.model_copy(update={"channel": name})
@@ -284,7 +280,6 @@ def load_frames(folder: Path | str) -> SessionFrames:
 
 
 def _check_exposures(session: SessionFrames) -> None:
-    """Raise MitsimError for pairs or repeats of unequal exposure, and for dark frames of unused exposures."""
     folder, rungs = session.folder, len(session.listed.exposure_ladder)
     frames: tuple[StripeFile | DarkFile, ...] = (*session.shots.values(), *session.dark)
     for frame in frames:
@@ -565,7 +560,6 @@ class ChartPlace(Configuration):
         return patches
 
     def means(self, image: FloatArray) -> FloatArray:
-        """Return the (24, ...) means over the patches; MitsimError where one lies outside."""
         import numpy as np
 
         return np.array([block.mean(axis=(0, 1)) for block in self.blocks(image)])

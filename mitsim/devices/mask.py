@@ -83,7 +83,6 @@ class Flaws:
         return float(extent_mm * (abs(np.cos(angle)) + abs(np.sin(angle))) * tilt**2 + 2 * self.margin_mm)
 
     def turned_back(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the coordinates on the mask itself of points of its plane."""
         if not self.turn_deg:
             return row, column
         cosine, sine = np.cos(np.radians(self.turn_deg)), np.sin(np.radians(self.turn_deg))
@@ -133,12 +132,10 @@ class Mask(ByValue):
 
     @property
     def lines(self) -> FloatArray:
-        """Return the (N + 1,) coordinates of the lines between features [mm]."""
         return np.asarray((np.arange(len(self.bits) + 1) - len(self.bits) / 2) * self.feature_mm)
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """Return the terms (weight, row profile (N,), column profile (N,))."""
         ones = np.ones(len(self.bits))
         if self.kind == "open":
             return ((1.0, ones, ones),)
@@ -173,7 +170,6 @@ class Mask(ByValue):
         return ((bits, bits),) if self.kind == "separable" else ((bits, bits), (~bits, ~bits))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
-        """Return the transmission (0..1) at points of the mask plane [mm]."""
         count = len(self.bits)
         row, column = (np.floor(np.asarray(s, dtype=np.float64) / self.feature_mm + count / 2) for s in (s_row, s_col))
         in_rows, in_columns = ((at >= 0) & (at < count) for at in (row, column))
@@ -207,7 +203,6 @@ def mls_code(order: int) -> npt.NDArray[np.int8]:
 
 
 def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int = 9) -> Mask:
-    """Return the mask of :func:`mls_code`, by default the paper's."""
     return Mask(kind, feature_mm, mls_code(order))
 
 
@@ -217,8 +212,7 @@ def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int 
 def etch(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatArray, FloatArray]:
     """Return lines (2 N + 2,) and values (2 N + 1, 2 N + 1) of a mask whose openings grew on each side.
 
-    Every place gets the greatest transmission within a square of half-side ``grow_mm``, or the least where that is
-    negative; beyond the mask it is opaque.
+    Every place gets the greatest transmission within a square of half-side ``grow_mm``, or the least if negative.
     """
     count = len(values)
     even = (np.arange(count + 1) - count / 2) * feature_mm

@@ -189,7 +189,6 @@ class MaskProfile(Configuration):
         return Plate(self.feature_mm, (draws < self.open_part).astype(np.float64), words)
 
     def put_on(self, camera: CameraGeometry, folder: Path) -> CameraGeometry:
-        """Return the ``camera`` with this mask. Raises as :meth:`plate`."""
         mask: dict[str, object] = {"mask_feature": self.feature_mm, "mask_plate": None}
         if self.kind == "psf":
             picture = self.plate_of_light(folder, camera.mask_distance)

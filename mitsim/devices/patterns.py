@@ -36,8 +36,6 @@ _MOST_CHECKED = 4096
 
 @dataclass(frozen=True)
 class Shot:
-    """One projected frame: pattern (row, column), whole (sign 0) or the positive or negative half."""
-
     row: int
     column: int
     sign: int = 0
@@ -78,8 +76,6 @@ class Lighting:
 
 @dataclass(frozen=True, eq=False)
 class PatternFamily:
-    """Separable patterns ``left``, ``right`` (n, K) of 0/1 or +-1, P_L and P_R, on an n x n grid."""
-
     name: str
     left: PatternFactor
     right: PatternFactor
@@ -94,7 +90,6 @@ class PatternFamily:
 
     @property
     def shots(self) -> tuple[Shot, ...]:
-        """Return every frame to project, row-major over (i, j); a positive half is followed by its negative half."""
         places = product(range(self.left.shape[1]), range(self.right.shape[1]), (1, -1) if self.signed else (0,))
         return tuple(Shot(*place) for place in places)
 
@@ -106,7 +101,6 @@ class PatternFamily:
 
     @cached_property
     def lighting(self) -> Lighting:
-        """Return the finest partition of pixels that are always lit alike, and each shot's light."""
         import numpy as np
 
         _, row = np.unique(self.left, axis=0, return_inverse=True)
@@ -148,7 +142,6 @@ def hadamard_orders(limit: int) -> list[int]:
 
 
 def stripe_count(n: int) -> int:
-    """Return the smallest order N of at least ``n``; MitsimError if no order up to 2 n is possible."""
     found = next(filter(_way, range(n, 2 * n + 1)), None)  # with a power of two among them
     if found is None:
         raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
@@ -225,10 +218,7 @@ def stripe_signs(n: int) -> PatternFactor:
 
 @dataclass(frozen=True)
 class PatternAxis:
-    """One axis of a family's patterns, ``left`` (rows) or ``right`` (columns), which have random streams of their own.
-
-    ``k`` is the number in the family's name, 1 without one.
-    """
+    """One axis of a family's patterns; ``k`` is the number in the family's name, 1 without one."""
 
     n: int
     k: int
@@ -238,8 +228,6 @@ class PatternAxis:
 
 @dataclass(frozen=True)
 class Family:
-    """Properties of a pattern family; see :func:`pattern_family`."""
-
     name: str
     forms: tuple[str, ...]
     factor: Callable[[PatternAxis], PatternFactor]
@@ -431,10 +419,7 @@ def _places(*keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _sign_changes(side: FloatArray) -> npt.NDArray[np.int64]:
-    """Return the sign changes of each column of a +-1 ``side`` within its first K rows.
-
-    The array is empty unless the rows are Sylvester's matrix, whose columns have each of 0 to K - 1 changes once.
-    """
+    """Return the sign changes of each column of a +-1 ``side``; empty unless Sylvester's matrix."""
     import numpy as np
 
     count = side.shape[1]

@@ -87,7 +87,6 @@ class Plate(ByValue):
 
     @property
     def identity(self) -> str:
-        """Return a text for manifests that is equal only for equal plates."""
         return f"{self.words}, features of {self.feature_mm:g} mm, sha256 {self.digest}"
 
     @property
@@ -96,7 +95,6 @@ class Plate(ByValue):
 
     @cached_property
     def lines(self) -> FloatArray:
-        """Return the (N + 1,) coordinates of the lines between features [mm]."""
         if self.lines_mm is not None:
             return self.lines_mm
         return np.asarray((np.arange(len(self.values) + 1) - len(self.values) / 2) * self.feature_mm)
@@ -144,12 +142,10 @@ class Plate(ByValue):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """Return terms (weight, row profile (N,), column profile (N,)) up to :attr:`left_out`."""
         return self._terms_and_rest[0]
 
     @property
     def left_out(self) -> float:
-        """Return the relative rms part of the transmission that the terms leave."""
         return self._terms_and_rest[1]
 
     @cached_property
@@ -179,7 +175,6 @@ class Plate(ByValue):
 
     @cached_property
     def most_terms(self) -> int:
-        """Return the largest number of terms: distinct rows or columns, whichever are fewer."""
         if self.crosses is not None:
             return len(self.crosses)
         both = self.values, np.ascontiguousarray(self.values.T)
@@ -191,7 +186,6 @@ class Plate(ByValue):
 
     @cached_property
     def largest(self) -> LargestTerms:
-        """Return the terms of the light that pixels see, where some hundreds suffice."""
         return LargestTerms(self.values, self.averaged)
 
     @cached_property
@@ -208,7 +202,6 @@ class Plate(ByValue):
 
     @property
     def residual(self) -> float:
-        """Return the rms residual of the best separable mask, relative to the part that a solver uses."""
         return min(self.residuals)
 
     @cached_property
@@ -308,9 +301,7 @@ def _distinct(
 ) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
     """Return the distinct rows and columns of ``values``, weighted by number and by widths between uneven ``lines``.
 
-    The result has the (N,) index of the distinct row and column of each, roots of their weights, (rows, 1) and
-    (columns,),
-    and (rows, columns) values times both roots.
+    The result has the (N,) index of each row and column, roots of the weights, and weighted (rows, columns) values.
     """
     widths = np.ones(len(values)) if lines is None else np.diff(lines) * (len(lines) / np.ptp(lines))
     rows, first, row = np.unique(values, axis=0, return_index=True, return_inverse=True)
@@ -359,7 +350,6 @@ class LargestTerms:
         self._squared, self._turn = squared[::-1][: self.count], directions @ turn[:, ::-1][:, : self.count]
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the terms (weight, row profile (N,), column profile (N,))."""
         with single_threaded_blas():
             left = self._values @ self._spread(self._turn)
             right = (self._spread(self._seen @ self._turn) / self._squared).T @ self._values

@@ -241,9 +241,8 @@ class ProjectorModel(Configuration):
     def glare(self) -> float:
         """Return the part of a pixel's light that the lens scatters, from the ``ansi_contrast``.
 
-        At the middles of the four fields along one axis, a Gaussian leaves ``even`` of an even picture, and
-        ``fields`` of one
-        that alternates between +1 and -1, times the field's own sign.
+        ``even`` is left of an even picture at the middles of four fields, and ``fields`` of one that alternates
+        between +1 and -1.
         """
         if self.ansi_contrast is None:
             return 0.0
@@ -270,7 +269,6 @@ class ProjectorModel(Configuration):
 
     @property
     def traced_lines(self) -> Lines:
-        """Return the lines, which paths carry together; raise MitsimError for too many."""
         lines = self.lines
         if len(lines.shares) > MOST_LINES:
             problem = f"colour: projector {self.name} has {len(lines.shares)} lines, and a path carries {MOST_LINES}"
@@ -278,7 +276,6 @@ class ProjectorModel(Configuration):
         return lines
 
     def in_bands(self, count: int) -> ProjectorModel:
-        """Return a projector whose lines are the means of ``count`` bands (:meth:`Lines.bands`)."""
         bands = self.lines.bands(count)
         waves, shares = tuple(band.mean_nm for band in bands), tuple(sum(band.shares) for band in bands)
         return self.model_copy(update={"wavelengths_nm": waves, "radiant_shares": shares})
@@ -336,7 +333,7 @@ class Response(ByValue):
     def of(cls, sensor: SensorModel) -> Response:
         """Return the response of a ``sensor`` without a mosaic; one number of efficiency counts at every wavelength.
 
-        Raises MitsimError for a sensor whose efficiency is not known, or not at any wavelength of :data:`SPECTRA_NM`.
+        Raises MitsimError for a sensor without a known efficiency in :data:`SPECTRA_NM`.
         """
         curve = sensor.quantum_efficiency_curve
         if curve is None:
@@ -345,7 +342,6 @@ class Response(ByValue):
 
     @classmethod
     def of_each(cls, sensor: SensorModel) -> tuple[Response, ...]:
-        """Return the responses under filters of each colour, or of all pixels without a mosaic."""
         if sensor.mosaic is None:
             return (cls.of(sensor),)
         colours = {name: getattr(sensor.mosaic_curves, name) for name in dict.fromkeys(sensor.mosaic)}
@@ -421,7 +417,7 @@ def line_units(sensor: SensorModel, lines: Lines) -> tuple[float, ...]:
 
     Behind a mosaic the lines share the count as they share power, s_l / sum_k s_k w_k lambda_k, with w_k the
     electrons a
-    photon of line k. MitsimError for a line that the sensor does not see; behind a mosaic, where it sees none.
+    photon of line k. MitsimError where the sensor does not see the lines.
     """
     if sensor.mosaic is not None:
         mean = np.mean(sensor.planes(lines.wavelengths_nm), axis=0)

@@ -41,11 +41,10 @@ class SensorModel(Configuration, defer_build=True):
     """A camera after EMVA 1288 release 4.0: per-pixel electronics and how pixels are binned.
 
     The fields describe one **pixel**; a frame's element is a **superpixel** of `binning` x `binning` = b^2
-    pixels whose values are summed. Area, full well, dark current, black level and largest code of a superpixel
-    are b^2 times those of a pixel, and its read noise is b times as large. The sum is rounded once where a camera
-    rounds each pixel, which neglects (b^2 - 1)/12 DN^2 of variance. With `binning_on_chip` charge is summed and
-    read once: read noise, row noise, offsets, black level and largest code are those of one reading. A field
-    that is left out is an effect that the camera does not have. Ranges hold every known device, with room.
+    pixels whose values are summed. Area, full well, dark current, black level and largest code are then b^2 times
+    as large, and read noise b times. The sum is rounded once, which neglects (b^2 - 1)/12 DN^2 of variance. With
+    `binning_on_chip` charge is read once: noises, offsets, black level and largest code are those of one reading.
+    A field that is left out is an effect that the camera does not have.
     """
 
     name: str
@@ -202,11 +201,9 @@ class SensorModel(Configuration, defer_build=True):
         return self
 
     def efficiency(self, wavelength_nm: float, plane: Plane | None = None) -> float:
-        """Return the electrons per photon, at all wavelengths the same for a camera whose file states one number.
+        """Return the electrons per photon of pixels under a ``plane`` of a mosaic, or of all pixels.
 
-        ``plane`` is the colour of the filter of a camera with a mosaic. Raises MitsimError outside the curve,
-        without an
-        efficiency, or for a plane that the camera does not have.
+        Raises MitsimError outside the curve, without an efficiency, or for a plane that the camera does not have.
         """
         if (self.mosaic is None) != (plane is None):
             filters = f"a mosaic {self.mosaic}" if self.mosaic else "no mosaic"
@@ -240,7 +237,6 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def sensor_only(self) -> bool:
-        """Return True if no source states an efficiency, so that the camera can neither capture nor sense."""
         return not self.states_efficiency and self.mosaic is None
 
     @property
@@ -294,7 +290,6 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def dark_factor(self) -> float:
-        """Return the factor 2^((T - T_stated) / T_doubling) of the dark current (EMVA 1288 4.0)."""
         if self.temperature_c is None or self.dark_current_temperature_c is None or self.dark_doubling_c is None:
             return 1.0
         return float(2 ** ((self.temperature_c - self.dark_current_temperature_c) / self.dark_doubling_c))
@@ -341,7 +336,6 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def superpixel_full_well_e(self) -> float:
-        """Return b^2 full wells, or less if the node on chip holds less."""
         full = self.full_well_e * self.binning**2
         return full if self.binned_full_well_e is None else min(full, self.binned_full_well_e)
 
@@ -351,7 +345,6 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def superpixel_dark_current_e_per_s(self) -> float:
-        """Return the dark electrons a second at the sensor's temperature, without hot pixels."""
         return self.dark_current_e_per_s * self.binning**2 * self.dark_factor
 
     @property
@@ -365,7 +358,6 @@ class SensorModel(Configuration, defer_build=True):
 
 
 def check_exposure(seconds: float) -> float:
-    """Return the exposure ``seconds``; raise ArgumentError if no camera has it."""
     shortest, longest = EXPOSURE_S
     if not shortest <= seconds <= longest:
         raise ArgumentError("exposure", f"{seconds:g}: give the seconds of every frame, {shortest:g} to {longest:g}")

@@ -201,7 +201,6 @@ class Drift(Configuration):
 
 
 def amount_in_words(kind: str, amount: float) -> str:
-    """Return an ``amount`` of drift with its unit; parts of a whole as a percentage."""
     unit = DRIFT_UNITS[kind]
     return f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"
 
@@ -278,7 +277,6 @@ class SessionRecipe(Configuration):
         return self
 
     def of_one_depth(self) -> SessionRecipe:
-        """Return the recipe; raise MitsimError if it has depths."""
         if self.depths:
             problem = f"recipe: has {len(self.depths)} depths, and this makes one calibration"
             raise MitsimError(f"{problem}; use calibrate_depths, or leave depths out")
@@ -292,7 +290,6 @@ def load_recipe(path: Path | str | None = None) -> SessionRecipe:
 
 
 def recipe_text(recipe: SessionRecipe) -> str:
-    """Return the ``recipe`` as TOML that :func:`load_recipe` reads."""
     import tomli_w  # here: only those who print a recipe need it
 
     return tomli_w.dumps(recipe.model_dump(mode="json", exclude_defaults=True))
@@ -388,7 +385,6 @@ class Modelling:
 
     @property
     def free(self) -> tuple[str, ...]:
-        """Return the names of the numbers that are fitted, each once."""
         return tuple(name for name in UNITS if name in (*self.fitted, "gain"))
 
     def used_patterns(self, changes: Sequence[int], pairs: bool, repeats: int) -> list[tuple[Side, int]]:

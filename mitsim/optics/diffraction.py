@@ -1,16 +1,16 @@
 """Wave-optical shadow of a mask as separable terms: scalar Fresnel diffraction.
 
-Goodman, Introduction to Fourier Optics, 4.2 and 4.5. A point source is at tan-angle tau and depth z, and a mask whose
-amplitude transmission is a sum of separable terms is at distance d. The field of a term on the sensor is a product of
-two 1-D functions of s = u (1 - d/z) + d tau, with the effective distance D = d (z - d) / z. A profile that jumps by
-J_k at e_k gives, relative to an unbounded open mask::
+Goodman, Introduction to Fourier Optics, 4.2 and 4.5. Behind a mask whose amplitude is a sum of separable terms, the
+field
+of a term is a product of two 1-D functions of s = u (1 - d/z) + d tau, with the effective distance D = d (z - d) /
+z. A
+profile that jumps by J_k at e_k gives, relative to an unbounded open mask::
 
     U(s) = sum_k J_k E(s - e_k),    E(x) = 1/2 + (1 - i)/2 (C + i S)(x sqrt(2 / (lambda D)))
 
 with Fresnel's integrals C and S. E is the unit step plus the wave from the edge, so that U is the profile plus one
 convolution of the jumps on a fine grid. Beyond |x| = R, lambda D / 2 over the grid's step, the grid does not resolve
-the edge wave, so that it is faded out from 3 R / 4 to R. The lost light (4.5e-4 for a quarter micrometre and 550 nm)
-left the mask at tangents above 0.8, where the paraxial approximation fails. It is spread evenly.
+the edge wave, so that it is faded out from 3 R / 4 to R. The lost light (4.5e-4) is spread evenly.
 
 The intensity of ``t = sum_k w_k r_k c_k`` (real) is::
 
@@ -86,7 +86,6 @@ class EdgeWaves:
         self._kernel = kernel.astype(np.complex64) if single else kernel
 
     def field(self, aperture: Steps, start_mm: float) -> ComplexArray:
-        """Return the (count,) field at the cell centres from ``start_mm``; 1 without a mask."""
         return np.asarray(self.fields([aperture], start_mm)[0])
 
     def fields(self, apertures: Sequence[Steps], start_mm: float) -> ComplexArray:
@@ -108,11 +107,10 @@ class EdgeWaves:
 
 
 def edge_wave(x: FloatArray) -> ComplexArray:
-    """Return E - 1 = (1 - i)/2 (C + i S)(x) - 1/2 at ``x`` > 0 in units of sqrt(lambda D / 2).
+    """Return E - 1 = (1 - i)/2 (C + i S)(x) - 1/2 at ``x`` > 0 in units of sqrt(lambda D / 2), to 3e-16.
 
-    The value is -erfc(z)/2 at z = exp(-i pi/4) sqrt(pi/2) x, by the midpoint rule plus the pole that the rule misses
-    (Alazah, Chandler-Wilde and La Porte 2014, Numerische Mathematik 128, 635). The error is 3e-16. scipy.special is
-    avoided because its import takes 0.1 s.
+    The value is -erfc(z)/2 at z = exp(-i pi/4) sqrt(pi/2) x (Alazah, Chandler-Wilde and La Porte 2014, Numerische
+    Mathematik 128, 635). scipy.special is avoided because its import takes 0.1 s.
     """
     scale = ((_NODES + 0.5) * np.pi) ** 0.5
     y = (np.pi / 2) ** 0.5 * x
@@ -142,7 +140,6 @@ def fast_length(least: int) -> int:
 
 
 def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, spectrum: Spectrum) -> SeparableTerms:
-    """Return separable terms [(left (m, r), right (m, c)), ...] in the order of the module's formula."""
     shadow = _of_fields(shadow)
     weights = _pair_weights(shadow.weights())
     means = _thick_means if shadow.thickness_mm else _thin_means
@@ -191,7 +188,6 @@ def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
 
 
 def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
-    """Return the width [mm] of a grid cell; a wider feature holds a whole number of cells."""
     check_openings(shadow.mask, wavelength_nm)
     feature = shadow.mask.feature_mm
     fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5

@@ -60,7 +60,6 @@ class Steps(ByValue):
         return Steps(edges, self.at(middle) * far.at(scale * middle + shift))
 
     def cell_means(self, start: float, step: float, count: int) -> FloatArray:
-        """Return the (count,) means over cells of width ``step`` from ``start`` [mm]."""
         if self.blur_mm:
             return self._blurred_means(np.asarray(start + step * (np.arange(count) + 0.5)), step / 2, 0.0)
         bounds = start + step * np.arange(count + 1)
@@ -98,7 +97,6 @@ class Steps(ByValue):
         return np.asarray(total)
 
     def box_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """Return the means over two boxes in succession; lengths in mm."""
         if self.blur_mm:
             return self._blurred_means(centres, half_pixel, half_cell)
         reach = half_pixel + half_cell
@@ -167,7 +165,6 @@ class Antiderivative:
     """First and second antiderivative of piecewise constant functions whose means are subtracted."""
 
     def __init__(self, edges: FloatArray, values: FloatArray, step: float | None = None) -> None:
-        """Integrate (functions, n) values between (n + 1,) edges [mm]; equal pieces have width ``step``."""
         width = np.diff(edges)
         self._edges, self._step = edges, step
         self._mean = (values @ width) / (edges[-1] - edges[0])
@@ -187,7 +184,6 @@ class Antiderivative:
         return np.asarray(total + self._mean.reshape(-1, *[1] * centres.ndim))
 
     def smooth_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """Return means of sampled functions without jumps, interpolated between cells for many points."""
         step, low = self._step, float(centres.min())
         assert step is not None, "on equal cells"
         count = int((float(centres.max()) - low) / step) + 4

@@ -1,13 +1,14 @@
 """Shadow of masks without few separable terms, drawn on a raster of square cells.
 
-The raster serves turned masks, waves behind masks of many terms, and pictures of a point spread function. A sensor
-pixel as seen on the mask is a whole number of cells, because the correlation below needs that; the value of a cell is
-its mean. A point at depth z and tan-angle tau shades sensor point u by the raster's value at s = u (1 - d/z) + d tau.
-Means over cells add a variance of h^2 / 6 to an edge. A twelfth of the second difference along each axis is
-subtracted, which corrects half of it.
-
-**Waves.** The field behind a sum of K terms is the sum of products of the 1-D fields of
-:mod:`mitsim.optics.diffraction`. |U|^2 is averaged over points in each cell and over the lines of the light.
+A sensor pixel as seen on the mask is a whole number of cells, whose values are means. A point at depth z and
+tan-angle
+tau shades sensor point u by the raster's value at s = u (1 - d/z) + d tau. Means over cells add a variance of h^2 /
+6 to
+an edge. A twelfth of the second difference along each axis is subtracted, which corrects half of it. Waves behind a
+sum
+of terms are sums of products of the 1-D fields of :mod:`mitsim.optics.diffraction`, and |U|^2 is averaged over
+points in
+each cell and over the lines of the light.
 """
 
 from __future__ import annotations
@@ -74,7 +75,6 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 
 @lru_cache(maxsize=RASTERS_KEPT)
 def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
-    """Draw the :func:`raster` of a camera that states its cells."""
     mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
     assert isinstance(mask, Plate), "other masks have a closed form"
     pixel = geometry.pixel_pitch * shadow.shrink
@@ -95,7 +95,6 @@ def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | Non
 
 
 def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
-    """Return the raster cells per side for far points; nearer points have slightly more."""
     mask = geometry.build_mask()
     assert isinstance(mask, Plate)
     return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry), spectrum)
@@ -129,7 +128,6 @@ def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
 
 
 def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
-    """Return the number of points along a raster cell at which waves are squared."""
     apart = (wavelength_nm * 1e-6 * distance_mm) ** 0.5 / _POINTS_PER_FRESNEL_LENGTH
     return max(int(np.ceil(step_mm / apart)), _LEAST_WAVE_POINTS)
 
@@ -264,8 +262,6 @@ _Pair = tuple[int, int]
 
 
 class Correlation:
-    """Shadow of a raster at one depth, prepared once; ``fill_factor`` scales frames."""
-
     def __init__(self, shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float = 1.0) -> None:
         sides = _Side.both(shadow, rows, columns)
         self.shape = sides[0].pixels, sides[1].pixels
@@ -283,7 +279,6 @@ class Correlation:
         self._spectra = _spectra(cast("Plate", shadow.mask), (firsts[0], firsts[1]), self._size, self._phases)
 
     def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
-        """Return the (m, m') irradiance of ``light`` (r, c) in the cells ``rows`` x ``columns``."""
         left, right = self._spread[0][:, np.asarray(rows)], self._spread[1][:, np.asarray(columns)]
         brightest = float(np.abs(light).max()) or 1.0
         cells = _by_phase(left @ (light / brightest).astype(np.float32) @ right.T, self._phases)
@@ -350,7 +345,6 @@ def terms_of_raster(
     places: Places | None,
     terms: Sequence[Term],
 ) -> SeparableTerms:
-    """Return separable ``terms`` of a raster's shadow, [(left (m, r), right (m', c)), ...]."""
     sides = _Side.both(shadow, rows, columns)
     at = [np.arange(side.pixels) if places is None else np.asarray(places[axis]) for axis, side in enumerate(sides)]
 
@@ -393,7 +387,6 @@ class ProfileSampler:
         self._start = (-self._count / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
 
     def __call__(self, s: FloatArray, width: FloatArray) -> FloatArray:
-        """Return the means over [s - width/2, s + width/2]; at width 0 the value."""
         centre, half = s / self._feature - self._start, np.abs(width) / self._feature / 2
         low, high = centre - half, centre + half
         first, last = self._index(low), self._index(high)

@@ -28,8 +28,6 @@ _MOST_COLUMNS = 2**22
 
 @dataclass(frozen=True, eq=False)
 class AccumulatedLight:
-    """Independent estimates ``groups`` of light (rows, cells), and the optics of its cells."""
-
     optics: FrameOptics
     groups: tuple[sparse.csr_array, ...]
 
@@ -40,21 +38,9 @@ Formed = tuple[FloatArray, FloatArray]
 
 
 def form_frames(lights: Lights, basis: sparse.csr_array, probes: FloatArray | None) -> Formed:
-    """Form frames of mixtures of light, and their replicates times probes.
+    """Form (b, m, m') frames of mixtures ``basis`` (b, rows), and products of groups' frames with ``probes``.
 
-    Parameters
-    ----------
-    lights
-        Lights of the same rows, whose frames add up.
-    basis
-        (b, rows) mixtures.
-    probes
-        (m', probes) from :func:`probe_vectors`; None for no replicates.
-
-    Returns
-    -------
-    tuple
-        (b, m, m') frames, and (b, m * groups * probes) products of single groups.
+    The products are (b, m * groups * probes), of ``probes`` (m', probes) from :func:`probe_vectors`; None for none.
     """
     shape, groups = lights[0].optics.frame_shape, len(lights[0].groups)
     mixed, count = _mix_lights(lights, basis), basis.shape[0]
@@ -131,7 +117,6 @@ class Mixture:
 
     @property
     def sparse(self) -> bool:
-        """Return True if adding the few frames of each shot is faster than a matrix product."""
         return bool(self.own.nnz <= _FEW * len(self.weights))
 
     def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
@@ -237,9 +222,7 @@ def bound_of(products: FloatArray, energy: float) -> float:
 
     With many kinds of noise, the products have G - 1 equal eigenvalues. With one kind, the bound is that of
     Student's t
-    with G - 1 degrees of freedom. In between, the squared bound grows with the squared norm of the products, faster
-    at
-    first, because three differences do not always show a kind that has most of the noise.
+    with G - 1 degrees of freedom. In between, the squared bound grows with the squared norm of the products.
     """
     variance, freedom = float(np.trace(products)), len(products) - 1
     if not energy or not variance or not freedom:

@@ -63,7 +63,6 @@ def at_once(pixels: float) -> int:
 
 
 def frames_in_memory(classes: int, shots: int, pixels: float) -> int:
-    """Return the number of frames that :class:`ExpectedFrames` holds at once."""
     return (classes if mixes(classes, shots, pixels) else 0) + 3 * at_once(pixels)
 
 
@@ -82,29 +81,18 @@ def mixes(classes: int, shots: int, pixels: float) -> bool:
 class ExpectedFrames:
     """Frames of every shot of a family, each with the Monte Carlo variance of its mean.
 
-    Because light is linear, frames are formed once for a *basis*, the classes of projector pixels that a family
-    always
-    lights together, and mixed. A family with too many classes is formed shot by shot. The variance of the mean of G
-    groups
-    is ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``, and 0 for one group. Squared norms are estimated without bias from
-    products with random signs (Hutchinson's estimator).
+    Because light is linear, frames are formed once for the classes of projector pixels that a family always lights
+    together,
+    and mixed; a family with too many classes is formed shot by shot. The variance of the mean of G groups is
+    ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``, and 0 for one group. Squared norms are estimated without bias from
+    products with
+    random signs (Hutchinson's estimator).
 
-    Parameters
-    ----------
-    lights
-        Light of the same rows in one or several kinds of cells; their groups are paired.
-    lighting
-        Class of each row, and the fraction of full power that each class emits in each shot.
-    seed
-        Seed of the random signs.
-    ambient
-        Light (1, cells) of every shot, with groups paired to those of ``lights``.
-    specular
-        Frames that are added to those of some classes.
-    probed
-        :attr:`probed` of other shots of the same lights, classes and seed.
-    restated
-        Factor of the Monte Carlo error relative to the estimate from the groups' differences.
+    ``lights`` have the same rows (classes or pixels), and their groups are paired with those of ``ambient`` (1,
+    cells), which
+    every shot has. ``lighting`` has the class of each row. ``specular`` frames are added to those of some classes.
+    ``probed``
+    products of the same classes and seed are reused, and ``restated`` scales the Monte Carlo error.
     """
 
     def __init__(
@@ -169,7 +157,6 @@ class ExpectedFrames:
     # ---- Monte Carlo error, from random signs alone ----
 
     def sampling_error(self) -> tuple[float, float]:
-        """Return the relative Monte Carlo error of all frames and its 95 % bound without forming frames."""
         parts, energy, _ = self._energies
         return (float(np.sqrt(np.trace(parts) / energy)), forming.bound_of(parts, energy)) if energy else (0.0, 0.0)
 
@@ -306,7 +293,6 @@ def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
 
 
 def monte_carlo_bound(frames: Sequence[Frame] | ExpectedFrames) -> float:
-    """Return the 95 % bound of the Monte Carlo error of all ``frames``."""
     parts, energy = np.zeros((1, 1)), 0.0
     for frame in frames:
         parts = parts + frame.by_group * frame.irradiance.size
@@ -346,7 +332,6 @@ Kernel = Callable[[FloatArray], FloatArray]
 
 
 def add_speckle(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
-    """Multiply ``irradiance`` by a gamma field of mean 1 and standard deviation ``contrast``."""
     if contrast == 0:
         return irradiance
     return np.asarray(irradiance * rng.gamma(contrast**-2, contrast**2, size=irradiance.shape))

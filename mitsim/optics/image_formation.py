@@ -155,20 +155,9 @@ _Layer = _Raster | _Terms
 class FrameOptics:
     """The closed form, prepared once; applying it changes nothing.
 
-    Parameters
-    ----------
-    geometry
-        The camera.
-    rows, columns
-        Directions of the cells along the two axes.
-    depths
-        Depth of each layer [mm].
-    anchors
-        Points per side of the sensor from which light is seen.
-    spectrum
-        Lines of a wave-optical shadow; None for a geometric shadow.
-    places
-        Increasing rows and columns of a frame; None for all.
+    ``depths`` of the layers are in mm, and ``anchors`` are the points per side of the sensor from which light is
+    seen.
+    ``spectrum`` is None for a geometric shadow. ``places`` are increasing rows and columns of a frame; None for all.
     """
 
     def __init__(
@@ -198,7 +187,6 @@ class FrameOptics:
 
     @classmethod
     def of_terms(cls, layers: Sequence[SeparableTerms], weights: tuple[FloatArray, FloatArray]) -> FrameOptics:
-        """Return optics from known ``layers`` of terms and ``weights`` of the anchors."""
         found = cls.__new__(cls)
         cells = layers[0][0][0].shape[1], layers[0][0][1].shape[1]
         found._prepare([_Terms(terms, weights) for terms in layers], cells)
@@ -213,7 +201,6 @@ class FrameOptics:
 
     @property
     def terms(self) -> list[SeparableTerms] | None:
-        """Return the terms of each layer; None if one is drawn on a raster."""
         found = [layer.terms for layer in self._layers if isinstance(layer, _Terms)]
         return found if len(found) == len(self._layers) else None
 
@@ -362,5 +349,4 @@ def anchor_positions(count: int, half_width: float) -> FloatArray:
 
 
 def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
-    """Return (len(at), len(anchors)) Lagrange weights."""
     return np.stack(lagrange_weights(at, np.asarray(anchors, dtype=np.float64)), axis=1)

@@ -36,22 +36,13 @@ _ASKEW_BOXES = 2
 class Beams:
     """Bundles of rays that reach the sensor plane; the last index of each pair is (row, column).
 
-    Attributes
-    ----------
-    pixel
-        (q,) projector pixel (row * n + column) that each beam leaves.
-    flux
-        (q,) flux at full power [W m^-2 mm^2].
-    sensor
-        (q, 2, 2, 2) points where the corner rays cross the sensor plane [mm].
-    tangent
-        (q, 2, 2, 2) tan-angles seen from these points, in index coordinates.
-    throughput
-        (q, 2, 2) part of the light that remains at each corner.
-    unresolved
-        Flux on the sensor whose place was not found.
-    error
-        Standard error of the flux from beams that an edge cuts and that were not divided further.
+    ``flux`` (q,) is that of projector ``pixel`` (q,), row * n + column, at full power [W m^-2 mm^2]. ``sensor`` (q,
+    2, 2, 2)
+    are the points where the corner rays cross the sensor plane [mm], ``tangent`` their tan-angles in index
+    coordinates, and
+    ``throughput`` (q, 2, 2) the part of the light that remains. ``unresolved`` is flux whose place was not found,
+    and ``error``
+    the standard error of the flux from beams that an edge cuts.
     """
 
     pixel: IntArray
@@ -67,7 +58,6 @@ class Beams:
 
     @property
     def delivered(self) -> FloatArray:
-        """Return the (q,) flux that arrives at the sensor plane [W m^-2 mm^2]."""
         return np.asarray(self.flux * self.throughput.mean(axis=(1, 2)))
 
     @property
@@ -100,18 +90,9 @@ def specular_frames(
 ) -> SpecularFrames:
     """Form the frames of the classes that mirrors bring to the sensor.
 
-    Parameters
-    ----------
-    beams
-        Result of ``mitsim.transport.specular.trace_specular_chains``.
-    geometry
-        The camera.
-    terms
-        Samplers of the mask; ``[]`` gives no light.
-    labels
-        (n * n,) class of each projector pixel.
-    boxes_per_pixel
-        Boxes along a sensor pixel, at least 2, because a box turned by 45 degrees must not reach a third pixel.
+    ``labels`` (n * n,) are the classes of projector pixels, and ``terms`` samplers of the mask; ``[]`` gives no
+    light. At
+    least 2 ``boxes_per_pixel`` are needed, because a box turned by 45 degrees must not reach a third pixel.
     """
     labels = np.asarray(labels)
     corners = beams.sensor.reshape(len(beams), 4, 2)
@@ -148,8 +129,6 @@ def specular_frames(
 
 
 class _Cut(NamedTuple):
-    """Numbers of beams, and places and size of their boxes, relative to a beam."""
-
     beams: IntArray
     a: FloatArray
     b: FloatArray
@@ -157,8 +136,6 @@ class _Cut(NamedTuple):
 
 
 class _Boxes(NamedTuple):
-    """Boxes on the sensor: beam (k,) and flux (k,); position, extent, tan-angle and magnification ds/du, all (k, 2)."""
-
     beam: IntArray
     flux: FloatArray
     place: FloatArray
@@ -270,7 +247,6 @@ class SpecularLight:
         self._kept = lru_cache(_KEPT)(self._form)
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
-        """Return the frames of classes ``labels`` (n^2,); None if no beam reaches the sensor."""
         if not len(self.beams):
             return None
         return self._kept(np.asarray(labels, np.int64).tobytes(), geometry, spectrum)

@@ -82,7 +82,6 @@ class ShadowGeometry:
 
     @classmethod
     def of(cls, camera: CameraGeometry, depth_mm: float, places: Places | None = None) -> ShadowGeometry:
-        """Return the shadow geometry for points at ``depth_mm``; ``places`` selects rows and columns."""
         rows, columns = (camera.centres(axis) for axis in (0, 1))
         if places is not None:
             rows, columns = rows[np.asarray(places[0])], columns[np.asarray(places[1])]
@@ -116,7 +115,6 @@ class ShadowGeometry:
         return replace(self, pixel_centres_mm=self.columns_mm[0], active_mm=self.columns_mm[1], columns_mm=None)
 
     def from_mask(self, directions: Directions, axis: int) -> tuple[ShadowGeometry, Directions]:
-        """Return shadow and directions along one ``axis`` in coordinates of the mask's centre."""
         offset, tilt, own = self.offset_mm[axis], (self.tilt[axis],) * 2, self.along(axis)
         if not offset:
             return (own if tilt == own.tilt else replace(own, tilt=tilt)), directions
@@ -153,7 +151,6 @@ def both_axes(
     columns: Directions,
     axis: Callable[[ShadowGeometry, list[FloatArray], Directions], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute a shadow along rows and columns, once if both are equal."""
     terms = shadow.mask.terms
     row_profiles, column_profiles = [row for _, row, _ in terms], [column for _, _, column in terms]
     by_row, seen_rows = shadow.from_mask(rows, 0)
@@ -217,7 +214,6 @@ def trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray
 
 
 def nodes_between(places: FloatArray, count: int) -> FloatArray:
-    """Return Chebyshev nodes between the ``places`` that are farthest from 0; 0 for one."""
     reach = float(np.abs(places).max())
     return np.asarray(reach * np.cos(np.pi * (np.arange(count) + 0.5) / count) if count > 1 else np.zeros(1))
 

@@ -230,8 +230,7 @@ def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
     """Return the factors that stripes give of an operator (:mod:`mitsim.reconstruct.factors`).
 
     The uniform response sum_k (L_k 1) (R_k 1)^T splits into a v^T, and stripes h 1^T into u v^T with
-    u = sum_k L_k h <R_k 1, v> / |v|^2. Therefore the left factor is the sum of L_k with these weights, and likewise
-    right.
+    u = sum_k L_k h <R_k 1, v> / |v|^2, so that the left factor is the sum of L_k with these weights.
     """
     uniform = best_term([(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True)) for a, b in terms])
     split = uniform.left[:, 0], uniform.right[:, 0]
@@ -324,7 +323,6 @@ class ModelledCamera:
         return Placement(self.geometry.mask_distance)
 
     def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
-        """Return the (m, n) and (m', n') factors [sqrt(electrons / s)] of an unturned mask."""
         left, right = self._cached_factors(replace(placement, gain=1.0, mask_rotation=0.0))
         root = np.sqrt(placement.gain)
         return left * root, right * root
@@ -352,7 +350,6 @@ class ModelledCamera:
         return form
 
     def rotation_terms(self, placement: Placement) -> SeparableTerms:
-        """Return the change of the product of the factors per radian of rotation of the mask."""
         step = {"mask_shift_row": _DERIVED_MM, "mask_shift_column": _DERIVED_MM}
         ahead = self.factors(placement.move(step))
         behind = self.factors(placement.move({name: -value for name, value in step.items()}))

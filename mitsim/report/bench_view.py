@@ -214,7 +214,6 @@ class BenchView:
         return bool(inside.all() and z.min() <= _BEHIND * self._end and z.max() >= min(0.0, self.layout.projector[2]))
 
     def _plan(self, axes: Axes, axis: int) -> None:
-        """Draw the bench from above (``axis`` 0) or from the side (1)."""
         layout, geometry, end, (low, high) = self.layout, self.bench.geometry, self._end, self._range
         aligned, tan, projector = geometry.scene_distance, geometry.tan_half_fov, layout.projector
         start, across = min(0.0, float(projector[2])), high - low
@@ -286,7 +285,6 @@ class BenchView:
         axes.set_title("The camera enlarged, from above", loc="left")
 
     def _from_beside(self, axes: Axes) -> None:
-        """Draw the preview from a free place, with the light and the camera's field."""
         preview, layout, geometry = self.previews[1], self.layout, self.bench.geometry
         _show(axes, preview, "From beside")
         axes.set_xlabel("orange: the projector's light; blue: the camera's field")
@@ -390,7 +388,6 @@ class BenchView:
 
 
 def _fill_surfaces(axes: Axes, surfaces: list[Surface], axis: int) -> None:
-    """Draw the scene from above (``axis`` 0) or the right (1); near triangles cover far ones."""
     corners, heights, colors = [], [], []
     for surface in surfaces:
         if len(surface.triangles) > _FEW:

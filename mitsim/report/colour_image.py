@@ -78,7 +78,6 @@ class ColourImage:
 
     @cached_property
     def truth_xyz(self) -> FloatArray | None:
-        """(n, n', 3) CIE XYZ of the truth by the same matrix; None without a truth."""
         return None if self.truth is None else self.model.xyz(self.board * self.truth)
 
     @cached_property

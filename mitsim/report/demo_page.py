@@ -101,8 +101,6 @@ class Trust:
 
 @dataclass(frozen=True, eq=False)
 class Recovery:
-    """One reconstruction with its quality, lambda, the solver's sentence, and trust."""
-
     image: FloatArray
     quality: Quality
     lam: float | None = None
@@ -195,7 +193,6 @@ def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
 
 
 def build_report(report: ReportData, path: Path) -> Path:
-    """Write the page to ``path``, all or nothing."""
     write_text(path, render_html(report))
     return Path(path)
 
@@ -240,12 +237,10 @@ def render_html(report: ReportData) -> str:
 
 
 def _reflectance(image: npt.ArrayLike, name: str = "image") -> str:
-    """Draw reflectance as a grey PNG, cut to 0..1."""
     return data_uri(grey_png(lightness(_finite(image, name)), smallest=_SMALLEST))
 
 
 def _pattern(pattern: npt.ArrayLike) -> str:
-    """Draw the top left corner of a pattern, with -1 black."""
     values = _finite(pattern, "pattern")[:_PATTERN_CORNER, :_PATTERN_CORNER]
     return data_uri(grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values, smallest=_SMALLEST))
 

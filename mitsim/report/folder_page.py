@@ -341,7 +341,6 @@ def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
 
 
 def _of_colours(lines: SpectralFolder) -> Shown:
-    """Show an image in colour; lines that were solved one by one have their own pages."""
     folder, colours, names = lines.folder, lines.colours, lines.names
     assert colours is not None
     data = read_json(folder / COLOUR)

@@ -1,13 +1,12 @@
 """Exposures of a scene under any pattern family, and the images that they give, for comparisons in studies.
 
-The *rendered* model uses the traced light and calibrated factors. The *idealised* model is the paper's, with its own
-exact factors: a planar scene that is lit evenly, without falloff, and a geometric shadow of one separable term. It
-takes
-reflectance and mean flux from the rendered bench, so that exposure and noise are equal.
-
-Exposure conventions: *equal peak* fills the same part of the full well with each family's brightest pixel; *equal
-frame*
-gives every frame the exposure of uniform light; *equal total* shares that exposure among the family's frames.
+The *rendered* model uses the traced light and calibrated factors. The *idealised* model is the paper's: a planar
+scene that
+is lit evenly, and a geometric shadow of one separable term. Reflectance, exposure and noise are equal. *Equal peak*
+fills
+the same part of the full well with each family's brightest pixel, *equal frame* gives every frame the exposure of
+uniform
+light, and *equal total* shares that exposure among the family's frames.
 """
 
 from __future__ import annotations
@@ -56,8 +55,6 @@ LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
 
 
 class LitScene:
-    """A bench in its ``light``, traced by projector pixel."""
-
     def __init__(self, light: SampledLight) -> None:
         self.light, self.bench = light, light.bench
         self.uniform_s = cache(self._uniform_s)
@@ -136,7 +133,6 @@ class Unexposed:
         return self.lit.uniform_s(self.model) / (len(self.family.shots) if exposure == EQUAL_TOTAL else 1)
 
     def prepare(self, binning: int = 1) -> Prepared:
-        """Return the factorised model for averages of ``binning`` x ``binning`` pixels, which have to fill a frame."""
         rows, columns = (len(side) for side in self.sides)
         if rows % binning or columns % binning:
             raise MitsimError(
@@ -147,7 +143,6 @@ class Unexposed:
         return prepare(left, right, self.family.left, self.family.right, centre=self.centre)
 
     def data(self, seconds: float, binning: int = 1) -> tuple[Prepared, Accumulator]:
-        """Return the factorised model, and one accumulated noisy exposure of all frames."""
         model = self.prepare(binning)
         (sums,) = accumulate(self.exposer(seconds), self.family, self.expected, [model], binning)
         return model, sums
@@ -204,7 +199,6 @@ def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
 
 
 def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
-    """Average ``binning`` x ``binning`` pixels of a ``frame``, whose sides are multiples of it."""
     if binning == 1:
         return frame
     rows, columns = (size // binning for size in frame.shape)
@@ -214,7 +208,6 @@ def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
 def accumulate(
     exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared], binning: int = 1
 ) -> list[Accumulator]:
-    """Expose a family's frames once, subtract ambient light, and accumulate them for each model."""
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
         ambient = taken_off(exposer, family, expected)
@@ -260,7 +253,6 @@ class IdealCamera:
         return self._terms(*self.directions)
 
     def points(self) -> SeparableTerms:
-        """Return the operator for point sources at the pixels' centres."""
         rows, columns = (Directions(pixels.centres, 0.0) for pixels in self.directions)
         return self._terms(rows, columns)
 
@@ -277,7 +269,6 @@ class IdealCamera:
         return left * np.sqrt(rate), right * np.sqrt(rate)
 
     def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:
-        """Return the frames of a family; ``flux`` (n, n) is each pixel's irradiance without the mask [W m^-2]."""
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
         optics = self._optics if plane is None else self._optics_at(plane)
         return ExpectedFrames([AccumulatedLight(optics, (light,))], family.lighting, seed=0)

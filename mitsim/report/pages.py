@@ -122,7 +122,6 @@ _MOST_LISTED = 6
 
 
 def plan_rows(plan: Mapping[str, Any] | None) -> tuple[PlanRow, ...]:
-    """Return the rows of a ``plan`` that have mitsim's own form."""
     listed = (plan or {}).get("effects")
     rows = []
     for each in listed if isinstance(listed, list) else ():
@@ -139,7 +138,6 @@ def plan_rows(plan: Mapping[str, Any] | None) -> tuple[PlanRow, ...]:
 
 
 def stages_of(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Return the seconds of each visible stage, and the rest as "all else"."""
     total, stages = total_of(seconds), {name: value for name, value in seconds.items() if name != "total"}
     shown = {name: value for name, value in stages.items() if value >= _LEAST_STAGE * total}
     rest = total - math.fsum(shown.values())
@@ -212,8 +210,6 @@ REFLECTANCE = Scale(0.0, 1.0, "of the board's reflectance")
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG with file name, title and caption; a ``wide`` one fills a page's width."""
-
     name: str
     title: str
     caption: str

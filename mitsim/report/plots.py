@@ -138,7 +138,6 @@ def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
 
 
 def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
-    """Draw (n, n) images [reflectance] with captions by the rows' names, cut to 0..1."""
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
     inches = (size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL
     figure, cells = panels_of(len(rows), len(columns), *inches, layout="compressed")
@@ -194,7 +193,6 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
 
 
 def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
-    """Draw the singular values of each system, relative to the largest, over their rank."""
     figure, axes = figure_of(0.42 * WIDTH)
     for index, (name, values) in enumerate(curves.items()):
         ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
@@ -288,7 +286,6 @@ def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
 
 
 def tells(figure: Figure) -> bool:
-    """Return True if a figure shows an image, or two points or bars."""
     for axes in figure.axes:
         if axes.images or any(
             isinstance(each, PolyCollection) or len(each.get_offsets()) > 1 for each in axes.collections
@@ -369,7 +366,6 @@ def draw_sensed(sensed: Sensed, ax: Axes | None = None) -> Axes:
 
 
 def draw_rendered(rendered: Rendered, ax: Axes | None = None) -> Axes:
-    """Draw the irradiance of a ``rendered`` frame, the mean of its channels."""
     channels = rendered.mean.shape[2]
     title = f"{rendered.facts['estimator']} estimator" + (f", mean of {channels} channels" if channels > 1 else "")
     return _draw(ax, rendered.mean.mean(axis=2), title, "irradiance [W/m$^2$]")

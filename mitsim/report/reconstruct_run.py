@@ -199,8 +199,6 @@ def reconstruct_colours(
 
 
 class _Work(NamedTuple):
-    """Folders of a coloured image, its ``board``, and the place of a chart."""
-
     lines: ColourManifest
     run: Path
     calibration: Path
@@ -456,7 +454,6 @@ class Solver:
             total.add(part, row, column)
 
     def images(self, lam: Lambda, relative: bool = False) -> LineImages:
-        """Solve for all lines; a number ``lam`` may be ``relative`` to the largest sigma^2."""
         pairs = [*zip(self._models, self._sums, strict=True)]
         energy = sum(total.energy for total in self._sums)
         if isinstance(lam, str):

@@ -1,9 +1,6 @@
 """Checks of a scene file before Mitsuba makes objects of it.
 
-Making objects can run native code and read any file, and Mitsuba accepts NaN, negative light or a reflectance of 2
-silently. Therefore :mod:`mitsim.scene.outline` checks the bytes, ``mitsuba.parser`` parses them without plugins, and
-the
-tree is checked here with the ``limits`` of numbers and the ``headers`` of files.
+Making objects can run native code and read any file, and Mitsuba accepts NaN, negative light or a reflectance of 2.
 """
 
 from __future__ import annotations
@@ -109,7 +106,6 @@ def check_file(
 
 @contextmanager
 def looking_beside(outline: Outline) -> Iterator[None]:
-    """Let Mitsuba find files in the scene's folder; turn its errors into MitsimError."""
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
     beside.prepend(mi.filesystem.path(str(outline.path.parent)))

@@ -183,8 +183,6 @@ _Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class _Element:
-    """Number and properties of an element of a PLY file."""
-
     count: int
     properties: list[tuple[str, str]]
 

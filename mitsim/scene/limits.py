@@ -29,8 +29,6 @@ _MOST_UNEVEN = 1e7
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers from ``low`` to ``high``; ``above`` and ``below`` exclude the bounds."""
-
     low: float
     high: float
     above: bool = False
@@ -160,7 +158,6 @@ def check_plugin(tag: Tag, plugin: str) -> None:
 
 
 def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) -> None:
-    """Raise MitsimError if a ``variant`` lacks the ``plugin``, or properties that it needs."""
     backend, _, kind = variant.rpartition("_")
     if plugin in _LACKED and kind != "spectral":
         rule = f"{variant} lacks it: {_LACKED[plugin].format(spectral=f'{backend}_spectral')}"

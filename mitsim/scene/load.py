@@ -98,7 +98,6 @@ class LoadedScene:
 
     @cached_property
     def smoothed(self) -> bool:
-        """Return True if a surface may have shading normals that differ from its own."""
         return any(_is_smoothed(shape) for shape in self.scene.shapes())
 
 
@@ -374,7 +373,6 @@ _MOST_PASSED = 16
 
 
 def why_dark(loaded: LoadedScene) -> str:
-    """Return the reason why the sensor sees nothing, and the remedy."""
     geometry, grid = loaded.camera.geometry, loaded.pixels
     to_world = loaded.camera.world_transform()
     projector_to_world = mi.traverse(loaded.projector)["to_world"]

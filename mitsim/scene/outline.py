@@ -53,7 +53,6 @@ class Tag:
         return f"<{cut(self.name + written, 200)}>"
 
     def refusal(self, what: str, value: object, rule: str) -> MitsimError:
-        """Return ``file:line: what: got value in <tag ...>; rule`` as an error."""
         got = cut(value if isinstance(value, str) else f"{value:g}")
         return MitsimError(f"{self.path}:{self.line}: {cut(what)}: got {got} in {self}; {rule}")
 
@@ -102,7 +101,6 @@ class Outline:
         return self._tags.get((*key, name)) or self._tags[(*key, "")]
 
     def refusal(self, error: BaseException) -> MitsimError:
-        """Return one line for an ``error`` of Mitsuba, with the last place that it names."""
         message = one_line(error)
         places = [*re.finditer(r"(?:[Ww]hile loading|At) (\S.*?) \(line (\d+), col (\d+)\): ", message)]
         if not places:
@@ -285,13 +283,11 @@ class SceneFiles:
         return path
 
     def include(self, tag: Tag, name: str) -> Path:
-        """Return the file of an ``<include>``, relative to the file that names it."""
         path = self.find(tag, name, tag.path.parent)
         _check_native(tag.path, path.parent)
         return path
 
     def spectrum(self, tag: Tag, folder: Path, name: str) -> None:
-        """Check the file of a spectrum, for which Mitsuba looks in ``folder`` first."""
         if self.find(tag, name, folder).stat().st_size > _MOST_SPECTRUM:
             raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
 

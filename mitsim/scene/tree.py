@@ -41,9 +41,9 @@ _ALIGNED = float(CameraGeometry.model_fields["scene_distance"].default)
 def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tuple[Tag, float], ...]:
     """Move all objects of a checked tree so that its first ``mitsim_lensless`` is at the origin; directions are kept.
 
-    Return the tag of each shape, and the distance [mm] by which its single precision vertices are moved. Raises
-    MitsimError
-    if a projector is too far from its camera for single precision.
+    Return the tag and the moved distance [mm] of each shape in single precision. Raises MitsimError if a projector
+    is too far
+    from its camera.
     """
     nodes = state.nodes
     cameras = [node for node in nodes if node.props.plugin_name() == "mitsim_lensless"]
@@ -72,7 +72,6 @@ def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tupl
 
 
 def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
-    """Raise MitsimError for a mesh that loses its digits near the camera."""
     if len(moved) != len(scene.shapes()):
         return
     for (tag, distance), shape in zip(moved, scene.shapes(), strict=True):
@@ -111,7 +110,6 @@ def _is(node: mi.parser.SceneNode, kind: str) -> bool:
 
 
 def placement_of(props: mi.Properties, centred: bool = True) -> FloatArray:
-    """Return the (4, 4) transform to the world, about the object's centre if ``centred``."""
     name = _CENTRES.get(props.plugin_name(), "position")
     matrix = np.array(props["to_world"].matrix, dtype=np.float64) if "to_world" in props else np.eye(4)
     if centred and name in props:
@@ -263,7 +261,6 @@ def _point(props: mi.Properties, name: str, default: tuple[float, float, float])
 
 
 def prism(props: mi.Properties) -> Mesh:
-    """Return the prism of a cylinder in the world, with normals and uv of Mitsuba's cylinder."""
     radius = float(props.get("radius", 1.0))
     first, last = _point(props, "p0", (0, 0, 0)), _point(props, "p1", (0, 0, 1))
     v, u = np.meshgrid([0.0, 1.0], np.linspace(0, 1, _SIDES + 1), indexing="ij")

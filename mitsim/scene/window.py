@@ -112,10 +112,7 @@ def straightening(where: str, projector: mi.Emitter, camera: mi.Sensor, grid: Pr
 
 
 def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window: _Place, z: float) -> FloatArray:
-    """Return the (4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
-
-    The homography between plane and picture is determined by four probes of the emitter.
-    """
+    """Return the (4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, from four probes."""
     half = 0.25 * z  # any four points do
     probes = np.array([[half, half], [half, -half], [-half, half], [-half, -half]])
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(probes))
