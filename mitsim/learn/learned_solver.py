@@ -69,7 +69,7 @@ class LearnedSolver(Solver):
         return f"{self.manifest.method} {digest.hexdigest()[:12]}"
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
-        """Factorise the camera's model, with doubts where it differs from the model of the training.
+        """Factorise the camera's model, with doubts where it differs from that of the training.
 
         Raise MitsimError for images of another size, other patterns, and another camera where the weights belong to
         one.

@@ -1,17 +1,15 @@
 """Learned methods: the network that all share, the camera's model as tensors, the methods, and FlatNet's losses.
 
-*Network.* A U-Net (Ronneberger et al., arXiv 1505.04597) returns a change of its input. Its last layer begins at zero,
-so that an untrained network changes nothing. Training turns and mirrors images in one of eight ways for each step; a
-reconstructed image is the mean over all.
+*Network.* A U-Net (Ronneberger et al., arXiv 1505.04597) returns a change of its input. Its last layer begins at zero.
+Training turns and mirrors images; a reconstructed image is the mean over all eight ways.
 
-*Camera.* In the basis where the model is diagonal (:mod:`mitsim.reconstruct.solver`) W = sigma o C + noise, with C =
-V_L^T X V_R the coefficients of the image X. Over the noise's standard deviation, w = s o C + noise of variance 1. The
-image nearest to both the data and an image Z, argmin ||w - s o C||^2 + rho ||X - Z||^2, is ::
+*Camera.* In the basis where the model is diagonal (:mod:`mitsim.reconstruct.solver`), over the noise's standard
+deviation, w = s o C + noise of variance 1, with C = V_L^T X V_R the coefficients of the image X. The image nearest to
+both the data and an image Z, argmin ||w - s o C||^2 + rho ||X - Z||^2, is ::
 
     X = Z + V_L [s (w - s o V_L^T Z V_R) / (s^2 + rho)] V_R^T
 
-Unmeasured directions remain those of Z. All methods begin at the image nearest to the frames and to an even grey; a
-network adds the unmeasured part.
+Unmeasured directions remain those of Z. All methods begin at the image nearest to the frames and to an even grey.
 """
 
 from __future__ import annotations
@@ -58,10 +56,9 @@ class UNet(nn.Module):
         self.to(memory_format=torch.channels_last)
 
     def forward(self, images: Tensor, way: int = 0) -> Tensor:
-        """Return the change of images (B, channels_in, n, n') that are seen in a way from 0 to 7.
+        """Return the change of images (B, channels_in, n, n'), mirrored and transposed by the bits of ``way``.
 
-        The bits of the way mirror both axes and exchange them. Training uses bfloat16 where the processor computes with
-        it, because it is twice as fast.
+        Training uses bfloat16 where the processor computes with it, because it is twice as fast.
         """
         axes = [axis for axis in (-2, -1) if way >> (axis + 2) & 1]
         half = self.training and has_half(images.device)
@@ -191,8 +188,6 @@ class Data:
 
 
 class Binning(Accumulator):
-    """Sum of frames that also keeps them binned, in `frames` (K, K', b, b') of single precision."""
-
     def __init__(self, prepared: Prepared) -> None:
         super().__init__(prepared)
         sides = prepared.left, prepared.right
@@ -239,7 +234,6 @@ class Method(nn.Module):
         return torch.stack([self(data, model, way) for way in range(WAYS)]).mean(0)
 
     def loss(self, truths: Tensor, data: Data, model: Diagonal, noise: torch.Generator) -> Tensor:
-        """Return the mean logarithm of the squared errors, so that every picture counts by its decibels."""
         return decibels(self(data, model, drawn_way(noise)), truths)
 
 
@@ -390,8 +384,7 @@ _RATE, _BETAS, _SLOPE = 2e-4, (0.5, 0.999), 0.2
 class Critic:
     """FlatNet's two other losses: differences of features, and an adversary.
 
-    Features come from a network with drawn weights, which work as well as learned ones (Liu et al., arXiv 2103.10571),
-    so that no weights are downloaded.
+    Features come from drawn weights, which work as well as learned ones (Liu et al., arXiv 2103.10571).
     """
 
     def __init__(self, request: Training, like: Tensor) -> None:

@@ -72,7 +72,7 @@ class PairsManifest(BaseModel):
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     """Version of the layout."""
     kind: Literal["pairs"] = "pairs"
-    """What the folder is."""
+    """Kind of the folder."""
     status: Literal["incomplete", "complete"] = "complete"
     """Whether all shards are written."""
     configuration: dict[str, Any] = {}
@@ -92,7 +92,7 @@ class PairsManifest(BaseModel):
     sensor: str
     """The sensor's model as JSON, by which noise is drawn."""
     digital: Digital
-    """How numbers become electrons a second, and what noise they have, at that exposure."""
+    """Conversion of numbers to electrons a second, and their noise, at that exposure."""
     scene: str
     """Where the scene lies."""
     idealised: bool
@@ -111,7 +111,7 @@ class PairsManifest(BaseModel):
     ambient_shots: int = Field(ge=0)
     """Shots of the ambient frame that is taken off; 0: none is."""
     groups: tuple[dict[str, float], ...] = ()
-    """What was drawn for each bench, where benches vary."""
+    """Drawn numbers of each bench, where benches vary."""
     shards: tuple[Shard, ...] = ()
     """Files, in order."""
     warnings: tuple[str, ...] = ()
@@ -153,7 +153,7 @@ class ModelManifest(Configuration):
     noise: tuple[float, float] = Field(strict=False)
     """Noise of a datum over its rms, least and largest of the pairs."""
     pairs: Plain
-    """What the store of the pairs says of itself."""
+    """Facts of the store of the pairs."""
     training: Plain
     """Steps, batch, rate, seed and weights of losses; `curve`, the PSNR of pairs that choose, by step; `psnr_db` of
     pairs that neither teach nor choose."""

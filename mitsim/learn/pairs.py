@@ -139,7 +139,6 @@ class WhitePrints:
         return PrintLight(tuple(parts), emission(simulation.physics, lighting))
 
     def ideal_light(self, family: PatternFamily) -> PrintLight:
-        """Return the light of the separable model: even on all pixels, the mask without diffraction."""
         bench, lighting = self.light.bench, family.lighting
         pixels, classes = bench.n**2, int(lighting.labels.max()) + 1
         sides = IdealCamera(bench, bench.geometry.mask).directions
@@ -295,7 +294,6 @@ class FolderPictures:
 
     @cached_property
     def photographs(self) -> tuple[int, ...]:
-        """Number of the first file that holds the same bytes as each file."""
         digests = [hashlib.sha256(path.read_bytes()).digest() for path in self.files]
         return tuple(map(digests.index, digests))
 
@@ -346,7 +344,6 @@ class _Maker:
         return "" if self._asked.idealised else traced_anew(bench)
 
     def check(self, shards: Sequence[Shard]) -> None:
-        """Read all pictures and open all benches before any light is traced; MitsimError if one fails."""
         if isinstance(self._pictures, FolderPictures):
             files = len(self._pictures.files)
             for number in {index % files for each in shards for index in range(each.first, each.first + each.count)}:

@@ -81,7 +81,7 @@ ORDERS = {"2 surfaces": (2, 2), "3 surfaces": (3, 3), "4 surfaces": (4, 4), "5 o
 _FEWER = 4
 """Factor of samples that an order saves because it is traced alone."""
 
-# -------- A scene and its patterns, with what the pilot measured of them
+# -------- A scene and its patterns, with the results of the pilot
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +189,6 @@ class Judge:
         return {**measured, **judge, "sensor_noise": noise if np.isfinite(sensor.full_well_e) else None}
 
     def of_reference(self) -> SampledLight:
-        """Return the light without effects that the reference lacks."""
         probe, plan, absent = self.probe, self.light.plan, names(lambda effect: not effect.in_reference)
         if not any(EFFECTS[name].retraced(Physics.of(probe.bench)) for name in absent & plan.settings.effects):
             return reform(self.light, absent)
@@ -236,11 +235,10 @@ def _timed(work: Callable[[], object]) -> float:
     return time.perf_counter() - started
 
 
-# -------- What one point measures
+# -------- Measurement of one point
 
 
 def measure_run(judge: Judge, accuracy: float, opening_s: float) -> Iterator[dict[str, Value]]:
-    """Yield the row of a whole capture at an ``accuracy``, whose scene took ``opening_s`` to open."""
     probe, stages, errors = judge.probe, [], []
     bench, plan = probe.bench, probe.plan(accuracy)
     around = probe.pilot_runs.seconds + sum(frame_seconds(bench, len(probe.family.shots)).values())
@@ -304,7 +302,6 @@ def _part_row(
 
 
 def full_plan(probe: Probe) -> Plan:
-    """Return the plan with all parts on, and samples that take at most :data:`PART_S`."""
     plan = probe.plan(probe.accuracy)
     now, finer = plan.settings, probe.finest(plan).settings
     counted = ("anchors", "followed_anchors", "occluded_anchors", "subdivision")
@@ -449,7 +446,6 @@ def _reaching(row: dict[str, Any], error: float) -> dict[str, Any]:
 
 
 def _kept(rows: DataFrame) -> tuple[str, bool | None]:
-    """Judge whether each run keeps its accuracy, with room for the judge's error and for sampling."""
     rows = rows[rows["error"].notna()]
     over = [row["error"] / math.hypot(row["accuracy"], row["judge_error"]) for row in rows.to_dict("records")]
     return (f"error over accuracy at most {max(over):.2f}", max(over) <= 1.25) if over else ("not measured", None)
@@ -461,7 +457,6 @@ def _unbiased(rows: DataFrame) -> tuple[str, bool]:
 
 
 def _faster(rows: DataFrame) -> tuple[str, bool | None]:
-    """Judge how much longer than the quoted run the reference takes for the same error."""
     quoted = choose_rows(rows, {"estimator": RUN, "accuracy": QUOTED, "extrapolated": False}).to_dict("records")
     slow = choose_rows(rows, {"estimator": REFERENCE}).to_dict("records")
     if not quoted or not slow:

@@ -67,7 +67,7 @@ if TYPE_CHECKING:
 AnyBench = TypeVar("AnyBench", bound=Apparatus)
 Row = dict[str, Value]
 
-# -------- What each source costs an image
+# -------- Cost of each source in an image
 
 CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"
 RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
@@ -142,8 +142,7 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[Los
 def _drifts(stand: DriftStand, budget: Budget, measured: float) -> tuple[list[LossRow], list[str]]:
     """Return rows of drifts, and reasons why some were not predicted.
 
-    The model's drift does not move light that the model lacks. Therefore the uncertainty is all that the model's error
-    and the rest have in common, and chance.
+    The model's drift does not move light that the model lacks, so that all common parts of both errors are uncertain.
     """
     still, found, refused = stand.expected_image(Drift()), list[LossRow](), list[str]()
     target, scene, pixels = still.image - budget.steady, stand.lit.truth, budget.steady.size
@@ -158,7 +157,7 @@ def _drifts(stand: DriftStand, budget: Budget, measured: float) -> tuple[list[Lo
             Prediction(stand.before_db, still.psnr_db(truth), moved.psnr_db(truth)).predicted_lost_db
             for truth in (target, scene)
         )
-        # Noise that happens to look like what the drift does, and the draw of what drifts at random.
+        # Noise that happens to resemble the effect of the drift, and the draw of random drifts.
         alike = budget.scatter.common(budget.drawn, moved.image - still.image) / pixels
         chance = math.hypot(alike, math.sqrt(stand.scatter(drift, budget.steady))) / measured
         sure = math.hypot(lost - apart, 10 * math.log10(1 + chance / 10 ** (lost / 10)))
@@ -232,7 +231,7 @@ def gain_without(part: float, measured: float, explained: float, deviation: floa
     chance = abs(_decibels((part + deviation) / most) - lost)
     if measured >= explained:
         return lost, math.hypot(chance, _decibels(part / explained if explained else 0.0) - lost)
-    # More is predicted than there is: at most, all of what is too much is this source's.
+    # The prediction exceeds the measurement, by this source at most.
     return lost, math.hypot(chance, _decibels(max(part - (explained - measured), 0.0) / measured) - lost)
 
 
@@ -311,7 +310,6 @@ _PROFILE_MM, _SAID_DB = 0.7, 0.005
 def measure_session(
     bench: Bench, recipe: SessionRecipe, patterns: str, seed: int, accuracy: float
 ) -> tuple[list[Row], dict[str, FloatArray]]:
-    """Return rows of a session without its ``recipe``'s drift, and of an image, and maps of the factors' errors."""
     job, family = Job(), bench.family(patterns, seed)
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), seed)
@@ -387,7 +385,6 @@ def compare_shadows(bench: Bench) -> list[Row]:
 
 @single_threaded_blas()
 def judge_session(lit: LitSession, noisy: Estimate, clean: Estimate) -> tuple[list[Row], dict[str, FloatArray]]:
-    """Return errors of ``noisy`` factors beside their prediction, and maps (m, n) in predicted deviations."""
     rows, maps = [session_cost(lit, noisy, clean)], {}
     pairs = zip(FACTORS, SIDES, (clean.left, clean.right), (noisy.left, noisy.right), strict=True)
     for name, side, exact, found in pairs:
@@ -417,7 +414,7 @@ def singular_rows(exact: FloatArray, found: FloatArray, deviation: FloatArray) -
     left, values, right = np.linalg.svd(exact, full_matrices=False)
     _, noisy, turned = np.linalg.svd(found, full_matrices=False)
     variance = np.square(deviation)
-    # Means of a_jk^2 and of a_jk a_kj, at [j, k]; and of what leaves the span of U, by k.
+    # Means of a_jk^2 and of a_jk a_kj, at [j, k]; and of the part outside the span of U, by k.
     squares = np.square(left).T @ variance @ np.square(right).T
     products = np.zeros_like(squares)
     for column, vector in zip(variance.T, right.T, strict=True):

@@ -24,7 +24,7 @@ from mitsim.sensor.emva import LEAST_DARK, LINEAR, MOST_FITTED, SPLIT, Alike, Pa
 from mitsim.sensor.moments import frame_moments
 from mitsim.studies.emva_options import Procedure
 
-# -------- Simulated frames, and what closed forms expect of frames
+# -------- Simulated frames, and closed-form expectations
 
 _TO = 1.15
 _DARK_STEPS = 6
@@ -160,7 +160,6 @@ class Frames:
         return 0.0 if sensor.bits is None or clear else spread
 
     def offset_slope(self, index: int) -> float:
-        """Return digital numbers per electron of offset in a set, rms over the pixels."""
         spread = self.spread
         if not spread:
             return self.sensor.gain_dn_per_e
@@ -168,7 +167,6 @@ class Frames:
         return self.sensor.gain_dn_per_e * math.sqrt(float(between[0])) / spread
 
     def slope(self, electrons: float) -> float:
-        """Return digital numbers per electron of light around a level."""
         if not self.sensor.linearity:
             return self.sensor.gain_dn_per_e
         around = np.array([electrons * 0.999, electrons * 1.001 + 1])
@@ -222,10 +220,9 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
 
 
 def _draw_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -> list[Stack]:
-    """Draw dark and bright stacks: sums of squares of offsets, responses and remaining noise.
+    """Draw dark and bright stacks with common offsets.
 
-    By row, column and pixel these are independent: with f degrees of freedom squares are chi-square, and products of
-    two parts normal. Both stacks share offsets.
+    Sums of squares by row, column and pixel are independent: chi-square, and normal for products of two parts.
     """
     m, n = frames.shape
     places = frames.dark, frames.bright
@@ -352,7 +349,6 @@ def _faults(flats: FlatFrames, taken: Sequence[Alike]) -> Iterator[str]:
 
 
 def _altered(flats: FlatFrames, taken: Sequence[Alike], used: Sequence[Alike]) -> list[tuple[bool, bool, str]]:
-    """Return signs of altered numbers or exchanged sets: seen, refused, and the text."""
     names, means = _names(flats), [each.mean for each in taken]
     peak, dark = means[saturation_of(taken)[0]], min(each.mean for each in taken if not each.light)
     combs = [

@@ -3,7 +3,7 @@
 **Light without effects** (:class:`Ablation`). Light without any effect is the paper's idealised model: an evenly lit
 sheet at the aligned distance that shows the truth, under the geometric shadow of the mask. Without
 
-- *falloff*, every projector pixel is as bright on a white board as their mean, in matt scenes at every sensor pixel;
+- *falloff*, every projector pixel is as bright on a white board as their mean, in matt scenes all over the sensor;
 - *diffraction*, *black level*, *speckle*, values are neutral (:data:`mitsim.bench.effects.EFFECTS`);
 - *keystone*, light lies where its projector pixel would, if the window filled its bounding box evenly;
 - *depth*, light lies where its ray from the projector meets the aligned plane;
@@ -134,7 +134,7 @@ class Ablation:
         if not off:
             return self.light
         bench, moved = self.light.bench, off & _MOVED
-        # Light over mirrors lies among direct light, and only tracing tells one from the other.
+        # Light over mirrors lies among direct light, and only tracing separates them.
         direct = self._trace(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
         share = self.light.simulation.physics.projector.share  # the truth has no glare
         flux = share * self._exact if RENDER_NOISE in off else self.light.flux
@@ -214,7 +214,7 @@ class _AblationSimulation(Simulation):
         }
 
     def accumulator(self, name: str, labels: Labels, lines: int) -> DeviceAccumulator | None:
-        # What is added up on the device lies where it was traced.
+        # Light that is accumulated on the device lies where it was traced.
         moved = self._off & {DEPTH, KEYSTONE} and PASSES[name].anchors
         return None if moved else super().accumulator(name, labels, lines)
 
@@ -310,7 +310,6 @@ def _present(light: SampledLight) -> dict[str, bool]:
 
 
 def _off_plane(light: SampledLight) -> bool:
-    """Return True if some light is seen beside its place on the aligned plane."""
     bench, simulation = light.bench, light.simulation
     path_samples = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
     size = [(last - first) / bench.n for first, last in bench.windows]
@@ -367,7 +366,6 @@ def reform(light: SampledLight, absent: frozenset[str]) -> SampledLight:
 
 
 def ablations(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str, Settings]]:
-    """Yield the name of each present effect, or number above one, and ``settings`` without it."""
     for name in sorted(present & names(lambda effect: effect.in_frames)):
         yield name, replace(settings, effects=settings.effects - {name})
     if settings.anchors > 1:
@@ -455,7 +453,6 @@ class Expected:
     variance: float = 0.0
 
     def psnr_db(self, truth: FloatArray) -> float:
-        """Return the PSNR of the mean squared error against a ``truth`` (n, n'), peak 1."""
         square = (float(np.square(self.image - truth).sum()) + self.variance) / truth.size
         return float("inf") if square == 0 else float(-10 * np.log10(square))
 
@@ -530,7 +527,6 @@ class LinearImage:
     centre: bool = False
 
     def expected_image(self, scene: FloatArray, changed: Changed | None = None, noise: Noise | None = None) -> Expected:
-        """Return the expected image of a ``scene`` (n, n') with differences and noise of its frames."""
         changed, noise = changed or Changed(), noise or Noise()
         left, right = self.axes
         cameras = [(self.left, self.right), *changed.terms]  # U has no means where frames are to lose theirs

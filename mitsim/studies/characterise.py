@@ -66,7 +66,6 @@ _UNITS = {
 
 
 def figures_set(frames: Frames) -> dict[str, float]:
-    """Return the figures that the camera is set to; variances of those found as variances."""
     sensor, brightest, current = frames.sensor, int(frames.light.argmax()), mean_dark_current(frames.sensor)
     alive, light = 1 - sensor.dead_pixels, float(frames.light[brightest])
     # At no exposure if the light varies by exposure.
@@ -362,7 +361,6 @@ def characterise(
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Measure a real camera by its frames under even light and in the dark."""
     job, facts = job or Job(), listed.listed
     stated = {name: getattr(facts, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
 

@@ -147,7 +147,6 @@ def replace_spectra(scene: str, folder: Path, weigh: Callable[[FloatArray, Float
 
 
 def serving(line: LitLine, other: LitLine) -> Factors:
-    """Return the factors of an ``other`` line for a ``line``, with the gain nearest to its own."""
     own, model = line.factors, other.factors
     gain = 1.0
     for mine, theirs in ((own.left, model.left), (own.right, model.right)):
@@ -225,7 +224,6 @@ def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
 def daylit_images(
     line: LitLine, light: tuple[FloatArray, float], lux: float, patterns: str, seed: int
 ) -> list[Solution]:
-    """Solve an exposure of a line beside daylight, by Tikhonov's and by Markov's regularisation."""
     bench, family = line.lit.bench, line.lit.bench.family(patterns, seed)
     lamp = lux / FULL_LX * electrons_from_irradiance(light[0], 1.0, bench.sensor, light[1])
     unit = Exposer(bench.devices, 1.0, 0)
@@ -244,7 +242,6 @@ def daylit_images(
 
 
 def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
-    """Return the exposure time [s] that fills the default part of the full well."""
     brightest = max(float(rate.max()) for rate in rates) + sensor.superpixel_dark_current_e_per_s
     return float(Exposure().fraction * sensor.superpixel_full_well_e / brightest)
 

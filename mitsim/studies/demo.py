@@ -259,6 +259,5 @@ def doubts(family: FamilyResult) -> tuple[str, ...]:
 
 
 def scene_line(path: Path) -> str:
-    """Return the scene's name, and the first sentence of the comment that opens its file."""
     name, (sentence, _) = path.resolve().parent.name, opening_words(path)
     return f"{name}: {sentence}" if sentence else name

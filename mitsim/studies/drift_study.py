@@ -95,6 +95,7 @@ class Prediction:
 
     @property
     def predicted_error_db(self) -> float:
+        """Return the change of the loss if the image without drift is as predicted, because the model omits light."""
         return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
 
 
@@ -226,7 +227,6 @@ class DriftStand:
         return {name: self.linear.expected_image(self.lit.truth, each).image - still for name, each in alone.items()}
 
     def clear(self, factors: Factors, light: SampledLight) -> FloatArray:
-        """Return the image (n, n) of noiseless frames of a ``light``, by the lambda without a drift."""
         return LitScene(light).rendered_frames(factors, self.family, self.seed).clear(self.linear.lam)
 
     @cached_property
@@ -248,14 +248,13 @@ class DriftStand:
         return found
 
     def _frame_changes(self, drift: Drift) -> Changed:
-        """Return the changes of the frames by a ``drift``, to first order."""
         count = self.family.left.shape[1], self.family.right.shape[1]
         black = self.lit.light.simulation.physics.black_level
         ramp = levels(self.seed, "power", len(self.family.shots), drift.power_ramp).reshape(*count, -1)
         gain = (1 + drift.exposure) * (1 + drift.power) * ramp
         changed = Changed(
             terms=self._terms(drift),
-            leak=black / (1 - black),  # as a part of a session's light, which lacks what black pixels leak
+            leak=black / (1 - black),  # as a part of a session's light, which lacks the leak of black pixels
             gain=gain.mean(axis=2),
             gain_apart=(gain[:, :, 0] - gain[:, :, -1]) / 2,
             flicker=self._gains(drift, "power", drift.power_flicker),
@@ -297,7 +296,6 @@ class DriftStand:
         return frame if own.dark_e_per_s is None else frame + own.dark_e_per_s - sensor.superpixel_dark_current_e_per_s
 
     def _gains(self, drift: Drift, source: str, rms: float) -> Gains:
-        """Return gains from frame to frame: a flicker of ``rms``, and cosine and sine of its ripple."""
         found: list[float | FloatArray] = [rms] if rms else []
         if source in drift.ripples:
             amplitude, hertz = drift.ripples[source]
@@ -311,7 +309,6 @@ class DriftStand:
         return self.linear.scatter(self.lit.truth, self._frame_changes(drift), error) / error.size**2
 
     def _terms(self, drift: Drift) -> SeparableTerms:
-        """Return the terms that a ``drift`` of mask or projector adds to the camera's operator."""
         bench = self.lit.bench
         best = IdealCamera(bench, bench.geometry.mask, self._spectrum).factors
         at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
@@ -413,7 +410,6 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def recipe_of(path: str | None) -> SessionRecipe:
-    """Return the recipe at ``path``, or the shipped one with a drift; MitsimError as :func:`load_recipe`."""
     return load_recipe(shipped_path("calibration", "drift.toml") if path is None else Path(path))
 
 
@@ -454,9 +450,7 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
 
 
 def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
-    """Return the scene in light of a moved projector, by the same plan, because another plan's errors would count as
-    drift.
-    """
+    """Return the scene in light of a moved projector, by the same plan, so that errors of plans cancel."""
     return LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan))
 
 

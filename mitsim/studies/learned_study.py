@@ -102,7 +102,6 @@ _PAINT = """<bsdf type="diffuse" id="sheet_bsdf">
 
 
 def place_setup(studio: Studio, setup: Setup, place: str) -> Setup:
-    """Return the setup of one of :data:`PLACES`; MitsimError where a shipped scene lacks what is changed."""
     shipped = "lamp_bench" if place == AMBIENT else "photograph"
 
     def write(folder: Path) -> None:
@@ -184,7 +183,6 @@ class Case:
 
 
 def case_of(studio: Studio, setup: Setup, condition: str, patterns: str, seed: int) -> Case:
-    """Return the frames of a setup's print, exposed at equal peak, from a shared file."""
 
     def write(path: Path) -> None:
         place = next(name for name, conditions in PLACES.items() if condition in conditions)
@@ -257,7 +255,6 @@ class School:
     budget: Budget
 
     def network(self, cell: Cell) -> tuple[LearnedSolver, float | None]:
-        """Return the network of a ``cell``, and the time of its training [s], or None if it resumed or existed."""
         from mitsim.learn.learned_solver import read_network
         from mitsim.learn.training import train_network
 
@@ -466,9 +463,9 @@ def _flags(found: Solution, case: Case) -> dict[str, Value]:
 
 
 def network_row(model: LearnedSolver, factors: Factors, case: Case) -> tuple[dict[str, Value], FloatArray]:
-    """Return scores, flags and image of a network with a calibration's ``factors``.
+    """Return scores, flags and image of a network.
 
-    An image is flagged for frames that it does not reproduce (``flag_image``), frames that no image gives
+    Flags are for frames that the image does not reproduce (``flag_image``), frames that no image gives
     (``flag_frames``), another camera or calibration, and unknown noise.
     """
     from mitsim.learn.learned_solver import beyond_noise

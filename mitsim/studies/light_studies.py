@@ -1,13 +1,11 @@
-"""Studies of light: the patterns, their exposure, ambient light, and what gloss and light over several surfaces do.
+"""Studies of light: the patterns, their exposure, ambient light, gloss, and light over several surfaces.
 
-*patterns*, section IV-B and figure 4 of the paper: 1 to 64 uniform, random, dots or Hadamard patterns, by three ways to
-expose them.
+*patterns*: section IV-B and figure 4 of the paper. *ambient*: supplement, with a lamp from a hundredth of the
+projector's light to a hundred times.
 
 *exposure*, section V-B, figure 9, and the supplement's error analysis: for a least-squares image x' of a scene x, ||x||
 / ||x - x'|| = ||x|| / (s rho), with rho^2 = Tr (A^T A)^-1 = sum 1 / s_i^2 over the singular values of the model A of
 all frames, and s the noise of a datum. (The paper writes SER = sqrt(T) SNR / rho for T equal frames.)
-
-*ambient*, supplement: three families under a lamp from a hundredth of the projector's light to a hundred times.
 
 *reflectivity*, supplement. *Gloss*: every scene has a matt twin (``finish=matt``), whose reflectance L is the truth. At
 one lambda an image R(Y) is linear in the frames Y. Therefore its error is a sum of differences, with t the apparent
@@ -19,12 +17,9 @@ reflectance of the glossy scene, its mean over the sensor:
     saturation       = R(mean reading of Y_all) - R(Y_all)
     rest             = R(Y_even) - t and noise       error that a matt scene of the same brightness has as well
 
-where Y_even is the twin's light, with that of each projector pixel times t / L.
-
-*Global light*: dots separate direct from global light (Nayar, Krishnan, Grossberg and Raskar 2006, with a lens), here
-by :func:`mitsim.reconstruct.focus.separate`. Depth hides most of the gain, so that every scene is also shown with
-direct light as the calibrated factors have it. A user's scene is measured for gloss if it has a parameter ``finish``,
-otherwise for global light.
+where Y_even is the twin's light, with that of each projector pixel times t / L. *Global light*: dots separate direct
+from global light (Nayar, Krishnan, Grossberg and Raskar 2006), by :func:`mitsim.reconstruct.focus.separate`. A user's
+scene is measured for gloss if it has a parameter ``finish``, otherwise for global light.
 """
 
 from __future__ import annotations

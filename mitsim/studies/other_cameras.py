@@ -172,7 +172,6 @@ class MovedMask:
         return centre_columns(factor) if self.lit.bench.geometry.centred else factor
 
     def measure(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
-        """Return the noisy frame at one place [electrons/s], less ambient light."""
         bench, expected = self.lit.bench, self.expected_frames(row_mm, column_mm)
         speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
         exposer = Exposer(bench.devices, seconds, integer(self.seed, "mask", f"{row_mm:g}", f"{column_mm:g}"), speckle)
@@ -202,7 +201,7 @@ def _multishot_measure(studio: Studio, point: Point) -> Found:
         places = spread(7)
         if model == IDEALISED:
             return ideal_places(bench, places, lit.board_flux)
-        key = bench.devices_digest, places, seed  # what a session sees, whatever is printed
+        key = bench.devices_digest, places, seed  # a session does not depend on the print
         return studio.once("places", 1, key, lambda: calibrated_places(bench, places, seed))
 
     images: dict[str, Image] = {}
@@ -318,7 +317,6 @@ def take(
 
 
 def best_image(classes: Classes, frames: FloatArray, truth: FloatArray) -> tuple[Solution, float]:
-    """Return the direct solution nearest to the truth over lambda, and its PSNR [dB]."""
     projected = classes.project(frames)
 
     def solve(lam: float) -> tuple[Solution, float]:

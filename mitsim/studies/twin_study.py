@@ -137,7 +137,6 @@ def _size(values: Numbers) -> str:
 
 
 def read_captures(files: Mapping[str, tuple[Path, Path]], seed: int) -> list[Measured]:
-    """Return every plane of all captures; MitsimError for files that are no captures."""
     recipe, found = Recipe.load(), []
     raw = {name: recipe.planes(frame) for name, (frame, _) in files.items()}
     offsets = plane_offsets(recipe.how)
@@ -173,7 +172,6 @@ def noise_of(planes: Sequence[FloatArray]) -> tuple[float, float]:
 
 
 def draw_noise(plane: FloatArray, gain: float, read_variance: float, seed: int, name: str) -> FloatArray:
-    """Return noise (rows, columns) of a simulated sensor in the light of a ``plane`` [DN]."""
     sensor = SensorModel(
         name="twin", pixel_pitch_um=PITCH_MM * 1e3, full_well_e=float("inf"), gain_dn_per_e=gain,
         read_noise_e=float(np.sqrt(read_variance)) / gain, source="mitsim study twin",
@@ -274,7 +272,7 @@ def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> Floa
     return np.asarray(expected[0], dtype=np.float64)
 
 
-# -------- What a simulated frame explains of a measured one
+# -------- Explained part of a measured frame
 
 CAUSES = ("row and column means", "explained", "scale", "smooth field", "mask's code", "scene's image", "noise", "rest")
 """Parts of a measured frame's energy, in the order of their removal."""
@@ -342,7 +340,6 @@ def _parts(measured: Measured, codes: Codes, expected: FloatArray, gain: float) 
 
 
 def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, float]:
-    """Return the smooth light or gain in a ``rest``, and its number of parameters."""
     sides = [legvander(np.linspace(-1, 1, count), _DEGREE).astype(np.float64) for count in rest.shape]
     degrees = [each for each in product(range(_DEGREE + 1), repeat=2) if 0 < sum(each) <= _DEGREE]
     shapes: list[FloatArray] = [np.outer(sides[0][:, row], sides[1][:, column]) for row, column in degrees]

@@ -103,7 +103,6 @@ class Sessions:
 
     @single_threaded_blas()
     def _by_lines(self, off: frozenset[str]) -> Estimate:
-        """Return the noise-free factors of +-1 stripes, from lines of the projector that are lit one by one."""
         light, n = self._ablation.without(off), self._session.bench.n
         second = Exposer(self._session.bench.devices, 1.0, self._session.seed)
 
@@ -221,7 +220,6 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def ends(way: str, effect: str) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the effects that are on without an ``effect`` and with it."""
     if way == ALONE:
         return frozenset(), frozenset({effect})
     if way == LEFT_OUT:

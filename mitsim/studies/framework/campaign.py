@@ -118,7 +118,6 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figu
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write ``rows`` to the CSV file ``path``, all or nothing; MitsimError on failure."""
     from pandas import DataFrame
 
     write_text(path, DataFrame([dict(row) for row in rows], dtype=object).to_csv(index=False))
@@ -374,7 +373,6 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
 
 @contextmanager
 def _campaign(study: str, experiment: Study, scope: Scope, output: Path | str) -> Iterator[tuple[Path, Store]]:
-    """Hold the folder ``output`` of a study, and its store; an earlier run of the same code is resumed."""
     name = experiment.name
     with study_folder(output, name) as folder:
         head = folder / f"{name}.json"
@@ -425,7 +423,6 @@ def _head(folder: Path) -> dict[str, Any]:
 
 
 def read_scope(folder: Path) -> tuple[str, Scope]:
-    """Return name and scope of the study in a ``folder``; MitsimError if there is none."""
     for file in sorted(folder.glob("*.json")) if folder.is_dir() else ():
         head = read_json(file)
         if isinstance(head, dict) and isinstance(head.get("study"), str) and "scope" in head:
@@ -458,8 +455,6 @@ def _open(shared: str | None) -> Any:
 
 @dataclass(frozen=True)
 class _LazyStudio:
-    """Studio of this process, opened at its first use, because loading the renderer takes seconds."""
-
     shared: str | None
 
     def __getattr__(self, name: str) -> Any:
@@ -467,7 +462,6 @@ class _LazyStudio:
 
 
 def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
-    """Measure a ``point`` of the experiment ``name`` in this process's studio."""
     return find_experiment(name).measure(cast("Studio", _LazyStudio(shared)), point)
 
 

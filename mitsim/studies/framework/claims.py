@@ -35,7 +35,6 @@ patterns."""
 
 
 def choose_rows(rows: DataFrame, where: Where) -> DataFrame:
-    """Return the rows that match ``where``; a column that the table lacks has the value None."""
     for name, value in _chosen(where).items():
         column: Any = rows[name] if name in rows else rows.index.to_series().map(lambda _: None)
         if callable(value):
@@ -274,8 +273,7 @@ class Gain(_Range):
     at_least, at_most
         range of the gain of ``one`` over ``other``; by default above 0.
     apart, other_error
-        True to state ``other`` under the first head and ``one`` under the second; column of a further error of
-        ``other``.
+        True to state each side under its own head; column of a further error of ``other``.
     """
 
     one: Where
@@ -328,6 +326,5 @@ TOLERANCE_DB = 2.0
 
 
 def stated(claim: str, low: float, high: float, **where: Any) -> Level:
-    """Return the claim of a mean PSNR in the paper's range [dB], within :data:`TOLERANCE_DB`."""
     paper = f"{low:g} to {high:g} dB"
     return Level(claim, paper=paper, where=where, at_least=low - TOLERANCE_DB, at_most=high + TOLERANCE_DB)

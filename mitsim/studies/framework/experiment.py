@@ -146,7 +146,6 @@ class Scope:
 
     @property
     def repeats(self) -> tuple[int, ...]:
-        """Seeds of a study without prints: three of a whole study, so that means have errors."""
         three = (self.seeds[0] + more for more in range(3))
         return self.choose(tuple(dict.fromkeys((*self.seeds, *three))), self.seeds)
 
@@ -236,7 +235,6 @@ class Results:
 
     @cached_property
     def frame(self) -> DataFrame:
-        """Table with one measurement a row."""
         from pandas import DataFrame  # here, because it takes half a second and processes that measure do without
 
         return DataFrame([dict(row) for row in self.rows], dtype=object)
@@ -248,7 +246,7 @@ class Results:
         return self.arrays.get((str(row.get("point")), name))
 
 
-# -------- What a study declares
+# -------- Declaration of a study
 
 KNOBS = "{knobs}"
 HEADS = "Paper", "Idealised", "Rendered"
@@ -367,7 +365,6 @@ def find_experiment(name: str) -> Study:
 
 
 def check_study(name: str) -> None:
-    """Raise MitsimError for an unknown study ``name``."""
     if name in GONE:
         raise MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
     if name not in (*EXPERIMENTS, ALL) and "." not in name:
@@ -384,7 +381,7 @@ def _load_file(path: str) -> Any:
     return module
 
 
-# -------- What a sweep varies and shows, in the words of a command line
+# -------- Knobs and measures of a sweep, in the words of a command line
 
 MEASURES = {
     "psnr": ("psnr_db", "PSNR [dB]"),
@@ -425,7 +422,6 @@ def values_of(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def measures_of(text: str) -> tuple[str, ...]:
-    """Return the comma-separated measures in ``text``; MitsimError for an unknown one."""
     names = tuple(text.split(","))
     if unknown := [name for name in names if name not in MEASURES]:
         raise MitsimError(f"--measure {unknown[0]!r}: use {', '.join(MEASURES)}")
@@ -433,7 +429,6 @@ def measures_of(text: str) -> tuple[str, ...]:
 
 
 def check_sweep(sweep: Sweep, pictures: int) -> None:
-    """Raise MitsimError for a ``sweep`` that varies nothing, or an impossible knob."""
     knobs, allowed = dict(sweep), {"exposure": CONVENTIONS, "method": METHODS}
     if not knobs:
         raise MitsimError(
@@ -462,7 +457,6 @@ def check_drifts(sweep: Sweep) -> None:
 
 
 def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> float:
-    """Return the value of a ``knob`` as a number of a ``kind``; MitsimError for anything else."""
     try:
         return kind(text)
     except ValueError:

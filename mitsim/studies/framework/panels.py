@@ -145,20 +145,18 @@ def is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Lines(Panel):
-    """Means of a column over another with bars of one standard error, a curve for each colour, facets below each other.
+    """Means of a column over another with bars of one standard error.
 
     Attributes
     ----------
     x, x_label, y, y_label
         columns along the axes, and the axes' names with units.
     colour, facet
-        columns of the curves and of the facets; a mapping shows several columns of numbers instead of ``y``.
+        columns of the curves and facets; a mapping shows several columns of numbers instead of ``y``.
     shared
         rows that begin every curve, such as one uniform frame.
-    log
-        True for a logarithmic x axis; an axis over decades is logarithmic anyway.
-    ticks
-        True for a tick at every measured x, as far as there is room.
+    log, ticks
+        True for a logarithmic x axis, and for a tick at every measured x.
     """
 
     x: str
@@ -201,14 +199,12 @@ class Lines(Panel):
 
 @dataclass(frozen=True)
 class Bars(Panel):
-    """Means of a column as horizontal bars with one standard error, a group for each row, a bar for each colour.
+    """Means of a column as horizontal bars with one standard error, a group for each of ``rows``.
 
     Attributes
     ----------
     rows, colour
         columns of the groups and of the bars in each; a mapping shows several columns of numbers instead of ``x``.
-    x, x_label
-        column, and the axis' name with unit.
     ordered
         True for the largest on top; False for the order of the table.
     """
@@ -243,15 +239,7 @@ class Bars(Panel):
 
 @dataclass(frozen=True)
 class Pivot(Panel):
-    """A table of the page: means of a column by the values of two others.
-
-    Attributes
-    ----------
-    rows, columns
-        columns whose combinations are the table's rows and columns; a mapping shows several columns of numbers.
-    value
-        column that is averaged.
-    """
+    """A table of the page: means of the column ``value`` by the values of ``rows`` and ``columns``."""
 
     rows: Columns
     _: KW_ONLY
@@ -288,11 +276,8 @@ class Images(Panel):
 
     Attributes
     ----------
-    across
-        columns whose combinations are the grid's columns; or (title, caption) by the name of an array, for several
-        arrays of one point.
-    columns
-        values of ``across`` in their order; None: all of the table.
+    across, columns
+        columns whose combinations are the grid's columns, or (title, caption) by the name of an array; their order.
     down
         columns whose combinations are the grid's rows.
     array, before
@@ -356,7 +341,6 @@ def _few(items: Sequence[Any]) -> list[Any]:
 
 
 def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], title: str) -> Figure:
-    """Draw images with their truths."""
     from mitsim.report.plots import image_grid
 
     truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
@@ -487,7 +471,6 @@ def page_of(sections: Sequence[Section], title: str) -> str:
 
 
 def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
-    """Write the page of some ``sections`` to ``path``, all or nothing, and return the path; MitsimError on failure."""
     write_text(path, page_of(sections, title))
     return path
 

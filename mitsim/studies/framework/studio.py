@@ -79,7 +79,7 @@ def flags_of(*statuses: Status, misfit: Misfit | None = None, others: Iterable[s
 class Studio:
     """Benches, their light and their factors, the last few of each; a context that removes its temporary folder.
 
-    ``shared`` is a folder of plans and calibrations that several studios share; with None they are kept privately.
+    Studios with one ``shared`` folder share plans and calibrations.
     """
 
     def __init__(self, shared: str | None = None) -> None:
@@ -214,7 +214,6 @@ class Studio:
 
 
 def finding(studio: Studio, point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
-    """Return the findings of a point in one row; the ``image`` is kept for a few prints, with the truth."""
     kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
     arrays = image_arrays(image, studio.lit_scene(point.setup).truth) if kept and image is not None else {}
     return Found((point.row(**measured),), arrays)
