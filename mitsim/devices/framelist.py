@@ -364,8 +364,6 @@ class FlatList(Configuration):
 
 @dataclass(frozen=True)
 class FlatFrames:
-    """The ``folder`` of a camera's frames, and its list."""
-
     folder: Path
     listed: FlatList
 
@@ -565,7 +563,6 @@ class ChartPlace(Configuration):
         return np.array([block.mean(axis=(0, 1)) for block in self.blocks(image)])
 
     def blocks(self, image: FloatArray) -> list[FloatArray]:
-        """Return the pixels (rows, columns, ...) of each patch; MitsimError where one lies outside."""
         rows, columns = image.shape[:2]
         outside = next((box for box in self.patches if box[1] > rows or box[3] > columns), None)
         if outside is not None:

@@ -32,10 +32,9 @@ _TAPS = {
 
 # ---- What goes wrong when a mask is made and mounted ----
 #
-# Flaws and a drawn mask in, its lines and transmissions out.
-# Over-etching moves the edges of all openings outward and under-etching inward, corners staying square. Edge blur is a
-# Gaussian over the transmission of power. Dust lies on the mask as discs that let less light through. Then the mask is
-# turned in its plane, and tilted to the sensor.
+# Over-etching moves the edges of all openings outward and under-etching inward; corners stay square. Edge blur is a
+# Gaussian over the transmission of power. Dust on the mask is discs that transmit less light. Then the mask is turned
+# in its plane, and tilted to the sensor.
 
 _REACH = 8.3
 _LINES = 16
@@ -76,9 +75,8 @@ class Flaws:
         return _REACH * self.blur_mm
 
     def reach(self, extent_mm: float) -> float:
-        """Return the side [mm] of a square that holds a mounted mask of side ``extent_mm``."""
         angle = np.radians(self.turn_deg)
-        # A tilted mask meets a ray beside where an even one does, by less than the tangent of its tilt.
+        # A ray meets a tilted mask farther out than an even one, by less than the tangent of the tilt.
         tilt = 1 + sum(abs(angle) for angle in self.tilt_mrad) * 1e-3
         return float(extent_mm * (abs(np.cos(angle)) + abs(np.sin(angle))) * tilt**2 + 2 * self.margin_mm)
 
@@ -179,7 +177,6 @@ class Mask(ByValue):
 
 
 def mean_opening(is_open: BoolArray, widths: FloatArray) -> float:
-    """Return the mean width of openings (N, c) down the rows of ``widths`` (N,); 0 without one."""
     begins = np.diff(is_open, axis=0, prepend=False) & is_open
     return float((widths @ is_open).sum() / max(np.count_nonzero(begins), 1))
 

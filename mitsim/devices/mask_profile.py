@@ -227,8 +227,8 @@ def load_mask(path: Path | str) -> MaskProfile | None:
 # Studies take it as a camera that shifts it (:mod:`mitsim.reconstruct.convolution`), a camera file's mask of the kind
 # ``psf`` as a shadow that grows as the point comes nearer (:class:`mitsim.devices.mask_profile.MaskProfile`).
 #
-# Such as the picture that came with DiffuserCam (Antipa et al., Optica 5, 1, 2018; data of the repository
-# Waller-Lab/DiffuserCam-Tutorial, BSD 3-Clause), which mitsim does not ship: give its path.
+# An example is the picture of DiffuserCam (Antipa et al., Optica 5, 1, 2018; repository
+# Waller-Lab/DiffuserCam-Tutorial, BSD 3-Clause), which mitsim does not ship.
 
 _PICTURE = Wanted("point spread function", colour=True)
 _PIXEL_BYTES = 64

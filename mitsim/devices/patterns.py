@@ -181,7 +181,7 @@ def _construct(order: int) -> npt.NDArray[np.int64]:
 
     how, number = way_to(order)
     if how == "doubled":
-        # Not scipy.linalg.hadamard: importing it takes longer than all else that a refusal needs.
+        # scipy.linalg.hadamard is avoided because its import takes longer than the rest of a refusal.
         doubled = np.ones((1, 1), dtype=np.int64)
         while len(doubled) < order:
             doubled = np.kron([[1, 1], [1, -1]], doubled)

@@ -127,7 +127,6 @@ class Plate(ByValue):
 
     @cached_property
     def crosses(self) -> tuple[Term, ...] | None:
-        """Return at most two exact terms (weight, row (N,), column profile (N,)), or None."""
         rest = self.values.copy()
         terms: list[Term] = []
         while True:
@@ -291,7 +290,7 @@ def within(plate: Plate, reach_mm: float) -> Plate:
         part = plate.values[beyond:-beyond, beyond:-beyond]
         if part.any():
             return replace(plate, values=part)
-        # Closed all over, which no plate is: out to the next open feature.
+        # The part is closed all over, although no plate is: grow it to the next open feature.
         beyond, more = beyond - more, 2 * more
     return plate
 

@@ -77,12 +77,6 @@ class Lines:
         return Lines(tuple(power), tuple(power.values()))
 
     def bands(self, count: int) -> tuple[Lines, ...]:
-        """Return the lines of each of ``count`` bands, shortest first; MitsimError for fewer than one band or too many.
-
-        Bands minimise the power's mean squared distance from their :attr:`mean_nm`, so that a sum over bands is a
-        Gauss rule
-        of one node each.
-        """
         lines = self.shining
         size = len(lines.shares)
         if not 1 <= count <= size:
@@ -289,7 +283,7 @@ class ProjectorModel(Configuration):
 
 # -------- Light of lamps as a camera counts it
 #
-# Light of lamps as a camera counts it: its quantum efficiency in; what light of every wavelength is worth, out.
+# A camera's quantum efficiency gives the weight of light of every wavelength.
 #
 # A camera counts photons, whatever their wavelength: light of spectral irradiance E(lambda) makes
 #
@@ -368,7 +362,6 @@ class Response(ByValue):
         return len(self.planes) / len(_PLANES)
 
     def bands(self, count: int, part: int = 0, parts: int = 1) -> tuple[Band, ...]:
-        """Return equal bands of the counted wavelengths [nm], or number ``part`` of ``parts`` of each."""
         first, last = self.range_nm
         edges = first + (last - first) * np.arange(count * parts + 1) / (count * parts)
         return tuple((float(edges[place]), float(edges[place + 1])) for place in range(part, count * parts, parts))

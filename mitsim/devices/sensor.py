@@ -353,7 +353,6 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def largest_dn(self) -> int | None:
-        """Return b^2 (2^bits - 1), on chip 2^bits - 1; None for real numbers."""
         return None if self.bits is None else (2**self.bits - 1) * self.codes
 
 
@@ -460,7 +459,7 @@ class EfficiencyCurve(Configuration):
         if not first <= wavelength_nm <= last:
             problem = f"got {wavelength_nm:g} nm; the curve of quantum efficiency is of {first:g} to {last:g} nm"
             raise MitsimError(f"{problem}; use light of these")
-        # Without numpy, which would be half the time of a refusal.
+        # numpy is avoided because its import takes half the time of a refusal.
         above = max(1, bisect_left(self.wavelengths_nm, wavelength_nm))
         below, beyond = self.wavelengths_nm[above - 1 : above + 1]
         part = (wavelength_nm - below) / (beyond - below)

@@ -17,7 +17,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, chec
 from mitsim.devices.sensor import ExposureFraction
 
 # -------- The white board of a calibration session
-# A board without these is flat, faces the camera on the aligned plane, and is larger than what the camera sees.
+# The default board is flat, faces the camera on the aligned plane, and is larger than the camera's view.
 
 
 class BoardShape(Configuration):
@@ -168,7 +168,6 @@ class Drift(Configuration):
 
     @property
     def ripples(self) -> Mapping[str, tuple[float, float]]:
-        """Return relative amplitude and frequency [Hz] of sources that ripple: ``power``, ``lamp``."""
         both = ("power", self.power_ripple, self.power_ripple_hz), ("lamp", self.lamp_ripple, self.lamp_ripple_hz)
         return {name: (amplitude, hertz) for name, amplitude, hertz in both if amplitude and hertz}
 

@@ -101,7 +101,7 @@ class EdgeWaves:
             half = np.fft.rfft(jumps, size)
             whole = np.concatenate((half, np.conj(half[:, (size - 1) // 2 : 0 : -1])), axis=1)
             waves = np.fft.ifft(whole * self._kernel)
-        # The first 2 reach - 1 values lack jumps on their left, or hold what wrapped around the end.
+        # The first 2 reach - 1 values lack jumps on their left, or contain values that wrapped around the end.
         waves = waves[:, 2 * reach - 1 : 2 * reach - 1 + count]
         return np.asarray(waves + profiles[:, reach : reach + count])
 
@@ -122,7 +122,7 @@ def edge_wave(x: FloatArray) -> ComplexArray:
         imaginary += part
     eighth = np.exp(-0.25j * np.pi)
     pole = np.exp(-2 * scale * eighth * y)
-    # Whole turns are taken off before pi is multiplied: far from the edge there are thousands.
+    # Whole turns are subtracted before the product with pi, because there are thousands far from the edge.
     phase = np.exp(1j * np.pi * np.fmod(np.square(x) / 2, 2)) * eighth
     return np.asarray(-(phase * (y / scale) * (real + 1j * (square * imaginary)) + pole / (1 + pole)))
 
@@ -192,7 +192,7 @@ def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
     feature = shadow.mask.feature_mm
     fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5
     widest = min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH) * (_THICK_STEPS if shadow.thickness_mm else 1)
-    # Within a cell a finer mask counts by its mean: its orders are evanescent.
+    # Features that are finer than a cell are averaged, because their orders are evanescent.
     return feature / float(np.ceil(feature / widest)) if feature > widest else widest
 
 

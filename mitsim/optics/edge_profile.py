@@ -65,7 +65,7 @@ class Steps(ByValue):
         bounds = start + step * np.arange(count + 1)
         index = np.searchsorted(self.edges, bounds, side="right")
         means = np.concatenate(([0.0], self.values, [0.0]))[index[:-1]]
-        # Only where an edge lies inside: a difference of large sums would lose digits everywhere.
+        # Only cells that an edge cuts are computed from sums, because a difference of large sums loses digits.
         cut = np.flatnonzero(np.diff(index))
         covered = np.concatenate(([0.0], np.cumsum(self.values * np.diff(self.edges))))
         at = np.interp(bounds[[cut, cut + 1]], self.edges, covered)
@@ -170,7 +170,7 @@ class Antiderivative:
         self._mean = (values @ width) / (edges[-1] - edges[0])
         self._values = values - self._mean[:, None]
         self._first = _running_sums(self._values * width)
-        # A slope of the second antiderivative drops out of its second difference, its size does not.
+        # The slope is removed because it cancels in the second difference, where its size would cost digits.
         self._first -= self._first.mean(axis=1, keepdims=True)
         self._second = _running_sums((self._first[:, :-1] + self._first[:, 1:]) * (width / 2))
 

@@ -68,7 +68,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 
     Raises MitsimError if the raster has too many cells, or waves behind the mask cannot be computed.
     """
-    # However it was chosen to be drawn: a run then has its plan's.
+    # Both choices of the user give one cache entry, so that a run has the raster of its plan.
     chosen = {"mask_fft": False, "mask_cells": cells_per_pixel(geometry)}
     return draw_raster(geometry.model_copy(update=chosen), depth, spectrum)
 
@@ -251,8 +251,8 @@ def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDA
 #
 #     frame[i, j] = sum_ab X[a, b] V[a + q i, b + q j]
 #
-# It is exact for the raster, to rounding in single precision, 1e-6 of a frame's mean, whatever the cells; the sum of
-# separable terms gives the same (tests/unit/optics/test_correlation.py), and takes a product for each of them.
+# The result is exact for the raster up to rounding in single precision, 1e-6 of a frame's mean; the sum of separable
+# terms gives the same (tests/unit/optics/test_correlation.py).
 
 _APART = 8
 """Step in pixels of the first lit pixel, so that light in cells of other sizes reuses the raster's spectra."""
@@ -283,7 +283,7 @@ class Correlation:
         brightest = float(np.abs(light).max()) or 1.0
         cells = _by_phase(left @ (light / brightest).astype(np.float32) @ right.T, self._phases)
         total = np.zeros(self._spectra.shape[2:], dtype=np.complex64)
-        # One after the other, each stays in a processor's cache.
+        # Phases are computed one after the other, so that each stays in a processor's cache.
         for phase in np.ndindex(*self._phases):
             seen = scipy.fft.fft(scipy.fft.rfft(cells[phase], self._size[1]), self._size[0], axis=0, overwrite_x=True)
             total += np.multiply(np.conjugate(seen, out=seen), self._spectra[phase], out=seen)
@@ -362,7 +362,7 @@ def _part(values: FloatArray, first: int, count: int) -> FloatArray:
     return result
 
 
-# -------- Samplers of a mask: functions that can be asked for means
+# -------- Samplers of a mask: functions that return means
 # A term is ``(weight, row sampler, column sampler)``. A sampler takes arrays of centres s and widths w (mm, index
 # coordinates in the mask plane) and of tan-angles t, and gives the mean over each [s - w/2, s + w/2] of a mask
 # profile for light that comes under t. :func:`geometric_samplers` makes them for a thin mask's geometric shadow,
@@ -390,7 +390,7 @@ class ProfileSampler:
         centre, half = s / self._feature - self._start, np.abs(width) / self._feature / 2
         low, high = centre - half, centre + half
         first, last = self._index(low), self._index(high)
-        # Two features that are cut and what lies between: with nothing between, no large sums are subtracted.
+        # Two cut features and the part between: without a part between, no large sums are subtracted.
         parts = self._values[first] * (first - low) + self._values[last] * (high - last + 1)
         parts += self._sums[np.maximum(last - 1, first)] - self._sums[first]
         return np.asarray(np.where(first == last, self._values[first], parts / np.where(half > 0, 2 * half, 1)))

@@ -93,7 +93,7 @@ def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_arr
     places, indices = np.unique(light.indices, return_inverse=True)
     lit = sparse.csr_array((light.data, indices, light.indptr), shape=(light.shape[0], max(len(places), 1)))
     product = (basis @ lit).tocsr()
-    # SciPy adds matrices of sorted rows entry by entry, and others by way of all their columns.
+    # SciPy adds matrices of sorted rows entry by entry, and other matrices over all their columns.
     product.sort_indices()
     wide = places[product.indices] if len(places) else product.indices
     return sparse.csr_array((product.data, wide, product.indptr), shape=(basis.shape[0], light.shape[1]))
@@ -104,7 +104,7 @@ def _row(matrix: sparse.csr_array, row: int) -> Entries:
     return matrix.indices[inside], matrix.data[inside]
 
 
-# -------- Shots as sums of frames that are held
+# -------- Shots as sums of frames in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ def mix_frames(weights: FloatArray, basis: FloatArray, out: FloatArray | None = 
 
 # -------- Replicates
 #
-# Replicates: frames of independent groups of light in, the Monte Carlo error of their mean and its bound out.
+# Monte Carlo error of the mean of frames of independent groups of light, and its bound.
 #
 # Squared norms are estimated without bias from products with random signs (Hutchinson's estimator), because forming as
 # many frames as there are groups would cost more than the frames themselves.

@@ -280,7 +280,7 @@ class ExpectedFrames:
         return in_threads(frame_of, range(len(light)))
 
 
-# -------- The error of frames that were formed
+# -------- Monte Carlo error of frames that were formed
 
 
 def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
@@ -354,7 +354,7 @@ def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArra
     pairs *= np.outer(spectrum.weights, spectrum.weights)
     together = np.unique(2 / (inverse[:, None] + inverse)[pairs > 0])
     spaces = {wavelength: _space(devices, pixels_mm, lit, wavelength * 1e-6) for wavelength in together}
-    # Of two lines, grains at their mean wave number; where lines are coherent at all they are close to it.
+    # Two lines use grains at their mean wave number, because coherent lines are close to it.
     both = np.array([[spaces.get(2 / (k + other), 0.0) for other in inverse] for k in inverse])
     return float(np.sqrt((1 + coherence.polarisation**2) / 2 * (pairs * both).sum()))
 

@@ -290,7 +290,7 @@ def raster_error(
         drawn = few.model_copy(update={"mask_cells": finer * cells_per_pixel(few)})
         shadow = replace(ShadowGeometry.of(drawn, depth), mask=raster(drawn, depth, spectrum))
         if finer == 1 and not known and math.isfinite(number_of_terms(raster(drawn, depth, spectrum))):
-            # As runs may form it: what its largest terms leave out is then part of what is told.
+            # The frame is formed as in a run, so that the error includes the terms that are left out.
             return sum_of(terms_of_raster(shadow, rows, columns, drawn.pixel_fill_factor, None, shadow.mask.terms))
         return Correlation(shadow, rows, columns, drawn.pixel_fill_factor).image(light, row, column)
 

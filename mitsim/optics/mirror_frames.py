@@ -255,7 +255,7 @@ class SpecularLight:
         beams = self.beams
         area, pixels = math.prod(geometry.pitches), math.prod(geometry.frame_shape)
         met = (np.abs(beams.sensor.mean(axis=(1, 2))) < geometry.half_width).all(axis=1)
-        # Points that edges leave lie in single pixels: their rms over all of them.
+        # Flux that edges leave is uncertain in single pixels; its rms is over all pixels.
         unsure = math.hypot(beams.unresolved, beams.error * math.sqrt(pixels))
         return float(beams.delivered[met].sum()) / area / pixels, unsure / area / pixels
 

@@ -193,7 +193,7 @@ def trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray
 
     def below(x: FloatArray) -> FloatArray:
         distance = np.abs(x)
-        # The tail is used only where it is not empty and at most 2 short wide, so neither bound changes a value.
+        # The tail is used only where it is between 0 and 2 short, so that neither bound changes a value.
         tail = np.square(np.clip(short + long - distance, 0, 2 * short))
         tail /= np.maximum(8 * short * long, np.finfo(float).tiny)
         upper = np.where(distance <= long - short, 0.5 - distance / (2 * long), tail)

@@ -79,7 +79,7 @@ def shadow_terms(
         along, across = geometry.mask_tilt
         by_row, by_column = _crossings(shadow, rows, columns)
         first, second = nodes_between(by_column, nodes[0]), nodes_between(by_row, nodes[1])
-        # One look at both axes serves a node of each; the last of fewer nodes is looked at again.
+        # One evaluation of both axes serves a node of each; the last of fewer nodes is evaluated again.
         padded = [np.pad(each, (0, max(nodes) - len(each)), "edge") for each in (first, second)]
         tilts = [((along, across * float(i)), (across, along * float(j))) for i, j in zip(*padded, strict=True)]
         seen = [form(replace(shadow, tilt=tilt)) for tilt in tilts]
@@ -129,7 +129,7 @@ def _moving_terms(
     def shaking(by_mm: float) -> SeparableTerms:
         if not deviation:
             return shifted(by_mm)
-        # Factor by factor, because the axes shake independently.
+        # Factors are averaged one by one, because the axes shake independently.
         parts = [shifted(by_mm + float(place) * deviation) for place in _SHAKES]
         return [
             tuple(sum(weight * pair[side] for weight, pair in zip(weights, pairs, strict=True)) for side in (0, 1))
@@ -162,7 +162,7 @@ def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
 
 # -------- Sums of separable terms as operators
 #
-# Sums of separable terms as operators: how far two are apart, and how far one is from a single separable term.
+# Sums of separable terms as operators: differences, and the distance from a single separable term.
 #
 # The sum of ``L_k (x) R_k`` takes an image X to the frame ``sum_k L_k X R_k^T``. As a matrix from pixels to pixels it
 # has (m m') x (n n') entries; written with vec(L_k) and vec(R_k) as columns it is ``A = L R^T`` with as few columns as
@@ -353,7 +353,7 @@ class ModelledCamera:
         step = {"mask_shift_row": _DERIVED_MM, "mask_shift_column": _DERIVED_MM}
         ahead = self.factors(placement.move(step))
         behind = self.factors(placement.move({name: -value for name, value in step.items()}))
-        # A mask that moves on by o is seen at s - o.
+        # A mask that moves by o is seen at s - o.
         slopes = [(back - on) / (2 * _DERIVED_MM) for on, back in zip(ahead, behind, strict=True)]
         left, right = self.factors(placement)
         geometry, distance = self.geometry, placement.mask_distance

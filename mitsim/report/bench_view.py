@@ -225,7 +225,7 @@ class BenchView:
         axes.axvline(aligned, color=BLACK, lw=0.8, ls=":")
         window = layout.window[:, axis]
         axes.plot([aligned] * 2, [window.min(), window.max()], color=ORANGE, lw=3.5, solid_capstyle="butt")
-        # Symbols of the devices stand behind their pinholes.
+        # Symbols of the devices are drawn behind their pinholes.
         facing, half = layout.window.mean(axis=0) - projector, 0.022 * length
         for place, along, color in ((projector, facing, ORANGE), (np.zeros(3), np.array([0, 0, 1.0]), BLUE)):
             ahead = along[[2, axis]] / np.linalg.norm(along[[2, axis]])
@@ -292,7 +292,7 @@ class BenchView:
         for eye, corners, color in ((layout.projector, layout.window, ORANGE), (np.zeros(3), stop, BLUE)):
             axes.add_patch(Polygon(preview.project(corners), closed=True, fill=False, color=color, lw=1.2))
             for corner in corners:
-                # Up to where the free camera is: what is behind that has no place in its picture.
+                # Lines end at the free camera, because points behind it are not in its picture.
                 shown = preview.project(corner + np.linspace(0, 1, 50)[:, None] * (eye - corner))
                 axes.plot(*shown[np.isfinite(shown).all(axis=1)].T, color=color, lw=0.9)
         rows, columns = preview.picture.shape[:2]
@@ -328,7 +328,7 @@ class BenchView:
             figure.add_trace(_line(name, place[None], _LAMP, 5, mode="markers"))
         ends = np.array([[[min(side), max(side)] for side in (each.x, each.y, each.z)] for each in figure.data])
         extents = ends[:, :, 1].max(axis=0) - ends[:, :, 0].min(axis=0)
-        # Plotly makes the sides' geometric mean 1: of a high room the longest is far more, and the eye goes back.
+        # Plotly makes the sides' geometric mean 1. Therefore the eye moves back for a scene with one long side.
         back = max(1.0, float(extents.max() / np.cbrt(extents.prod())) / _IN_SIGHT)
         view_from = dict(zip("xyz", (-2.1 * back, -1.45 * back, 1.0 * back), strict=True))
         titles = {"xaxis": "z, from the sensor [mm]", "yaxis": "x, to the left [mm]", "zaxis": "y, up [mm]"}

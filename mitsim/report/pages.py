@@ -170,7 +170,7 @@ def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-# -------- Pictures of numbers, which state what black and white are
+# -------- Pictures of numbers, with the meaning of black and white
 
 SMALLEST, LARGEST = 512, 1024
 _MOST_FRAMES = 64
@@ -272,7 +272,7 @@ def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[in
     return Picture("frames", "What the camera recorded", f"{which}, {order}{mean}: {scale.words(sheet)}", data, True)
 
 
-# -------- Rows of a study in, their means out
+# -------- Means of the rows of a study
 
 Value = str | int | float | bool | None
 _SEEN = 0.05

@@ -287,7 +287,7 @@ def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> Colou
                 noise += float(np.maximum(shots.manifest.digital.variance(datum.light, datum.shots), 0.0).sum())
         with clock.stage("solve"):
             solved = solver.images(lam)
-        # What the noise of frames and factors leaves of the residual, as a part of the data.
+        # Part of the residual that the noise of frames and factors explains, relative to the data.
         explained = 0.0
         for each in factors.values():
             if (own := each.manifest.noise) is not None:
@@ -425,7 +425,7 @@ class Solver:
             best_term([(weight * left, right) for weight, (left, right) in zip(row, lines, strict=True)])
             for row in weights
         ]
-        # (channels, lines): the part of each line's image in the image that the one separable camera gives.
+        # (channels, lines): part of each line's image in the image of the one separable camera.
         mixing = np.array(
             [
                 [

@@ -88,14 +88,14 @@ def check_file(
     files = SceneFiles(path, outside)
     outline = Outline(path, defines, files)
     config = mi.parser.ParserConfig("scalar_rgb")  # any: parsing does not look at it
-    # Without optimize, for that merges rectangles of one material into a mesh that has lost their boxes and names.
+    # Optimisation is off because it merges rectangles of one material into a mesh without their boxes and names.
     config.parallel = config.merge_equivalent = config.merge_meshes = False
     with looking_beside(outline):
         state = mi.parser.parse_file(config, str(path), **outline.defines)
         mi.parser.transform_all(config, state)
     tree = _Tree(outline, files, variant, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
-    # Groups are in the scene by their instances alone.
+    # Groups are in the scene only by their instances.
     shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
     facts = tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes)
     own = {str(path): name for path, name in files.own.items() if name in PREPARED}

@@ -56,7 +56,7 @@ def check_image(path: Path) -> tuple[int, bool]:
             problem = f"its channels are {' and '.join(sorted(header.types))}"
             raise ValueError(f"{problem}; save all as float, or all as half")
     elif start.startswith(b"#?"):
-        # The first line that Mitsuba could take for the size.
+        # This is the first line that Mitsuba could read as the size.
         size = next((line for line in start.split(b"\n") if b"-Y" in line), b"")
         (height, width), grey = _two_numbers(rb"-Y (\d{1,9}) \+X (\d{1,9})", size), False
     elif start[:2] in (b"PF", b"Pf"):
@@ -217,7 +217,7 @@ def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:
     order: str | None = ""
     parts: dict[str, _Element] = {}
     for line in header.split(b"\n")[1:-2]:
-        # Split as C does: text has further blanks and line ends, which Mitsuba would not take for such.
+        # Lines are split as in C, because Python splits at further blanks and line ends that Mitsuba ignores.
         words = [word.decode("ascii", "replace") for word in line.split()]
         kinds = words[2:4] if words[:2] == ["property", "list"] else words[1:2]
         match words:

@@ -68,7 +68,7 @@ LIMITS = {
     **dict.fromkeys(("eumelanin", "pheomelanin"), LIGHT),
     **dict.fromkeys(("alpha", "alpha_u", "alpha_v"), _ROUGHNESS),
     **dict.fromkeys(("roughness", "anisotropic", "metallic", "opacity", "weight"), _PART),
-    # Further weights of principled materials, of which Mitsuba takes any number.
+    # These are further weights of principled materials, for which Mitsuba accepts any number.
     **dict.fromkeys(("sheen", "sheen_tint", "spec_tint", "spec_trans", "specular"), _PART),
     **dict.fromkeys(("flatness", "clearcoat", "clearcoat_gloss"), _PART),
     "diff_trans": Range(0, 2),
@@ -80,13 +80,13 @@ LIMITS = {
     "temperature": Range(0, 1e5, above=True),
     "g": Range(-1, 1, above=True, below=True),
     "sample_count": Range(1, 1e6),
-    # Of the reference alone, which would lose light by other values.
+    # Only the reference reads these, and it would lose light by other values.
     **dict.fromkeys(("shading_samples", "emitter_samples", "bsdf_samples"), Range(1, 1e6)),
     "sampling_weight": Range(0, _LARGEST, above=True, hint=": the reference would find no light of this lamp"),
     "timeout": Range(-1, 0, hint=": the reference would stop before all its light is in"),
     "max_depth": Range(-1, 10000),
     "rr_depth": Range(1, 10000),
-    # Below a wavelength of light, and too near for a camera whose mask lies in front of it: lengths given in metres.
+    # The lower limit refuses lengths in metres: it is below a wavelength, and too near for a camera with a mask.
     **dict.fromkeys(("pixel_pitch", "row_pitch", "mask_feature"), Range(1e-4, FARTHEST, hint=_METRES)),
     "scene_distance": Range(1, FARTHEST, hint=_METRES),
 }
@@ -112,8 +112,8 @@ def check_transform(tag: Tag, name: str, matrix: npt.NDArray[np.float64], rigid:
 
 
 # -------- Which plugins a scene may have
-# Those that are left out run or read what cannot be checked beforehand (binary grids, tables and caches), or give
-# something else than light on a sensor.
+# Other plugins run or read content that cannot be checked beforehand (binary grids, tables and caches), or give no
+# light on a sensor.
 
 _TEXTURES = "bitmap blackbody checkerboard d65 irregular mesh_attribute rawconstant regular srgb uniform"
 PLUGINS = {
@@ -169,11 +169,11 @@ def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) ->
 
 # -------- Estimators, and what they cannot render
 #
-# What an estimator cannot render: the tree of a checked scene in; its refusal out, or what is known to be lost.
+# Refusals of a checked scene by each estimator, and light that is known to be lost.
 #
-# The factored estimator knows surfaces alone. The reference is the scene's own integrator, and of Mitsuba's only those
-# for volumes see a light through what lets it straight on: the others take a hole that is cut out for opaque whenever
-# they connect a surface to a lamp or projector, and lose that light without a word.
+# The factored estimator supports only surfaces. The reference is the scene's own integrator. Of Mitsuba's, only
+# integrators for volumes see a light through surfaces that let it pass straight: the others treat a hole in a cut-out
+# material as opaque when they connect a surface to a lamp or projector, and lose that light.
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light pass straight on."""

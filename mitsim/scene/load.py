@@ -133,7 +133,7 @@ def load_scene(
             warnings.warn(f"mesh {mesh}: its materials ({materials}) are not read; it has the scene's", stacklevel=2)
     tree.check_meshes(moved, scene)
     _add_up_normals(scene, checked.without_normals)
-    # After normals were added up: once Mitsuba's own had a NaN, which loading the same files again did not.
+    # Texels are checked after normals were added up, because Mitsuba's own normals once had a NaN.
     check_texels(path, scene, checked.limits)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
@@ -194,7 +194,7 @@ _PARALLEL = 0.9999
 def _is_smoothed(shape: mi.Shape) -> bool:
     if not shape.is_mesh() or not shape.has_vertex_normals():
         return shape.class_name() in _SMOOTH_BY_CLASS
-    # Rectangles and cubes are meshes that tell no parameters of one.
+    # Rectangles and cubes are meshes without the parameters of one.
     held = shape.faces_buffer(), shape.vertex_positions_buffer(), shape.vertex_normals_buffer()
     faces, positions, normals = (np.array(each).reshape(-1, 3) for each in held)
     corners = positions[faces].astype(np.float64)
@@ -204,8 +204,8 @@ def _is_smoothed(shape: mi.Shape) -> bool:
 
 
 # -------- Values of a loaded scene's bitmaps and meshes
-# OpenEXR holds NaN, infinity, negative numbers and reflectances above 1, and Mitsuba takes them without a word; so do
-# meshes, whose vertices have colours too. The renderer would spread one such texel over every frame.
+# OpenEXR files and colours of vertices may hold NaN, infinity, negative numbers and reflectances above 1, which
+# Mitsuba accepts. The renderer would spread one such texel over every frame.
 
 _ANY = Range(-np.inf, np.inf)
 _ROUNDING = 1e-5
@@ -267,7 +267,7 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
                 continue  # coefficients of smooth spectra in Mitsuba's model: of any, they lie within 0 and 1
             file = re.search(r'name = "([^"]*)"', held)
             named = file[1] if file else name
-            # Mitsuba calls a texture by its parameter, and one that is referenced by a number.
+            # Mitsuba names a texture by its parameter, and a referenced texture by a number.
             limit = limits.get(named if last == "data" else last) or limits.get(name.rpartition(".")[2], _ANY)
             wrong = ~np.isfinite(values) | (values < limit.low) | (values > limit.high + _ROUNDING)
             if wrong.any():
@@ -312,7 +312,7 @@ def with_own_files(checked: CheckedScene) -> Iterator[None]:
                 continue
             square = fit_square(read_reflectance(Path(name)))
             codes = np.rint(255 * square)
-            # As a shipped print's where that holds them: the same file gives the same frames, however it is named.
+            # Whole codes are written as in a shipped print, so that the same picture gives the same frames.
             whole = bool(np.abs(codes - 255 * square).max() < _CODE_ROUNDING)
             made = Path(stack.enter_context(tempfile.TemporaryDirectory())) / f"picture{'.png' if whole else '.exr'}"
             values = codes.astype(np.uint8) if whole else square.astype(np.float32)

@@ -277,7 +277,7 @@ class SceneFiles:
         if not path.is_file():
             raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
         self.used[path] = None
-        # Mitsuba looks for a plugin in the folder "plugins" beside the scene and in the working folder, its own last.
+        # Mitsuba searches the folder "plugins" beside the scene and in the working folder before its own.
         for folder in (path.parent, Path()):
             _check_native(path, folder)
         return path

@@ -135,14 +135,14 @@ def _place(props: mi.Properties, matrix: FloatArray) -> None:
 
 # -------- Thin cylinders and small lamps as meshes
 #
-# Mitsuba solves a quadratic in single precision for the point where a ray meets a cylinder: with a radius r at a
-# distance D its discriminant is off by 6e-8 (D / r)^2, by as much as itself for 0.15 mm at 400 mm, which loses 3 to 7
-# % of the light. Triangles keep the rounding of their corners, 3e-8 D. So a thin cylinder is handed on as a prism
-# whose mean width is that of the cylinder (perimeter over pi), made in double precision. Spheres are met from the
-# ray's point nearest to them, which loses 5e-4 of the light where r is 1e-5 D, and stay - unless they shine: Mitsuba
-# draws points of such a lamp by the cosine of its radius seen from afar, 1 - (r / D)^2 / 2, which single precision has
-# only 1.2e-7 (D / r)^2 of. Its light on surfaces is 3 % too much for 0.5 mm at 300 mm, 7 % for 0.1 mm, and nothing for
-# 0.05 mm. Of a mesh points are drawn by area. (Cauchy: a convex body shows a quarter of its area in the mean.)
+# Mitsuba solves a quadratic in single precision for the point where a ray meets a cylinder. With radius r at distance
+# D its discriminant errs by 6e-8 (D / r)^2, by 100 % for 0.15 mm at 400 mm, which loses 3 to 7 % of the light.
+# Triangles keep the rounding of their corners, 3e-8 D. Therefore a thin cylinder is replaced by a prism whose mean
+# width is that of the cylinder (perimeter over pi), made in double precision. Spheres are met from the ray's nearest
+# point, which loses 5e-4 of the light for r = 1e-5 D, and stay unless they emit. Mitsuba draws points of such a lamp
+# by the cosine of its visible radius, 1 - (r / D)^2 / 2, which single precision resolves only to 1.2e-7 (D / r)^2. Its
+# light on surfaces is 3 % too much for 0.5 mm at 300 mm, 7 % for 0.1 mm, and zero for 0.05 mm. Points of a mesh are
+# drawn by area. (Cauchy: the mean visible area of a convex body is a quarter of its surface.)
 
 _SLENDER = 400.0
 """Ratio of distance to radius from which Mitsuba's cylinders lose 8e-4 of their light."""
@@ -212,7 +212,7 @@ def _thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iter
             continue
         if distance > slender * radius and below & mixed:
             raise tag.refusal("radius", got, held.format(distance / slender, rule))
-        # What a lamp lights may be further away than camera and projector.
+        # Surfaces that a lamp lights may be further away than camera and projector.
         if not below & mixed and (_farthest(ends, eyes + places) if lamp else distance) > slender * radius:
             yield index
 
@@ -236,7 +236,7 @@ def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> No
         if name in props:
             del props[name]
     props["filename"] = str(path)
-    # A lamp with vertex normals would shine by them, and lose light.
+    # A lamp with vertex normals would emit by them, and lose light.
     props["face_normals"] = _emits(props, nodes)
 
 
@@ -307,8 +307,8 @@ def _triangles(rows: int, columns: int) -> FloatArray:
 
 # -------- Materials made of others
 #
-# Those of Mitsuba lose light of mirrors, or hold for light from the camera alone: :mod:`mitsim.transport.plugins`
-# .wrappers says which, and has others in their place.
+# Mitsuba's own materials lose light of mirrors, or are correct only for light from the camera
+# (:mod:`mitsim.transport.plugins.wrappers`).
 
 
 def put_wrappers(state: mi.parser.ParserState) -> None:
@@ -389,7 +389,7 @@ def tilts(props: mi.Properties) -> tuple[FloatArray, FloatArray]:
 
 # -------- The film of a camera file
 #
-# A scene's film and ``pixel_pitch`` stand for what no camera file says: a file that is named says what the sensor is.
+# The scene's film and ``pixel_pitch`` are defaults, which the sensor of a camera file replaces.
 
 _FILMS = PLUGINS["film"].split()
 _WINDOW = "crop_offset_x", "crop_offset_y", "crop_width", "crop_height"
