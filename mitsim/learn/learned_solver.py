@@ -103,6 +103,7 @@ class LearnedSolver(Solver):
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
+        """Return the image of the frames; raise MitsimError if it is not finite."""
         problem = prepared.problem(frames)
         variance = datum_variance(problem)
         like = next(self.network.parameters())

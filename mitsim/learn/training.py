@@ -142,6 +142,7 @@ class Trainer:
         return self.taken >= self.request.steps or gone
 
     def go_on(self, job: Job) -> None:
+        """Take the steps up to the next judgement; raise MitsimError if the loss is not finite."""
         steps = self.request.steps
         for number in range(self.taken, min(self.taken + max(steps // _LOOKS, 1), steps)):
             if not math.isfinite(self.step(number)):

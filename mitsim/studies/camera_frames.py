@@ -63,6 +63,7 @@ class Frames:
 
     @classmethod
     def of(cls, sensor: SensorModel, procedure: Procedure) -> Frames:
+        """Return the frames of a simulated camera; MitsimError if no light saturates it."""
         capacity, steps, pixels = capacity_of(sensor), procedure.steps, procedure.pixels
         hottest = sensor.dark_current_e_per_s + sensor.hot_dark_current_e_per_s
         hottest = sensor.binning**2 * sensor.dark_factor * hottest
@@ -269,6 +270,7 @@ _FLOATS = 9
 
 
 def read_sets(flats: FlatFrames, job: Job) -> list[Alike]:
+    """Compute the statistics of every set; MitsimError if the frames show nothing of the camera."""
     where = f"frames {flats.folder}"
     shape = image_size(flats.folder / flats.sets[0].files[0], flats.wanted)
     if min(shape) < _LEAST_SIDE:

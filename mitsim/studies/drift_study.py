@@ -146,6 +146,7 @@ class DriftStand:
         return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto, image=images[0])
 
     def predict(self, drift: Drift) -> Prediction:
+        """Return the predicted effect; MitsimError for a drift that the bench cannot have."""
         return Prediction(
             self.before_db, *(self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
         )
@@ -410,6 +411,7 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def recipe_of(path: str | None) -> SessionRecipe:
+    """Return the recipe at ``path``, or the shipped one; MitsimError as :func:`load_recipe`."""
     return load_recipe(shipped_path("calibration", "drift.toml") if path is None else Path(path))
 
 

@@ -102,6 +102,7 @@ _PAINT = """<bsdf type="diffuse" id="sheet_bsdf">
 
 
 def place_setup(studio: Studio, setup: Setup, place: str) -> Setup:
+    """Return a setup of :data:`PLACES`; MitsimError where a shipped scene lacks the changed part."""
     shipped = "lamp_bench" if place == AMBIENT else "photograph"
 
     def write(folder: Path) -> None:

@@ -105,6 +105,7 @@ class Recipe:
         return cls(how, validate(Digital, listed["digital"], f"list {path}"), listed["bits"], listed["n"])
 
     def planes(self, path: Path) -> dict[str, FloatArray]:
+        """Return the whole planes [DN]; MitsimError for a file that is no capture."""
         numbers = read_image(path, Wanted("capture", mosaic=self.how.mosaic))
         if numbers.shape != _RAW:
             raise MitsimError(f"capture {path}: is {_size(numbers)}; give the raw frame, {_RAW[0]} x {_RAW[1]}")
@@ -124,6 +125,7 @@ class Recipe:
         return Preparer.of(how, self.digital, Wanted()).frame(Path(), plane).astype(np.float64)
 
     def scene(self, path: Path) -> FloatArray:
+        """Return the authors' image (n, n, 3), 0 to 1; MitsimError for another size."""
         image = read_image(path, Wanted("image", bits=(8,), colour=True))
         if image.shape != (self.n, self.n, 3):
             raise MitsimError(
@@ -137,6 +139,7 @@ def _size(values: Numbers) -> str:
 
 
 def read_captures(files: Mapping[str, tuple[Path, Path]], seed: int) -> list[Measured]:
+    """Return every plane; MitsimError for files that are no captures."""
     recipe, found = Recipe.load(), []
     raw = {name: recipe.planes(frame) for name, (frame, _) in files.items()}
     offsets = plane_offsets(recipe.how)

@@ -118,6 +118,7 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figu
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a CSV file, all or nothing; MitsimError on failure."""
     from pandas import DataFrame
 
     write_text(path, DataFrame([dict(row) for row in rows], dtype=object).to_csv(index=False))
@@ -171,6 +172,7 @@ class Store:
             np.savez_compressed(file, allow_pickle=False, **{"rows": rows, **found.arrays})  # type: ignore[arg-type]
 
     def load(self, point: Point) -> Found:
+        """Return the findings; MitsimError when the file is damaged."""
         from mitsim.core.arrays import read_npz
 
         path = self._file(point)
@@ -423,6 +425,7 @@ def _head(folder: Path) -> dict[str, Any]:
 
 
 def read_scope(folder: Path) -> tuple[str, Scope]:
+    """Return name and scope; MitsimError for a folder without a study."""
     for file in sorted(folder.glob("*.json")) if folder.is_dir() else ():
         head = read_json(file)
         if isinstance(head, dict) and isinstance(head.get("study"), str) and "scope" in head:

@@ -365,6 +365,7 @@ def find_experiment(name: str) -> Study:
 
 
 def check_study(name: str) -> None:
+    """Raise MitsimError for an unknown ``name``."""
     if name in GONE:
         raise MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
     if name not in (*EXPERIMENTS, ALL) and "." not in name:
@@ -422,6 +423,7 @@ def values_of(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def measures_of(text: str) -> tuple[str, ...]:
+    """Return the comma-separated measures; MitsimError for an unknown one."""
     names = tuple(text.split(","))
     if unknown := [name for name in names if name not in MEASURES]:
         raise MitsimError(f"--measure {unknown[0]!r}: use {', '.join(MEASURES)}")
@@ -429,6 +431,7 @@ def measures_of(text: str) -> tuple[str, ...]:
 
 
 def check_sweep(sweep: Sweep, pictures: int) -> None:
+    """Raise MitsimError for a ``sweep`` that varies nothing, or an impossible knob."""
     knobs, allowed = dict(sweep), {"exposure": CONVENTIONS, "method": METHODS}
     if not knobs:
         raise MitsimError(
@@ -457,6 +460,7 @@ def check_drifts(sweep: Sweep) -> None:
 
 
 def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> float:
+    """Return a number of a ``kind``; MitsimError for anything else."""
     try:
         return kind(text)
     except ValueError:
