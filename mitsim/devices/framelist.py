@@ -118,7 +118,7 @@ Identity = Annotated[Plain, BeforeValidator(_with_name)]
 
 
 class FrameList(Configuration):
-    """What a real session's frames are of, and how they are read."""
+    """Frames of a real session, and how they are read."""
 
     camera: Identity
     """Identity that a run must share: a name, or anything as a run's manifest has it."""
@@ -181,7 +181,7 @@ class SessionFrames:
         return replace(self, listed=self.listed.model_copy(update={"prepare": prepare, "camera": camera}))
 
     def with_preparer(self) -> SessionFrames:
-        """Return the session with its preparer, which reads dark and flat frames, and the end of its scale.
+        """Return the session with its preparer and the end of its scale.
 
         Raises MitsimError for frames that cannot be read, and for a list of all planes.
         """
@@ -342,7 +342,7 @@ class LitSet(DarkSet):
 
 
 class FlatList(Configuration):
-    """What a camera's frames are of, and how they are read."""
+    """Frames of a camera, and how they are read."""
 
     name: str = Field(min_length=1, max_length=200)
     """What the camera is called."""
@@ -428,7 +428,7 @@ class KnownCapture(Configuration):
 
 
 class KnownList(Configuration):
-    """Captures of known pictures, and what is known of their camera."""
+    """Captures of known pictures, and known properties of their camera."""
 
     centre: bool = False
     """Frames lose row and column means (FlatCam masks)."""

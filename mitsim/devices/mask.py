@@ -30,7 +30,7 @@ _TAPS = {
 """Feedback taps by order, as in ``scipy.signal.max_len_seq``."""
 
 
-# ---- What goes wrong when a mask is made and mounted ----
+# ---- Flaws of making and mounting a mask ----
 #
 # Over-etching moves the edges of all openings outward and under-etching inward; corners stay square. Edge blur is a
 # Gaussian over the transmission of power. Dust on the mask is discs that transmit less light. Then the mask is turned

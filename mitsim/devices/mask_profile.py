@@ -52,7 +52,7 @@ _MOST_GROWTH = 8
 
 
 class MaskProfile(Configuration):
-    """What a mask is made of; the scene states where it stands."""
+    """Material and flaws of a mask; the scene states its place."""
 
     kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"]
     """What it is made as; `mitsim list masks` says what each is."""

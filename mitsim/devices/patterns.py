@@ -209,7 +209,7 @@ def _conference(q: int) -> npt.NDArray[np.int64]:
 
 
 def stripe_signs(n: int) -> PatternFactor:
-    """Return the (``n``, N) first rows of the smallest Hadamard matrix that has them, for a calibration's stripes."""
+    """Return the (``n``, N) first rows of the smallest Hadamard matrix, for a calibration's stripes."""
     return hadamard_matrix(stripe_count(n))[:n]
 
 

@@ -255,7 +255,6 @@ class Plate(ByValue):
         return int(np.ceil(self.flaws.reach(self.extent_mm) / self.feature_mm))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
-        """Return the transmission (0..1) at points of the plane [mm], without blur and dust."""
         count = len(self.values)
         s_row, s_col = self.flaws.turned_back(np.asarray(s_row), np.asarray(s_col))
         if self.lines_mm is None:
@@ -269,7 +268,6 @@ class Plate(ByValue):
 
 @lru_cache(maxsize=8)
 def within(plate: Plate, reach_mm: float) -> Plate:
-    """Return the ``plate`` with its dust, and cut at ``reach_mm`` from its centre where that saves terms."""
     flaws = plate.flaws
     if flaws.turn_deg:
         reach_mm *= 2**0.5

@@ -56,7 +56,7 @@ class BoardShape(Configuration):
         return ", ".join(parts) or "flat, larger than the view"
 
 
-# -------- What moves between a calibration and a capture: the table [drift] of a recipe
+# -------- Motion between a calibration and a capture: the table [drift] of a recipe
 # Every number is 0 where nothing moves. Mask, projector, power, lamps, sensor and exposure are as they were in the
 # session before it, and as stated here in the capture after it; a session itself drifts by `session_ramp` and
 # `session_flicker` alone.
@@ -99,7 +99,7 @@ class MaskMotion(Configuration):
 
 
 class Drift(Configuration):
-    """What moves between a calibration and a capture, and by how much."""
+    """Motions and changes between a calibration and a capture."""
 
     mask_rows_um: float = Field(default=0.0, ge=-1000, le=1000)
     """Mask moves down the rows, um."""

@@ -120,9 +120,9 @@ def reconstruct_psf(
 ) -> Judged:
     """Recover the image of a run with a measured point spread function, and write the files of :func:`reconstruct`.
 
-    ``psf`` is a picture of the light of a scene point. ``reduce`` x ``reduce`` pixels of frames and picture become
-    one. The
-    ``options`` are ``lam``, ``method``, ``bounds`` and ``iterations``.
+    ``reduce`` x ``reduce`` pixels of frames and ``psf`` become one. The ``options`` are ``lam``, ``method``,
+    ``bounds`` and
+    ``iterations``.
     """
     from mitsim.reconstruct.point_spread_image import psf_inputs, reconstruct_psf_request
 

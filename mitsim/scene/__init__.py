@@ -1,1 +1,1 @@
-"""What is in front of the camera: checked scene files, projector grid, pattern families and the effect plan."""
+"""The scene before the camera: checked scene files, projector grid, pattern families and the effect plan."""

@@ -328,8 +328,8 @@ def put_wrappers(state: mi.parser.ParserState) -> None:
 # -------- Lamps that are meshes emit by their faces
 #
 # Mitsuba draws points of a mesh emitter with the normals of its vertices, and weighs the light by their cosine instead
-# of the face's: of normals 30 and 60 degrees off it keeps 0.85 and 0.47. ``face_normals`` drops them. They also say
-# which side emits, so faces that are wound the other way are flipped.
+# of the face's: of normals 30 and 60 degrees off it keeps 0.85 and 0.47. ``face_normals`` drops them. Normals also
+# determine which side emits, so that faces that are wound the other way are flipped.
 
 _MESHES = ("obj", "ply")
 _FLAT = 1e-4
@@ -399,9 +399,8 @@ _PITCH = float(CameraGeometry.model_fields["pixel_pitch"].default)
 def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
     """Give the cameras of a scene the pitch and format of a camera file; return a sentence if something changes.
 
-    The pitch of the ``sensor`` replaces the scene's beyond :data:`PITCH_TOLERANCE`; its rows and columns replace the
-    film's
-    size and crop window. Raises MitsimError for a camera without a film whose size can be set.
+    A pitch within :data:`PITCH_TOLERANCE` stays. Raises MitsimError for a camera without a film whose size can be
+    set.
     """
     nodes, words = checked.state.nodes, ""
     for node in nodes:
