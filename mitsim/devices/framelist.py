@@ -379,8 +379,7 @@ class FlatFrames:
 def load_flats(folder: Path | str) -> FlatFrames:
     """Return the files of the ``folder`` with their meaning.
 
-    Raises MitsimError without a list, for a list that breaks a rule, for frames that are missing or without a
-    partner,
+    Raises MitsimError without a list, for a list that breaks a rule, for frames that are missing or without a partner,
     and for an exposure under light without one in the dark.
     """
     folder = Path(folder)
@@ -474,8 +473,7 @@ class KnownCaptures:
 def load_known(path: Path | str) -> KnownCaptures:
     """Return the list in the file ``path``, TOML or JSON.
 
-    Raises MitsimError for a list that breaks a rule, and for runs or pictures that are missing, unfinished, of
-    several
+    Raises MitsimError for a list that breaks a rule, and for runs or pictures that are missing, unfinished, of several
     cameras, or of other lines than the first.
     """
     path = Path(path)

@@ -241,9 +241,8 @@ def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> Floa
     """Return the point spread function in a picture (PNG, TIFF, NPY, OpenEXR), with sum 1.
 
     Colours are averaged, the median along the edges is subtracted, ``reduce`` x ``reduce`` pixels are averaged, and
-    negative values become zero. Raises MitsimError for a file that is no picture, has a palette or more than
-    ``most`` pixels
-    per side, for a ``reduce`` that does not fit, and without light above the background.
+    negative values become zero. Raises MitsimError for a file that is no picture, has a palette or more than ``most``
+    pixels per side, for a ``reduce`` that does not fit, and without light above the background.
     """
     path = Path(path)
     size = image_size(path, _PICTURE)

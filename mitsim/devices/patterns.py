@@ -251,10 +251,8 @@ def pattern_family(
     """Register a function from a :class:`PatternAxis` to its (n, K) factor of 0/1 or +-1 as a pattern family.
 
     ``forms`` are its names: ``NAME``, or ``NAME:K``, and ``NAME:RxC`` as well where rows and columns may differ.
-    ``label``
-    is the name in reports. ``random`` families take a seed. ``signed`` returns True if patterns of a K take the
-    value -1, and
-    ``check`` raises MitsimError for a K that does not exist. A name that is taken raises ValueError.
+    ``label`` is the name in reports. ``random`` families take a seed. ``signed`` returns True if patterns of a K take
+    the value -1, and ``check`` raises MitsimError for a K that does not exist. A name that is taken raises ValueError.
     """
     name = forms[0].partition(":")[0]
     if name in FAMILIES:
@@ -377,14 +375,10 @@ def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.N
     """Return orders in which the frames of a run may have been taken, by name, as permutations p.
 
     Shot k of ``patterns.captures`` is then frame p[k] of those at hand. Captures are ``row-major``; ``column-major``
-    loops
-    over rows inside columns. Sylvester's Hadamard patterns also have ``sequency`` (Walsh), ``dyadic`` (Paley) and
-    ``natural``
-    order. In signed pairs, + precedes - except for ``halves-exchanged`` (- before +), ``plus-first`` (all + before
-    all -) and
-    ``minus-first``, which also follow another order, as in ``sequency,plus-first``. Two names may have the same
-    permutation.
-    ``taken`` is the order that `mitsim import --order` applied to the frames at hand.
+    loops over rows inside columns. Sylvester's Hadamard patterns also have ``sequency`` (Walsh), ``dyadic`` (Paley) and
+    ``natural`` order. In signed pairs, + precedes - except for ``halves-exchanged`` (- before +), ``plus-first`` (all +
+    before all -) and ``minus-first``, which also follow another order, as in ``sequency,plus-first``. Two names may
+    have the same permutation. ``taken`` is the order that `mitsim import --order` applied to the frames at hand.
     """
     import numpy as np
 

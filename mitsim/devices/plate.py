@@ -51,9 +51,8 @@ class Plate(ByValue):
     """A square plate of square features, each with its own transmission; MitsimError for values out of range.
 
     ``values`` (N, N) are transmissions of power, read-only, or of any size with ``irradiance``: the light behind the
-    plate,
-    which includes waves. ``lines_mm`` (N + 1,) separate features that are not equal. Light is always averaged over
-    ``averaged`` features, the side of a sensor pixel. ``words`` describe the plate in manifests.
+    plate, which includes waves. ``lines_mm`` (N + 1,) separate features that are not equal. Light is always averaged
+    over ``averaged`` features, the side of a sensor pixel. ``words`` describe the plate in manifests.
     """
 
     feature_mm: float
@@ -316,11 +315,9 @@ def _distinct(
 class LargestTerms:
     """Terms of large ``values`` (N, N) that hold means over squares of ``averaged`` values per side up to 1e-4, rms.
 
-    With S the means along an axis, and U sigma W^T the largest singular vectors of S V S^T, the terms are
-    V S^T W sigma^-1 U^T S V (Nystroem's approximation). Vectors come from a sketch in random directions (Halko,
-    Martinsson
-    and Tropp, SIAM Review 53, 217, 2011). ``sizes`` are tried in order; ``left_out`` is the rms part of the means
-    that is
+    With S the means along an axis, and U sigma W^T the largest singular vectors of S V S^T, the terms are V S^T W
+    sigma^-1 U^T S V (Nystroem's approximation). Vectors come from a sketch in random directions (Halko, Martinsson and
+    Tropp, SIAM Review 53, 217, 2011). ``sizes`` are tried in order; ``left_out`` is the rms part of the means that is
     missing, above 1e-4 where ``count`` is too small.
     """
 
@@ -390,8 +387,7 @@ _PICTURES = ".png", ".tif", ".tiff"
 def read_drawing(path: Path) -> FloatArray:
     """Return the (rows, columns) transmissions, 0 to 1, of the drawing ``path``; pictures are linear in transmission.
 
-    Row 0 is at the top and column 0 at the left for a viewer from the sensor. Raises MitsimError for a file that is
-    no
+    Row 0 is at the top and column 0 at the left for a viewer from the sensor. Raises MitsimError for a file that is no
     PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
     """
     rows, columns = image_size(path, _DRAWING)

@@ -309,10 +309,8 @@ class Response(ByValue):
     """Response of a camera's pixels, or of those under filters of one colour, to light of each wavelength.
 
     ``counts`` (k,) are electrons a photon times the wavelength [nm], evenly over :data:`SPECTRA_NM`; outside
-    ``range_nm`` with
-    the efficiency of the end. ``beyond_nm`` is the integral of efficiency and wavelength beyond Mitsuba's spectra,
-    over its
-    value at the end. ``planes`` are the numbers of its pixels in each 2 x 2.
+    ``range_nm`` with the efficiency of the end. ``beyond_nm`` is the integral of efficiency and wavelength beyond
+    Mitsuba's spectra, over its value at the end. ``planes`` are the numbers of its pixels in each 2 x 2.
     """
 
     counts: FloatArray
@@ -371,11 +369,9 @@ class Response(ByValue):
 class CountedLamps(ByValue):
     """A scene's lamps as its camera counts them, in four ``bands`` [nm] of each response.
 
-    ``spectra`` are the wavelengths of diffraction, and ``shares`` the part of the counts, per band. ``unknown`` is
-    the largest
-    part of the light that would count if the efficiency did not end. ``units`` are wavelength [nm] and irradiance [W
-    m^-2] for
-    a count of 1, per line of the projector.
+    ``spectra`` are the wavelengths of diffraction, and ``shares`` the part of the counts, per band. ``unknown`` is the
+    largest part of the light that would count if the efficiency did not end. ``units`` are wavelength [nm] and
+    irradiance [W m^-2] for a count of 1, per line of the projector.
     """
 
     responses: tuple[Response, ...]
@@ -408,9 +404,8 @@ class CountedLamps(ByValue):
 def line_units(sensor: SensorModel, lines: Lines) -> tuple[float, ...]:
     """Return the irradiance [W m^-2] of each of the ``lines`` at which the ``sensor`` counts 1.
 
-    Behind a mosaic the lines share the count as they share power, s_l / sum_k s_k w_k lambda_k, with w_k the
-    electrons a
-    photon of line k. MitsimError where the sensor does not see the lines.
+    Behind a mosaic the lines share the count as they share power, s_l / sum_k s_k w_k lambda_k, with w_k the electrons
+    a photon of line k. MitsimError where the sensor does not see the lines.
     """
     if sensor.mosaic is not None:
         mean = np.mean(sensor.planes(lines.wavelengths_nm), axis=0)

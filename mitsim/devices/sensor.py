@@ -40,11 +40,11 @@ _LEVELS = 256
 class SensorModel(Configuration, defer_build=True):
     """A camera after EMVA 1288 release 4.0: per-pixel electronics and how pixels are binned.
 
-    The fields describe one **pixel**; a frame's element is a **superpixel** of `binning` x `binning` = b^2
-    pixels whose values are summed. Area, full well, dark current, black level and largest code are then b^2 times
-    as large, and read noise b times. The sum is rounded once, which neglects (b^2 - 1)/12 DN^2 of variance. With
-    `binning_on_chip` charge is read once: noises, offsets, black level and largest code are those of one reading.
-    A field that is left out is an effect that the camera does not have.
+    The fields describe one **pixel**; a frame's element is a **superpixel** of `binning` x `binning` = b^2 pixels whose
+    values are summed. Area, full well, dark current, black level and largest code are then b^2 times as large, and read
+    noise b times. The sum is rounded once, which neglects (b^2 - 1)/12 DN^2 of variance. With `binning_on_chip` charge
+    is read once: noises, offsets, black level and largest code are those of one reading. A field that is left out is an
+    effect that the camera does not have.
     """
 
     name: str
@@ -268,9 +268,8 @@ class SensorModel(Configuration, defer_build=True):
     def offset_parts(self) -> tuple[float, float, float]:
         """Return the standard deviations of a superpixel's offset by pixel, row and column [electrons].
 
-        They are (b^2, b^3, b^3)^(1/2) times one pixel's, because b readings share a row's offset in each of b rows.
-        On chip
-        there is one reading.
+        They are (b^2, b^3, b^3)^(1/2) times one pixel's, because b readings share a row's offset in each of b rows. On
+        chip there is one reading.
         """
         pixel, line = self._readings
         return self.dsnu_pixel_e * pixel, self.dsnu_row_e * line, self.dsnu_column_e * line
@@ -371,9 +370,8 @@ def load_sensor(path: Path | str) -> SensorModel:
 def sensor_table(path: Path | str) -> Table:
     """Return the fields of the sensor in a TOML file without its table ``[mask]``.
 
-    A line ``base`` names a shipped camera, or a file beside it, whose fields are inherited. Raises MitsimError if
-    there is
-    no such base.
+    A line ``base`` names a shipped camera, or a file beside it, whose fields are inherited. Raises MitsimError if there
+    is no such base.
     """
     table, read, first = read_toml(path), [Path(path).resolve()], path
     while (base := table.pop(BASE, None)) is not None:

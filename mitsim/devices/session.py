@@ -389,9 +389,8 @@ class Modelling:
     def used_patterns(self, changes: Sequence[int], pairs: bool, repeats: int) -> list[tuple[Side, int]]:
         """Return side and number of the +-1 patterns whose frames are used.
 
-        They are uniform light, then ever finer stripes (by their ``changes`` of sign), because a mask's fringes
-        change the
-        deep shadows of coarse stripes least.
+        They are uniform light, then ever finer stripes (by their ``changes`` of sign), because a mask's fringes change
+        the deep shadows of coarse stripes least.
         """
         shots = max(self.frames // repeats, 2)
         most = shots // 2 if pairs else max(shots - 2, 1)

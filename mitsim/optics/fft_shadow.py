@@ -1,14 +1,10 @@
 """Shadow of masks without few separable terms, drawn on a raster of square cells.
 
-A sensor pixel as seen on the mask is a whole number of cells, whose values are means. A point at depth z and
-tan-angle
-tau shades sensor point u by the raster's value at s = u (1 - d/z) + d tau. Means over cells add a variance of h^2 /
-6 to
-an edge. A twelfth of the second difference along each axis is subtracted, which corrects half of it. Waves behind a
-sum
-of terms are sums of products of the 1-D fields of :mod:`mitsim.optics.diffraction`, and |U|^2 is averaged over
-points in
-each cell and over the lines of the light.
+A sensor pixel as seen on the mask is a whole number of cells, whose values are means. A point at depth z and tan-angle
+tau shades sensor point u by the raster's value at s = u (1 - d/z) + d tau. Means over cells add a variance of h^2 / 6
+to an edge. A twelfth of the second difference along each axis is subtracted, which corrects half of it. Waves behind a
+sum of terms are sums of products of the 1-D fields of :mod:`mitsim.optics.diffraction`, and |U|^2 is averaged over
+points in each cell and over the lines of the light.
 """
 
 from __future__ import annotations

@@ -220,8 +220,7 @@ def noise_of_groups(probed: FloatArray, rows: int, groups: int) -> FloatArray:
 def bound_of(products: FloatArray, energy: float) -> float:
     """Return the 95 % bound of a relative error from (G, G) inner ``products`` and the frames' squared norm.
 
-    With many kinds of noise, the products have G - 1 equal eigenvalues. With one kind, the bound is that of
-    Student's t
+    With many kinds of noise, the products have G - 1 equal eigenvalues. With one kind, the bound is that of Student's t
     with G - 1 degrees of freedom. In between, the squared bound grows with the squared norm of the products.
     """
     variance, freedom = float(np.trace(products)), len(products) - 1

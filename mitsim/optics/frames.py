@@ -34,8 +34,7 @@ _ALL = sparse.csr_array(np.ones((1, 1)))
 class Frame:
     """Expected irradiance (m, m') [W m^-2] of one shot, and its Monte Carlo variance (mean over pixels).
 
-    ``removed`` is the part of the light below zero, which interpolation between anchors can leave. ``heaviest`` is
-    the
+    ``removed`` is the part of the light below zero, which interpolation between anchors can leave. ``heaviest`` is the
     largest part of the variance from one group of the light: (G - 1) / G if one path dominates. ``by_group`` has the
     (G, G) inner products of the groups' contributions.
     """
@@ -82,17 +81,13 @@ class ExpectedFrames:
     """Frames of every shot of a family, each with the Monte Carlo variance of its mean.
 
     Because light is linear, frames are formed once for the classes of projector pixels that a family always lights
-    together,
-    and mixed; a family with too many classes is formed shot by shot. The variance of the mean of G groups is
+    together, and mixed; a family with too many classes is formed shot by shot. The variance of the mean of G groups is
     ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``, and 0 for one group. Squared norms are estimated without bias from
-    products with
-    random signs (Hutchinson's estimator).
+    products with random signs (Hutchinson's estimator).
 
-    ``lights`` have the same rows (classes or pixels), and their groups are paired with those of ``ambient`` (1,
-    cells), which
-    every shot has. ``lighting`` has the class of each row. ``specular`` frames are added to those of some classes.
-    ``probed``
-    products of the same classes and seed are reused, and ``restated`` scales the Monte Carlo error.
+    ``lights`` have the same rows (classes or pixels), and their groups are paired with those of ``ambient`` (1, cells),
+    which every shot has. ``lighting`` has the class of each row. ``specular`` frames are added to those of some
+    classes. ``probed`` products of the same classes and seed are reused, and ``restated`` scales the Monte Carlo error.
     """
 
     def __init__(

@@ -1,10 +1,9 @@
 """Closed form of image formation: irradiance on every sensor pixel from light per (layer, anchor, tan-angle cell).
 
-The shadow of a cell is separable, and so is the interpolation between anchors. The frame of one light distribution T
-is ``sum over layers and mask terms of L T R^T``, where the rows of T run over (anchor row, cell row) and its columns
-over (anchor column, cell column). Only rows and columns that hold light enter the product. Behind a mask that is
-drawn
-on a raster (:mod:`mitsim.optics.fft_shadow`), the frame of each pair of anchors is a correlation.
+The shadow of a cell is separable, and so is the interpolation between anchors. The frame of one light distribution T is
+``sum over layers and mask terms of L T R^T``, where the rows of T run over (anchor row, cell row) and its columns over
+(anchor column, cell column). Only rows and columns that hold light enter the product. Behind a mask that is drawn on a
+raster (:mod:`mitsim.optics.fft_shadow`), the frame of each pair of anchors is a correlation.
 """
 
 from __future__ import annotations
@@ -155,8 +154,7 @@ _Layer = _Raster | _Terms
 class FrameOptics:
     """The closed form, prepared once; applying it changes nothing.
 
-    ``depths`` of the layers are in mm, and ``anchors`` are the points per side of the sensor from which light is
-    seen.
+    ``depths`` of the layers are in mm, and ``anchors`` are the points per side of the sensor from which light is seen.
     ``spectrum`` is None for a geometric shadow. ``places`` are increasing rows and columns of a frame; None for all.
     """
 

@@ -2,8 +2,7 @@
 
 A beam is a quadrilateral of one projector pixel's window with a known flux. Its four corner rays give the place where
 it lands, and quantities between them are bilinear. A beam is cut into boxes of at most half a sensor pixel, and each
-box gives the pixels that it overlaps their part of the flux times the mask's mean. Because boxes tile the beam, flux
-is
+box gives the pixels that it overlaps their part of the flux times the mask's mean. Because boxes tile the beam, flux is
 conserved. Coordinates are centred index coordinates (s_row = -y, s_col = -x) in mm.
 """
 
@@ -36,13 +35,10 @@ _ASKEW_BOXES = 2
 class Beams:
     """Bundles of rays that reach the sensor plane; the last index of each pair is (row, column).
 
-    ``flux`` (q,) is that of projector ``pixel`` (q,), row * n + column, at full power [W m^-2 mm^2]. ``sensor`` (q,
-    2, 2, 2)
-    are the points where the corner rays cross the sensor plane [mm], ``tangent`` their tan-angles in index
-    coordinates, and
-    ``throughput`` (q, 2, 2) the part of the light that remains. ``unresolved`` is flux whose place was not found,
-    and ``error``
-    the standard error of the flux from beams that an edge cuts.
+    ``flux`` (q,) is that of projector ``pixel`` (q,), row * n + column, at full power [W m^-2 mm^2]. ``sensor`` (q, 2,
+    2, 2) are the points where the corner rays cross the sensor plane [mm], ``tangent`` their tan-angles in index
+    coordinates, and ``throughput`` (q, 2, 2) the part of the light that remains. ``unresolved`` is flux whose place was
+    not found, and ``error`` the standard error of the flux from beams that an edge cuts.
     """
 
     pixel: IntArray
@@ -75,8 +71,7 @@ class SpecularFrames(ClassFrames):
     """Irradiance by mirrors, one frame for each class of projector pixels that reaches the sensor.
 
     ``lit_pixels`` are the projector pixels whose light meets the sensor. ``flux`` is that on the sensor without the
-    mask
-    [W m^-2 mm^2], ``unresolved`` the part that is left out, and ``error`` the standard error of the rest.
+    mask [W m^-2 mm^2], ``unresolved`` the part that is left out, and ``error`` the standard error of the rest.
     """
 
     lit_pixels: IntArray
@@ -90,9 +85,8 @@ def specular_frames(
 ) -> SpecularFrames:
     """Form the frames of the classes that mirrors bring to the sensor.
 
-    ``labels`` (n * n,) are the classes of projector pixels, and ``terms`` samplers of the mask; ``[]`` gives no
-    light. At
-    least 2 ``boxes_per_pixel`` are needed, because a box turned by 45 degrees must not reach a third pixel.
+    ``labels`` (n * n,) are the classes of projector pixels, and ``terms`` samplers of the mask; ``[]`` gives no light.
+    At least 2 ``boxes_per_pixel`` are needed, because a box turned by 45 degrees must not reach a third pixel.
     """
     labels = np.asarray(labels)
     corners = beams.sensor.reshape(len(beams), 4, 2)
@@ -148,8 +142,7 @@ def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
     """Yield all boxes of the beams ``reached``, no side longer than ``box`` [mm], in portions that fit into memory.
 
     Numbers of boxes are rounded up to three leading bits, so that many beams share one. Askew beams get up to three
-    times
-    as many, because boxes then overlap and leave gaps.
+    times as many, because boxes then overlap and leave gaps.
     """
     corners = beams.sensor[reached]
     sides = [np.diff(corners, axis=axis).reshape(len(reached), 2, 2) for axis in (1, 2)]

@@ -1,8 +1,7 @@
 """Geometric shadow of a mask: mean transmissions from sensor pixels and directions, as separable terms.
 
-The ray from sensor coordinate u toward tau = x/z, which meets the scene at depth z, crosses the mask plane (distance
-d) at s = u (1 - d/z) + d tau. The mean over a pixel and a cell is the profile weighted by a trapezoid. Its integral
-over
+The ray from sensor coordinate u toward tau = x/z, which meets the scene at depth z, crosses the mask plane (distance d)
+at s = u (1 - d/z) + d tau. The mean over a pixel and a cell is the profile weighted by a trapezoid. Its integral over
 each feature is a difference of a piecewise quadratic function, so that the mean is exact. (A second cumulative sum of
 the profile would cancel in float64.)
 
@@ -15,8 +14,8 @@ leaves through s entered at::
 Therefore each direction has its own clear profile M(s) M(s') on the exit face. A cell takes that of its centre.
 
 A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. A mask that is
-tilted, at distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t), times
-sqrt(1 + a^2). All coordinates are centred index coordinates in mm.
+tilted, at distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t), times sqrt(1 +
+a^2). All coordinates are centred index coordinates in mm.
 """
 
 from __future__ import annotations
@@ -66,8 +65,7 @@ class ShadowGeometry:
 
     ``pixel_centres_mm`` (m,) serve both axes without ``columns_mm``. ``distance_mm`` is that to the exit face, d, and
     ``depth_mm`` that to the scene, z, which may be ``inf``. ``tilt`` has, for rows and columns, the growth of the
-    mask's
-    distance with the coordinate, and its excess at the centre.
+    mask's distance with the coordinate, and its excess at the centre.
     """
 
     mask: Mask | Plate

@@ -56,10 +56,9 @@ def shadow_terms(
     """Return the shadow of directions at one depth [mm] as separable terms [(left (m, r), right (m', c)), ...].
 
     Each value is the mean over a pixel's active area times the fill factor, because irradiance is per pixel area. The
-    angular response belongs to the light and is not included. ``spectrum`` has the lines of a wave-optical shadow,
-    each with
-    its own terms, and is None for a geometric one. ``places`` are increasing rows and columns of the frame; None for
-    all.
+    angular response belongs to the light and is not included. ``spectrum`` has the lines of a wave-optical shadow, each
+    with its own terms, and is None for a geometric one. ``places`` are increasing rows and columns of the frame; None
+    for all.
     """
     shadow, waves = ShadowGeometry.of(geometry, depth, places), spectrum is not None
     if geometry.is_drawn(waves):
@@ -209,8 +208,7 @@ def best_term(terms: SeparableTerms) -> BestTerm:
 def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacking:
     """Return the part of an operator that factors (m, n) and (m', n') estimated from a session's stripes lack.
 
-    Comparing the factors that stripes give of ``terms``, which assume pixels of one brightness, with the found
-    factors
+    Comparing the factors that stripes give of ``terms``, which assume pixels of one brightness, with the found factors
     gives the brightness of each column in the session.
     """
     whole = terms
@@ -229,8 +227,8 @@ def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacki
 def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
     """Return the factors that stripes give of an operator (:mod:`mitsim.reconstruct.factors`).
 
-    The uniform response sum_k (L_k 1) (R_k 1)^T splits into a v^T, and stripes h 1^T into u v^T with
-    u = sum_k L_k h <R_k 1, v> / |v|^2, so that the left factor is the sum of L_k with these weights.
+    The uniform response sum_k (L_k 1) (R_k 1)^T splits into a v^T, and stripes h 1^T into u v^T with u = sum_k L_k h
+    <R_k 1, v> / |v|^2, so that the left factor is the sum of L_k with these weights.
     """
     uniform = best_term([(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True)) for a, b in terms])
     split = uniform.left[:, 0], uniform.right[:, 0]
@@ -290,10 +288,8 @@ class Placement:
     """Positions of mask and projector, and brightness of the board.
 
     Shifts and distance of the mask are in mm, and ``mask_rotation`` runs from rows toward columns [rad].
-    ``magnification``
-    scales the projector's window, whose shift is a tangent. ``gain`` is in electrons per second from a projector
-    pixel on a
-    sensor pixel without the mask.
+    ``magnification`` scales the projector's window, whose shift is a tangent. ``gain`` is in electrons per second from
+    a projector pixel on a sensor pixel without the mask.
     """
 
     mask_distance: float

@@ -25,11 +25,9 @@ from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE
 class ColourImage:
     """Images of a scene at spectral lines, their colours, and how well both are known.
 
-    ``images`` and ``truth`` (n, n', lines) are reflectances relative to the calibration's ``board``. Colours are
-    fitted on a
-    ``chart``; MitsimError if it lies outside. ``solution`` and ``of_lines`` are numbers of one solve for all lines,
-    or of each
-    line's, by the keys of the JSON. An image of other ``inputs`` is not replaced.
+    ``images`` and ``truth`` (n, n', lines) are reflectances relative to the calibration's ``board``. Colours are fitted
+    on a ``chart``; MitsimError if it lies outside. ``solution`` and ``of_lines`` are numbers of one solve for all
+    lines, or of each line's, by the keys of the JSON. An image of other ``inputs`` is not replaced.
     """
 
     lines: ColourManifest
@@ -89,9 +87,8 @@ class ColourImage:
     def patches(self) -> list[dict[str, Any]]:
         """Return CIE Delta E 2000 of the mean of each patch to its spectrum in D65; empty without a chart.
 
-        ``floor`` is that of the patch's spectrum at the lines by the fixed matrix, the least for these lines.
-        ``truth`` is that
-        of the truth by the image's matrix.
+        ``floor`` is that of the patch's spectrum at the lines by the fixed matrix, the least for these lines. ``truth``
+        is that of the truth by the image's matrix.
         """
         if self.chart is None:
             return []

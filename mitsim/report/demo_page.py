@@ -112,8 +112,7 @@ class Recovery:
 class FamilyResult:
     """A pattern family.
 
-    ``shots`` counts frames. ``patterns`` are some (n, n) examples. ``idealised`` solves the paper's model,
-    ``rendered``
+    ``shots`` counts frames. ``patterns`` are some (n, n) examples. ``idealised`` solves the paper's model, ``rendered``
     rendered frames with calibrated factors, whose PSNR [dB] by exposure convention is ``by_exposure``.
     """
 
@@ -139,9 +138,8 @@ class BudgetRow(NamedTuple):
 class ReportData:
     """Content of the demo's page.
 
-    ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, row 0 at the top as seen along +z.
-    ``main`` is
-    the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in DN by
+    ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, row 0 at the top as seen along +z. ``main``
+    is the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in DN by
     caption.
     """
 

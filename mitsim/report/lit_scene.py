@@ -1,12 +1,9 @@
 """Exposures of a scene under any pattern family, and the images that they give, for comparisons in studies.
 
-The *rendered* model uses the traced light and calibrated factors. The *idealised* model is the paper's: a planar
-scene that
-is lit evenly, and a geometric shadow of one separable term. Reflectance, exposure and noise are equal. *Equal peak*
-fills
-the same part of the full well with each family's brightest pixel, *equal frame* gives every frame the exposure of
-uniform
-light, and *equal total* shares that exposure among the family's frames.
+The *rendered* model uses the traced light and calibrated factors. The *idealised* model is the paper's: a planar scene
+that is lit evenly, and a geometric shadow of one separable term. Reflectance, exposure and noise are equal. *Equal
+peak* fills the same part of the full well with each family's brightest pixel, *equal frame* gives every frame the
+exposure of uniform light, and *equal total* shares that exposure among the family's frames.
 """
 
 from __future__ import annotations
@@ -109,9 +106,8 @@ class LitScene:
 class Unexposed:
     """Frames of a scene before any exposure, and the factors that solve them.
 
-    ``centre`` is True where means are subtracted from frames; ``plane`` is that of an idealised scene, None for that
-    of the
-    factors.
+    ``centre`` is True where means are subtracted from frames; ``plane`` is that of an idealised scene, None for that of
+    the factors.
     """
 
     lit: LitScene
@@ -312,8 +308,7 @@ def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> dict[str, str 
     """Return relative rms differences of a mask in one ``light`` from its geometric shadow, among ``systems`` by light.
 
     ``point_source`` and ``scene_pixel`` compare operators, for points and averaged over projector pixels; ``factor``
-    compares
-    a solver's factors. ``separability`` is the remainder of the operator without its best separable term,
+    compares a solver's factors. ``separability`` is the remainder of the operator without its best separable term,
     ``separability_centred`` the same without row and column means.
     """
     system, geometric = systems[light], systems[GEOMETRIC]

@@ -74,9 +74,8 @@ def curves(
 ) -> Figure:
     """Draw curves with bars of one standard error, in panels below each other on one scale.
 
-    Panels with fewer than two places along x are left out. A curve without a name is not in the legend. ``log``
-    forces a
-    logarithmic x axis, and ``ticks`` sets one at every measured x that has room.
+    Panels with fewer than two places along x are left out. A curve without a name is not in the legend. ``log`` forces
+    a logarithmic x axis, and ``ticks`` sets one at every measured x that has room.
     """
 
     def points(curve: Curve) -> FloatArray:

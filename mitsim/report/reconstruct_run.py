@@ -120,9 +120,8 @@ def reconstruct_psf(
 ) -> Judged:
     """Recover the image of a run with a measured point spread function, and write the files of :func:`reconstruct`.
 
-    ``reduce`` x ``reduce`` pixels of frames and ``psf`` become one. The ``options`` are ``lam``, ``method``,
-    ``bounds`` and
-    ``iterations``.
+    ``reduce`` x ``reduce`` pixels of frames and ``psf`` become one. The ``options`` are ``lam``, ``method``, ``bounds``
+    and ``iterations``.
     """
     from mitsim.reconstruct.point_spread_image import psf_inputs, reconstruct_psf_request
 
@@ -378,8 +377,7 @@ class MosaicCamera:
     """A camera under a ``mosaic`` of 2 x 2 colour filters.
 
     ``lefts`` (lines, m, n) and ``rights`` (lines, m', n') are factors without filters, ``weights`` (4, lines) the
-    responses
-    of the four pixels.
+    responses of the four pixels.
     """
 
     lefts: FloatArray
@@ -397,9 +395,8 @@ class MosaicCamera:
 class LineImages:
     """Images (lines, n, n') of all lines by one way.
 
-    ``lam`` is that of the joint solve, or the geometric mean of the planes' or channels'. ``residual`` is ||Y -
-    model|| /
-    ||Y|| over all frames.
+    ``lam`` is that of the joint solve, or the geometric mean of the planes' or channels'. ``residual`` is ||Y - model||
+    / ||Y|| over all frames.
     """
 
     images: FloatArray

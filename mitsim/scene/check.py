@@ -51,10 +51,8 @@ class CheckedScene:
     """A scene of which Mitsuba may make objects, its files (the scene first), and allowed ranges ``limits`` by name.
 
     ``shapes``, ``small_lamps`` (which no path can hit), ``coloured`` (may depend on wavelength) and ``parting``
-    (dispersive
-    glass) are tags in order. ``own`` are files that a user names and mitsim prepares. ``unread`` are names of
-    materials that
-    meshes refer to. ``unfit`` has the estimators that must refuse the scene.
+    (dispersive glass) are tags in order. ``own`` are files that a user names and mitsim prepares. ``unread`` are names
+    of materials that meshes refer to. ``unfit`` has the estimators that must refuse the scene.
     """
 
     outline: Outline

@@ -95,9 +95,8 @@ def check_ply(path: Path) -> tuple[bool, str]:
 def check_obj(path: Path) -> tuple[bool, str]:
     """Check that Mitsuba reads a Wavefront mesh correctly.
 
-    Mitsuba drops continued lines, faces that it cannot read, and free-form surfaces, and covers concave faces by a
-    fan that
-    overlaps. Return True if any vertices have normals, and the name of the materials, "" without.
+    Mitsuba drops continued lines, faces that it cannot read, and free-form surfaces, and covers concave faces by a fan
+    that overlaps. Return True if any vertices have normals, and the name of the materials, "" without.
     """
     if path.stat().st_size > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")

@@ -197,8 +197,7 @@ class Unfit:
     """Refusals of a scene by each estimator, and light that is lost in a scene that is accepted; None for neither.
 
     ``caustics`` is lost by the reference: light from lamps that no path can hit, over mirrors or glass. ``lamps`` is
-    the
-    same for the factored estimator, and ``instances`` its light over mirrors or glass inside instances.
+    the same for the factored estimator, and ``instances`` its light over mirrors or glass inside instances.
     """
 
     factored: MitsimError | None = None

@@ -111,8 +111,7 @@ def load_scene(
 ) -> LoadedScene:
     """Load a scene XML into the current variant; the plugin ``mitsim_lensless`` must be registered.
 
-    ``needs_projector`` refuses a scene without exactly one projector, or one that the factored estimator cannot
-    render.
+    ``needs_projector`` refuses a scene without exactly one projector, or one that the factored estimator cannot render.
     Pitch and format of a ``sensor`` replace the scene's. ``outside`` allows files outside the scene's folder.
 
     Raises MitsimError of one line that names the file, for any fault.
@@ -299,8 +298,7 @@ def with_own_files(checked: CheckedScene) -> Iterator[None]:
     """Prepare the files that the user named; the prepared files exist within the context.
 
     Raises MitsimError for a picture that is no reflectance, a mesh without faces or with normals that point inwards,
-    and if
-    files cannot be written.
+    and if files cannot be written.
     """
     with ExitStack() as stack:
         for node in checked.state.nodes:

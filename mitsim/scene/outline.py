@@ -2,8 +2,7 @@
 
 Mitsuba's parser has faults that this module prevents (cases in tests/hard/hostile/). It recurses until its stack
 overflows. It opens what ``<include>`` and ``<spectrum>`` name while it reads, even a pipe or a file outside, and each
-include again; ``<path>`` lets it find native code. It reads ``$albedo2`` as ``$albedo`` followed by 2, an empty
-number
+include again; ``<path>`` lets it find native code. It reads ``$albedo2`` as ``$albedo`` followed by 2, an empty number
 as 0, and a matrix without its last row. Of two objects with one name it takes the second.
 """
 
@@ -61,12 +60,10 @@ class Outline:
     """Positions of the tags of a scene and of its includes.
 
     ``defines`` precede the values of ``<default>``; files become absolute paths. ``files`` records includes.
-    ``projected``
-    are files that objects inside the projectors name.
+    ``projected`` are files that objects inside the projectors name.
 
-    Raises MitsimError if the XML is not well formed, too large or nested too deep, names files that are not allowed,
-    or has
-    parameters that are missing, unknown or not plain.
+    Raises MitsimError if the XML is not well formed, too large or nested too deep, names files that are not allowed, or
+    has parameters that are missing, unknown or not plain.
     """
 
     def __init__(self, path: Path, defines: Mapping[str, str], files: SceneFiles) -> None:
@@ -294,9 +291,8 @@ class SceneFiles:
     def find_named(self, parameter: str, name: str) -> Path:
         """Return the path of the file that a user names for a scene ``parameter``.
 
-        A ``name`` is relative to the working folder if it starts with a dot, and to the scene's folder if only that
-        has it.
-        Raises MitsimError if the file is missing, or both folders have one of that name.
+        A ``name`` is relative to the working folder if it starts with a dot, and to the scene's folder if only that has
+        it. Raises MitsimError if the file is missing, or both folders have one of that name.
         """
         own, here = self.folder / name, Path(name)
         places = [here] if name.startswith(".") or here.is_absolute() else [own, here]

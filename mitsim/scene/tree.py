@@ -41,9 +41,8 @@ _ALIGNED = float(CameraGeometry.model_fields["scene_distance"].default)
 def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tuple[Tag, float], ...]:
     """Move all objects of a checked tree so that its first ``mitsim_lensless`` is at the origin; directions are kept.
 
-    Return the tag and the moved distance [mm] of each shape in single precision. Raises MitsimError if a projector
-    is too far
-    from its camera.
+    Return the tag and the moved distance [mm] of each shape in single precision. Raises MitsimError if a projector is
+    too far from its camera.
     """
     nodes = state.nodes
     cameras = [node for node in nodes if node.props.plugin_name() == "mitsim_lensless"]
@@ -166,8 +165,7 @@ def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -
     """Replace thin cylinders and small lamps by meshes, whose files exist within the context.
 
     Raises MitsimError if a shape is too thin for its distance, for a thin cylinder of smooth plastic, and if files
-    cannot be
-    written.
+    cannot be written.
     """
     thin = set(_thin_shapes(outline, state.nodes))
     with ExitStack() as stack:

@@ -1,9 +1,7 @@
 """The projector's pixel grid: n x n pixels of a stock ``projector`` emitter and the directions that they light.
 
-The emitter's texture is its all-white frame. The rectangle of lit texels is the *window* of n x n pixels that
-patterns
-use; dark texels around it are canvas. A window off the canvas's centre is a lens shift, which causes no keystone.
-Row 0
+The emitter's texture is its all-white frame. The rectangle of lit texels is the *window* of n x n pixels that patterns
+use; dark texels around it are canvas. A window off the canvas's centre is a lens shift, which causes no keystone. Row 0
 is at +y and column 0 at +x for a viewer along +z.
 """
 
@@ -34,11 +32,9 @@ _Place = tuple[int, float, float, tuple[int, int]]
 class ProjectorGrid:
     """A window of n x n projector pixels in a canvas (rows, columns), and its position on the camera's aligned plane.
 
-    ``first_row`` and ``first_column`` are the texel of pixel (0, 0), fractional for a drifted picture. ``row_tan``
-    and
+    ``first_row`` and ``first_column`` are the texel of pixel (0, 0), fractional for a drifted picture. ``row_tan`` and
     ``column_tan`` are (first edge, last edge) of the window's bounding box as tan-angles in index coordinates.
-    ``keystone`` is
-    the largest deviation of the corners from that box in projector pixels.
+    ``keystone`` is the largest deviation of the corners from that box in projector pixels.
     """
 
     n: int
@@ -57,9 +53,8 @@ class ProjectorGrid:
 def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> ProjectorGrid:
     """Find the lit window of a projector and its position in front of a camera.
 
-    Raises MitsimError, which begins with ``where``, if the texture is no bitmap with a lit square window, or does
-    not light
-    the camera's aligned plane.
+    Raises MitsimError, which begins with ``where``, if the texture is no bitmap with a lit square window, or does not
+    light the camera's aligned plane.
     """
     parameters = mi.traverse(projector)
     if "irradiance.data" not in parameters:
@@ -102,9 +97,8 @@ def window_at(
 def straightening(where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, z: float) -> FloatArray:
     """Return the (3, 3) homography that removes the keystone from tan-angles (row, column, 1) at the depth ``z``.
 
-    It maps to the positions of the projector pixels if the window filled its bounding box evenly. Raises MitsimError
-    if the
-    projector does not light the plane.
+    It maps to the positions of the projector pixels if the window filled its bounding box evenly. Raises MitsimError if
+    the projector does not light the plane.
     """
     corners = _window_corners(where, projector, camera, grid.place, z)
     low, high = corners.min(axis=0), corners.max(axis=0)
