@@ -133,7 +133,7 @@ def way_to(order: int) -> Way:
     way = _way(order)
     if way is None:
         below, above = hadamard_orders(order)[-1:] or [1], next(o for o in range(order + 1, 4 * order + 5) if _way(o))
-        raise MitsimError(f"there is no Hadamard matrix of order {order}; use {below[0]} or {above}")
+        raise MitsimError(f"order {order} has no Hadamard matrix; use {below[0]} or {above}")
     return way
 
 
