@@ -241,15 +241,6 @@ def error_bars(
     return figure
 
 
-def pareto_front(points: Sequence[Point]) -> list[Point]:
-    """Return the ``points`` that no other point beats in both seconds and error, the fastest first."""
-    front: list[Point] = []
-    for seconds, error in sorted(points):
-        if not front or error < front[-1][1]:
-            front.append((seconds, error))
-    return front
-
-
 # -------- Parts of figures
 
 

@@ -70,9 +70,8 @@ from mitsim.light.passes import FOLLOWED, PASSES, LightEstimate
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, TracedPass, expected_of
 from mitsim.light.truth import Truth
-from mitsim.optics.frames import ClassFrames, ExpectedFrames
+from mitsim.optics.frames import ExpectedFrames
 from mitsim.scene.window import straightening
-from mitsim.transport.integrator import ANY, FollowingTracer
 from mitsim.transport.plugins.base import rows_columns, turn_and_origin
 from mitsim.transport.projector import CanvasMap
 from mitsim.transport.records import DIRECT, DeviceAccumulator, DeviceSums, PathSamples
@@ -376,32 +375,6 @@ def ablations(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str
         yield "layers", replace(settings, layers=())
     if settings.subdivision > 1:
         yield "cells", replace(settings, subdivision=1)
-
-
-# -------- Light over some numbers of surfaces
-
-MOST = ANY
-
-
-class OfOrders(Simulation):
-    """Followed light of the orders ``fewest`` to ``most`` (:class:`mitsim.transport.integrator.FollowingTracer`),
-    without direct light and specular chains.
-    """
-
-    def __init__(self, bench: Apparatus, settings: Settings, fewest: int, most: int) -> None:
-        super().__init__(bench, settings)
-        self._orders = fewest, most
-
-    @cached_property
-    def passes(self) -> Mapping[str, TracedPass]:
-        found = {}
-        for name, each in super().passes.items():
-            if isinstance(each.tracer, FollowingTracer):
-                found[name] = replace(each, tracer=each.tracer.of_orders(*self._orders))
-        return found
-
-    def specular_frames(self, labels: Labels) -> ClassFrames | None:
-        return None
 
 
 # -------- The image that is expected of changed frames

@@ -78,11 +78,6 @@ def test_seven_families_can_be_told_apart() -> None:
     assert len({line.get_color() for line in lines}) == 7
 
 
-def test_the_front_is_what_nothing_beats() -> None:
-    points = [(3.0, 0.1), (1.0, 1.0), (2.0, 0.5), (2.5, 0.5), (1.0, 2.0), (4.0, 0.2)]
-    assert plots.pareto_front(points) == [(1.0, 1.0), (2.0, 0.5), (3.0, 0.1)]
-
-
 def test_an_error_of_nothing_has_no_dot() -> None:
     errors = {"large": 0.4, "nothing": 0.0, "a long name of an effect, with its parts": 1e-5}
     figure = plots.error_bars(errors, limit=1e-3)
