@@ -291,7 +291,6 @@ WITHOUT_NUMPY = (
     "calibrate --frames bad -o c",
     "calibrate photograph --model wave --frames bad -o c",
     "calibrate photograph --model wave -o full",
-    "calibrate --from made/cal -o c",
     "calibrate photograph -o full",
     "calibrate photograph -o full --resume",
     "calibrate photograph -o none/c",

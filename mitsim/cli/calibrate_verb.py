@@ -34,9 +34,6 @@ class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed
     output: Path | None = to_make(None, "calibration folder to make; of --plan, recipe to write", "CAL")
     frames: Path | None = option(None, "folder with the frames of a real session, instead of a scene", metavar="DIR")
     known: Path | None = option(None, "list of captures of known pictures, instead of a scene", metavar="LIST.toml")
-    aged: Path | None = option(
-        None, "calibration that has aged: moved until the frames of --known fit", "--from", metavar="CAL"
-    )
     write_frames: Path | None = option(
         None, "folder to write the simulated frames to, for --frames", metavar="DIR", panel=OUTPUT
     )
@@ -78,10 +75,8 @@ def calibrate(asked: Calibrating) -> int:
     $ mitsim calibrate --frames session -o cal --camera imx249
     """
     if asked.known is not None:
-        asked.allow("known aged", f"--known {asked.known}: runs and their list decide")
+        asked.allow("known", f"--known {asked.known}: runs and their list decide")
         return _calibrate_known(asked.known, asked)
-    if asked.aged is not None:
-        raise MitsimError(f"--from {asked.aged}: is mended by captures of known pictures; give --known LIST too")
     if asked.model is not None and not asked.planning:
         return _fit(asked)
     for name in ("frames_used", "fit", "model"):
@@ -205,13 +200,13 @@ def _calibrate_known(listed: Path, asked: Calibrating) -> int:
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.framelist import load_known
 
-    captures, output, aged = load_known(listed), asked.folder, asked.aged  # refused before the fit is imported
+    captures, output = load_known(listed), asked.folder  # refused before the fit is imported
     check_output(output)
-    from mitsim.reconstruct.known_pictures import calibrate_known, moved_in_words
+    from mitsim.reconstruct.known_pictures import calibrate_known
 
     held = memory_from_here()
     with asked.job() as job:
-        found = calibrate_known(captures, output, job, aged)
+        found = calibrate_known(captures, output, job)
     results = {
         name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
         for name, each in found.items()
@@ -223,10 +218,6 @@ def _calibrate_known(listed: Path, asked: Calibrating) -> int:
         payload["planes"] = results
     pictures = f"{first['pictures']} picture" + "s" * (first["pictures"] > 1)
     lines = [f"{first['frames']} frames of {pictures} in {first['seconds']['total']:.1f} s: {output}"]
-    if aged is not None:
-        left, before = first["unexplained_residual"], first["unexplained_before"]
-        lines += [f"Moved: {moved_in_words(first['moved'])}", f"Left over beyond noise {left:.2%}, before {before:.2%}"]
-        return asked.finish_folder(output, payload, lines, warnings)
     rows, columns = first["scale"]
     lines.append(
         f"Pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "

@@ -49,19 +49,13 @@ def likeness(image: np.ndarray, number: int, plane: str) -> float:
 
 POSE = {"orientation": "turned", "scale": [0.473, 0.475], "terms": 1}
 """As the search of the slow test finds them."""
-
-
-def half(row: int, column: int) -> str:
-    """A crop of nearly half of the pixels."""
-    return f"{{row = {row}, column = {column}, rows = 340, columns = 420}}"
+HALF = "{row = 80, column = 100, rows = 340, columns = 420}"
 
 
 @pytest.mark.slow
-def test_half_of_one_plane_tells_the_code_and_where_the_mask_is(call: Callable[..., Any], tmp_path: Path) -> None:
-    """Correlations were 0.933 and 0.963. Then the capture that was not learned from, and the same one a pixel further
-    down and two to the right: the difference of the two fits is that, to 0.01 pixels of the frame that they share."""
-    runs = {number: captured(number, call, tmp_path, channel='"gb"', crop=half(80, 100)) for number in (6, 7)}
-    further = captured(7, call, tmp_path, channel='"gb"', crop=half(81, 102))
+def test_half_of_one_plane_tells_the_code(call: Callable[..., Any], tmp_path: Path) -> None:
+    """Correlations with the authors' image of the capture that was not learned from were 0.933 and 0.963."""
+    runs = {number: captured(number, call, tmp_path, channel='"gb"', crop=HALF) for number in (6, 7)}
     green = {"colour": "green"}
     for learned, judged, least in ((6, 7, 0.92), (7, 6, 0.95)):
         listed = listing(tmp_path, runs[learned], learned, green, centre=True, **POSE)
@@ -69,13 +63,6 @@ def test_half_of_one_plane_tells_the_code_and_where_the_mask_is(call: Callable[.
         image = reconstruct(load_run(runs[judged]), load_calibration(tmp_path / f"cal_{learned}")).image
         assert likeness(image, judged, "g") > least
         assert not factors.ok  # its noise is not stated, and pictures by another calibration lack what that took away
-    moved = []
-    for run in (runs[7], further):
-        (factors,) = calibrate_known(listing(tmp_path, run, 7, green), aged=tmp_path / "cal_6").values()
-        found = factors.manifest.result["moved"]
-        moved.append([found[name]["value"] for name in ("shadow_rows", "shadow_columns")])
-    assert moved[0] == pytest.approx([0, 0], abs=0.15)
-    assert np.subtract(moved[1], moved[0]) == pytest.approx([-1, -2], abs=0.03)
 
 
 @pytest.mark.slow
