@@ -112,7 +112,7 @@ class JointMosaic:
         if not 0 < lam < np.inf:
             raise MitsimError(f"lambda is {lam}; give a finite number above 0")
         # Imported here because a capture behind filters needs no linear algebra of SciPy.
-        from mitsim.reconstruct.convolution import conjugate_gradients
+        from mitsim.reconstruct.point_spread import conjugate_gradients
 
         (rows, left), (columns, right), (lines, mixed) = self._spectra
 

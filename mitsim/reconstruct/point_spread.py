@@ -1,7 +1,9 @@
 """Image within bounds from frames, patterns and a measured point spread function.
 
-A camera whose scene points all cast one light h, each shifted by its place (:mod:`mitsim.reconstruct.convolution`),
-sees Y_i = crop(h * (P_i o X)). Minimised over all X within bounds is
+A diffuser before a bare sensor casts one pattern of light h from every scene point, shifted by its place (Antipa et
+al., Optica 5, 1, 2018). One scene pixel shifts h by one sensor pixel. Under the pattern P_i (arXiv 2111.12862, section
+"Coded Illumination with Nonseparable Systems") the frame is Y_i = crop(h * (P_i o X)). Minimised over all X within
+bounds is
 
     P(X) = 1/2 sum_i ||Y_i - crop(h * (P_i o X))||^2 + weight TV(X) + ridge / 2 ||X||^2
 
@@ -15,15 +17,6 @@ preconditioned by a division by |H|^2 + mu and start from the image at half the 
 and in each pass replaced by the quadratic that touches it. The iterations end where the last half of all steps has
 lowered the objective by at most ``tolerance`` of itself (Strakos and Tichy, ETNA 13, 2002).
 
-**Gap.** With r the frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that pushes against bounds alone,
-and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the bounds, no farther than R = ||X||
-from X,
-
-    P(X) - min P <= weight TV(X) - Q . grad X + N . (X - bound) + ||e||^2 / 2 + R |g| - ridge R^2 / 2
-
-with g = A^T (r + e) + ridge X + div Q - N, where |g| > ridge R; otherwise |g|^2 / (2 ridge) replaces the last two
-terms. d is a few steps of conjugate gradients on A^T A d = -g.
-
 **Weight.** Blocks of sensor pixels are held out and predicted from the image of the rest. Where the best lambda asks
 for clearly more noise than the frames have, the weight follows from that model error in place of the noise.
 
@@ -33,15 +26,24 @@ needs a negative or rough image. So the least of
     1/2 ||A X - Y||^2 + w TV(X),    X >= 0
 
 is compared with that of the same light mirrored and turned, which has the same spectrum.
+
+**Dots.** Under dots of period k no pixel is in two frames, so that the normal equations fall into k^2 independent
+systems, one for the n^2/k^2 pixels of each *class* that shines together, as in the paper's equation 8. Where the sensor
+gets all light, the matrix of a class is a section of one convolution with h's autocorrelation at every k-th place,
+
+    G[p, p'] = sum over sensor pixels s of h[s - p] h[s - p'],       p - p' a multiple of k,
+
+and is solved on grids of 2n/k pixels a side.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import Any, Literal, NamedTuple
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -50,10 +52,12 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
-from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import check_lambda
 from mitsim.reconstruct.solvers import Prior, lengths, slopes_adjoint, slopes_of
 
 Array = npt.NDArray[Any]
+Operator = Callable[[FloatArray], FloatArray]
 
 _MU = 10.0
 _COARSE_STEPS, _LEAST_SIDE = 60, 32
@@ -62,10 +66,8 @@ _FIRST_SMOOTH, _SHARPENED = 10.0, 0.3
 """Smoothing slope of the first pass, and its ratio between passes; large weights otherwise need five times the steps.
 """
 _PASS, _PASS_UNBOUND = 6, 12
-_TIGHTENED = 2
 _NOTHING = 1e-300
 _FEWEST = 1e-12
-_HUGE = 1e30
 
 
 # ---- The camera ------------------------------------------------------------------------------------------------------
@@ -187,6 +189,14 @@ class ShiftedLight:
         place[:rows, :columns] = smaller[:rows, :columns]
         return image
 
+    def divisor(self, ridge: float, slope_weight: float) -> Array:
+        """Return 1 / (|H|^2 + mu + ridge - slope_weight Laplacian), the preconditioner under uniform light."""
+        total = np.square(np.abs(self.spectrum)) + _MU * float(np.square(self.psf).sum()) + ridge
+        if slope_weight:
+            rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in self.grid)
+            total += slope_weight * (rows[:, None] + columns[: total.shape[1]])
+        return np.asarray(1 / total, self.precision)
+
     @property
     def column_power(self) -> float:
         power = float(np.square(self.psf).sum())
@@ -244,17 +254,14 @@ class _State:
         return self.objective - self.prior.weight * flattened
 
     @cached_property
-    def _stiffness(self) -> Array:
-        return np.asarray(self.prior.weight / np.maximum(self._slopes, self.smooth))
-
-    @cached_property
     def gradient(self) -> Array:
         return self.light.correlate(self.residual) + self.bend(self.image)
 
     def bend(self, direction: Array) -> Array:
         bent = self.prior.ridge * direction
         if self.prior.weight:
-            bent += slopes_adjoint(slopes_of(direction) * self._stiffness)
+            stiffness = self.prior.weight / np.maximum(self._slopes, self.smooth)
+            bent += slopes_adjoint(slopes_of(direction) * stiffness)
         return bent
 
     @property
@@ -275,78 +282,18 @@ class _State:
         return replace(self, image=image, residual=self.residual + self.light.image_of(image - self.image))
 
     @cached_property
-    def _divided(self) -> Array:
-        light, prior = self.light, self.prior
-        total = np.square(np.abs(light.spectrum)) + _MU * float(np.square(light.psf).sum()) + prior.ridge
-        if prior.weight:
-            rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in light.grid)
-            total += prior.weight / self.smooth * (rows[:, None] + columns[: total.shape[1]])
-        return np.asarray(1 / total, light.precision)
+    def _divisor(self) -> Array:
+        return self.light.divisor(self.prior.ridge, self.prior.weight / self.smooth if self.prior.weight else 0.0)
 
     def divide(self, image: Array) -> Array:
         if self.light.patterns is not None:
             return image
         rows, columns = image.shape
-        turned = fft.rfft2(image, self.light.grid) * self._divided
+        turned = fft.rfft2(image, self.light.grid) * self._divisor
         return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
 
     def precise(self, number: float) -> Any:
         return self.image.dtype.type(number)
-
-    # ---- how far above the minimum
-
-    def gap(self) -> float:
-        variation = 0.0
-        if self.prior.weight:
-            length = self._slopes
-            held = length * length / np.maximum(length, self.smooth)
-            variation = self.prior.weight * float((length - held).sum(dtype=np.float64))
-        free, slope, direction, power = self.free, self.gradient, None, 1.0
-        ridge, reach = self.prior.ridge, math.sqrt(_dot(self.image, self.image))
-
-        def lowered(slope: Array) -> float:
-            pressed, left = self._parts(slope)
-            length = math.sqrt(_dot(left, left))
-            if length <= ridge * reach:
-                return pressed + (length * length / (2 * ridge) if ridge else 0.0)
-            return pressed + length * reach - ridge * reach**2 / 2
-
-        best, seen = lowered(slope), np.zeros_like(self.residual)
-        for _ in range(_TIGHTENED):
-            left = np.where(free, slope, self.precise(0))
-            turned = self.divide(left) * free
-            before, power = power, _dot(left, turned)
-            if power <= 0:
-                break
-            direction = -turned if direction is None else self.precise(power / before) * direction - turned
-            ahead = self.light.image_of(direction)
-            seen = seen + self.precise(power / max(_dot(ahead, ahead), _NOTHING)) * ahead
-            slope = self.gradient + self.light.correlate(seen)
-            best = min(best, _dot(seen, seen) / 2 + lowered(slope))
-        return max(variation, 0.0) + best
-
-    def _parts(self, slope: Array) -> tuple[float, Array]:
-        """Return N . (X - bound) and ``slope`` - N, for an N that makes both small."""
-        if not self.prior.bounded:
-            return 0.0, slope
-        reach = max(math.sqrt(_dot(self.image, self.image)), 1 / _HUGE)
-        below, above = (
-            np.abs(self.image - self.precise(bound)) if math.isfinite(bound) else None for bound in self.prior.bounds
-        )
-        pressed = np.zeros_like(slope)
-        left = np.where(self.free, slope, 0)
-        for _ in range(2):
-            rate = self.precise(max(self.prior.ridge, math.sqrt(_dot(left, left)) / reach))
-            pressed = np.zeros_like(slope)
-            if below is not None:
-                pressed += np.maximum(slope - rate * below, 0)
-            if above is not None:
-                pressed += np.minimum(slope + rate * above, 0)
-            left = slope - pressed
-        total = 0.0
-        for room, part in ((below, np.maximum(pressed, 0)), (above, np.minimum(pressed, 0))):
-            total += 0.0 if room is None else abs(_dot(room, part))
-        return total, left
 
 
 def _dot(first: Array, second: Array) -> float:
@@ -357,22 +304,18 @@ def _dot(first: Array, second: Array) -> float:
 
 
 class Minimum(NamedTuple):
-    """Image (n, n') of the whole scene near the minimum.
-
-    ``fall`` is the objective's relative fall in the last half of the steps; ``gap`` bounds its excess over the
-    minimum.
-    """
+    """Image (n, n') of the whole scene near the minimum; ``fall`` is the objective's in the last half of the steps."""
 
     image: Array
     iterations: int
     objective: float
     fall: float
-    gap: float
 
 
 def minimise(light: ShiftedLight, frames: Array, prior: Prior, iterations: int, tolerance: float) -> Minimum:
+    """Return the image whose objective falls by at most ``tolerance`` of itself in the last half of the steps."""
     state, spent, fall = _descend(_start(light, frames, prior), iterations, tolerance)
-    return Minimum(state.image, spent, state.objective, fall, state.gap() / max(state.objective, _NOTHING))
+    return Minimum(state.image, spent, state.objective, fall)
 
 
 def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
@@ -447,7 +390,7 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
 
 # ---- The weight of the prior, and the misfit -------------------------------------------------------------------------
 
-RIDGE, _WEIGHT = 50.0, 1.2
+RIDGE, WEIGHT = 50.0, 1.2
 """Lambda over the mean square of a pixel's light, by relative error; TV's weight in units of the gradient's error."""
 _CLEARLY = 2.0
 _SIDE, _STEPS = 128, 60
@@ -511,15 +454,6 @@ def frame_error(light: ShiftedLight, frames: Array) -> float:
     place = best + (before - after) / 2 / max(before - 2 * here + after, 1e-300)
     level = mean * 10 ** (place / 2) / RIDGE
     return level if level > _CLEARLY * noise else noise
-
-
-def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Literal["ridge", "weight"]) -> Prior:
-    """Return ``prior`` with an automatic ridge or weight of TV."""
-    if kind == "weight":
-        return replace(prior, weight=_WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power))
-    if light.patterns is not None:
-        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
-    return replace(prior, ridge=RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power)
 
 
 # ---- The misfit ----
@@ -630,3 +564,115 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
         off=(off[0] - (rows - 1) / 2, off[1] - (columns - 1) / 2),
         size=(rows, columns),
     )
+
+
+# ---- Least squares of many frames: conjugate gradients, and the classes of dots --------------------------------------
+
+
+def solve_iteratively(
+    camera: ShiftedLight,
+    frames: FloatArray,
+    lam: float,
+    tolerance: float = 1e-6,
+    iterations: int = 500,
+    watch: Callable[[FloatArray], bool] | None = None,
+) -> Solution:
+    """Return the least squares with lambda ||X||^2 of all frames (K K', m, m') under any patterns."""
+    camera.check_frames(frames)
+    target = camera.correlate(frames)
+    return conjugate_gradients(
+        lambda image: camera.correlate(camera.image_of(image)), target, lam, None, tolerance, iterations, watch
+    )
+
+
+def conjugate_gradients(
+    normal: Operator,
+    target: FloatArray,
+    lam: float | str,
+    inverse: Operator | None = None,
+    tolerance: float = 1e-6,
+    most: int = 500,
+    watch: Callable[[FloatArray], bool] | None = None,
+) -> Solution:
+    """Solve (``normal`` + lambda) X = ``target`` (Hestenes and Stiefel 1952).
+
+    The preconditioner ``inverse`` is symmetric and positive. Steps end early when ``watch`` returns True.
+    """
+    lam = check_lambda(lam)
+    image, left = np.zeros_like(target), target
+    size = float(np.linalg.norm(target)) or 1.0
+    turned = inverse(left) if inverse else left
+    direction, power, spent = turned, float(np.vdot(left, turned)), 0
+    residual = float(np.linalg.norm(left)) / size
+    while residual > tolerance and spent < most:
+        spent += 1
+        moved = normal(direction) + lam * direction
+        step = power / float(np.vdot(direction, moved))
+        image, left = image + step * direction, left - step * moved
+        residual = float(np.linalg.norm(left)) / size
+        if watch and watch(image):
+            break
+        turned = inverse(left) if inverse else left
+        before, power = power, float(np.vdot(left, turned))
+        direction = turned + power / before * direction
+    figures = f"Residual of the normal equations {residual:.0e} after {spent} iterations."
+    if residual > tolerance:
+        remedy = "allow more iterations, a larger tolerance or a larger lambda"
+        status = Status(Verdict.NOT_CONVERGED, f"Not converged to {tolerance:g}", remedy, figures)
+    else:
+        status = Status(Verdict.SOLVED, "Solved", "", figures)
+    return Solution(image, lam, residual, status, iterations=spent)
+
+
+class DotClasses:
+    """A ``camera`` that gets all light, under shifting dots of period ``k``; 1 is uniform light."""
+
+    def __init__(self, camera: ShiftedLight, k: int) -> None:
+        self.camera, self.k, self._n = camera, k, camera.scene[0]
+        if not 1 <= k <= self._n:
+            raise MitsimError(f"dots of period {k}: give 1 to {self._n}, the scene's pixels a side")
+        if camera.sensor != camera.whole:
+            raise MitsimError(f"sensor of {camera.sensor}: classes of dots are solved where it gets all light")
+        self._side = -(-self._n // k)
+        self._grid = [fft.next_fast_len(-(-size // k)) for size in camera.whole]
+        self._spectrum = fft.fft2(camera.psf, tuple(k * size for size in self._grid))
+        power = self._fold(np.square(np.abs(self._spectrum))).real
+        self.largest = float(power.max())
+        size = fft.next_fast_len(2 * self._side - 1, real=True)
+        steps = (np.arange(size) + size // 2) % size - size // 2
+        near = np.abs(steps) < self._side
+        rows, columns = (steps % length for length in self._grid)
+        self._kernel = fft.rfft2(np.where(np.outer(near, near), fft.ifft2(power).real[np.ix_(rows, columns)], 0.0))
+        self._size = size, size
+
+    def project(self, frames: FloatArray) -> FloatArray:
+        """Return the right side (n, n) of the normal equations of all frames (k^2, m, m')."""
+        replace(self.camera, patterns=(np.ones((self._n, self.k)),) * 2).check_frames(frames)
+        weight, (rows, columns) = self._spectrum.conj(), self.camera.sensor
+        classes = np.empty((self.k, self.k, self._side, self._side))
+        for (a, b), frame in zip(product(range(self.k), repeat=2), frames, strict=True):
+            placed = np.zeros(weight.shape)
+            # Moved so that the class's first pixel is the first number.
+            placed[:rows, :columns] = frame
+            placed = np.roll(placed, (-a, -b), axis=(0, 1))
+            light = fft.ifft2(self._fold(fft.fft2(placed) * weight))
+            classes[a, b] = light.real[: self._side, : self._side]
+        return self._join(classes)
+
+    def solve(self, projected: FloatArray, lam: float, tolerance: float = 1e-6) -> Solution:
+        return conjugate_gradients(self._normal, projected, lam, None, tolerance)
+
+    def _normal(self, image: FloatArray) -> FloatArray:
+        room = self._side * self.k - self._n
+        padded = np.pad(image, ((0, room), (0, room)))
+        classes = padded.reshape(self._side, self.k, self._side, self.k).transpose(1, 3, 0, 2)
+        whole = fft.irfft2(fft.rfft2(classes, self._size) * self._kernel, self._size)
+        return self._join(whole[..., : self._side, : self._side])
+
+    def _fold(self, spectrum: Array) -> Array:
+        rows, columns = self._grid
+        return np.asarray(spectrum.reshape(self.k, rows, self.k, columns).mean(axis=(0, 2)))
+
+    def _join(self, classes: FloatArray) -> FloatArray:
+        size = self._side * self.k
+        return np.ascontiguousarray(classes.transpose(2, 0, 3, 1).reshape(size, size)[: self._n, : self._n])

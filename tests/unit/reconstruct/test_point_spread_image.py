@@ -106,7 +106,7 @@ def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_conver
 
     psf = "--psf", str(tmp_path / "psf.npy")
     status, found = call(*psf, "--method", "nonnegative", "-o", str(tmp_path / "image"))
-    assert status == 0 and found["rank"] is None and found["objective"] > 0 and found["relative_gap"] >= 0
+    assert status == 0 and found["rank"] is None and found["objective"] > 0 and found["relative_gap"] is None
     image = read_frame(tmp_path / "image" / "image.exr")[0]["reflectance"]
     shown = read_image(tmp_path / "image" / "image.png")
     assert np.abs(shown - 255 * lightness(image / image.max())).max() < 0.51, "rounded"
