@@ -114,10 +114,6 @@ class MovingShadow:
         return self.along(-1j * self._angles[:, None] * self._spectra)
 
 
-def shadow_step(factor: FloatArray) -> float:
-    return _step(*_spectra(factor), len(factor))
-
-
 def _spectra(columns: FloatArray) -> tuple[ComplexArray, FloatArray]:
     taper = np.square(np.sin(np.pi * (np.arange(len(columns)) + 0.5) / len(columns)))
     spectra = np.fft.rfft((columns - taper @ columns / taper.sum()) * taper[:, None], axis=0)[1:]
