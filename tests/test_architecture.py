@@ -566,7 +566,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (10, 1853),
     "planner": (6, 1905),
-    "reconstruct": (22, 6475),
+    "reconstruct": (22, 6473),
     "report": (9, 2214),
     "scene": (8, 1739),
     "sensor": (5, 1191),
