@@ -46,8 +46,9 @@ class Good:
     def __init__(self, folder: Path) -> None:
         self.bench = made(folder)
         self.folder = folder
-        for ending, name in (("hdf5", "run.h5"), ("mat", "run.mat")):
-            export(self.bench.run, ending, folder / name, self.bench.calibration)
+        export(self.bench.run, "hdf5", folder / "run.h5", self.bench.calibration)
+        factors = {"P1b": np.ones((50, 16)), "Q1b": np.ones((62, 18)), "angle": -0.4, "text": "calibration"}
+        scipy.io.savemat(folder / "run.mat", factors)  # as a FlatCam's calibration
         numbers = (np.arange(80).reshape(8, 10) * 40).astype(np.uint16)
         for name in ("a.png", "a.tif", "b.tif"):
             Image.fromarray(numbers).save(folder / name, **({"compression": "tiff_lzw"} if name == "b.tif" else {}))
@@ -88,6 +89,8 @@ def changed(name: str) -> Callable[[Good], Make]:
 def _read(path: Path) -> Sequence[str]:
     """What reads a file, writing beside it."""
     out = str(path.parent / "out")
+    if path.name == "run.mat":
+        return ("import", str(path), "--channel", "b", "--calibration-output", out)
     if path.name.startswith("run."):
         return ("import", str(path), "-o", out, "--calibration-output", out + "2")
     if path.name.startswith("light."):

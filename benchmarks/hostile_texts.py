@@ -415,7 +415,7 @@ def places(good: Good) -> Make:
             ("export", at["run"], "--format", "png", "--projector", "mp_cl1", "-o", to),
             ("export", at["run"], "--format", "mat", "--calibration", at["cal"], "-o", to + ".mat"),
             ("import", at["run.h5"], "-o", to, "--calibration-output", to + "2"),
-            ("import", at["run.mat"], "-o", to),
+            ("import", at["run.mat"], "--channel", "b", "--calibration-output", to),
             ("import", at["a.png"], *FRAMES, "-o", to),
             ("calibrate", "--frames", at["session"], "-o", to),
             ("sense", at["light.exr"], "--camera", camera, "-o", to + chance.choice(("", ".png"))),

@@ -273,7 +273,6 @@ LARGEST_VARIABLE = (1 << 31) - 1
 """Largest array in a MATLAB file of version 5 [bytes]."""
 _HEAD = 128
 _HDF5, _HDF5_MARK = 2, b"\x89HDF\r\n\x1a\n"
-_USER_BLOCK = 512
 _MATRIX, _COMPRESSED = 14, 15
 _COMPLEX = 0x08
 _BYTES_OF = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
@@ -299,14 +298,6 @@ def write_variables(path: Path, variables: Mapping[str, Any]) -> None:
     # A descriptor: given a name, savemat puts .mat behind it.
     with whole_file(path) as part, part.open("wb") as file:
         savemat(file, dict(variables), do_compression=True, long_field_names=True)
-
-
-def is_hdf5(path: Path) -> bool:
-    """Return True if ``path`` is HDF5, as MATLAB files of version 7.3 are."""
-    check_plain(path)
-    with open(path, "rb") as file:
-        head = file.read(_USER_BLOCK + len(_HDF5_MARK))
-    return head.startswith(_HDF5_MARK) or head[_USER_BLOCK:] == _HDF5_MARK
 
 
 def read_variables(path: Path) -> dict[str, Any]:

@@ -292,7 +292,7 @@ class Capture:
 
         MitsimError if xarray, an extra, is not installed.
         """
-        return from_above("exchange.labelled", "label_capture")(self)
+        return from_above("exchange.other_programs", "label_capture")(self)
 
     def __repr__(self) -> str:
         return f"Capture({self.manifest.patterns.family or 'patterns'}: {self._size}, {self.folder or 'in memory'})"

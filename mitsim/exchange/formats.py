@@ -30,20 +30,19 @@ if TYPE_CHECKING:
     from mitsim.exchange.packed import Run
 
 
-PNG = "png"
-"""Only this format is a folder; it has no calibration and no run behind colour filters."""
+HDF5, PNG = "hdf5", "png"
+"""Only HDF5 holds several spectral lines; only pictures are a folder, and hold no calibration."""
 FORMATS = {
-    "hdf5": "packed.write_hdf5",
-    "mat": "matlab.write_matlab",
-    "torch": "labelled.write_tensors",
+    HDF5: "packed.write_hdf5",
+    "mat": "other_programs.write_matlab",
+    "torch": "other_programs.write_tensors",
     PNG: "png_files.write_pngs",
 }
 """Functions that write each format: from place, run, and calibration or projector to notes on the use of the file, or
 on parts of the run that it does not hold."""
-READERS = {".h5": "packed.load_hdf5", ".hdf5": "packed.load_hdf5", ".mat": "matlab.load_mat"}
+READERS = {".h5": "packed.load_hdf5", ".hdf5": "packed.load_hdf5", ".mat": "other_programs.load_flatcam"}
 """Functions that open files of `mitsim import`, by suffix: from place and channel to a context of
 :data:`mitsim.exchange.packed.Loaded`."""
-_CALLED = {"output": "run", "calibration_output": "calibration"}
 
 
 def _function(name: str) -> Callable[..., Any]:
@@ -141,9 +140,10 @@ def check_export(
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
     lines = open_lines(folder, RUN, MOSAIC)
     calibrated = None if factors is None else lines.check_calibration(factors)
-    if lines.filters and format == PNG:
-        able = ", ".join(name for name in FORMATS if name != PNG)
-        raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
+    if lines.colours and format != HDF5:
+        raise MitsimError(
+            f"{folder}: has several spectral lines, and {format} holds one; use {HDF5}, or a line's folder"
+        )
     for part in lines.parts.values():  # refused before numpy is imported
         manifest = read_manifest(part, RunManifest)
         if format == PNG:
@@ -163,10 +163,9 @@ def check_format(
         raise ArgumentError("projector", f"{projector}: {format} draws no pictures for one; leave it out")
     if calibration is not None and format == PNG:
         raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
-    ending = Path(output).suffix.lower()
-    if ending in READERS and FORMATS[format].partition(".")[0] != (reader := READERS[ending].partition(".")[0]):
-        right = next(name for name, writer in FORMATS.items() if writer.startswith(reader))
-        raise MitsimError(f"output {output}: {ending} is of {right}, not of {format}; rename it")
+    ending, own = Path(output).suffix.lower(), {HDF5: (".h5", ".hdf5"), "mat": (".mat",)}.get(format, ())
+    if ending in READERS and ending not in own:
+        raise MitsimError(f"output {output}: {ending} is not of {format}; rename it")
 
 
 @check_arguments
@@ -176,7 +175,7 @@ def import_file(
     calibration_output: Path | str | None = None,
     channel: str | None = None,
 ) -> dict[str, Any]:
-    """Write the folders in a file of `mitsim export`, each whole or not at all.
+    """Write the folders in an HDF5 file of `mitsim export`, or in a FlatCam's `.mat`, each whole or not at all.
 
     Parameters
     ----------
@@ -208,31 +207,30 @@ def import_file(
     check_plain(source)  # refused before numpy is imported
     if channel is not None:
         check_channel(channel)
-    with _function(READERS[source.suffix.lower()])(source, channel) as (run, calibration, left_out):
-        wanted = {"output": (output, run), "calibration_output": (calibration_output, calibration)}
-        for argument, (place, held) in wanted.items():
+    with _function(READERS[source.suffix.lower()])(source, channel) as (run, calibration):
+        wanted = {
+            "run": ("output", output, run),
+            "calibration": ("calibration_output", calibration_output, calibration),
+        }
+        for kind, (argument, place, held) in wanted.items():
             if place is not None and held is None:
-                raise ArgumentError(argument, f"{place}: {source} holds no {_CALLED[argument]}; leave this out")
+                raise ArgumentError(argument, f"{place}: {source} holds no {kind}; leave this out")
         with ExitStack() as stack:
-            folders = [(stack.enter_context(whole_folder(place)), held) for place, held in wanted.values() if place]
+            folders = [(stack.enter_context(whole_folder(place)), held) for _, place, held in wanted.values() if place]
             for folder, held in folders:
                 held.fill(folder)
     parts = {} if calibration is None or calibration_output is None else calibration.parts
     angles = sorted({part.manifest.configuration.get(TURNED, 0) for part in parts.values()})
+    turned = [f"Its frames are turned by {each:g} degrees: import them with --turn {each:g}" for each in angles if each]
+    flags = [f"{line}: {text}" if line else text for line, part in parts.items() for text in part.manifest.warnings]
     return {
         "frames": None if run is None else _frames_of(run),
         "output": None if output is None else str(output),
         "calibration_output": None if calibration_output is None else str(calibration_output),
-        "holds": [_CALLED[argument] for argument, (_, held) in wanted.items() if held],
-        "left_out": list(left_out),
-        "notes": [
-            f"Its frames are turned by {angle:g} degrees: import them with --turn {angle:g}"
-            for angle in angles
-            if angle
-        ],
-        "warnings": [
-            f"{line}: {text}" if line else text for line, part in parts.items() for text in part.manifest.warnings
-        ],
+        "holds": [kind for kind, (*_, held) in wanted.items() if held],
+        "left_out": [],
+        "notes": turned,
+        "warnings": flags,
     }
 
 

@@ -108,8 +108,8 @@ class Content(manifests.Coloured, Generic[Manifest]):
 
 Run = Content[RunManifest]
 Calibration = Content[CalibrationManifest]
-Loaded = tuple[Run | None, Calibration | None, tuple[str, ...]]
-"""Run and calibration of an exchanged file, if present, and the parts of a run that it does not hold."""
+Loaded = tuple[Run | None, Calibration | None]
+"""Run and calibration of an exchanged file, if present."""
 
 
 def pack_run(folder: Path) -> Packed[RunManifest]:
@@ -318,7 +318,7 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
                             raise MitsimError(f"{path}: has no calibration of {name}; export it again")
                     parts = {name: _calibration_in(lines[name], path) for name in colours.names}
                     calibration = Content(parts, colours, text)
-        yield run, calibration, ()
+        yield run, calibration
 
 
 def _run_in(place: h5py.Group, path: Path) -> Packed[RunManifest]:

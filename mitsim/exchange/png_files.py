@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.files import whole_file, whole_folder, write_json, write_text
+from mitsim.core.files import whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import COLOUR, ClosingKind, Patterns, RunManifest
+from mitsim.core.manifests import ClosingKind, Patterns, RunManifest
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.projector import ProjectorModel
@@ -254,42 +254,35 @@ def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[st
     Returns notes on reading frames and on the size of cells. MitsimError for digital numbers above 16 bits, patterns of
     other values than 0, 1 and -1, or a projector of unknown or too few pixels.
     """
-    rasters = {name: check_pictures(shots.manifest, projector, str(shots.place)) for name, shots in run.parts.items()}
-    notes = [f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN"] if run.colours else []
-    with whole_folder(folder) as whole:
-        for line, shots in run.parts.items():
-            manifest, place, names = shots.manifest, whole / line, list[str]()
-            rows, columns = (len(matrix) for matrix in manifest.patterns.matrices)
-            closing, captures = manifest.closing_frame, manifest.patterns.captures
-            pictures = with_closing(pictures_of(manifest.patterns, str(shots.place)), closing.kind if closing else None)
-            place.mkdir(exist_ok=True)
-            count = len(captures) + bool(closing)
-            where = draw(place, pictures, count, rasters[line], (rows, columns), str(shots.place))
-            (place / "frames").mkdir()
-            frames = ((shot.file, channels["DN"]) for shot, channels, _ in shots_of(shots))
-            last = [(closing.file, shots.read(closing.file)[0]["DN"])] if closing else []
-            for index, (file, dn) in enumerate(chain(frames, last)):
-                if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
-                    raise MitsimError(
-                        f"{shots.place / file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up "
-                        f"to {_LARGEST}; use the format hdf5"
-                    )
-                names.append(frame_name(index))
-                write_png(place / "frames" / names[-1], dn.astype(np.uint16))
-            own = folder / line
-            again = f"--patterns {own / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
-            if (ambient := manifest.ambient_frame) is not None:
-                with whole_file(place / "ambient.npy") as part, part.open("wb") as stream:
-                    np.save(stream, shots.read(ambient.file)[0]["DN"])
-                again += f" --ambient-frame {own / 'ambient.npy'} --ambient-shots {ambient.shots}"
-            if closing is not None:
-                again += f" --closing-frame {closing.kind} --closing-exposure {closing.exposure_s!r}"
-            write_json(place / PATTERNS, describe(manifest.patterns, names[: len(captures)], where))
-            again += f" --camera NAME --calibration {Path('CAL', line)} -o {Path('RUN', line)}"
-            notes.append(f"Read again by: mitsim import {own / 'frames'} {again}")
-        if run.colours:
-            write_text(whole / COLOUR, run.text)
-    return (*notes, f"Patterns in cells of {describe_cells(where)}")
+    shots = run.parts[""]
+    manifest, source, names = shots.manifest, str(shots.place), list[str]()
+    raster = check_pictures(manifest, projector, source)
+    rows, columns = (len(matrix) for matrix in manifest.patterns.matrices)
+    closing, captures = manifest.closing_frame, manifest.patterns.captures
+    again = f"--patterns {folder / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
+    with whole_folder(folder) as place:
+        pictures = with_closing(pictures_of(manifest.patterns, source), closing.kind if closing else None)
+        where = draw(place, pictures, len(captures) + bool(closing), raster, (rows, columns), source)
+        (place / "frames").mkdir()
+        frames = ((shot.file, channels["DN"]) for shot, channels, _ in shots_of(shots))
+        last = [(closing.file, shots.read(closing.file)[0]["DN"])] if closing else []
+        for index, (file, dn) in enumerate(chain(frames, last)):
+            if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
+                raise MitsimError(
+                    f"{shots.place / file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up "
+                    f"to {_LARGEST}; use the format hdf5"
+                )
+            names.append(frame_name(index))
+            write_png(place / "frames" / names[-1], dn.astype(np.uint16))
+        if (ambient := manifest.ambient_frame) is not None:
+            with whole_file(place / "ambient.npy") as part, part.open("wb") as stream:
+                np.save(stream, shots.read(ambient.file)[0]["DN"])
+            again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {ambient.shots}"
+        if closing is not None:
+            again += f" --closing-frame {closing.kind} --closing-exposure {closing.exposure_s!r}"
+        write_json(place / PATTERNS, describe(manifest.patterns, names[: len(captures)], where))
+    note = f"Read again by: mitsim import {folder / 'frames'} {again} --camera NAME --calibration CAL -o RUN"
+    return note, f"Patterns in cells of {describe_cells(where)}"
 
 
 def check_pictures(manifest: RunManifest, projector: str | None, place: str) -> Raster:

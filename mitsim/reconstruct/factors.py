@@ -576,7 +576,7 @@ class Factors:
 
     def to_xarray(self) -> Dataset:
         """Return both factors as an ``xarray.Dataset`` with units and, where they are known, coordinates in mm."""
-        return from_above("exchange.labelled", "label_factors")(self)
+        return from_above("exchange.other_programs", "label_factors")(self)
 
     def __repr__(self) -> str:
         shapes = ", ".join(f"{name} {side.shape[0]} x {side.shape[1]}" for name, side in self._sides())

@@ -214,7 +214,7 @@ class Reconstruction(Solution):
 
         The ``factors`` that it was solved with give coordinates in mm.
         """
-        return from_above("exchange.labelled", "label_image")(self, factors)
+        return from_above("exchange.other_programs", "label_image")(self, factors)
 
     def __repr__(self) -> str:
         rows, columns = self.image.shape

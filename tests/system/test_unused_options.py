@@ -20,7 +20,6 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Made:
     bench = made(tmp_path_factory.mktemp("bench"))
     folder = bench.run.parent
     export(bench.run, "hdf5", folder / "run.h5", bench.calibration)
-    export(bench.run, "mat", folder / "run.mat", bench.calibration)
     Image.new("L", (8, 8)).save(folder / "a.png")
     np.zeros(64, np.uint16).tofile(folder / "a.raw")
     np.save(folder / "light.npy", np.ones((4, 4)))
@@ -31,8 +30,7 @@ FRAMES = "--camera imx249 --patterns uniform --exposure 1 --projector-pixels 4"
 CASES = [
     ("export {run} --format png -o {out}", "--overwrite"),
     *(
-        (f"import {{folder}}/run.{ending} -o {{out}}", option)
-        for ending in ("h5", "mat")
+        ("import {folder}/run.h5 -o {out}", option)
         for option in (
             *("--patterns uniform", "--camera imx249", "--exposure 1", "--calibration {cal}", "--projector-pixels 128"),
             *("--black-level 3", "--ambient-frame {folder}/a.png", "--ambient-shots 2", "--shape 8x8", "--bits 8"),

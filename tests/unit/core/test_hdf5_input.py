@@ -9,10 +9,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from mitsim.exchange.matlab import variables_in
 
 from mitsim.core.arrays import checked_hdf5
 from mitsim.core.errors import MitsimError
-from mitsim.exchange.matlab import variables_in
 from mitsim.exchange.packed import load_hdf5
 from mitsim.learn.pair_store import PairStore, is_shard
 from mitsim.light.light_file import read_light

@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -34,7 +33,6 @@ from mitsim.core.manifests import CALIBRATION, Digital, lines_of_planes, write_c
 from mitsim.core.prepare import Preparer
 from mitsim.devices.framelist import load_frames
 from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
-from mitsim.exchange.formats import export, import_file
 from mitsim.exchange.real import import_capture
 from mitsim.reconstruct.captured_session import calibrate_frames
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, made
@@ -412,81 +410,6 @@ def test_a_list_says_what_options_do_not(tmp_path: Path) -> None:
 
 
 # -------- Files of other programs
-
-
-def mat73(path: Path, variables: dict[str, Any]) -> None:
-    """As MATLAB's -v7.3 writes them: HDF5 behind 512 bytes, columns first, texts as letters of 16 bits."""
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, value in variables.items():
-            text = isinstance(value, str)
-            array = np.array([[ord(letter) for letter in value]], np.uint16) if text else np.atleast_2d(value)
-            data = file.create_dataset(name, data=array.T)
-            data.attrs["MATLAB_class"] = np.bytes_("char" if text else {"f": "double"}.get(array.dtype.kind, "uint32"))
-        file.create_group("#refs#")
-        file.create_group("a_struct")
-    with path.open("r+b") as raw:
-        raw.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-
-
-def test_matlab_files_of_version_7_3(tmp_path: Path) -> None:
-    """A FlatCam's calibration, one plane and all, and an export that MATLAB saved again. (Planted: rows for
-    columns.)"""
-    rng = np.random.default_rng(5)
-    sides = {
-        f"{stem}{name}": rng.normal(size=size) for stem, size in (("P1", (50, 16)), ("Q1", (62, 18))) for name in PLANES
-    }
-    mat73(tmp_path / "calib.mat", {**sides, "cSize": [[50.0, 62.0]], "angle": -0.4})
-    import_file(tmp_path / "calib.mat", None, tmp_path / "cal", "gr")
-    assert np.array_equal(ms.load_calibration(tmp_path / "cal").left, sides["P1gr"].astype(np.float32))
-    result = import_file(tmp_path / "calib.mat", None, tmp_path / "cals", "all")
-    assert "import them with --turn -0.4" in result["notes"][0]
-    for name in PLANES:
-        factors = ms.load_calibration(tmp_path / "cals" / name)
-        assert np.array_equal(factors.right, sides[f"Q1{name}"].astype(np.float32))
-        assert factors.manifest.camera == {"name": "calib", "channel": name}
-    bench = made(tmp_path / "bench")
-    export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
-    from mitsim.exchange.matlab import variables_in
-
-    held = {name: value for name, value in variables_in(tmp_path / "all.mat").items() if name[0] != "_"}
-    texts = {name: str(value.item()) for name, value in held.items() if value.dtype.kind == "U"}
-    mat73(tmp_path / "again.mat", {**held, **texts})
-    import_file(tmp_path / "again.mat", tmp_path / "run 2", tmp_path / "cal 2")
-    assert np.array_equal(ms.load_run(tmp_path / "run 2").dn, ms.load_run(bench.run).dn)
-    assert np.array_equal(ms.load_calibration(tmp_path / "cal 2").left, ms.load_calibration(bench.calibration).left)
-
-
-@pytest.mark.parametrize("stated", [{"cSize": [[50.0, 62.0]]}, {}])
-def test_factors_whose_rows_and_columns_are_exchanged_are_refused(stated: dict[str, Any], tmp_path: Path) -> None:
-    """As h5py writes arrays that nobody turned over. (Seen: taken, as a camera of 16 pixels. Planted: not
-    looked at.)"""
-    sides = {f"{stem}r": np.ones((16, pixels)) for stem, pixels in (("P1", 50), ("Q1", 62))}
-    mat73(tmp_path / "calib.mat", {**sides, **stated})
-    with pytest.raises(
-        MitsimError, match="P1r and Q1r have 16 and 16 pixels for 50 and 62 of the scene: rows and columns"
-    ):
-        import_file(tmp_path / "calib.mat", None, tmp_path / "cal", "r")
-    assert not (tmp_path / "cal").exists()
-
-
-def test_damaged_matlab_files_of_version_7_3_are_refused(tmp_path: Path) -> None:
-    mat73(tmp_path / "calib.mat", {"P1r": np.ones((50, 16)), "Q1r": np.ones((62, 18))})
-    whole = (tmp_path / "calib.mat").read_bytes()
-    with pytest.raises(MitsimError, match="P1gr is missing"):
-        import_file(tmp_path / "calib.mat", None, tmp_path / "cal", "gr")
-    for size in (600, len(whole) // 2, len(whole) - 100):
-        (tmp_path / "cut.mat").write_bytes(whole[:size])
-        with pytest.raises(MitsimError, match=r"cut\.mat"):
-            import_file(tmp_path / "cut.mat", None, tmp_path / "cal", "r")
-    with h5py.File(tmp_path / "link.mat", "w") as file:
-        file["P1r"] = h5py.ExternalLink("calib.mat", "/P1r")
-    with pytest.raises(MitsimError, match="is a link"):
-        import_file(tmp_path / "link.mat", None, tmp_path / "cal", "r")
-    with h5py.File(tmp_path / "huge.mat", "w") as file:
-        file.create_dataset("P1r", (10**6, 10**6), "f8", chunks=(100, 100))
-    with pytest.raises(MitsimError, match="P1r claims"):
-        import_file(tmp_path / "huge.mat", None, tmp_path / "cal", "r")
-    assert not (tmp_path / "cal").exists()
 
 
 def write_dng(path: Path, values: np.ndarray, mosaic: str = "BGGR", orientation: int = 1) -> None:

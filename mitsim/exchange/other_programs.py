@@ -1,24 +1,30 @@
-"""Export of runs and factors to tensors of PyTorch, and of captures, factors and images to xarray (CF conventions).
+"""Runs and factors for MATLAB, PyTorch and xarray, and a real FlatCam's calibration from its MATLAB file.
 
-Both libraries are extras (`pip install mitsim[torch,xarray]`), imported when they are used.
+PyTorch and xarray are extras (`pip install mitsim[torch,xarray]`), imported when they are used.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError, cut, reason_of
+from mitsim.core.arrays import FloatArray, read_variables, write_variables
+from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
+from mitsim.core.exr import Channel
 from mitsim.core.files import whole_file
-from mitsim.core.manifests import SIDES
+from mitsim.core.imagelist import ALL, WAVELENGTHS_NM
+from mitsim.core.manifests import CALIBRATION, SIDES, CalibrationManifest, lines_of_planes
 from mitsim.core.runs import TRUTH, Capture
-from mitsim.exchange.packed import FACTORS, Calibration, Run
+from mitsim.exchange.capture_list import TURNED
+from mitsim.exchange.packed import FACTORS, Calibration, Content, Loaded, Packed, Run, as_channel, shots_of
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
 from mitsim.version import __version__
@@ -26,51 +32,114 @@ from mitsim.version import __version__
 if TYPE_CHECKING:
     from xarray import Dataset
 
-# -------- Tensors
+# -------- MATLAB
 
-_PATTERNS = ("P_L", "P_R")
+
+def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
+    """Write a run with the variables of the paper's script, whole or not at all; return notes on omitted parts.
+
+    `phi_left` (P o X) `phi_right`' = `data_coded` - `measBg` in digital numbers, for each pattern P = PL(:, i)
+    PR(:, j)' (Zheng & Asif, arXiv 2111.12862, section III-B). `data_coded` and, for signed pairs, `data_negative` are
+    (rows, columns, K, K'), `measBg` is (rows, columns). MitsimError for a run that such a file cannot hold.
+    """
+    shots = run.parts[""]
+    manifest, digital = shots.manifest, shots.manifest.digital
+    dn_per_rate = digital.gain_dn_per_e * digital.exposure_s
+    signs = {abs(shot.sign) for shot in manifest.patterns.captures}
+    if len(signs) != 1:
+        raise MitsimError(f"{shots.place}: mixes whole shots and signed pairs; use the format hdf5")
+    left, right = manifest.patterns.matrices
+    stacks: dict[int, FloatArray] = {}
+    for shot, channels, _ in shots_of(shots):
+        dn = channels["DN"]
+        if not stacks:
+            shape = *dn.shape, left.shape[1], right.shape[1]
+            stacks = {sign: np.empty(shape, order="F") for sign in ((-1, 1) if signs == {1} else (0,))}
+        stacks[shot.sign][:, :, shot.row, shot.column] = dn
+    others = {name: shots.read(file)[0]["DN"] for name, file in manifest.others.items()}
+    variables: dict[str, Any] = {"run_manifest": shots.text, "PL": left, "PR": right, **others}
+    if signs == {1}:
+        variables |= {"data_coded": stacks[1] - stacks[-1], "data_negative": stacks[-1], "measBg": np.zeros(dn.shape)}
+    else:
+        dark = digital.black_level_dn + digital.dark_current_e_per_s * dn_per_rate
+        background = others["ambient"].astype(np.float64) if "ambient" in others else np.full(dn.shape, dark)
+        variables |= {"data_coded": stacks[0], "measBg": background}
+    if TRUTH in shots.names:
+        channels, metadata = shots.read(TRUTH)
+        variables["truth"] = channels["reflectance"]
+        variables["truth_board_reflectance"] = float(metadata.get("board_reflectance", math.nan))
+        if "standard_error" in channels:
+            variables["truth_standard_error"] = channels["standard_error"]
+    if calibration:
+        factors = calibration.parts[""]
+        for side, file in zip(SIDES, FACTORS, strict=True):  # [sqrt(electrons / s)] in sqrt(DN)
+            factor = factors.read(file)[0]["factor"].astype(np.float64)
+            variables[f"phi_{side}"] = factor * math.sqrt(dn_per_rate)
+        variables["calibration_manifest"] = factors.text
+    write_variables(path, variables)
+    without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
+    return (*without, "Left out: expected electrons of the frames")
+
+
+@contextmanager
+def load_flatcam(path: Path, channel: str | None) -> Iterator[Loaded]:
+    """Read one plane of a real FlatCam, or `all`, from its calibration file (Asif et al. 2017, arXiv 1509.00116).
+
+    A plane of the colour sensor without the means of its rows and columns is P1 X Q1^T. The manifests' configuration
+    holds the angle by which frames are turned first. MitsimError for a file without that plane.
+    """
+    if channel is None:
+        problem = f"is not given, and {path} is read as a FlatCam's calibration, by planes"
+        raise ArgumentError("channel", f"{problem}; give it, and take runs back by the format hdf5")
+    variables = read_variables(path)
+    angle = float(np.ravel(variables.get("angle", 0.0))[0])
+
+    def matrix(name: str) -> Channel:
+        values = np.asarray(variables.get(name))
+        if values.ndim != 2 or values.dtype.kind not in "uif" or values.shape[0] < values.shape[1]:
+            given = f"is {values.dtype} of shape {values.shape}" if name in variables else "is missing"
+            raise MitsimError(f"{path}: {name} {given}; a matrix of sensor pixels x fewer scene pixels is needed")
+        return as_channel(values.astype(np.float32), name, path)
+
+    def part(plane: str) -> Packed[CalibrationManifest]:
+        sides = {name: matrix(f"{stem}{plane}") for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
+        manifest = CalibrationManifest(
+            camera={"name": path.stem, "channel": plane}, centre=True, configuration={TURNED: angle} if angle else {}
+        )
+        return Packed(manifest, "", FACTORS, lambda name: ({"factor": sides[name]}, {}), path)
+
+    if channel != ALL:
+        yield None, Content({"": part(channel)})
+        return
+    colours = lines_of_planes(CALIBRATION, WAVELENGTHS_NM)
+    text = json.dumps(colours.model_dump(mode="json"))
+    yield None, Content({name: part(name) for name in colours.names}, colours, text)
+
+
+# -------- Tensors of PyTorch
 
 
 def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
     """Write a run as tensors that `torch.load` reads with `weights_only`, whole or not at all.
 
-    Several lines add a first axis to the tensors. Behind colour filters `y` has no such axis, and `weights` (4, lines)
-    is the light that each filter passes. MitsimError if PyTorch is not installed, a frame cannot be read, or lines
-    differ in their patterns or shapes.
+    `y` (K K', rows, columns) are electrons a second without ambient light, patterns row-major over (i, j).
+    MitsimError if PyTorch is not installed or a frame cannot be read.
     """
     try:
         torch: Any = importlib.import_module("torch")
     except ImportError as error:
         raise MitsimError(f"torch is not installed ({error}); type: pip install 'mitsim[torch]'") from error
-    shared, lines = dict[str, FloatArray](), dict[str, dict[str, FloatArray]]()
-    for name, part in run.parts.items():
-        shots = Capture(part.manifest, None, {file: part.read(file) for file in dict.fromkeys(part.names)})
-        lines[name] = {"y": measurements(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
-    if run.filters:  # frames of all lines at once
-        shared = {**lines.pop(""), "weights": np.array(run.filters.weights)}
-    for name in run.names:
-        arrays = lines.setdefault(name, {})
-        if name in run.parts and TRUTH in run.parts[name].names:
-            arrays["x"] = run.parts[name].read(TRUTH)[0]["reflectance"][None].astype(np.float64)
-        elif run.truths.keys() >= {*run.names}:
-            arrays["x"] = run.truths[name][0]["reflectance"][None].astype(np.float64)
-        if calibration is not None:
-            factors = (calibration.parts[name].read(file)[0]["factor"] for file in FACTORS)
-            arrays.update({side: np.asarray(factor, np.float64) for side, factor in zip(SIDES, factors, strict=True)})
-    first, *others = lines.values()
-    for arrays in others:
-        if arrays.keys() != first.keys() or any(arrays[key].shape != first[key].shape for key in first):
-            raise MitsimError(f"{path}: lines differ in shape; use the format hdf5")
-        if not all(np.array_equal(arrays[key], first[key]) for key in first.keys() & {*_PATTERNS}):
-            raise MitsimError(f"{path}: lines differ in their patterns; use the format hdf5")
-    for key, values in first.items():
-        # The truth has an axis of one channel, which the lines take.
-        join = np.concatenate if key == "x" else np.stack
-        alone = run.colours is None or key in _PATTERNS
-        shared[key] = values if alone else join([arrays[key] for arrays in lines.values()])
-    if run.colours:
-        shared["wavelengths_nm"] = np.array(run.colours.wavelengths_nm)
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in shared.items()}
+    part = run.parts[""]
+    shots = Capture(part.manifest, None, {file: part.read(file) for file in dict.fromkeys(part.names)})
+    left, right = shots.patterns
+    frames = {(each.row, each.column): each.frame for each in shots.pattern_measurements()}
+    arrays = {"y": np.stack([frames[place] for place in sorted(frames)]), "P_L": left, "P_R": right}
+    if TRUTH in part.names:
+        arrays["x"] = part.read(TRUTH)[0]["reflectance"][None].astype(np.float64)
+    if calibration is not None:
+        factors = (calibration.parts[""].read(file)[0]["factor"] for file in FACTORS)
+        arrays.update({side: np.asarray(factor, np.float64) for side, factor in zip(SIDES, factors, strict=True)})
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
     with whole_file(path) as place:
         try:
             torch.save(tensors, place)
@@ -79,14 +148,7 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
     return ()
 
 
-def measurements(shots: Capture) -> FloatArray:
-    """Return (K K', rows, columns) electrons a second without ambient light, patterns row-major over (i, j)."""
-    columns = shots.patterns[1].shape[1]
-    frames = {each.row * columns + each.column: each.frame for each in shots.pattern_measurements()}
-    return np.stack([frames[index] for index in sorted(frames)])
-
-
-# -------- Labelled arrays
+# -------- Labelled arrays of xarray, after the CF conventions
 
 Labels = dict[str, tuple[Any, ...]]
 """Dimensions, values and attributes by name, as xarray requires."""
