@@ -9,7 +9,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from mitsim.exchange.matlab import variables_in
 
 from mitsim.core.arrays import checked_hdf5
 from mitsim.core.errors import MitsimError
@@ -64,7 +63,6 @@ HOSTILE: dict[str, tuple[Callable[[h5py.File], object], str]] = {
 READERS: dict[str, Callable[[Path], object]] = {
     "light": lambda path: read_light(path, None),  # type: ignore[arg-type]
     "run": lambda path: load_hdf5(path).__enter__(),
-    "MATLAB": variables_in,
     "pairs": lambda path: PairStore(path.parent, None)._file(Stub(path.name)).__enter__(),  # type: ignore[arg-type]
 }
 

@@ -22,7 +22,6 @@ import torch
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
-from mitsim.exchange import labelled
 from mitsim.learn import methods, training, verbs
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, read_network
 from mitsim.learn.methods import BIN, CLASSES, LEVELS, WAYS, Binning, Critic, Data, Diagonal, UNet, has_half
@@ -212,7 +211,7 @@ def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
     problem = prepared.problem(sums)
     variance = datum_variance(problem)
     data, own = Data.of(problem.projected[None], variance, DOUBLE), Diagonal.of(prepared, DOUBLE)
-    y = torch.as_tensor(labelled.measurements(shots))[None]
+    y = torch.as_tensor(np.stack([each.frame for each in shots.pattern_measurements()]))[None]
     network = CLASSES["plug-and-play"]((16, 16)).double()
     with torch.no_grad():
         for values in network.network.last.parameters():
