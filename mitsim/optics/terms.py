@@ -251,12 +251,6 @@ def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], Separa
     return values, split_term
 
 
-def relative_difference(terms: SeparableTerms, reference: SeparableTerms) -> float:
-    """Return ||A - B|| / ||B||; rounding hides values below 1e-7."""
-    minus = [(-left, right) for left, right in reference]
-    return float(np.sqrt(_energy([*terms, *minus]) / _energy(reference)))
-
-
 def centre_terms(terms: SeparableTerms) -> SeparableTerms:
     return [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
 

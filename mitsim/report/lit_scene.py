@@ -8,7 +8,7 @@ exposure of uniform light, and *equal total* shares that exposure among the fami
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Literal
@@ -28,12 +28,12 @@ from mitsim.devices.mask import CameraMask
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.projector import Spectrum
 from mitsim.light.light import SampledLight
-from mitsim.metrics import Quality, psnr, relative_error
+from mitsim.metrics import Quality, psnr
 from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import best_term, centre_terms, relative_difference, shadow_terms
+from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
@@ -216,9 +216,6 @@ def accumulate(
 
 # -------- The paper's idealised camera
 
-BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
-"""Range and bands of a usual filter; bands of 23 nm hardly move a shadow's fringes."""
-GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector", "broadband"
 
 Pair = tuple[FloatArray, FloatArray]
 """Left and right factor, (pixels, n) each."""
@@ -247,10 +244,6 @@ class IdealCamera:
     @cached_property
     def terms(self) -> SeparableTerms:
         return self._terms(*self.directions)
-
-    def points(self) -> SeparableTerms:
-        rows, columns = (Directions(pixels.centres, 0.0) for pixels in self.directions)
-        return self._terms(rows, columns)
 
     @cached_property
     def factors(self) -> Pair:
@@ -292,46 +285,3 @@ class IdealCamera:
     @cached_property
     def _optics(self) -> FrameOptics:
         return FrameOptics(self._geometry, *self.directions, (self.bench.geometry.scene_distance,), 1, self.spectrum)
-
-
-def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
-    edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
-    return {
-        GEOMETRIC: None,
-        LINE: Spectrum(np.array([bench.projector.effective_wavelength_nm]), np.ones(1)),
-        PROJECTOR: bench.spectrum,
-        BROADBAND: Spectrum((edges[:-1] + edges[1:]) / 2, np.full(BROADBAND_BANDS, 1 / BROADBAND_BANDS)),
-    }
-
-
-def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> dict[str, str | int | float]:
-    """Return relative rms differences of a mask in one ``light`` from its geometric shadow, among ``systems`` by light.
-
-    ``point_source`` and ``scene_pixel`` compare operators, for points and averaged over projector pixels; ``factor``
-    compares a solver's factors. ``separability`` is the remainder of the operator without its best separable term,
-    ``separability_centred`` the same without row and column means.
-    """
-    system, geometric = systems[light], systems[GEOMETRIC]
-    factor, assumed = system.factors[0], geometric.factors[0]
-    # (left, right) and (-left, -right) are one camera.
-    sign = 1.0 if np.vdot(factor, assumed) >= 0 else -1.0
-    return {
-        "mask": system.mask,
-        "light": light,
-        "wavelengths": len(system.spectrum.weights) if system.spectrum else 0,
-        "terms": len(system.terms),
-        "point_source": relative_difference(system.points(), geometric.points()),
-        "scene_pixel": relative_difference(system.terms, geometric.terms),
-        "factor": relative_error(sign * factor, assumed),
-        "separability": best_term(system.terms).residual,
-        "separability_centred": best_term(centre_terms(system.terms)).residual,
-    }
-
-
-def point_profiles(bench: Apparatus) -> dict[str, FloatArray]:
-    """Return the (pixels,) shadow of a point on the axis, by light."""
-    camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
-    return {
-        name: best_term(shadow_terms(camera, axis, axis, camera.scene_distance, spectrum)).left[:, 0]
-        for name, spectrum in lights(bench).items()
-    }

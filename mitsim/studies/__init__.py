@@ -31,10 +31,11 @@ SHARED = {
 }
 """Modules of several studies, whose ``STUDIES`` have each by its name."""
 GONE = {
-    **dict.fromkeys(("diffraction", "models"), "calibration SCENE"),
-    "regularisation": "sweep SCENE --over method=tikhonov,tv",
-    "separation": "reflectivity",
-    "transfer": "learned --data DIR",
+    "diffraction": "study calibration SCENE",
+    "models": "calibrate SCENE --model wave",
+    "regularisation": "study sweep SCENE --over method=tikhonov,tv",
+    "separation": "study reflectivity",
+    "transfer": "study learned --data DIR",
 }
-"""Former studies, and the arguments of `mitsim study` that replace them."""
+"""Former studies, and the command that replaces each."""
 ALL = "all"

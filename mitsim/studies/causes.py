@@ -524,17 +524,6 @@ class LinearImage:
         variance += self.variance(scene, noise)
         return Expected(left.basis @ (self.filter * weights) @ right.basis.T, variance)
 
-    def scatter(self, scene: FloatArray, changed: Changed, error: FloatArray) -> float:
-        """Return the variance of the summed squared error that independent normal gains cause.
-
-        With gains that add e_g each to the image, beside an error b (``error``, n x n'): sum_g 4 (b . e_g)^2 + 2
-        |e_g|^4.
-        """
-        left, right = self.axes
-        off = self.filter * (left.basis.T @ error @ right.basis)
-        terms = self._by_gains(scene, changed)
-        return sum(4 * float((off * term).sum()) ** 2 + 2 * self._energy(np.square(term)) ** 2 for term in terms)
-
     def _by_gains(self, scene: FloatArray, changed: Changed) -> Iterator[FloatArray]:
         left, right = self.axes
         cameras = [(self.left, self.right), *changed.terms]

@@ -1,7 +1,7 @@
 """Loss of an image by each kind of drift between calibration and capture, measured and predicted [dB].
 
-*Measured*: noisy frames of the traced light through the camera after the drift, solved with the factors from before it,
-by the lambda chosen without the drift and by a lambda of their own. *Predicted* (:mod:`mitsim.studies.causes`): from
+*Measured*: noisy frames of the traced light through the camera after the drift, solved with the factors and the lambda
+from before it. *Predicted* (:mod:`mitsim.studies.causes`): from
 the same factors and the closed-form shadow of the paper's model, with the truth, the mean noise of a datum and, for
 lamps, the frame of their light.
 """
@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -38,7 +37,6 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import DRIFT_UNITS, DRIFT_WORDS, SIDES, Drift, SessionRecipe, amount_in_words, load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
-from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Solution
@@ -48,24 +46,20 @@ from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexpo
 from mitsim.report.pages import Value
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response, specimen
 from mitsim.studies.causes import Changed, Expected, Gains, LinearImage, Noise
-from mitsim.studies.framework.claims import Gain, choose_rows, distinct, mean_of
+from mitsim.studies.framework.claims import Gain
 from mitsim.studies.framework.experiment import (
     IMAGE,
     TEST_IMAGES,
     TRUTH,
     Found,
     Point,
-    Results,
     Scope,
     Study,
     group_by_setup,
     number_of,
 )
-from mitsim.studies.framework.panels import Bars, Images, Lines
+from mitsim.studies.framework.panels import Bars, Images
 from mitsim.studies.framework.studio import Studio, flags_of, single_precision
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 AMBIENT, SESSION = "ambient frame", "session"
 OFFSETS = "offset nonuniformity"
@@ -80,13 +74,19 @@ _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 # -------- A drift between calibration and capture: its measured and its predicted effect
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Predicted loss by a drift: PSNR [dB] without it, measured and predicted, and with it at the same lambda."""
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """PSNR [dB] without and with a drift, measured and predicted at one lambda, and the measured ``image`` with it."""
 
     before_db: float
+    after_db: float
     predicted_before_db: float
     predicted_db: float
+    image: FloatArray
+
+    @property
+    def lost_db(self) -> float:
+        return self.before_db - self.after_db
 
     @property
     def predicted_lost_db(self) -> float:
@@ -97,23 +97,6 @@ class Prediction:
     def predicted_error_db(self) -> float:
         """Return the change of the loss if the image without drift is as predicted, because the model omits light."""
         return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome(Prediction):
-    """Images with and without a drift, by the lambda from before it and by its own."""
-
-    after_db: float
-    auto_db: float
-    image: FloatArray
-
-    @property
-    def lost_db(self) -> float:
-        return self.before_db - self.after_db
-
-    @property
-    def lost_auto_db(self) -> float:
-        return self.before_db - self.auto_db
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,28 +124,18 @@ class DriftStand:
         ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
         exposer = DriftedExposer(bench.devices, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
         (sums,) = accumulate(exposer, self.family, expected, [model])
-        images = [model.solve(sums, self._before.lam).image, model.solve(sums, "auto").image]
-        after, auto = (psnr(image, truth) for image in images)
-        return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto, image=images[0])
-
-    def predict(self, drift: Drift) -> Prediction:
-        """Return the predicted effect; MitsimError for a drift that the bench cannot have."""
-        return Prediction(
-            self.before_db, *(self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
-        )
-
-    @property
-    def image(self) -> FloatArray:
-        return self._before.image
+        image = model.solve(sums, self.before.lam).image
+        predicted = (self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
+        return Outcome(self.before_db, psnr(image, truth), *predicted, image)
 
     @property
     def flags(self) -> dict[str, Value]:
         others = (*self.lit.light.warnings, *self.lit.light.unreached, *self.factors.warnings)
-        return flags_of(self._before.status, others=others)
+        return flags_of(self.before.status, others=others)
 
     @property
     def before_db(self) -> float:
-        return psnr(self.image, self.lit.truth)
+        return psnr(self.before.image, self.lit.truth)
 
     @cached_property
     def _frames(self) -> Unexposed:
@@ -177,18 +150,9 @@ class DriftStand:
         return self._frames.prepare()
 
     @cached_property
-    def _before(self) -> Solution:
-        (sums,) = accumulate(self._frames.exposer(self.exposure_s), self.family, self._expected, [self._model])
+    def before(self) -> Solution:
+        (sums,) = accumulate(self._frames.exposer(self.exposure_s), self.family, self._frames.expected, [self._model])
         return self._model.solve(sums, "auto")
-
-    @property
-    def _expected(self) -> ExpectedFrames:
-        return self._frames.expected
-
-    @property
-    def electrons(self) -> float:
-        exposer = self._frames.exposer(self.exposure_s)
-        return float(sum(exposer.electrons(frame).sum() for frame in self._expected))
 
     def session_mixes(self, drift: Drift) -> tuple[FloatArray, FloatArray]:
         """Return the (n, n) matrices that multiply the factors on the right as a session's power drifts.
@@ -202,10 +166,7 @@ class DriftStand:
         found, first = [], []
         for side in SIDES:
             shots = np.array([powers[side, number].mean() for number in range(len(powers) // 2)])
-            if self.recipe.signed_capture == "pair":
-                even, odd = (shots[::2] + shots[1::2]) / 2, (shots[::2] - shots[1::2]) / 2
-            else:
-                even, odd = shots[1:], shots[1:] - shots[0]
+            even, odd = (shots[::2] + shots[1::2]) / 2, (shots[::2] - shots[1::2]) / 2
             found.append((signs * even + odd) @ signs.T / signs.shape[1])
             first.append(even[0] + odd[0])
         scale = float(np.mean(first)) ** -0.5
@@ -233,15 +194,15 @@ class DriftStand:
     @cached_property
     def linear(self) -> LinearImage:
         factors = self.factors
-        return LinearImage(factors.left, factors.right, self.family, self._before.lam, factors.manifest.centre)
+        return LinearImage(factors.left, factors.right, self.family, self.before.lam, factors.manifest.centre)
 
     @cached_property
     def noises(self) -> Mapping[str, Noise]:
         frames = self._frames.noises(self.exposure_s)
         found = {name: Noise(datum=variance) for name, variance in frames.items() if name != NONUNIFORMITY}
-        if takes_ambient_frame("auto", self.family, self._expected):
+        if takes_ambient_frame("auto", self.family, self._frames.expected):
             exposer = self._frames.exposer(self.exposure_s)
-            off = exposer.electrons(self._expected.projector_off)
+            off = exposer.electrons(self._frames.expected.projector_off)
             variance = (exposer.sensor_noise(off) / self.exposure_s) ** 2 / ambient_shots(self.family)
             found[AMBIENT] = Noise(ambient=variance)
         if known := self.factors.manifest.noise:
@@ -261,9 +222,10 @@ class DriftStand:
             flicker=self._gains(drift, "power", drift.power_flicker),
             response=self._response,
         )
-        if self._expected.has_ambient:  # and with it black level, dark current and offsets, or as parts of a difference
+        # An ambient frame holds black level, dark current and offsets too.
+        if self._frames.expected.has_ambient:
             exposer = self._frames.exposer(1.0)
-            lamps = exposer.electrons(self._expected.projector_off)
+            lamps = exposer.electrons(self._frames.expected.projector_off)
             each = self._gains(drift, "lamp", drift.lamp_flicker)
             common = [rms / ambient_shots(self.family) ** 0.5 for rms in each]
             return replace(changed, added=lamps, added_gain=drift.lamp, added_flicker=each, added_common=common)
@@ -291,7 +253,7 @@ class DriftStand:
         """Readings of pixels (m, m') beyond those that a user subtracts without an ambient frame [electrons/s]."""
         sensor, shape = self.lit.bench.sensor, self.lit.bench.geometry.frame_shape
         own = specimen(sensor, shape)
-        if (own.offset_e is None and own.dark_e_per_s is None) or self._expected.has_ambient:
+        if (own.offset_e is None and own.dark_e_per_s is None) or self._frames.expected.has_ambient:
             return None
         frame = np.zeros(shape) if own.offset_e is None else own.offset_e.astype(np.float64) / self.exposure_s
         return frame if own.dark_e_per_s is None else frame + own.dark_e_per_s - sensor.superpixel_dark_current_e_per_s
@@ -304,10 +266,6 @@ class DriftStand:
             wave = amplitude / 2**0.5 * ripple_response(self.lit.bench.sensor, seconds, hertz, rows)
             found += [wave.real, wave.imag]
         return found
-
-    def scatter(self, drift: Drift, error: FloatArray) -> float:
-        """Return the variance that a random ``drift`` causes in the mean squared error, beside an ``error`` (n, n')."""
-        return self.linear.scatter(self.lit.truth, self._frame_changes(drift), error) / error.size**2
 
     def _terms(self, drift: Drift) -> SeparableTerms:
         bench = self.lit.bench
@@ -381,19 +339,21 @@ _LINES = {"lost_db": "measured", "predicted_lost_db": "predicted"}
 _LOST = "PSNR lost [dB]"
 _ERRORS = {"predicted_lost_db": "predicted_error_db"}
 _BEFORE = "without the drift"
-_SHOWN = 4
 AGREE_DB = 0.5
 """Largest useful difference [dB] between predicted and measured loss."""
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    drift, first = recipe_of(scope.recipe).drift, scope.seeds[0]
+    recipe, first = recipe_of(scope.recipe), scope.seeds[0]
+    drift = recipe.drift
     read_name(scope.patterns)
     amounts = {kind: [getattr(drift, kind)] for kind in drift.kinds} if not scope.sweep else {
         kind: [getattr(drift.alone(kind, number_of(kind, text)), kind) for text in texts] for kind, texts in scope.sweep
     }  # fmt: skip
     if not amounts:
         raise MitsimError(f"study drift: the table [drift] of {scope.recipe} moves nothing; give amounts in it")
+    if recipe.signed_capture != "pair" and any(kind.startswith("session") for kind in amounts):
+        raise MitsimError('study drift: drift of a session is studied for signed_capture = "pair"; change the recipe')
     if any(kind in _RIPPLES for kind in amounts):  # refused before any light is traced
         load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml", CAMERA)).known_line_time_s()
     sheet = scope.setup.with_print(TEST_IMAGES[0])
@@ -402,6 +362,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         Point.of(
             scope.setup if own else lamp if kind in _LAMPS else sheet,
             recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=DRIFT_UNITS[kind], amount=amount, seed=seed,
+            what=f"{DRIFT_WORDS[kind]}, {amount_in_words(kind, amount)}",
         )
         for seed in scope.choose(range(first, first + _SEEDS), scope.seeds)
         for kind, each in amounts.items()
@@ -429,16 +390,19 @@ def _measure(studio: Studio, point: Point) -> Found:
     session = _session(studio, point, recipe, drift) if kind.startswith("session") else None
     moved = None
     if kind.startswith("projector"):
-        moved = studio.once("moved projector", 6, (setup, drift), lambda: _move_projector(lit, drift))
+        # By the same plan, so that errors of plans cancel.
+        moved = studio.once(
+            "moved projector", 6, (setup, drift),
+            lambda: LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan)),
+        )  # fmt: skip
     found = known.outcome(drift, session, moved)
     measured: dict[str, Value] = {
-        "before_db": found.before_db, "after_db": found.after_db,
-        "lost_db": found.lost_db, "lost_auto_db": found.lost_auto_db,
+        "before_db": found.before_db, "after_db": found.after_db, "lost_db": found.lost_db,
         "predicted_before_db": found.predicted_before_db, "predicted_db": found.predicted_db,
         "predicted_lost_db": found.predicted_lost_db, "predicted_error_db": found.predicted_error_db,
         **known.flags,
     }  # fmt: skip
-    shown = {IMAGE: found.image, _BEFORE: known.image, TRUTH: lit.truth}
+    shown = {IMAGE: found.image, _BEFORE: known.before.image, TRUTH: lit.truth}
     return Found((point.row(**measured),), single_precision(shown))
 
 
@@ -451,64 +415,17 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
     return studio.once("drifting session", 2, key, lambda: bench.calibrate(seed=seed, recipe=own))
 
 
-def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
-    """Return the scene in light of a moved projector, by the same plan, so that errors of plans cancel."""
-    return LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan))
-
-
-def _by_kind(results: Results) -> Results:
-    first, rows = dict[Value, Value](), list[dict[str, Value]]()
-    for row in results.rows:
-        kind, amount = str(row["kind"]), float(str(row["amount"]))
-        what = f"{DRIFT_WORDS[kind]}, {amount_in_words(kind, amount)}"
-        rows.append({**row, "what": what, "first": row["amount"] == first.setdefault(kind, row["amount"])})
-    return replace(results, rows=rows)
-
-
-def _by_amount(results: Results) -> dict[str, Figure]:
-    drawn: dict[str, Figure] = {}
-    for kind, unit in {row["kind"]: row["unit"] for row in results.rows if not row["first"]}.items():
-        label = f"{DRIFT_WORDS[str(kind)]} [{unit}]"
-        panel = Lines(
-            "amount",
-            label,
-            file=str(kind),
-            y_label=_LOST,
-            where={"kind": kind},
-            colour=_LINES,
-            facet="",
-            errors=_ERRORS,
-        )
-        drawn |= panel.draw(results)
-    return drawn
-
-
-def _images(results: Results) -> dict[str, Figure]:
-    first = choose_rows(results.frame, {"first": True})
-    lost = {what: mean_of(choose_rows(first, {"what": what}), "lost_db").value for what in distinct(first, "what")}
-    dearest = sorted(lost, key=lambda what: -lost[what])[:_SHOWN]
-    panel = Images(
-        {_BEFORE: (_BEFORE, "{before_db:.1f} dB"), IMAGE: ("with it", "{after_db:.1f} dB")},
-        title="Images of the kinds that cost the most",
-        before={TRUTH: "truth"},
-        down=("what",),
-    )
-    return panel.draw(replace(results, rows=[row for what in dearest for row in results.rows if row["what"] == what]))
-
-
 STUDY = Study(
     "drift",
     "What drifts between calibration and capture",
     "How many decibels does each kind of drift cost, and do closed forms say so?",
     points=_points,
     measure=_measure,
-    derive=_by_kind,
     claims=(
         Gain(
             f"{{what}}: loss predicted within {AGREE_DB:g} dB",
             {},
             {},
-            where={"first": True},
             each="what",
             column="lost_db",
             other_column="predicted_lost_db",
@@ -523,14 +440,16 @@ STUDY = Study(
         Bars(
             "what",
             file="losses",
-            where={"first": True},
             colour=_LINES,
             x_label=_LOST,
             ordered=True,
             errors=_ERRORS,
         ),
-        _by_amount,
-        _images,
+        Images(
+            {_BEFORE: (_BEFORE, "{before_db:.1f} dB"), IMAGE: ("with it", "{after_db:.1f} dB")},
+            before={TRUTH: "truth"},
+            down=("what",),
+        ),
     ),
     about="PSNR that an image loses when one thing moves after the calibration. Measured: frames after the drift, "
     "solved with the factors and lambda from before it, against the same noise without the drift; one standard error "

@@ -143,7 +143,7 @@ def test_reconstruct_refuses(refused: Refused, lab: Any, options: list[str], fra
         (["study", "weather", "photograph", *NEW], ["'weather'", "accuracy"]),
         (["study", "twin", "photograph", *NEW], ["study twin photograph", "leave the scene out"]),
         (["study", "twin", *NEW], ["needs real captures", "--data FOLDER", "flatnet"]),
-        (["study", "transfer", *NEW], ["is part of another study now", "mitsim study learned --data DIR"]),
+        (["study", "transfer", *NEW], ["is no study of its own any more", "mitsim study learned --data DIR"]),
         (["study", "twin", "--data", "nowhere", *NEW], ["--data nowhere", "no such folder"]),
         (["plan", "photograph", "--accuracy", "0"], ["--accuracy 0"]),
         (["plan", "photograph", "--patterns", "dots:129"], ["dots:129", "128"]),

@@ -367,7 +367,7 @@ def find_experiment(name: str) -> Study:
 def check_study(name: str) -> None:
     """Raise MitsimError for an unknown ``name``."""
     if name in GONE:
-        raise MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
+        raise MitsimError(f"study {name}: is no study of its own any more; use `mitsim {GONE[name]}`")
     if name not in (*EXPERIMENTS, ALL) and "." not in name:
         raise MitsimError(f"study {name!r}: there is no such study; use {', '.join(EXPERIMENTS)}")
 

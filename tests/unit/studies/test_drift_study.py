@@ -18,7 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
-from mitsim.studies.drift_study import SESSION, DriftStand, Outcome, _move_projector
+from mitsim.studies.drift_study import SESSION, DriftStand, Outcome
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
 from mitsim.verbs import StudyOptions, scope_of, study
@@ -54,7 +54,7 @@ def lamp_stand(stand: DriftStand, shared_scene: Callable[..., Path], variant: st
 def test_without_drift_the_image_is_the_same_bit_for_bit(stand: DriftStand) -> None:
     """(Planted: the exposure chosen anew; another seed.)"""
     found = stand.outcome(Drift())
-    assert found.before_db == found.after_db == found.auto_db
+    assert found.before_db == found.after_db
     assert found.lost_db == found.predicted_lost_db == found.predicted_error_db == 0
 
 
@@ -122,17 +122,16 @@ def test_a_tilt_changes_the_image_as_it_is_predicted_to(stand: DriftStand, drift
     assert np.linalg.norm(tilted - still - changed) < 0.15 * np.linalg.norm(changed)
 
 
-@pytest.mark.parametrize("signed", ["pair", "uniform"])
-def test_a_session_whose_power_drifts_gives_other_factors(stand: DriftStand, signed: str) -> None:
+def test_a_session_whose_power_drifts_gives_other_factors(stand: DriftStand) -> None:
     """Phi C on either side, to 2 % of what the drift changes: noise of other light is what is left. What that costs, to
     0.5 dB. (Planted: pairs of the other sign in what is predicted, and in what is exposed; levels of the first side for
     both.)"""
-    drift, recipe = Drift(session_ramp=0.2, session_flicker=0.02), RECIPE.model_copy(update={"signed_capture": signed})
+    drift, recipe = Drift(session_ramp=0.2, session_flicker=0.02), RECIPE
     calibrate = stand.lit.bench.calibrate
     still, factors = (
         calibrate(seed=SEED, recipe=recipe.model_copy(update={"drift": moving})) for moving in (Drift(), drift)
     )
-    own = replace(stand, factors=still, recipe=recipe)
+    own = replace(stand, factors=still)
     for before, after, mix in zip(
         (still.left, still.right), (factors.left, factors.right), own.session_mixes(drift), strict=True
     ):
@@ -168,19 +167,15 @@ def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
     left = moved.truth[:-1] - 0.75 * truth[:-1] - 0.25 * truth[1:]
     assert np.linalg.norm(left) < 0.2 * np.linalg.norm(moved.truth - truth)
     assert drift_projector(stand.lit.bench, Drift(mask_rows_um=1.0)) is stand.lit.bench
-    # By the plan of the light before: another's errors pass for the drift's. (Planted: a plan of its own.)
-    own = _move_projector(stand.lit, drift).light
-    assert own.plan is stand.lit.light.plan and own.bench.loaded.pixels == bench.loaded.pixels
 
 
 def test_what_is_predicted_of_a_worse_image() -> None:
     """A drift that adds as much squared error as the image has costs 3 dB; if the model has half of that image's error,
     it alone would say 4.8. (Planted: decibels subtracted.)"""
-    levels = {"before_db": 30.0, "after_db": 27.0, "auto_db": 27.5}
-    found = Outcome(**levels, predicted_before_db=33.0103, predicted_db=28.2391, image=np.zeros((1, 1)))
+    found = Outcome(30.0, 27.0, predicted_before_db=33.0103, predicted_db=28.2391, image=np.zeros((1, 1)))
     assert found.predicted_lost_db == pytest.approx(3.0103, abs=1e-3)
     assert found.predicted_error_db == pytest.approx(4.7712 - 3.0103, abs=1e-3)
-    assert found.lost_db == 3.0 and found.lost_auto_db == 2.5
+    assert found.lost_db == 3.0
 
 
 def test_an_image_is_off_the_still_one_by_the_noise_that_is_predicted_of_its_capture(stand: DriftStand) -> None:
@@ -189,7 +184,7 @@ def test_an_image_is_off_the_still_one_by_the_noise_that_is_predicted_of_its_cap
     capture = [noise for name, noise in stand.noises.items() if name != SESSION]
     reported = sum(stand.linear.variance(stand.lit.truth, noise) for noise in capture) / stand.lit.truth.size
     still = stand.clear(stand.factors, stand.lit.light)
-    assert np.mean(np.square(stand._before.image - still)) == pytest.approx(reported, rel=0.27)
+    assert np.mean(np.square(stand.before.image - still)) == pytest.approx(reported, rel=0.27)
 
 
 def test_points_are_every_kind_alone() -> None:
@@ -210,7 +205,7 @@ def test_points_are_every_kind_alone() -> None:
         experiment.points(Scope(Setup(), (None,), patterns="stripes:8"))
 
 
-def test_options_of_the_study() -> None:
+def test_options_of_the_study(tmp_path: Path) -> None:
     """(Planted: a recipe for any study; a ripple without a frequency refused.)"""
     scope = Scope(Setup(), (None,))
     assert scope_of("drift", scope, "dots:7", [("power", ("0.1", "0.2"))], "psnr").sweep == (("power", ("0.1", "0.2")),)
@@ -229,6 +224,12 @@ def test_options_of_the_study() -> None:
     assert find_experiment("drift").points(unknown)
     with pytest.raises(MitsimError, match=r"^sensor 'Aptina MT9M034': [^\n]*give line_time_us[^\n]*$"):
         find_experiment("drift").points(replace(unknown, sweep=(("power_ripple", ("0.1",)),)))
+    uniform = tmp_path / "uniform.toml"
+    text = shipped_path("calibration", "drift.toml").read_text()
+    assert 'signed_capture = "pair"' in text
+    uniform.write_text(text.replace('signed_capture = "pair"', 'signed_capture = "uniform"'))
+    with pytest.raises(MitsimError, match='studied for signed_capture = "pair"'):
+        find_experiment("drift").points(Scope(Setup(), (None,), recipe=str(uniform)))
     with pytest.raises(MitsimError, match="moves nothing"):
         find_experiment("drift").points(
             Scope(Setup(), (None,), recipe=str(shipped_path("calibration", "session.toml")))
@@ -236,17 +237,16 @@ def test_options_of_the_study() -> None:
 
 
 def test_claims_hold_predictions_against_what_was_measured() -> None:
-    """At the first amount of each kind, mean over seeds. (Planted: all amounts together.)"""
+    """Of each kind and amount, mean over seeds. (Planted: all amounts together.)"""
     rows = [
-        {"kind": "power", "unit": "1", "amount": amount, "seed": seed, "lost_db": amount + 0.1 * seed,
+        {"kind": "power", "what": f"power {amount}", "amount": amount, "seed": seed, "lost_db": amount + 0.1 * seed,
          "predicted_lost_db": predicted + 0.1 * seed, "predicted_error_db": 0.3}
         for amount, predicted in ((1.0, 1.4), (2.0, 9.0))
         for seed in (0, 1)
     ]  # fmt: skip
-    rows += [{**row, "kind": "exposure", "predicted_lost_db": 3.0} for row in rows[:2]]
     experiment, results = find_experiment("drift"), Results(rows)
-    power, exposure = experiment.judge(results)
-    assert power.verdict == "confirmed" and exposure.verdict == "not confirmed"
+    power, other = experiment.judge(results)
+    assert power.verdict == "confirmed" and other.verdict == "not confirmed"
     assert power.idealised == "1.45 \N{PLUS-MINUS SIGN} 0.30 dB lost"
     assert power.rendered == "1.050 \N{PLUS-MINUS SIGN} 0.050 dB lost"
-    assert set(experiment.draw(results)) == {"losses.png", "power.png"}
+    assert set(experiment.draw(results)) == {"losses.png"}

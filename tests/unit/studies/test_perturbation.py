@@ -163,27 +163,6 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
         assert found == pytest.approx(variance * energy(disturbances), rel=1e-9), (changed, noise)
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-def test_the_draw_of_gains_scatters_by_each_alone(name: str) -> None:
-    """4 (b . e)^2 + 2 |e|^4 of each gain's e, as the solver makes it. (Planted: signs of two frames; |e|^2 for
-    |e|^4.)"""
-    shown, error = family(name), RNG.standard_normal((N, N))
-    dark, count = np.zeros_like(seen(shown)), seen(shown).shape[:3]
-    alone = []
-    for shot in np.ndindex(count):
-        one = dark.copy()
-        one[shot] = 1
-        alone.append(one)
-    common = [] if shown.signed else [0.2 * (dark + FRAME)]
-    cases = [(Changed(flicker=(0.3,)), [0.3 * seen(shown) * one for one in alone]),
-             (Changed(added=FRAME, added_flicker=(0.3,), added_common=(0.2,)),
-              [0.3 * FRAME * one for one in alone] + common)]  # fmt: skip
-    for changed, disturbances in cases:
-        moved = [solved(each, shown) for each in disturbances]
-        reported = sum(4 * np.vdot(error, each) ** 2 + 2 * np.vdot(each, each) ** 2 for each in moved)
-        assert image(shown).scatter(SCENE, changed, error) == pytest.approx(reported, rel=1e-9)
-
-
 def test_decibels_of_a_gain_are_known_exactly() -> None:
     """Without noise and with next to no lambda, power 1 + e makes the image (1 + e) X: its error is e X. (Planted: the
     gain squared.)"""

@@ -188,12 +188,3 @@ def test_a_page_says_first_how_many_claims_hold(tmp_path: Path) -> None:
     page = build_page([section], tmp_path / "page.html", section.title).read_text()
     order = [page.index(each) for each in (said, section.detail, "claim 4", "<img", "Zheng")]
     assert order == sorted(order)
-
-
-def test_images_of_a_drift_stand_beside_the_truth() -> None:
-    """Of the kinds that cost the most. (Planted: in the table's order.)"""
-    results = invented("drift")
-    cells = find("drift").draw(results)["images.png"].axes
-    assert [axes.get_title() for axes in cells[:3]] == ["truth", "without the drift", "with it"] and len(cells) == 12
-    most = max(results.rows, key=lambda row: row["lost_db"])  # type: ignore[arg-type,return-value]
-    assert str(most["amount"]) and cells[2].get_xlabel() == f"{most['after_db']:.1f} dB"
