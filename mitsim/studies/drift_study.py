@@ -125,8 +125,8 @@ class DriftStand:
         exposer = DriftedExposer(bench.devices, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
         (sums,) = accumulate(exposer, self.family, expected, [model])
         image = model.solve(sums, self.before.lam).image
-        predicted = (self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
-        return Outcome(self.before_db, psnr(image, truth), *predicted, image)
+        still, predicted = (self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
+        return Outcome(self.before_db, psnr(image, truth), still, predicted, image)
 
     @property
     def flags(self) -> dict[str, Value]:
