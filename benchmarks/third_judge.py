@@ -4,7 +4,7 @@
     python benchmarks/third_judge.py --json FILE --reference 1024 [--scenes NAME ...]
     python benchmarks/third_judge.py --json FILE --hidden 10 [--scenes NAME ...] [--accuracy 1e-2]
 
-Thirty scenes of rectangles, balls, wires, holes, a pane and mirrors (`tests/physics/judged_scenes.py`), twelve by hand
+Thirty scenes of rectangles, balls, rods, holes, a pane and mirrors (`tests/physics/judged_scenes.py`), ten by hand
 and the rest drawn by a seeded generator. A row each: relative difference over all shots of dots:3 and 16 sensor pixels
 between the factored estimator and the judge (`tests/physics/third_judge.py`), that of their sums, what both state as
 their errors, whether the difference is within them, and why the run is flagged. With --reference, the reference's light

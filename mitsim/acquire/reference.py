@@ -196,7 +196,7 @@ def render(
     job = job or Job()
     spp = _samples(bench, estimator, spp)
     check_accuracy(accuracy)
-    warnings, notes, bound = tuple[str, ...](), bench.loaded.notes, None
+    warnings, notes, bound = tuple[str, ...](), tuple[str, ...](), None
     started = time.perf_counter()
     if estimator == REFERENCE:
         if bench.loaded.projector is not None:

@@ -177,8 +177,7 @@ def _diffraction(bench: Apparatus) -> str:
 def _lamps(bench: Apparatus) -> str:
     counted = ", counted from {:g} to {:g} nm".format(*bench.counted_lamps.range_nm) if bench.counted_lamps else ""
     lamps = len(bench.loaded.lamps)
-    counted = f"{lamps} emitter{'s' if lamps > 1 else ''} beside the projector{counted}"
-    return "; ".join((counted, *bench.loaded.notes))
+    return f"{lamps} emitter{'s' if lamps > 1 else ''} beside the projector{counted}"
 
 
 def _lens(bench: Apparatus) -> str:

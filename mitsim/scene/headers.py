@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -68,28 +66,146 @@ def check_image(path: Path) -> tuple[int, bool]:
     return width * height, grey
 
 
+def _pillow_size(path: Path, start: bytes) -> tuple[tuple[int, int], bool]:
+    from PIL.Image import Exif
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
+
+    reader = {b"\x89PN": PngImageFile, b"\xff\xd8\xff": JpegImageFile}.get(start[:3])
+    if reader is None:
+        raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
+    try:
+        opened = reader(path)
+    except (SyntaxError, OSError, ValueError):
+        raise ValueError("is a damaged PNG or JPEG image; save it again") from None
+    with opened as image:
+        exif = Exif()  # not by getexif, which looks for it behind a PNG's pixels too, and decodes them
+        try:
+            exif.load(image.info.get("exif", b""))
+            turned = exif.get(_ORIENTATION, 1)
+        except Exception:  # of a damaged one, whatever its reader stumbles over
+            raise ValueError("has damaged Exif data; save it again") from None
+        if turned != 1:
+            raise ValueError(f"has the orientation {turned}, which Mitsuba passes over; save it turned as it is seen")
+        if getattr(image, "custom_mimetype", None) == "image/apng":
+            raise ValueError("is animated, and Mitsuba shows its first picture alone; save that")
+        return image.size, image.mode in _GREY
+
+
+def _two_numbers(pattern: bytes, header: bytes) -> tuple[int, int]:
+    match = re.fullmatch(pattern, header, re.DOTALL)
+    if not match:
+        raise ValueError("is a damaged Radiance or PFM image; save it again")
+    return int(match[1]), int(match[2])
+
+
 def check_ply(path: Path) -> tuple[bool, str]:
     """Check a PLY mesh, because Mitsuba would read beyond its arrays.
 
     Return True if vertices have normals, and the name of the texture, "" without.
     """
     with open(path, "rb") as file:
-        start = file.read(_HEADER)
-        found = re.match(rb"ply\r?\n.*?\nend_header\r?\n", start, re.DOTALL)
+        found = re.match(rb"ply\r?\n.*?\nend_header\r?\n", file.read(_HEADER), re.DOTALL)
         if not found:
             raise ValueError("is no PLY mesh; its header must end within 64 KiB")
         file.seek(found.end())
         body = file.read()
     order, parts = _ply_header(found[0])
-    points, indices = _ply_body(body, order, parts)
-    _check_points(points)
-    count = parts["vertex"].count
-    if indices.min() < 0 or indices.max() >= count:
-        named = f"{indices.min()} to {indices.max()}"
-        raise ValueError(f"has faces with vertices {named}, but {count} vertices; mend the mesh")
+    if order is None and len(body) > _MOST_TEXT:
+        raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary")
+    # A text is an array of words, all of which are read as double precision.
+    words = body.split() if order is None else []
+    types = {name: _row_type(properties, order) for name, (_, properties) in parts.items()}
+    widths = [types[name].itemsize // (8 if order is None else 1) for name in parts]
+    starts = np.cumsum([0, *(count * width for (count, _), width in zip(parts.values(), widths, strict=True))]).tolist()
+    held, count = len(words if order is None else body), parts["vertex"][0]
+    if starts[-1] > held:
+        holder = "text holds" if order is None else "bytes hold"
+        counts = f"{count} vertices and {parts['face'][0]} triangles"
+        raise ValueError(f"claims {counts}, more than its {holder}; export the mesh again")
+    rows: dict[str, npt.NDArray[Any]] = {}
+    for name, start, end in zip(parts, starts, starts[1:], strict=False):
+        if name not in ("vertex", "face"):
+            continue
+        if order is not None:
+            rows[name] = np.frombuffer(body, types[name], parts[name][0], start)
+            continue
+        try:
+            numbers = np.array(words[start:end]).astype(np.float64)
+        except ValueError:
+            raise ValueError("holds words that are no numbers; export the mesh again") from None
+        rows[name] = numbers.view(types[name])
+    vertex, corners = rows["vertex"], rows["face"][_INDICES]
+    if (rows["face"][_CORNERS] != 3).any():
+        raise ValueError("has faces that are no triangles; export triangles")
+    if held > starts[-1]:
+        raise ValueError("holds more than its header claims; export the mesh again")
+    if not np.isfinite(corners).all():
+        raise ValueError("has corners that are no numbers; export the mesh again")
+    _check_points(np.stack([vertex[axis].astype(np.float64) for axis in "xyz"]))
+    low, high = corners.astype(np.int64).min(), corners.astype(np.int64).max()
+    if low < 0 or high >= count:
+        raise ValueError(f"has faces with vertices {low} to {high}, but {count} vertices; mend the mesh")
     texture = re.search(rb"\ncomment TextureFile ([^\r\n]*)", found[0])
     named = texture[1].decode("utf-8", "replace").strip() if texture else ""
-    return {"nx", "ny", "nz"} <= dict(parts["vertex"].properties).keys(), named
+    return {"nx", "ny", "nz"} <= {*vertex.dtype.names}, named
+
+
+_Properties = list[tuple[str, str]]
+
+
+def _row_type(properties: _Properties, order: str | None) -> np.dtype[np.void]:
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+    for name, kind in properties:
+        if " " in kind:
+            length, item = ("f8", "f8") if order is None else [order + each for each in kind.split()]
+            fields += [(_CORNERS, length), (_INDICES, item, (3,))]
+        else:
+            fields.append((name, "f8" if order is None else order + kind))
+    return np.dtype(fields)
+
+
+def _ply_header(header: bytes) -> tuple[str | None, dict[str, tuple[int, _Properties]]]:
+    """Return the byte order (None for text) and the elements in order.
+
+    Whole numbers as coordinates are refused because Mitsuba divides them by the largest of their type.
+    """
+    order: str | None = ""
+    parts: dict[str, tuple[int, _Properties]] = {}
+    for line in header.split(b"\n")[1:-2]:
+        # Lines are split as in C, because Python splits at further blanks and line ends that Mitsuba ignores.
+        words = [word.decode("ascii", "replace") for word in line.split()]
+        kinds = words[2:4] if words[:2] == ["property", "list"] else words[1:2]
+        match words:
+            case ["comment", *_] | []:
+                continue
+            case ["format", name, _]:
+                order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}.get(name, "")
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,9}", count) and name not in parts:
+                parts[name] = (int(count), [])
+            case ["property", *_, name] if parts and len(words) in (3, 5) and {*kinds} <= _PLY_TYPES.keys():
+                parts[[*parts][-1]][1].append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))
+            case _:
+                problem = f"has a header line that is not understood ({' '.join(words)[:40]!r})"
+                raise ValueError(f"{problem}; remove it, or export the mesh again")
+    if order == "" or not {"vertex", "face"} <= parts.keys():
+        raise ValueError("has no format, or no elements vertex and face; export vertices and triangles")
+    for element, (rows, properties) in parts.items():
+        names = [name for name, _ in properties]
+        if len({*names}) != len(names):
+            raise ValueError(f"has two properties of one name in element {element[:40]}; export the mesh again")
+        if rows and not names:
+            raise ValueError(f"has an element {element[:40]} without properties; export the mesh again")
+        if element != "face" and any(" " in kind for _, kind in properties):
+            raise ValueError(f"has a list in element {element[:40]}; export vertices and triangles alone")
+    kinds_of = dict(parts["vertex"][1])
+    if not all(kinds_of.get(axis, "") in ("f4", "f8") for axis in "xyz"):
+        raise ValueError("has vertices without x, y, z of type float or double; export the mesh again")
+    if [name for name, kind in parts["face"][1] if " " in kind] not in (["vertex_index"], ["vertex_indices"]):
+        raise ValueError("has faces without one list vertex_indices, or with others; export triangles alone")
+    if not parts["face"][0]:
+        raise ValueError("has no triangles: it is a cloud of points; export a mesh")
+    return order, parts
 
 
 def check_obj(path: Path) -> tuple[bool, str]:
@@ -141,152 +257,3 @@ def check_obj(path: Path) -> tuple[bool, str]:
 def _check_points(points: npt.NDArray[np.float64]) -> None:
     if not np.isfinite(points).all() or np.abs(points).max(initial=0) > FARTHEST:
         raise ValueError(f"has vertices that are not finite or beyond {FARTHEST:g} mm; mend the mesh")
-
-
-def _pillow_size(path: Path, start: bytes) -> tuple[tuple[int, int], bool]:
-    from PIL.Image import Exif
-    from PIL.JpegImagePlugin import JpegImageFile
-    from PIL.PngImagePlugin import PngImageFile
-
-    reader = {b"\x89PN": PngImageFile, b"\xff\xd8\xff": JpegImageFile}.get(start[:3])
-    if reader is None:
-        raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
-    try:
-        opened = reader(path)
-    except (SyntaxError, OSError, ValueError):
-        raise ValueError("is a damaged PNG or JPEG image; save it again") from None
-    with opened as image:
-        exif = Exif()  # not by getexif, which looks for it behind a PNG's pixels too, and decodes them
-        try:
-            exif.load(image.info.get("exif", b""))
-            turned = exif.get(_ORIENTATION, 1)
-        except Exception:  # of a damaged one, whatever its reader stumbles over
-            raise ValueError("has damaged Exif data; save it again") from None
-        if turned != 1:
-            raise ValueError(f"has the orientation {turned}, which Mitsuba passes over; save it turned as it is seen")
-        if getattr(image, "custom_mimetype", None) == "image/apng":
-            raise ValueError("is animated, and Mitsuba shows its first picture alone; save that")
-        return image.size, image.mode in _GREY
-
-
-def _two_numbers(pattern: bytes, header: bytes) -> tuple[int, int]:
-    match = re.fullmatch(pattern, header, re.DOTALL)
-    if not match:
-        raise ValueError("is a damaged Radiance or PFM image; save it again")
-    return int(match[1]), int(match[2])
-
-
-_Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
-"""Coordinates, and the corners of each triangle."""
-
-
-@dataclass(frozen=True)
-class _Element:
-    count: int
-    properties: list[tuple[str, str]]
-
-    def dtype(self, order: str) -> np.dtype[np.void]:
-        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-        for name, kind in self.properties:
-            if " " in kind:
-                length, item = kind.split()
-                fields += [(_CORNERS, order + length), (_INDICES, order + item, (3,))]
-            else:
-                fields.append((name, order + kind))
-        return np.dtype(fields)
-
-    def column(self, name: str) -> int:
-        before = self.properties[: [other for other, _ in self.properties].index(name)]
-        return len(before) + 3 * any(" " in kind for _, kind in before)
-
-    @property
-    def lists(self) -> list[str]:
-        return [name for name, kind in self.properties if " " in kind]
-
-    @property
-    def words(self) -> int:
-        return len(self.properties) + 3 * bool(self.lists)
-
-
-def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:
-    """Return the byte order (None for text) and the elements in order.
-
-    Whole numbers as coordinates are refused because Mitsuba divides them by the largest of their type.
-    """
-    order: str | None = ""
-    parts: dict[str, _Element] = {}
-    for line in header.split(b"\n")[1:-2]:
-        # Lines are split as in C, because Python splits at further blanks and line ends that Mitsuba ignores.
-        words = [word.decode("ascii", "replace") for word in line.split()]
-        kinds = words[2:4] if words[:2] == ["property", "list"] else words[1:2]
-        match words:
-            case ["comment", *_] | []:
-                continue
-            case ["format", name, _]:
-                order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}.get(name, "")
-            case ["element", name, count] if re.fullmatch(r"[0-9]{1,9}", count) and name not in parts:
-                parts[name] = _Element(int(count), [])
-            case ["property", *_, name] if parts and len(words) in (3, 5) and {*kinds} <= _PLY_TYPES.keys():
-                parts[[*parts][-1]].properties.append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))
-            case _:
-                problem = f"has a header line that is not understood ({' '.join(words)[:40]!r})"
-                raise ValueError(f"{problem}; remove it, or export the mesh again")
-    if order == "" or not {"vertex", "face"} <= parts.keys():
-        raise ValueError("has no format, or no elements vertex and face; export vertices and triangles")
-    for element, part in parts.items():
-        names = [name for name, _ in part.properties]
-        if len({*names}) != len(names):
-            raise ValueError(f"has two properties of one name in element {element[:40]}; export the mesh again")
-        if part.count and not names:
-            raise ValueError(f"has an element {element[:40]} without properties; export the mesh again")
-        if part.lists and element != "face":
-            raise ValueError(f"has a list in element {element[:40]}; export vertices and triangles alone")
-    kinds_of = dict(parts["vertex"].properties)
-    if not all(kinds_of.get(axis, "") in ("f4", "f8") for axis in "xyz"):
-        raise ValueError("has vertices without x, y, z of type float or double; export the mesh again")
-    if parts["face"].lists not in (["vertex_index"], ["vertex_indices"]):
-        raise ValueError("has faces without one list vertex_indices, or with others; export triangles alone")
-    if not parts["face"].count:
-        raise ValueError("has no triangles: it is a cloud of points; export a mesh")
-    return order, parts
-
-
-def _ply_body(body: bytes, order: str | None, parts: Mapping[str, _Element]) -> _Mesh:
-    if order is None and len(body) > _MOST_TEXT:
-        raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary")
-    words = body.split() if order is None else []
-    types = {name: part.dtype(order or "<") for name, part in parts.items()}
-    widths = {name: part.words if order is None else types[name].itemsize for name, part in parts.items()}
-    starts = np.cumsum([0, *(part.count * widths[name] for name, part in parts.items())]).tolist()
-    first = dict(zip(parts, starts, strict=False))
-    held, vertices, faces = len(words if order is None else body), parts["vertex"], parts["face"]
-    if starts[-1] > held:
-        counts = f"{vertices.count} vertices and {faces.count} triangles"
-        holder = "text holds" if order is None else "bytes hold"
-        raise ValueError(f"claims {counts}, more than its {holder}; export the mesh again")
-    vertex: npt.NDArray[Any]
-    face: npt.NDArray[Any]
-    if order is None:
-        try:
-            vertex, face = (
-                np.array(words[first[name] : first[name] + part.count * part.words])
-                .astype(np.float64)
-                .reshape(-1, part.words)
-                for name, part in (("vertex", vertices), ("face", faces))
-            )
-        except ValueError:
-            raise ValueError("holds words that are no numbers; export the mesh again") from None
-        points = np.stack([vertex[:, vertices.column(axis)] for axis in "xyz"])
-        at = faces.column(faces.lists[0])
-        lengths, corners = face[:, at], face[:, at + 1 : at + 4]
-    else:
-        vertex, face = (np.frombuffer(body, types[n], parts[n].count, first[n]) for n in ("vertex", "face"))
-        points = np.stack([vertex[axis].astype(np.float64) for axis in "xyz"])
-        lengths, corners = face[_CORNERS], face[_INDICES]
-    if (lengths != 3).any():
-        raise ValueError("has faces that are no triangles; export triangles")
-    if held > starts[-1]:
-        raise ValueError("holds more than its header claims; export the mesh again")
-    if not np.isfinite(corners).all():
-        raise ValueError("has corners that are no numbers; export the mesh again")
-    return points, corners.astype(np.int64)

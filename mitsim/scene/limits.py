@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
-from mitsim.core.errors import MitsimError, cut, near_name
+from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import PIXELS
 from mitsim.scene.headers import FARTHEST
 from mitsim.scene.outline import Tag
@@ -21,10 +19,6 @@ if TYPE_CHECKING:
 
 _LARGEST = 1e20
 """Largest number: its square is far from the end of single precision (3.4e38)."""
-_RIGID = 1e-4
-_SMALLEST_SIZE = 1e-9
-"""Smallest scale of a transform [mm]: below any wavelength, and 1 / its cube is still finite."""
-_MOST_UNEVEN = 1e7
 
 
 @dataclass(frozen=True)
@@ -94,23 +88,6 @@ LIMITS = {
 TABLES = ("value", "values", "color", "color0", "color1", "scale")
 
 
-def check_transform(tag: Tag, name: str, matrix: npt.NDArray[np.float64], rigid: bool) -> None:
-    """Raise MitsimError if a (4, 4) ``matrix`` cannot be inverted, or is not ``rigid``."""
-    if not np.isfinite(matrix).all():
-        raise tag.refusal(name, np.nan, "give finite numbers")
-    turn = matrix[:3, :3]
-    sizes = np.linalg.svd(turn, compute_uv=False)
-    even = sizes[2] > _SMALLEST_SIZE and sizes[0] < FARTHEST and sizes[0] < _MOST_UNEVEN * sizes[2]
-    if not (even and np.abs(matrix).max() <= FARTHEST):
-        got = f"stretching by {sizes[2]:g} to {sizes[0]:g}, moving by {np.abs(matrix[:3, 3]).max():g}"
-        rule = f"it must be invertible, with sizes of {_SMALLEST_SIZE:g} to {FARTHEST:g}"
-        raise tag.refusal(name, got, rule)
-    error = float(np.abs(turn.T @ turn - np.eye(3)).max())
-    if rigid and not (error < _RIGID and np.linalg.det(turn) > 0):
-        rule = "a camera or projector is moved and turned only: no scaling, no mirroring"
-        raise tag.refusal(name, f"R^T R {error:.2g} from 1", rule)
-
-
 # -------- Which plugins a scene may have
 # Other plugins run or read content that cannot be checked beforehand (binary grids, tables and caches), or give no
 # light on a sensor.
@@ -135,7 +112,7 @@ PLUGINS = {
 }
 """Allowed plugins by tag, beside ``<scene>``."""
 _SPECTRAL_ALONE = "only spectral variants have it; use --variant {spectral}, or --colour lines or mosaic"
-_LACKED = {
+LACKED = {
     "blackbody": _SPECTRAL_ALONE,
     "irregular": f'{_SPECTRAL_ALONE}, or write the table as value="400:0.2, 700:0.5"',
     "regular": f'{_SPECTRAL_ALONE}, or write the table as value="400:0.2, 700:0.5"',
@@ -144,27 +121,13 @@ _LACKED = {
 """Plugins of Mitsuba 3.9.1 that variants without wavelengths lack, and the remedy."""
 
 
-def references(props: mi.Properties) -> list[int]:
+def references_of(props: mi.Properties) -> list[str]:
     resolved = mi.Properties.Type.ResolvedReference
-    return [props[name].index() for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118 - no dict
+    return [name for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118 - no dict
 
 
-def check_plugin(tag: Tag, plugin: str) -> None:
-    allowed = PLUGINS.get(tag.name, "scene").split()
-    if plugin not in allowed or (tag.name == "scene" and "version" not in tag.attributes):
-        raise tag.refusal(
-            "type", repr(plugin), f"{near_name(cut(plugin), allowed)}allowed are {', '.join(sorted(allowed))}"
-        )
-
-
-def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) -> None:
-    backend, _, kind = variant.rpartition("_")
-    if plugin in _LACKED and kind != "spectral":
-        rule = f"{variant} lacks it: {_LACKED[plugin].format(spectral=f'{backend}_spectral')}"
-        raise tag.refusal("type", repr(plugin), rule)
-    if plugin == "hair" and kind == "mono" and "sigma_a" not in given:
-        rule = f"{variant} has no colours for its pigments; give sigma_a in their place, or use --variant {backend}_rgb"
-        raise tag.refusal("type", repr(plugin), rule)
+def references(props: mi.Properties) -> list[int]:
+    return [props[name].index() for name in references_of(props)]
 
 
 # -------- Estimators, and what they cannot render
@@ -206,133 +169,100 @@ class Unfit:
     lamps: str | None = None
     instances: str | None = None
 
-    @classmethod
-    def of(cls, outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
-        tree = _References(nodes)
-        medium = next(tree.to(PLUGINS["medium"].split()), None)
-        factored = _unfit_for_factored(outline, tree)
-        if medium is not None:
-            rule = "only the reference estimator follows light through media; remove it, or render by it with volpath"
-            factored = outline.tag(medium[0]).refusal(medium[1], "a medium", rule)
-        opaque = _under_bumps(outline, tree)
-        return cls(
-            factored or opaque,
-            _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)) or opaque,
-            _caustics(outline, tree, ("projector", *SMALL_LAMPS), "the reference"),
-            _caustics(outline, tree, SMALL_LAMPS, "the factored estimator"),
-            _in_instances(outline, tree),
-        )
 
+def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
+    """Return the refusals of a checked tree by each estimator, and the light that is lost."""
 
-def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estimator: str) -> str | None:
-    mirror = next(tree.to(MIRRORS), None)
-    light = next((node for node in tree.nodes if node.props.plugin_name() in lights), None)
-    if mirror is None or light is None:
-        return None
-    place, what = outline.tag(mirror[0]), tree.plugin(*mirror)
-    brought = f"that {place.path.name}:{place.line} ({what}) brings to other surfaces, so that is missing"
-    remedy = "use a light that has a surface (area; mitsim_projector for the reference)"
-    rule = f"{estimator} finds no light of it {brought}; {remedy}"
-    return str(outline.tag(light).refusal("light", repr(str(light.props.plugin_name())), rule))
+    def below(node: mi.parser.SceneNode) -> Iterator[mi.parser.SceneNode]:
+        for child in (nodes[index] for index in references(node.props)):
+            yield child
+            yield from below(child)
 
+    def plugin(node: mi.parser.SceneNode) -> str:
+        return str(node.props.plugin_name())
 
-def _unfit_for_factored(outline: Outline, tree: _References) -> MitsimError | None:
-    """Return the refusal of a projector whose picture blends texels, or of a sheet that multiplies light."""
-    for node in tree.nodes:
-        picture = tree.child(node, "irradiance") if node.props.plugin_name() == "projector" else None
-        if picture is None or picture.props.plugin_name() != "bitmap":
-            continue
-        kind = picture.props.get("filter_type", "bilinear")  # Mitsuba's default
-        if kind != "nearest":
-            why = "the projector's pixels would run into each other, where patterns need them even; give its bitmap"
-            nearest = '<string name="filter_type" value="nearest"/>'
-            rule = f"{why} {nearest}, and blur_pixels of the projector's TOML file for a blur"
-            return outline.tag(picture, "filter_type").refusal("filter_type", repr(kind), rule)
-    for node, name in tree.to(("principledthin",)):
-        thin = tree.nodes[node.props[name].index()]
-        if thin.props.get("spec_trans", 0.0) != 0.0:  # a number, or a texture of unknown values
+    # All references to an object. The scene, and materials without a shape, are ignored because they only list.
+    materials = PLUGINS["bsdf"].split()
+    users = [node for node in nodes[1:] if plugin(node) not in materials]
+    used = [inner for node in users for inner in below(node) if plugin(inner) in materials]
+    links = [
+        (node, name, nodes[node.props[name].index()]) for node in (*users, *used) for name in references_of(node.props)
+    ]
+
+    def first(plugins: Sequence[str]) -> tuple[mi.parser.SceneNode, str, mi.parser.SceneNode] | None:
+        return next((link for link in links if plugin(link[2]) in plugins), None)
+
+    factored: MitsimError | None = None
+    reference: MitsimError | None = None
+    # ---- The factored estimator cannot render pictures that blend texels, sheets that multiply light, and media
+    for node in nodes:
+        if plugin(node) == "projector" and "irradiance" in references_of(node.props):
+            picture = nodes[node.props["irradiance"].index()]
+            kind = picture.props.get("filter_type", "bilinear")  # Mitsuba's default
+            if plugin(picture) == "bitmap" and kind != "nearest" and factored is None:
+                why = "the projector's pixels would run into each other, where patterns need them even; give its bitmap"
+                nearest = '<string name="filter_type" value="nearest"/>'
+                rule = f"{why} {nearest}, and blur_pixels of the projector's TOML file for a blur"
+                factored = outline.tag(picture, "filter_type").refusal("filter_type", repr(kind), rule)
+    for *_, sheet in links:
+        # A number, or a texture of unknown values.
+        if plugin(sheet) == "principledthin" and sheet.props.get("spec_trans", 0.0) != 0.0 and factored is None:
             why = "its sharp transmission is defined for light from the camera alone, so only the reference renders it"
             rule = f"{why}; remove it, or use diff_trans, a thindielectric or render's reference"
-            return outline.tag(thin, "spec_trans").refusal("spec_trans", "a transmission", rule)
-    return None
-
-
-def _in_instances(outline: Outline, tree: _References) -> str | None:
-    groups = (node for node in tree.nodes if node.props.plugin_name() == "shapegroup")
-    mirror = next((mirror for node in groups for mirror in tree.below(node, MIRRORS)), None)
-    if mirror is None:
-        return None
-    why = "inside of an instance glass is no pane and a mirror casts no glint: light that it brings from the projector"
-    rule = f"{why} is missing; place the shape itself"
-    return str(outline.tag(mirror).refusal("bsdf", repr(str(mirror.props.plugin_name())), rule))
-
-
-def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
-    """Return the refusal of a material under bumps that Mitsuba treats as opaque or turns about the normal."""
-    for node, name in tree.to(BUMPS):
-        bumps = tree.nodes[node.props[name].index()]
-        what = str(bumps.props.plugin_name())
-        for inner in tree.below(bumps, PLUGINS["bsdf"].split()):
-            plugin = str(inner.props.plugin_name())
-            if plugin in STRAIGHT:
-                why = f"inside of a {what} Mitsuba takes it for opaque wherever it connects a surface to a light"
+            factored = outline.tag(sheet, "spec_trans").refusal("spec_trans", "a transmission", rule)
+    medium = first(PLUGINS["medium"].split())
+    if medium is not None:
+        rule = "only the reference estimator follows light through media; remove it, or render by it with volpath"
+        factored = outline.tag(medium[0]).refusal(medium[1], "a medium", rule)
+    # ---- The scene's integrator, the reference, loses light
+    integrator = next((node for node in nodes if plugin(node) in PLUGINS["integrator"].split()), None)
+    kind = "path" if integrator is None else plugin(integrator)  # Mitsuba's own default
+    cause = medium or first(STRAIGHT)
+    if kind == "ptracer":
+        rule = "it starts paths at lamps alone, and mitsim_lensless needs those of the camera; use path or volpath"
+        reference = outline.tag(integrator).refusal("integrator", repr(kind), rule)
+    elif cause is not None and kind not in _VOLUMETRIC:
+        place = outline.tag(cause[0])
+        rule = f"it loses light at {place.path.name}:{place.line} ({plugin(cause[2])}); use volpath"
+        reference = outline.tag(integrator or nodes[0]).refusal("integrator", repr(kind), rule)
+    # ---- Materials under bumps, which Mitsuba treats as opaque or turns about the normal
+    for bumps in (child for *_, child in links if plugin(child) in BUMPS):
+        for inner in (each for each in below(bumps) if plugin(each) in materials):
+            if plugin(inner) in STRAIGHT:
+                why = (
+                    f"inside of a {plugin(bumps)} Mitsuba takes it for opaque wherever it connects a surface to a light"
+                )
                 remedy = "turn them round: the mask, or other material that light passes, outermost"
                 rule = f"{why}, so that is missing; {remedy}"
-            elif what == "bumpmap" and (plugin in _TURNING or any(each in inner.props for each in _ALONG)):
+            elif plugin(bumps) == "bumpmap" and (
+                plugin(inner) in _TURNING or any(each in inner.props for each in _ALONG)
+            ):
                 why = "inside of a bumpmap Mitsuba mixes up the axes along the surface, so it would be turned about its"
                 remedy = "give one bumpmap, a normalmap outermost, or a material that is alike in all directions"
                 rule = f"{why} normal; {remedy}"
             else:
                 continue
-            return outline.tag(inner).refusal("bsdf", repr(plugin), rule)
-    return None
-
-
-def _lost_by_integrator(outline: Outline, tree: _References, cause: _Found | None) -> MitsimError | None:
-    found = (node for node in tree.nodes if node.props.plugin_name() in PLUGINS["integrator"].split())
-    integrator = next(found, None)
-    plugin = integrator.props.plugin_name() if integrator is not None else "path"  # Mitsuba's own default
-    if integrator is not None and plugin == "ptracer":
-        rule = "it starts paths at lamps alone, and mitsim_lensless needs those of the camera; use path or volpath"
-        return outline.tag(integrator).refusal("integrator", repr(plugin), rule)
-    if cause is None or plugin in _VOLUMETRIC:
-        return None
-    place, what = outline.tag(cause[0]), tree.plugin(*cause)
-    rule = f"it loses light at {place.path.name}:{place.line} ({what}); use volpath"
-    return outline.tag(integrator or tree.nodes[0]).refusal("integrator", repr(plugin), rule)
-
-
-_Found = tuple[mi.parser.SceneNode, str]
-
-
-@dataclass(frozen=True)
-class _References:
-    nodes: Sequence[mi.parser.SceneNode]
-
-    def to(self, plugins: Sequence[str]) -> Iterator[_Found]:
-        """Yield nodes, and names of their properties, that refer to one of the ``plugins``.
-
-        The scene and materials without a shape are ignored because they only list.
-        """
-        materials = PLUGINS["bsdf"].split()
-        users = [node for node in self.nodes[1:] if node.props.plugin_name() not in materials]
-        used = (other for node in users for other in self.below(node, materials))
-        for node in chain(users, used):
-            for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
-                if self.plugin(node, name) in plugins:
-                    yield node, name
-
-    def below(self, node: mi.parser.SceneNode, plugins: Sequence[str]) -> Iterator[mi.parser.SceneNode]:
-        for other in (self.nodes[index] for index in references(node.props)):
-            if other.props.plugin_name() in plugins:
-                yield other
-            yield from self.below(other, plugins)
-
-    def child(self, node: mi.parser.SceneNode, name: str) -> mi.parser.SceneNode | None:
-        if name not in node.props or node.props.type(name) != mi.Properties.Type.ResolvedReference:
-            return None
-        return self.nodes[node.props[name].index()]
-
-    def plugin(self, node: mi.parser.SceneNode, name: str) -> str:
-        child = self.child(node, name)
-        return "" if child is None else str(child.props.plugin_name())
+            refusal = outline.tag(inner).refusal("bsdf", repr(plugin(inner)), rule)
+            factored, reference = factored or refusal, reference or refusal
+    # ---- Light that is lost over mirrors
+    mirror, lost = first(MIRRORS), list[str | None]()
+    for lights, estimator in ((("projector", *SMALL_LAMPS), "the reference"), (SMALL_LAMPS, "the factored estimator")):
+        light = next((node for node in nodes if plugin(node) in lights), None)
+        if mirror is None or light is None:
+            lost.append(None)
+            continue
+        place = outline.tag(mirror[0])
+        brought = (
+            f"that {place.path.name}:{place.line} ({plugin(mirror[2])}) brings to other surfaces, so that is missing"
+        )
+        remedy = "use a light that has a surface (area; mitsim_projector for the reference)"
+        rule = f"{estimator} finds no light of it {brought}; {remedy}"
+        lost.append(str(outline.tag(light).refusal("light", repr(plugin(light)), rule)))
+    groups = (node for node in nodes if plugin(node) == "shapegroup")
+    hidden = next((inner for node in groups for inner in below(node) if plugin(inner) in MIRRORS), None)
+    instances = None
+    if hidden is not None:
+        why = "inside of an instance glass is no pane and a mirror casts no glint"
+        rule = f"{why}: light that it brings from the projector is missing; place the shape itself"
+        instances = str(outline.tag(hidden).refusal("bsdf", repr(plugin(hidden)), rule))
+    return Unfit(factored, reference, *lost, instances)

@@ -16,14 +16,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.core.prepare import fit_square, read_reflectance
 from mitsim.scene import tree
 from mitsim.scene.check import PICTURE, CheckedScene, check_file, looking_beside
 from mitsim.scene.headers import check_obj, check_ply
-from mitsim.scene.limits import Range, Unfit
+from mitsim.scene.limits import PLUGINS, SMALL_LAMPS, Range, Unfit
 from mitsim.scene.outline import Tag
 from mitsim.scene.window import ProjectorGrid, locate_projector
 
@@ -34,6 +33,9 @@ SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
 _FLAT, _TURNED = ("Rectangle", "Disk"), 1e-6
 """Flat shapes, and the difference between parallel normals in single precision."""
+_SMOOTH_BY_CLASS = ("Instance", "SDFGrid")
+_PARALLEL = 0.9999
+"""Cosine between normals of a face and of its vertices that counts as flat."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,6 @@ class LoadedScene:
         Lamps that no path can hit, with their tags.
     coloured, parting
         Tags of objects that may depend on wavelength, and of dispersive glass.
-    notes
-        Changes to the scene that render it correctly.
     one_way
         True if no surface sees another.
     sensor_note
@@ -77,7 +77,6 @@ class LoadedScene:
     coloured: tuple[Tag, ...]
     parting: tuple[Tag, ...] = ()
     samples: int | None = None
-    notes: tuple[str, ...] = ()
     one_way: bool = False
     sensor_note: str | None = None
     own: Mapping[str, str] = field(default_factory=dict)
@@ -98,7 +97,21 @@ class LoadedScene:
 
     @cached_property
     def smoothed(self) -> bool:
-        return any(_is_smoothed(shape) for shape in self.scene.shapes())
+        """Return True if a shape has normals that are not its faces' own, or may hide such a shape."""
+        for shape in self.scene.shapes():
+            if not shape.is_mesh() or not shape.has_vertex_normals():
+                if shape.class_name() in _SMOOTH_BY_CLASS:
+                    return True
+                continue
+            # Rectangles and cubes are meshes without the parameters of one.
+            held = shape.faces_buffer(), shape.vertex_positions_buffer(), shape.vertex_normals_buffer()
+            faces, positions, normals = (np.array(each).reshape(-1, 3) for each in held)
+            corners = positions[faces].astype(np.float64)
+            own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            cosines = np.abs((normals[faces] * own[:, None]).sum(axis=2))
+            if (cosines < _PARALLEL * np.linalg.norm(own, axis=1)[:, None]).any():
+                return True
+        return False
 
 
 @keep_scenes()
@@ -122,22 +135,20 @@ def load_scene(
     checked.config.variant = mi.variant()
     sensor_note = None if sensor is None else tree.fit_film(checked, sensor)
     with with_own_files(checked), looking_beside(checked.outline):
-        moved = tree.move_to_camera(checked.outline, checked.state)
-        notes = tree.emit_by_faces(checked)  # before thin shapes are meshes, too
-        with tree.with_thin_shapes_as_meshes(checked.outline, checked.state):
-            tree.put_wrappers(checked.state)
-            scene = mi.parser.instantiate(checked.config, checked.state)
+        tree.move_to_camera(checked.outline, checked.state)
+        tree.check_thin_shapes(checked.outline, checked.state.nodes)
+        tree.put_wrappers(checked.state)
+        scene = mi.parser.instantiate(checked.config, checked.state)
     for mesh, materials in checked.unread.items():
         if materials:
             warnings.warn(f"mesh {mesh}: its materials ({materials}) are not read; it has the scene's", stacklevel=2)
-    tree.check_meshes(moved, scene)
-    _add_up_normals(scene, checked.without_normals)
+    _add_up_normals(scene, {name for name, given in checked.normals.items() if given == {False}})
     # Texels are checked after normals were added up, because Mitsuba's own normals once had a NaN.
     check_texels(path, scene, checked.limits)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
-    emitters, shapes, unfit = list(scene.emitters()), scene.shapes(), checked.unfit
+    emitters, shapes = list(scene.emitters()), scene.shapes()
     projectors = [emitter for emitter in emitters if emitter.class_name() == "Projector"]
     for projector in projectors:
         scale = float(np.array(mi.traverse(projector)["scale"]).ravel()[0])
@@ -152,54 +163,45 @@ def load_scene(
         except MitsimError:
             if needs_projector:
                 raise
+    # Groups are in the scene only by their instances.
+    tags = checked.tags_of(set(PLUGINS["shape"].split()) - {"shapegroup"})
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
-    mirrors, glossy = _mirrors_and_gloss(scene, unfit)
+    flags = [shape.bsdf().flags() for shape in shapes if shape.bsdf()]
+    polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+    hidden = any(shape.class_name() == "Instance" for shape in shapes)
     flat = all(shape.class_name() in _FLAT and shape.bsdf() for shape in shapes)
-    one_sided = flat and not any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.BackSide) for shape in shapes)
+    one_sided = flat and not any(mi.has_flag(own, mi.BSDFFlags.BackSide) for own in flags)
     normals = [np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n).ravel() for shape in shapes if one_sided]
-    devices = cameras[0], projectors[0] if grid else None, grid
-    lamps = tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector")
-    tags = checked.shapes if len(checked.shapes) == len(shapes) else ()
-    small_lamps = tuple(zip(small, checked.small_lamps, strict=True))
-    facts: dict[str, Any] = {name: getattr(checked, name) for name in ("coloured", "parting", "samples", "own")}
-    facts |= {"one_way": bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED, "notes": notes}
-    facts |= {"mirrors": mirrors, "glossy": glossy, "unfit": unfit, "shapes": tags, "small_lamps": small_lamps}
-    return LoadedScene(path, checked.files, scene, *devices, lamps, sensor_note=sensor_note, **facts)
+    return LoadedScene(
+        path,
+        checked.files,
+        scene,
+        cameras[0],
+        projectors[0] if grid else None,
+        grid,
+        lamps=tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector"),
+        mirrors=any(own & polished for own in flags) or checked.unfit.instances is not None,
+        glossy=hidden or any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags),
+        unfit=checked.unfit,
+        shapes=tuple(tags) if len(tags) == len(shapes) else (),
+        small_lamps=tuple(zip(small, checked.tags_of(SMALL_LAMPS), strict=True)),
+        coloured=tuple(checked.coloured),
+        parting=tuple(checked.parting),
+        samples=checked.samples,
+        one_way=bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED,
+        sensor_note=sensor_note,
+        own=checked.own,
+    )
 
 
 def _one_projector(path: Path, found: Sequence[mi.Emitter]) -> MitsimError:
     return MitsimError(f"{path}: needs one emitter of type projector, the file has {len(found) or 'none'}")
 
 
-def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
-    flags = [shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf()]
-    mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
-    mirrors = any(own & mirror for own in flags) or unfit.instances is not None
-    hidden = any(shape.class_name() == "Instance" for shape in scene.shapes())
-    return mirrors, hidden or any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags)
-
-
 def holds_hair(flags: Any) -> Any:
     """Return True for ``flags`` of a material that is, or holds, hair."""
     both = int(mi.BSDFFlags.NonSymmetric) | int(mi.BSDFFlags.Null)
     return (flags & both) == both
-
-
-_SMOOTH_BY_CLASS = ("Instance", "SDFGrid")
-_PARALLEL = 0.9999
-"""Cosine between normals of a face and of its vertices that counts as flat."""
-
-
-def _is_smoothed(shape: mi.Shape) -> bool:
-    if not shape.is_mesh() or not shape.has_vertex_normals():
-        return shape.class_name() in _SMOOTH_BY_CLASS
-    # Rectangles and cubes are meshes without the parameters of one.
-    held = shape.faces_buffer(), shape.vertex_positions_buffer(), shape.vertex_normals_buffer()
-    faces, positions, normals = (np.array(each).reshape(-1, 3) for each in held)
-    corners = positions[faces].astype(np.float64)
-    own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    cosines = np.abs((normals[faces] * own[:, None]).sum(axis=2))
-    return bool((cosines < _PARALLEL * np.linalg.norm(own, axis=1)[:, None]).any())
 
 
 # -------- Values of a loaded scene's bitmaps and meshes
@@ -214,39 +216,35 @@ _WHOLE = 2.0**40
 """Whole number for a normal of length 1: a vertex may have a million faces."""
 
 
-def _add_up_normals(scene: mi.Scene, without_normals: frozenset[str]) -> None:
-    """Compute vertex normals of meshes without normals such that every load gives the same bits.
+def _add_up_normals(scene: mi.Scene, without_normals: set[str]) -> None:
+    """Compute vertex normals of mesh files without normals such that every load gives the same bits.
 
-    Mitsuba adds them up in 32 bits in the order of its threads.
+    Mitsuba adds them up in 32 bits in the order of its threads. Here whole numbers are summed, because their order does
+    not matter, with the angles of the faces as weights (Thuermer and Wuethrich 1998, as in Mitsuba). A zero sum gives
+    Mitsuba's default normal.
     """
     parameters = mi.traverse(scene)
     for key in parameters.keys():  # noqa: SIM118 - SceneParameters is no dict
-        if key.rpartition(".")[2] == "vertex_normals":
-            mesh = parameters.properties[key][2]
-            files = re.search(r'name = "([^"]*)"', str(mesh))
-            if files and mesh.has_vertex_normals() and without_normals.issuperset(files[1].split(" + ")):
-                parameters[key] = dr.ravel(_vertex_normals(mesh))
+        if key.rpartition(".")[2] != "vertex_normals":
+            continue
+        mesh = parameters.properties[key][2]
+        files = re.search(r'name = "([^"]*)"', str(mesh))
+        if not (files and mesh.has_vertex_normals() and without_normals.issuperset(files[1].split(" + "))):
+            continue
+        corners = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
+        points = [mesh.vertex_position(corner) for corner in corners]
+        across = dr.normalize(dr.cross(points[1] - points[0], points[2] - points[0]))
+        sums = [dr.zeros(mi.Int64, mesh.vertex_count()) for _ in range(3)]
+        for i, (corner, here) in enumerate(zip(corners, points, strict=True)):
+            after, before = points[(i + 1) % 3], points[(i + 2) % 3]
+            angle = dr.unit_angle(dr.normalize(after - here), dr.normalize(before - here))
+            weighted = across * angle * _WHOLE
+            for total, value in zip(sums, weighted, strict=True):
+                dr.scatter_reduce(dr.ReduceOp.Add, total, mi.Int64(dr.round(value)), corner, dr.isfinite(value))
+        added = mi.Vector3f(*map(mi.Float, sums))
+        normals = dr.select(dr.squared_norm(added) > 0, mi.Normal3f(dr.normalize(added)), mi.Normal3f(1, 0, 0))
+        parameters[key] = dr.ravel(normals)
     parameters.update()
-
-
-def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
-    """Return vertex normals weighted by the angles of the faces (Thuermer and Wuethrich 1998, as in Mitsuba).
-
-    Whole numbers are summed because their order does not matter. A zero sum gives Mitsuba's default normal.
-    """
-    corners = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
-    points = [mesh.vertex_position(corner) for corner in corners]
-    across = dr.normalize(dr.cross(points[1] - points[0], points[2] - points[0]))
-    sums = [dr.zeros(mi.Int64, mesh.vertex_count()) for _ in range(3)]
-    for corner, here, after, before in zip(
-        corners, points, points[1:] + points[:1], points[2:] + points[:2], strict=True
-    ):
-        angle = dr.unit_angle(dr.normalize(after - here), dr.normalize(before - here))
-        weighted = across * angle * _WHOLE
-        for total, value in zip(sums, weighted, strict=True):
-            dr.scatter_reduce(dr.ReduceOp.Add, total, mi.Int64(dr.round(value)), corner, dr.isfinite(value))
-    added = mi.Vector3f(*map(mi.Float, sums))
-    return dr.select(dr.squared_norm(added) > 0, mi.Normal3f(dr.normalize(added)), mi.Normal3f(1, 0, 0))
 
 
 def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> None:
@@ -306,7 +304,7 @@ def with_own_files(checked: CheckedScene) -> Iterator[None]:
             if name not in checked.own:
                 continue
             if checked.own[name] != PICTURE:
-                checked.unread[name] = _stand(node.props, Path(name))
+                checked.unread[name] = _place_object(node.props, Path(name))
                 continue
             square = fit_square(read_reflectance(Path(name)))
             codes = np.rint(255 * square)
@@ -323,26 +321,30 @@ def with_own_files(checked: CheckedScene) -> Iterator[None]:
         yield
 
 
-def _stand(props: mi.Properties, path: Path) -> str:
+def _place_object(props: mi.Properties, path: Path) -> str:
+    """Put a user's mesh into a shape; return the name of the materials that are not read."""
     kinds = {".ply": check_ply, ".obj": check_obj}
     kind = path.suffix.lower()
     if kind not in kinds:
         raise MitsimError(f"object {path}: ends in {kind or 'nothing'}; read are .ply (triangles) and .obj")
     try:
         smooth, unread = kinds[kind](path)
-        mesh = mi.load_dict({"type": kind[1:], "filename": str(path)})
+        data = mi.traverse(mi.load_dict({"type": kind[1:], "filename": str(path)}))
     except (ValueError, RuntimeError, OSError) as error:
         said = str(error).strip().splitlines()[-1]
         raise MitsimError(f"object {path}: the file {said}") from None
     props.set_plugin_name(kind[1:])
     props["filename"] = str(path)
     props["face_normals"] = not smooth  # Mitsuba would smooth the edges of a mesh that states no normals
-    _, sides = tree.tilts(props)
-    behind = int((sides < 0).sum())
-    if behind > _BEHIND * sides.size:
-        problem = f"object {path}: the normals of {behind} of {sides.size} corners face against the way that their"
-        raise MitsimError(f"{problem} faces are wound; recompute normals outwards, or export without")
-    corners = np.array(mi.traverse(mesh)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    faces = np.array(data["faces"]).reshape(-1, 3)
+    corners = np.array(data["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    if smooth:
+        normals = np.array(data["vertex_normals"], dtype=np.float64).reshape(-1, 3)[faces]
+        a, b, c = (corners[faces[:, i]] for i in range(3))
+        against = (normals * np.cross(b - a, c - a)[:, None]).sum(axis=2) < 0
+        if against.mean() > _BEHIND:
+            got = f"the normals of {against.sum()} of {against.size} corners face against the way that their faces are"
+            raise MitsimError(f"object {path}: {got} wound; recompute normals outwards, or export without")
     low, high = corners.min(axis=0), corners.max(axis=0)
     longest = float((high - low).max())
     if longest <= 0:
@@ -354,130 +356,19 @@ def _stand(props: mi.Properties, path: Path) -> str:
     return unread
 
 
-# -------- Why a scene is dark
-#
-# Explanation of a dark scene: the reason why light of the projector does not reach the camera.
-#
-# A few hundred rays go from the projector through its window, or through the part of it that contains the scene, and
-# from the points that they hit to the sensor's centre. Holes, filters and glass let them pass.
-
-_RAYS = 24
-"""Rays per side: they hit anything larger than a 24th of the window."""
-_FAR = 3.0
-"""Multiple of the aligned plane's distance beyond which a scene counts as too far."""
-_SMALL = 1e-2
-_MOST_SHAPES = 64
-_MOST_PASSED = 16
-
-
 def why_dark(loaded: LoadedScene) -> str:
-    geometry, grid = loaded.camera.geometry, loaded.pixels
-    to_world = loaded.camera.world_transform()
-    projector_to_world = mi.traverse(loaded.projector)["to_world"]
-    start = projector_to_world @ mi.Point3f(0)
-    window = grid.row_tan, grid.column_tan
-    boxes = [loaded.scene.bbox(), *(shape.bbox() for shape in loaded.scene.shapes()[:_MOST_SHAPES])]
-    parts = [_part_with(box, loaded, to_world.inverse() @ start) for box in boxes]
-    for part in (window, *filter(None, parts)):
-        rows, columns = (low + (high - low) * (np.arange(_RAYS) + 0.5) / _RAYS for low, high in part)
-        y, x = (-geometry.scene_distance * edges.ravel() for edges in np.meshgrid(rows, columns, indexing="ij"))
-        plane = to_world @ mi.Point3f(x, y, geometry.scene_distance)
-        if not _is_any((projector_to_world.inverse() @ plane).z > 0):
-            return "the projector looks away from the scene, whose aligned plane lies behind it; turn the projector"
-        towards = dr.normalize(plane - start)
-        si = _meet_opaque(loaded.scene, mi.Ray3f(start, towards), None)
-        met = np.array(si.is_valid()).ravel()
-        if met.any():
-            break
-        if _is_any(loaded.scene.ray_test(mi.Ray3f(start, towards))):
-            return "all that the projector's rays meet lets light pass; put something opaque behind it"
-    else:
-        return _where_scene_lies(loaded, to_world, any(parts[1:]))
-    back = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
-    centre = to_world @ mi.Point3f(0)
-    lit = si.is_valid() & (back | (si.wi.z > 0))
-    facing = lit & (back | (dr.dot(si.n, centre - si.p) * dr.sign(dr.dot(si.n, start - si.p)) > 0))
-    if not _is_any(lit) or not _is_any(facing):
-        which = "camera" if _is_any(lit) else "projector"
-        met_by = f"{met.sum()} of {met.size} rays of the projector meet a surface, and it turns its back to the {which}"
-        remedy = "flip its normals or put its material in <bsdf type='twosided'>"
-        return f"{met_by}: a mesh wound the wrong way; {remedy}"
-    seen = np.array(to_world.inverse() @ si.p).reshape(3, -1)[:, np.array(facing).ravel()]
-    slope = np.abs(seen[:2] / seen[2]).max(axis=0)
-    if seen[2].max() <= geometry.mask_distance:
-        return f"what is lit lies at z = {seen[2].max():.4g} mm, not in front of the mask; move the scene along +z"
-    if slope.min() > geometry.tan_half_fov:
-        off = f"{np.degrees(np.arctan(slope.min())):.3g} degrees off the axis or more, and the stop (fov) lets"
-        remedy = f"{geometry.fov / 2:g} degrees pass; turn the camera or widen fov"
-        return f"what is lit lies outside the field stop: {off} {remedy}"
-    if not _is_any(facing & ~_meet_opaque(loaded.scene, si.spawn_ray_to(centre), centre).is_valid()):
-        return "something hides from the camera what is lit; move it out of the way"
-    if part is not window:
-        extents = [(own[1] - own[0]) / (whole[1] - whole[0]) for own, whole in zip(part, window, strict=True)]
-        spans = f"{min(extents):.1e} of the window only, {min(extents) * grid.n:.1e} projector pixels"
-        remedy = "give the projector a narrower fov, or a larger target"
-        return f"what is lit spans {spans}: too few rays meet it; {remedy}"
-    return "what is lit lies edge-on, is hidden or reflects nothing; turn it, move it or check its material"
-
-
-def _part_with(box: mi.BoundingBox3f, loaded: LoadedScene, start: mi.Point3f) -> tuple[tuple[float, float], ...] | None:
-    distance = loaded.camera.geometry.scene_distance
-    if not box.valid():
-        return None
-    corners = _corners(box, loaded.camera.world_transform())
-    origin = np.array(start).reshape(3, 1)
-    ahead = corners[2] > origin[2]
-    if not ahead.all() or distance <= origin[2, 0] or corners[2].min() > _FAR * distance:
-        return None
-    on_plane = origin + (corners - origin) * (distance - origin[2]) / (corners[2] - origin[2])
-    grid, part = loaded.pixels, []
-    for (low, high), tangents in zip((grid.row_tan, grid.column_tan), -on_plane[[1, 0]] / distance, strict=True):
-        first, last = max(low, float(tangents.min())), min(high, float(tangents.max()))
-        if first > last:
-            return None
-        part.append((first, last))
-    return tuple(part)
-
-
-def _corners(box: mi.BoundingBox3f, to_world: mi.Transform4f) -> FloatArray:
-    corners = np.array([list(box.corner(i)) for i in range(8)]).T
-    return np.array(to_world.inverse() @ mi.Point3f(corners)).reshape(3, -1)
-
-
-def _meet_opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> mi.SurfaceInteraction3f:
-    si = scene.ray_intersect(ray)
-    for _ in range(_MOST_PASSED):
-        clear = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
-        passing = si.is_valid() & (clear | (dr.max(si.bsdf().eval_null_transmission(si)) > 0))
-        if not _is_any(passing):
-            break
-        onward = si.spawn_ray(ray.d) if target is None else si.spawn_ray_to(target)
-        si = dr.select(passing, scene.ray_intersect(onward, passing), si)
-    return si
-
-
-def _where_scene_lies(loaded: LoadedScene, to_world: mi.Transform4f, within: bool) -> str:
-    distance, box = loaded.camera.geometry.scene_distance, loaded.scene.bbox()
+    """Return where a scene lies that no light of the projector reaches, and the place that the projector lights."""
+    box, distance = loaded.scene.bbox(), loaded.camera.geometry.scene_distance
     if not box.valid():
         return "the scene has no surfaces; add a shape"
-    corners = _corners(box, to_world)
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    place = ", ".join(f"{axis} = {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
-    where = f"no ray of the projector's window meets the scene, which lies at {place} mm of the camera"
-    if np.abs([low, high]).max() < _SMALL * distance:
-        return f"{where}: this looks like metres, and 1 unit is 1 mm; scale it by 1000"
-    if low[2] > _FAR * distance:
-        return f"{where}: too far, for the bench is aligned to {distance:g} mm; move it nearer or set scene_distance"
-    if high[2] <= 0:
-        return f"{where}: behind the camera, which looks along +z; move the scene or turn the camera"
-    if within:
-        problem = f"{where}: within the window, but {_RAYS} x {_RAYS} rays at each of its shapes miss them"
-        return f"{problem}; give the projector a narrower fov, or a larger target"
-    rows, columns = loaded.pixels.row_tan, loaded.pixels.column_tan
-    x, y = (f"{-distance * edges[1]:.4g} to {-distance * edges[0]:.4g}" for edges in (columns, rows))
-    window = f"x = {x}, y = {y}"
-    return f"{where}: outside the window, {window} mm at {distance:g} mm; move the scene or turn the projector"
-
-
-def _is_any(mask: mi.Bool) -> bool:
-    return bool(np.array(mask).any())
+    corners = mi.Point3f(np.array([list(box.corner(i)) for i in range(8)]).T)
+    seen = np.array(loaded.camera.world_transform().inverse() @ corners).reshape(3, -1)
+    ends = zip("xyz", seen.min(axis=1), seen.max(axis=1), strict=True)
+    place = ", ".join(f"{axis} = {low:.4g} to {high:.4g}" for axis, low, high in ends)
+    x, y = (
+        f"{-distance * high:.4g} to {-distance * low:.4g}"
+        for low, high in (loaded.pixels.column_tan, loaded.pixels.row_tan)
+    )
+    lit = f"the camera looks along +z, and the projector lights x = {x}, y = {y} mm at z = {distance:g} mm"
+    remedy = "move the scene there (1 unit is 1 mm), its front to camera and projector (or twosided), nothing before it"
+    return f"the scene lies at {place} mm of the camera; {lit}; {remedy}"

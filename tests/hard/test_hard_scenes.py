@@ -64,7 +64,7 @@ def test_scenes_in_other_units(
     The same paths; float32 turns some of 16 384 at edges of the box: from 1e-4 to 1e3 less than 2e-3. A ray epsilon of
     9e-5 units is then 0.2 % of the scene. The check that refuses metres is switched off.
     """
-    monkeypatch.setattr("mitsim.scene.check._Tree.check", lambda _: None)
+    monkeypatch.setattr("mitsim.scene.check._check_node", lambda *_: None)
     judge = frame_at(small_scene, 1.0)
     for scale in (1e-4, 1e-3, 1e-2, 1e2, 1e3):
         frame = frame_at(small_scene, scale) * scale**2

@@ -189,7 +189,7 @@ def sheet(z: float, albedo: float | Texels = 0.7, half: float = 90.0) -> Rectang
     return Rectangle(vector(0, 0, z), vector(half, 0, 0), vector(0, half, 0), albedo)
 
 
-def wires(seed: int, count: int, radius: float, near: float, far: float, albedo: float = 1.0) -> list[Shape]:
+def rods(seed: int, count: int, radius: float, near: float, far: float, albedo: float = 1.0) -> list[Shape]:
     """Straight ones in all directions across the view, each as likely at every distance."""
     rng = np.random.default_rng(seed)
     found: list[Shape] = []
@@ -238,7 +238,7 @@ def drawn(seed: int) -> Judged:
             shapes.append(Sphere(place, radius, albedo))
         elif kind == 1:
             along = vector(*rng.normal(size=2), 0.3 * rng.normal()) * rng.uniform(10, 40)
-            shapes.append(Cylinder(place - along, place + along, min(radius, 6.0), albedo))
+            shapes.append(Cylinder(place - along, place + along, float(np.clip(radius, 1.5, 6.0)), albedo))
         elif kind == 2:
             cut = picture(int(rng.integers(1000)), 7, 0, 255)
             binary = Texels(tuple(tuple(255 * (value > 127) for value in row) for row in cut.values))
@@ -260,10 +260,8 @@ def _by_hand() -> dict[str, Judged]:
     glass = Slab(vector(0, 0, 398), vector(0, 0, 1), 4.0)
     print_ = picture(5, 30)
     return {
-        "wires of 0.15 mm": of(*wires(1, 25, 0.15, 90, 420), fine=24),
-        "wires, coded": of(*wires(2, 25, 0.15, 90, 420), camera=CODED, fine=24),
-        "hairs of 0.02 mm": of(sheet(440, 0.05), *wires(3, 25, 0.02, 200, 420), fine=40),
-        "wires before a wall": of(sheet(440, 0.1), *wires(4, 12, 0.1, 150, 420), k=6, fine=30),
+        "rods, coded": of(*rods(2, 25, 1.5, 90, 420), camera=CODED, fine=24),
+        "rods before a wall": of(sheet(440, 0.1), *rods(4, 12, 1.5, 150, 420), k=6, fine=30),
         "balls of 0.05 mm at 1 m": of(sheet(1060, 0.1, 400), *balls(5, 20, 0.05, 950, 1050), fine=40),
         "mirror balls of 0.4 mm": of(sheet(460, 0.03, 110), *balls(6, 30, 0.4, 360, 400, mirror=0.85)),
         "print 0.03 mm behind glass": of(sheet(400.03, print_, 85), pane=glass),
@@ -278,7 +276,7 @@ def _by_hand() -> dict[str, Judged]:
         "devices 300 m away": of(
             sheet(440, print_), Sphere(vector(15, 5, 375), 20.0, 0.6), camera=CODED, fine=16, moved=(3e5, -3e5, 3e5)
         ),
-        "wires 1 km away": of(*wires(7, 25, 0.15, 90, 420), fine=24, moved=(-1e6, 2e5, 1e6)),
+        "rods 1 km away": of(*rods(7, 25, 1.5, 90, 420), fine=24, moved=(-1e6, 2e5, 1e6)),
     }  # fmt: skip
 
 

@@ -19,26 +19,23 @@ from tests.physics.judged_scenes import OPEN, opened, scenes, verdict
 pytestmark = pytest.mark.usefixtures("variant")
 SEEDS, SIGMAS, MIDDLE = 4, 8.6, (63.5, 63.5)
 """Groups, the gate of their standard errors that stands for three of the normal distribution, the centre as a pixel."""
-DIRECT = {"wires of 0.15 mm": (16, 0.04), "print 0.005 mm behind glass": (4, 0.01)}
-"""Samples of a projector pixel in a group, and how far the gate may be open. (Seen failing: 7 % less light of the wires
-as Mitsuba's own cylinders, none of the print by Mitsuba's offsets.)"""
 
 
-@pytest.mark.parametrize("name", DIRECT)
-def test_direct_light(tmp_path: Path, name: str) -> None:
-    judged, (samples, most) = scenes()[name], DIRECT[name]
+def test_direct_light(tmp_path: Path) -> None:
+    """Of a print that almost touches glass. (Seen failing: none of the print by Mitsuba's offsets.)"""
+    judged = scenes()["print 0.005 mm behind glass"]
     bench = opened(judged, tmp_path, open_bench)
     tracer = DirectTracer(bench.setup, 1)
-    light = [tracer.trace(seed, 0, samples).value.sum() / samples for seed in range(SEEDS)]
+    light = [tracer.trace(seed, 0, 4).value.sum() / 4 for seed in range(SEEDS)]
     found, error = float(np.mean(light)), float(np.std(light, ddof=1) / SEEDS**0.5)
     right = judge.direct(replace(judged.scene, camera=OPEN), MIDDLE, fine=8)
     gate = SIGMAS * error + 2e-3 * right
-    assert gate < most * right
+    assert gate < 0.01 * right
     assert abs(found - right) < gate, f"{found / right - 1:+.2%}, gate {gate / right:.2%}"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["print 0.03 mm behind glass", "wires, coded", "drawn 3"])
+@pytest.mark.parametrize("name", ["print 0.03 mm behind glass", "rods, coded", "drawn 3"])
 def test_frames(tmp_path: Path, name: str) -> None:
     judged = scenes()[name]
     found = verdict(judged, opened(judged, tmp_path, open_bench))
