@@ -118,11 +118,17 @@ def test_shapes_are_known_by_their_lines(small_scene: Write) -> None:
         ('<bsdf type="plastic"/>', True),  # its coating reflects in a single direction
         ('<bsdf type="roughconductor"><float name="alpha" value="0.05"/></bsdf>', False),
         ('<bsdf type="diffuse"/>', False),
+        ('<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf>', False),
+        ('<bsdf type="thindielectric"/>', True),
+        (
+            '<bsdf type="blendbsdf"><float name="weight" value="0.3"/><bsdf type="diffuse"/><bsdf type="conductor"/></bsdf>',
+            True,
+        ),
     ],
 )
 def test_mirrors_are_seen(small_scene: Write, bsdf: str, mirrors: bool) -> None:
-    loaded = load_scene(small_scene(extra=f'<shape type="sphere"><float name="radius" value="5"/>{bsdf}</shape>'))
-    assert loaded.mirrors == mirrors
+    sphere = f'<shape type="sphere"><float name="radius" value="5"/>{bsdf}</shape>'
+    assert load_scene(small_scene(extra=sphere, integrator="volpath")).mirrors == mirrors
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,6 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import specular_frames
-from mitsim.scene.limits import Unfit
-from mitsim.scene.load import _mirrors_and_gloss
 from mitsim.transport.connect import shines_in
 from mitsim.transport.projector import PinholeRays, ProjectorOptics
 from mitsim.transport.specular import trace_specular_chains
@@ -100,21 +98,6 @@ def test_power_is_the_irradiance_that_mitsuba_renders(variant: str) -> None:
     sampler.seed(0, N * N)
     radiance = np.array(integrator.sample(scene, sampler, ray)[0]).ravel()
     assert radiance * np.pi / 0.5 * 400**2 == pytest.approx(rays.power[:, 0], rel=1e-5)
-
-
-def test_what_counts_as_a_mirror(variant: str) -> None:
-    assert not _mirrors_and_gloss(scene_with(), Unfit())[0]
-    for bsdf, answer in (
-        ({"type": "diffuse"}, False),
-        ({"type": "roughconductor", "alpha": 0.05}, False),
-        ({"type": "mask", "opacity": 0.5, "bsdf": {"type": "diffuse"}}, False),
-        (CONDUCTOR, True),
-        ({"type": "twosided", "bsdf": CONDUCTOR}, True),
-        ({"type": "plastic"}, True),
-        ({"type": "thindielectric"}, True),
-        ({"type": "blendbsdf", "weight": 0.3, "a": {"type": "diffuse"}, "b": CONDUCTOR}, True),
-    ):
-        assert _mirrors_and_gloss(scene_with(sheet=plane(0, 400, bsdf)), Unfit())[0] is answer, bsdf
 
 
 def test_no_mirror_no_beams_and_a_depth_of_at_least_one(variant: str) -> None:
