@@ -121,7 +121,8 @@ def test_shapes_are_known_by_their_lines(small_scene: Write) -> None:
         ('<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf>', False),
         ('<bsdf type="thindielectric"/>', True),
         (
-            '<bsdf type="blendbsdf"><float name="weight" value="0.3"/><bsdf type="diffuse"/><bsdf type="conductor"/></bsdf>',
+            '<bsdf type="blendbsdf"><float name="weight" value="0.3"/><bsdf type="diffuse"/>'
+            '<bsdf type="conductor"/></bsdf>',
             True,
         ),
     ],
