@@ -148,7 +148,7 @@ def check_ply(path: Path) -> tuple[bool, str]:
         raise ValueError(f"has faces with vertices {low} to {high}, but {count} vertices; mend the mesh")
     texture = re.search(rb"\ncomment TextureFile ([^\r\n]*)", found[0])
     named = texture[1].decode("utf-8", "replace").strip() if texture else ""
-    return {"nx", "ny", "nz"} <= {*vertex.dtype.names}, named
+    return {"nx", "ny", "nz"} <= dict(parts["vertex"][1]).keys(), named
 
 
 _Properties = list[tuple[str, str]]

@@ -265,4 +265,4 @@ def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
         why = "inside of an instance glass is no pane and a mirror casts no glint"
         rule = f"{why}: light that it brings from the projector is missing; place the shape itself"
         instances = str(outline.tag(hidden).refusal("bsdf", repr(plugin(hidden)), rule))
-    return Unfit(factored, reference, *lost, instances)
+    return Unfit(factored, reference, lost[0], lost[1], instances)
