@@ -529,7 +529,6 @@ def steps(good: Good) -> Make:
         export: dict[str, Any] = {"format": "hdf5", "run": "run", "output": "a.h5"}
         odd: dict[str, Any] = {
             "focus": chance.choice((1e-9, 1e300, "map", "auto", 10**400, "x", -1)),
-            "margin": chance.choice((1, 999, -1, 10**30)),
             "method": chance.choice(("tv", "markov", "none", "a.pt", "")),
             "bounds": chance.choice(([1, 0], [0, 1], [float("nan"), 1], [float("-inf"), 1e300], [1])),
             "lambda": chance.choice((0, -1, 1e200, float("inf"), 10**400, "auto", "x")),

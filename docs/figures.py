@@ -76,7 +76,6 @@ STATED = (
     Stated(PHYSICS, "lit at once and {} with a beam of", "closed.speckle_white_beam", ".4f"),
     Stated(IMAGES_PAGE, "| cookie_bag (`dots:7x16`) | {} dB |", "pictures.each_depth_psnr_db", ".1f"),
     Stated(IMAGES_PAGE, "| {} dB | 27.2 dB | 0.3 mm |", "pictures.one_depth_psnr_db", ".1f"),
-    Stated(IMAGES_PAGE, "0.3/128)$, {} cells of the shipped", "closed.margin_cells", ".0f"),
     Stated(IMAGES_PAGE, "pixels in tan-angle. {} pixels from 363", "closed.parallax_cookie_bag", ".1f"),
 )
 """Every place whose figure is another place's, or follows from a closed form."""
@@ -159,9 +158,6 @@ def closed() -> dict[str, float]:
         "diffraction_640_nm": sided(640.0),
         "speckle_white": contrast(white),
         "speckle_white_beam": contrast(white, beam_radius_mm=0.5),
-        "margin_cells": math.floor(
-            (math.tan(math.radians(camera.fov / 2)) - window / 2 / camera.scene_distance) / pitch
-        ),
         "parallax_cookie_bag": 60.0 * (1 / 363 - 1 / 451) / pitch,
     }
 

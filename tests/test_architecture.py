@@ -351,7 +351,6 @@ WITHOUT_NUMPY = (
     "reconstruct made/run --calibration made/cal -o r --method wiener",
     "reconstruct made/run --calibration made/cal -o r --focus map --method tv",
     "reconstruct made/run --calibration made/cal -o r --focus 400",
-    "reconstruct made/run --calibration made/cal -o r --margin 2",
     "reconstruct made/run --calibration made/cal -o full",
     "reconstruct made/run --calibration made/cal -o none/r",
     "reconstruct made/run --calibration made/cal -o r --method none.pt",

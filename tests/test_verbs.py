@@ -242,7 +242,7 @@ def test_numpy_scalars_are_numbers(results: dict[str, Any]) -> None:
     assert np.array_equal(
         frame.digital, ms.sense(np.full((3, 3), 1e-3), "imx249", float(np.float32(0.01)), seed=2).digital
     )
-    assert ms.reconstruct(results["shots"], results["factors"], lam=np.float64(1.0), margin=np.int8(0)).lam == 1.0
+    assert ms.reconstruct(results["shots"], results["factors"], lam=np.float64(1.0)).lam == 1.0
     asked = Request.of(seed=np.int64(3), accuracy=np.float32(0.25))
     assert (asked.seed, asked.accuracy) == (3, 0.25) and type(asked.seed) is int
 

@@ -131,7 +131,7 @@ def reconstruct(asked: Reconstructing) -> int:
     if calibration is not None:
         for name, part in lines.check_calibration(calibration).parts.items():
             manifest = read_manifest(part, CalibrationManifest)
-            if asked.focus is not None or asked.margin:
+            if asked.focus is not None:
                 check_parallax(manifest.parallax, str(calibration / name))
     if asked.chart is not None:
         from mitsim.devices.framelist import load_chart

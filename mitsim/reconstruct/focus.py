@@ -1,6 +1,6 @@
-"""Factors of another depth or of a wider window, and light that no projector pixel sends.
+"""Factors of another depth.
 
-*Depth.* A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate s = u (1 - d/z) + d
+A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate s = u (1 - d/z) + d
 tau, and projector pixel i lights it at tau = A_i + B_i / z, B_i being the baseline. So the factor of depth z is the
 calibrated one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_i - u)(1/z - 1/z_0) at the
 board. Beyond the window, sensor pixels further on saw the same part of the mask in a column within, at u + v and tau -
@@ -8,23 +8,6 @@ v (1/d - 1/z_0) for any v. Rows at the sensor's edge without such a column are l
 
 *Between columns.* Sensor row u + k sees in column i what row u sees at i + k s, s being the columns that one sensor
 pixel's step makes up for. So a cubic spline with knots finer than columns is fitted to neighbouring rows.
-
-*Margin.* A wall beside the window scatters light of directions that no projector pixel has. Cells beyond the window
-cast the shadow of the window's edge, moved along the sensor, and count as lit in every pattern, so that the model
-stays separable.
-
-*Global light* is the same in all frames under shifting dots (Nayar, Krishnan, Grossberg and Raskar 2006). With P_ij
-the patterns,
-
-    Y_ij = Phi_L (P_ij o X) Phi_R^T + F,        F = Phi_L H_L g H_R^T Phi_R^T
-
-X is direct, F global light, whose image H_L g H_R^T is linear between nodes as far apart as the dots. With Phi H = Q R
-on each side and A = (sum_i U_i)^T Q, the least squares of all K frames over X and F = Q_L f Q_R^T have
-
-    K f - A_L^T (A_L f A_R^T) A_R = Q_L^T (sum_ij Y_ij) Q_R - A_L^T W A_R
-
-An eigenvalue of the left side over K is the part of a mode of F that lit pixels do not explain: 0 under uniform light,
-near 1 where the dots' shadows leave gaps.
 """
 
 from __future__ import annotations
@@ -41,11 +24,9 @@ from scipy.linalg import solveh_banded
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
-from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import check_parallax
-from mitsim.reconstruct.solver import Prepared
 
 _NEIGHBOURS = 4
 _DEGREE = 4
@@ -61,16 +42,15 @@ class DerivedCapture(Capture):
     def __init__(
         self,
         whole: Capture,
-        patterns: tuple[FloatArray, FloatArray] | None = None,
         part: tuple[slice, slice] = (slice(None), slice(None)),
         sensor: tuple[int, int] | None = None,
     ) -> None:
         super().__init__(whole.manifest, whole.folder)
-        self.whole, self._patterns, self._part, self._sensor = whole, patterns, part, sensor
+        self.whole, self._part, self._sensor = whole, part, sensor
 
     @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
-        return self._patterns or self.whole.patterns
+        return self.whole.patterns
 
     @cached_property
     def ambient(self) -> Ambient | None:
@@ -94,7 +74,7 @@ class MovedFactors:
         return DerivedCapture(shots, part=(self.rows, self.columns), sensor=self.sensor)
 
 
-# ---- Factors moved to another depth, or widened ----------------------------------------------------------------------
+# ---- Factors moved to another depth ----------------------------------------------------------------------------------
 
 
 def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
@@ -124,39 +104,6 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
     moved = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
     seen = [float((side.hidden_part(shift) < _HIDDEN).mean()) for side in sides]
     return MovedFactors(moved, rows, columns, sensor, 1 - seen[0] * seen[1])
-
-
-def widen_factors(factors: Factors, cells: int) -> MovedFactors:
-    parallax, sides = parallax_of(factors), (factors.left, factors.right)
-    if cells > (most := min(factor.shape[1] for factor in sides)):
-        raise ArgumentError("margin", f"{cells}: give at most {most}, the projector's pixels a side")
-    widened = [FactorOfDepths(factor, parallax, axis).beyond(cells) for axis, factor in enumerate(sides)]
-    part = min((known.stop - known.start) / len(factor) for factor, (_, known) in zip(sides, widened, strict=True))
-    if part < LEAST_PART:
-        raise ArgumentError(
-            "margin", f"{cells}: {max(part, 0):.0%} of the sensor know the shadow of all these cells; give fewer"
-        )
-    (left, rows), (right, columns) = widened
-    update = {}
-    for axis, factor in zip(("row", "column"), sides, strict=True):
-        for name in (f"{axis}_tan", f"{axis}_mm"):
-            first, last = getattr(parallax, name)
-            more = (last - first) * cells / factor.shape[1]
-            update[name] = first - more, last + more
-    manifest = factors.manifest.model_copy(update={"parallax": parallax.model_copy(update=update)})
-    wider = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
-    return MovedFactors(wider, rows, columns, (len(sides[0]), len(sides[1])))
-
-
-def light_margin(shots: Capture, cells: int) -> Capture:
-    if any(shot.sign for shot in shots.manifest.patterns.captures):
-        raise MitsimError(
-            f"margin {cells}: {shots.name} shows patterns of -1, as differences of two frames, in which what is lit "
-            "always is not there; leave margin out"
-        )
-    pad = (cells, cells), (0, 0)
-    left, right = (np.pad(side.astype(np.float64), pad, constant_values=1.0) for side in shots.patterns)
-    return DerivedCapture(shots, patterns=(left, right))
 
 
 def parallax_of(factors: Factors) -> Parallax:
@@ -213,14 +160,6 @@ class FactorOfDepths:
         mean = passed.mean(axis=0)
         # The image stays light relative to the board's, as the sensor as a whole sees it.
         return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
-
-    def beyond(self, margin: int) -> tuple[FloatArray, slice]:
-        rows, count = self.factor.shape
-        column = np.arange(-margin, count + margin)
-        row, within, known = self._sources(np.broadcast_to(column, (rows, column.size)))
-        shadows = self._shadow.at(row, within) * self.brightness(column)
-        shadows[:, margin : margin + count] = self.factor
-        return shadows, _whole(known)
 
     def hidden_part(self, shift: float) -> FloatArray:
         return np.asarray(1 - self._transmission(self._source_columns(shift)).mean(axis=0))
@@ -349,57 +288,3 @@ class ColumnSpline:
         first = (1 + 3 * (square - t)) / 6 - last
         third = (1 + 3 * (t + square)) / 6 - 3 * last
         return start, (first, 1 - first - third - last, third, last)
-
-
-# ---- Global light, the same in all frames ----------------------------------------------------------------------------
-
-_LEAST_EIGENVALUE = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class Separation:
-    """Light ``common`` (m, m') of all frames, and the ``image`` (n, n') that it looks like under uniform light."""
-
-    common: FloatArray
-    image: FloatArray
-    eigenvalues: FloatArray
-
-
-@single_threaded_blas()
-def separate(
-    model: Prepared,
-    seen: tuple[FloatArray, FloatArray],
-    patterns: tuple[FloatArray, FloatArray],
-    weights: FloatArray,
-    total: FloatArray,
-) -> Separation:
-    """Return the global light of frames under shifting dots.
-
-    ``seen`` are the factors with columns beside the window. Raises MitsimError for uniform light, +-1 patterns or
-    centred factors, under which global light looks like an image.
-    """
-    if model.centre or any((side < 0).any() for side in patterns):
-        raise MitsimError("separation: takes dots before a mask that is not centred; use dots:K")
-    measured = (model.sigma > 0).astype(np.float64)
-    bases, lit, images = [], [], []
-    for factor, lights, side in zip(seen, patterns, (model.left, model.right), strict=True):
-        # Functions linear between nodes a period of the dots apart, the outer ones at the window's ends.
-        pixels, margin = factor.shape[1], (factor.shape[1] - len(lights)) // 2
-        count = max(2, 1 + -(-(pixels - 1) // lights.shape[1]))
-        place = np.arange(pixels) * (count - 1) / max(pixels - 1, 1)
-        hats = np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count)))
-        basis, triangle = np.linalg.qr(factor @ hats)
-        bases.append(basis)
-        lit.append(side.common.T @ basis)
-        images.append(hats[margin : margin + len(lights)] @ np.linalg.inv(triangle))
-    (rows, columns), frames = (each.shape[1] for each in lit), model.left.pattern_count * model.right.pattern_count
-    pairs = [(each[:, :, None] * each[:, None, :]).reshape(len(each), -1) for each in lit]
-    explained = (pairs[0].T @ measured @ pairs[1]).reshape(rows, rows, columns, columns).transpose(0, 2, 1, 3)
-    target = bases[0].T @ total @ bases[1] - lit[0].T @ (measured * weights) @ lit[1]
-    reported, modes = np.linalg.eigh(np.eye(target.size) - explained.reshape(target.size, target.size) / frames)
-    if reported[-1] < _LEAST_EIGENVALUE:
-        raise MitsimError("separation: these patterns light all pixels in each frame; use dots:K with K of 2 or more")
-    inverse = np.divide(1.0, frames * reported, out=np.zeros_like(reported), where=reported > _LEAST_EIGENVALUE)
-    found = (modes @ (inverse * (modes.T @ target.ravel()))).reshape(rows, columns)
-    part = float(np.prod([side.mean() for side in patterns]))
-    return Separation(bases[0] @ found @ bases[1].T, images[0] @ found @ images[1].T / part, reported)

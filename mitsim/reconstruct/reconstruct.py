@@ -21,7 +21,7 @@ from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising, print_energy
 from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import light_margin, move_factors, widen_factors
+from mitsim.reconstruct.focus import move_factors
 from mitsim.reconstruct.misfit import Cause, LeftOut, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.request import (
     IMAGE_FILE,
@@ -305,7 +305,7 @@ def reconstruct(
     ------
     MitsimError
         For a capture and factors that do not fit each other, a frame that cannot be read, too little memory, another
-        lambda, method, focus, margin or range, or a calibration without parallax where that is needed.
+        lambda, method, focus or range, or a calibration without parallax where that is needed.
     """
     return reconstruct_request(shots, factors, ImageRequest(lam=lam, method=method, **options))
 
@@ -353,12 +353,6 @@ def reconstruct_request(
             frames = misfit.picture.uncertainty(solution.image)
             uncertainties = replace(uncertainties, sources={**uncertainties.sources, "frames": frames})
     status, image = misfit.judge(solution.status) if misfit else solution.status, solution.image
-    if request.margin:
-        inside = slice(request.margin, -request.margin)
-        image = image[inside, inside]
-        uncertainties = uncertainties and replace(
-            uncertainties, sources={name: values[inside, inside] for name, values in uncertainties.sources.items()}
-        )
     doubts.append(uncertainties.loss(image) if uncertainties else "")
     inherited = (
         f"The {what} was flagged: {' '.join(warning.split()).rstrip('.')}."
@@ -389,9 +383,6 @@ def check_image(shots: Capture, factors: Factors, request: ImageRequest) -> tupl
         check_parallax(factors.manifest.parallax, factors.name)
     if isinstance(request.focus, (int, float)):
         move_factors(factors, float(request.focus))
-    if request.margin:
-        wider = widen_factors(factors, request.margin)
-        shots, factors = light_margin(wider.of(shots), request.margin), wider.factors
     check_factorising(shots, factors, solver)
     return shots, factors, solver
 

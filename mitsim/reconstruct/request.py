@@ -90,16 +90,13 @@ class ImageRequest(Options):
     iterations: int | None = option(
         None, "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given", min=1, metavar="N"
     )
-    margin: int = option(
-        0, "cells round the window that are solved for too: they take up light from outside it", min=0, metavar="K"
-    )
 
     def model_post_init(self, context: object) -> None:
         lam: Any = self.lam
         focus: Any = self.focus
         if not isinstance(self.method, str) and not hasattr(self.method, "name"):
             raise ArgumentError("method", f"{short_text(self.method)}: give a method's name or a solver")
-        method, margin = self.name, self.margin
+        method = self.name
         if isinstance(self.method, str) and method not in METHODS:
             raise ArgumentError(
                 "method",
@@ -127,10 +124,6 @@ class ImageRequest(Options):
                 raise ArgumentError(name, f"{value}: come with method {NONNEGATIVE} or {TV}; {method} has none")
         if focus == "map" and method != TIKHONOV:
             raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
-        if margin and (focus is not None or method != TIKHONOV):
-            raise ArgumentError(
-                "margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus"
-            )
 
     @property
     def iterative(self) -> dict[str, Any]:
@@ -152,10 +145,8 @@ class ImageRequest(Options):
     def check_point_spread(self, reduce: int) -> None:
         if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:
             raise ArgumentError("reduce", f"{reduce}: give a whole number, 1 to {MOST_REDUCED}")
-        for name, neutral in (("focus", None), ("margin", 0)):
-            value = getattr(self, name)
-            if value != neutral:
-                raise ArgumentError(name, f"{value}: comes with a calibration, not with a point spread function")
+        if self.focus is not None:
+            raise ArgumentError("focus", f"{self.focus}: comes with a calibration, not with a point spread function")
         if self.name not in (TIKHONOV, NONNEGATIVE, TV):
             raise ArgumentError(
                 "method",
@@ -172,13 +163,11 @@ class ImageRequest(Options):
         }
         asked |= {} if self.focus is None else {"focus": self.focus}
         asked |= {} if self.depth_range is None else {"depth_range": list(self.depth_range)}
-        asked |= self.plain
-        return {**asked, "margin": self.margin} if self.margin else asked
+        return {**asked, **self.plain}
 
 
 class ImageKeys(TypedDict, total=False):
     focus: float | Literal["auto", "map"] | None
-    margin: int
     depth_range: tuple[float, float] | None
     bounds: tuple[float, float] | None
     iterations: int | None
@@ -191,7 +180,7 @@ def plain_bounds(bounds: Bounds) -> list[float | None]:
 def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
     if parallax is None:
         raise MitsimError(
-            f"calibration {calibration}: does not state its parallax, which focus and margin need; calibrate again, or "
+            f"calibration {calibration}: does not state its parallax, which focus needs; calibrate again, or "
             "add it to the manifest"
         )
     return parallax

@@ -17,9 +17,8 @@ reflectance of the glossy scene, its mean over the sensor:
     saturation       = R(mean reading of Y_all) - R(Y_all)
     rest             = R(Y_even) - t and noise       error that a matt scene of the same brightness has as well
 
-where Y_even is the twin's light, with that of each projector pixel times t / L. *Global light*: dots separate direct
-from global light (Nayar, Krishnan, Grossberg and Raskar 2006), by :func:`mitsim.reconstruct.focus.separate`. A user's
-scene is measured for gloss if it has a parameter ``finish``, otherwise for global light.
+where Y_even is the twin's light, with that of each projector pixel times t / L. A user's scene needs a parameter
+``finish``.
 """
 
 from __future__ import annotations
@@ -32,19 +31,16 @@ from math import inf
 import numpy as np
 from matplotlib.figure import Figure
 from scipy import sparse
-from scipy.interpolate import RegularGridInterpolator
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.devices.patterns import PatternFamily, Shot
+from mitsim.devices.patterns import PatternFamily
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.reconstruct.focus import FactorOfDepths, parallax_of, separate
 from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import Accumulator
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
 from mitsim.report.lit_scene import DIM, LitScene, Unexposed, peak_time
 from mitsim.sensor.moments import frame_moments
@@ -339,125 +335,40 @@ def _measure_gloss(studio: Studio, point: Point) -> Found:
     return Found(tuple(rows), single_precision(images))
 
 
-# -------- Direct and global light
-
-SCENES = ("corner", "cookie_bag")
-GLOBAL_FAMILIES = ("dots:4", "dots:7", "dots:10")
-AS_IT_IS, MENDED = DEPTHS = ("as it is", "depth mended")
-_ALL, SEPARATED, ALONE, GLOBAL = IMAGES = ("all light", "separated", "direct alone", "global")
-_MARGIN = 2
-"""Periods of the dots beyond the window from which light comes."""
-
-
-def _measure_global(studio: Studio, point: Point) -> Found:
-    frames = studio.frames(point.setup, RENDERED, str(point["patterns"]), int(point["seed"]))
-    lit, family, model = frames.lit, frames.family, frames.prepare()
-    if not lit.light.simulation.physics.interreflection:
-        raise MitsimError(
-            f"study reflectivity: light over several surfaces is not worth following in {point['subject']}"
-        )
-    parallax = parallax_of(studio.factors(point.setup, int(point["seed"])))
-    margin = _MARGIN * max(family.left.shape[1], family.right.shape[1])
-    seen = [FactorOfDepths(factor, parallax, axis).beyond(margin)[0] for axis, factor in enumerate(frames.sides)]
-    patterns = family.left.astype(float), family.right.astype(float)
-    seconds = frames.seconds(EQUAL_PEAK)
-    exposer, (left, right) = frames.exposer(seconds), frames.sides
-
-    def measure(rates: list[FloatArray]) -> list[tuple[Shot, FloatArray]]:
-        return [
-            (shot, exposer.rate(exposer.digital(np.maximum(rate, 0.0) * seconds, *shot.names)))
-            for shot, rate in zip(family.shots, rates, strict=True)
-        ]
-
-    def accumulate(taken: list[tuple[Shot, FloatArray]], common: FloatArray | float = 0.0) -> Accumulator:
-        sums = model.accumulator()
-        for shot, frame in taken:
-            sums.add(frame - common, shot.row, shot.column)
-        return sums
-
-    electrons = frames.exposer(1.0).electrons
-    direct = [electrons(frame) for frame in LitScene(direct_of(lit.light)).expected_frames(RENDERED, family)]
-    bounced = [electrons(frame) - own for frame, own in zip(frames.expected, direct, strict=True)]
-    mended = [np.asarray(left @ (family.light(shot) * lit.truth) @ right.T) for shot in family.shots]
-    known = global_truth(lit.light)
-    rows, arrays = [], {"direct, true": lit.truth, "global, true": known}
-    for depth, own in zip(DEPTHS, (direct, mended), strict=True):
-        taken = measure([one + more for one, more in zip(own, bounced, strict=True)])
-        whole = accumulate(taken)
-        found = separate(model, (seen[0], seen[1]), patterns, whole.sum, np.sum([frame for _, frame in taken], axis=0))
-        solved = whole, accumulate(taken, found.common), accumulate(measure(own))
-        images = dict(zip(IMAGES, (*(model.solve(sums).image for sums in solved), found.image), strict=True))
-        levels = {f"{name}_db": psnr(image, known if name == GLOBAL else lit.truth) for name, image in images.items()}
-        gain = levels[f"{SEPARATED}_db"] - levels[f"{_ALL}_db"]
-        rows.append(point.row(depth=depth, gain_db=gain, told=float(found.eigenvalues[0]), **levels))
-        arrays |= {f"{depth} {name}": image for name, image in images.items()}
-    return Found(tuple(rows), single_precision(arrays))
-
-
-def global_truth(light: SampledLight) -> FloatArray:
-    bench, grid = light.bench, light.simulation.grids["indirect"].bundle
-    cells = np.asarray(sum(group["indirect"].sum(axis=0) for group in light.groups)) / len(light.groups)
-    shape = len(grid.rows.centres), len(grid.columns.centres)
-    density = cells.reshape(-1, *shape).sum(axis=0) / (grid.rows.width * grid.columns.width)
-    windows = [np.linspace(*edges, bench.n + 1) for edges in bench.windows]
-    rows, columns = ((edges[1:] + edges[:-1]) / 2 for edges in windows)
-    seen = RegularGridInterpolator(
-        (grid.rows.centres, grid.columns.centres), density, bounds_error=False, fill_value=None
-    )(np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1))
-    area = np.outer(*(np.diff(edges) for edges in windows))
-    return np.asarray(seen * area / light.apparent.board_flux.reshape(bench.n, bench.n))
-
-
-# -------- The study of both
-
-GLOSS, GLOBAL_LIGHT = ("gloss", "global light")
+# -------- The study
 
 
 def _reflectivity_points(scope: Scope) -> list[Point]:
     base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
     if scope.pictures == (None,):
-        glossy = 'name="finish"' in locate(base.scene, "scenes", "scene.xml").read_text(errors="replace")
-        gloss, bounced = ([(base.scene, base)], []) if glossy else ([], [base])
+        if 'name="finish"' not in locate(base.scene, "scenes", "scene.xml").read_text(errors="replace"):
+            raise MitsimError(f"study reflectivity: {base.scene} has no parameter finish, whose matt is the truth")
+        gloss = [(base.scene, base)]
     else:
         gloss = [(name, replace(base, scene=name)) for name in scope.choose(SHIPPED, (CARD, DISC))]
-        highlight, bounced = replace(base, scene="highlight"), [replace(base, scene=name) for name in SCENES]
+        highlight = replace(base, scene="highlight")
         gloss += [
             (name, highlight.with_parameters(roughness=each, **shape))
             for name, shape in scope.choose(tuple(SHAPES.items()), ())
             for each in ROUGHNESSES[name]
         ]
-        bounced = list(scope.choose(bounced, bounced[:1]))
-    seeds, families = scope.repeats, scope.choose(GLOBAL_FAMILIES, GLOBAL_FAMILIES[1:2])
-    found = [Point.of(setup, part=GLOSS, subject=name, seed=seed) for name, setup in gloss for seed in seeds]
-    for setup in bounced:
-        columns = {"part": (GLOBAL_LIGHT,), "subject": (setup.scene,), "seed": seeds, "patterns": families}
-        found += Point.grid([setup], "part subject patterns seed", **columns)
-    return found
-
-
-def _reflectivity_measure(studio: Studio, point: Point) -> Found:
-    return (_measure_gloss if point["part"] == GLOSS else _measure_global)(studio, point)
+    return [Point.of(setup, subject=name, seed=seed) for name, setup in gloss for seed in scope.repeats]
 
 
 _CAUSES = {cause: (cause, f"{{{cause}_db:.1f}} dB") for cause in ERROR_SOURCES}
-_LIGHT = {"direct, true": ("direct, true", "")}
-_LIGHT |= {f"{{depth}} {name}": (name, f"{{{name}_db:.1f}} dB") for name in IMAGES[:-1]}
-_LIGHT |= {"global, true": ("global, true", ""), f"{{depth}} {GLOBAL}": (GLOBAL, f"{{{GLOBAL}_db:.1f}} dB")}
-_DOTS_ALONE = {"part": GLOSS, "patterns": "dots:7"}
+_DOTS_ALONE = {"patterns": "dots:7"}
 _DRAWN = _DOTS_ALONE | {"exposure": EQUAL_PEAK}
-_SWEPT, _NOT_SWEPT = {"subject": tuple(SHAPES)}, {"part": GLOSS, "subject": lambda name: name not in SHAPES}
-_SEPARATED = {"part": GLOBAL_LIGHT, "patterns": "dots:7"}
+_SWEPT, _NOT_SWEPT = {"subject": tuple(SHAPES)}, {"subject": lambda name: name not in SHAPES}
 _LEVELS = {"psnr_matt_db": "image", **{f"{cause}_db": f"{cause} alone" for cause in ERROR_SOURCES}}
 _artefacts = partial(Level, column="artefacts_db", optional=True)
-_gain = partial(Level, column="gain_db", every="subject", at_least=0.0, optional=True)
 _by_subject = partial(Images, down=("subject",))
 
 REFLECTIVITY = Study(
     "reflectivity",
-    "Gloss and global light",
-    "What do shiny surfaces and light over several surfaces do to the image, and what do dots tell of it?",
+    "Gloss",
+    "What do shiny surfaces do to the image?",
     points=_reflectivity_points,
-    measure=_reflectivity_measure,
+    measure=_measure_gloss,
     claims=(
         *(
             _artefacts(
@@ -472,10 +383,6 @@ REFLECTIVITY = Study(
                 (BLADE, "The metal blade comes out well", "quite good", _PLAIN_DB, inf),
                 (DISC, "The compact disc is worst", "severe artefacts", -inf, _PLAIN_DB),
             )
-        ),
-        *(
-            _gain(f"49 dots separate global light in scenes {words} (Nayar et al. 2006)", where=_SEPARATED | depth)
-            for words, depth in (("as they are", {"depth": AS_IT_IS}), ("with depth mended", {"depth": MENDED}))
         ),
     ),
     panels=(
@@ -499,17 +406,12 @@ REFLECTIVITY = Study(
             before=dict(zip(_TRUTHS, _TRUTHS, strict=True)),
         ),
         _by_subject(_CAUSES, file="causes_shipped", title="Errors by cause, grey is none", where=_DRAWN | _NOT_SWEPT),
-        _by_subject(_LIGHT, title="49 dots", where=_SEPARATED, each="depth"),
     ),
     heads=("Paper", "", "Rendered"),
     note="Each scene with gloss has a twin of matt paint, the truth of errors; apparent is the mean of the glossy "
     "scene over the sensor, the truth of the images' decibels. As the matt scene: exposed as long as the twin, so that "
     "highlights saturate. Decibels of a cause are the PSNR that its errors alone would leave. Pixels: brightness that "
-    "is not the matt one; sensor: light of a projector pixel that changes over the sensor. Global light came over "
-    "several surfaces, direct light over one. Images, exposed at equal peak: all light taken for direct; what is left "
-    "once global light is separated (Nayar et al. 2006, without a lens); direct light alone, the best that separation "
-    "can reach; and global light. As it is: the solver does not know the depth; depth mended: direct light is that of "
-    "the calibration at any depth.",
+    "is not the matt one; sensor: light of a projector pixel that changes over the sensor.",
 )
 
 STUDIES = {each.name: each for each in (PATTERNS, EXPOSURE, AMBIENT, REFLECTIVITY)}

@@ -250,7 +250,6 @@ def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
     for step, words in (
         ({"reconstruct": [good, {**IMAGE, "output": "b"}]}, "checksum differs"),
         ({"reconstruct": [good, {**good, "output": "b", "focus": 1e-3}]}, "focus"),
-        ({"reconstruct": [good, {**good, "output": "b", "margin": 900}]}, "margin"),
         ({"reconstruct": [good], "export": [{"format": "hdf5", "run": "run", "output": "a.h5"}]}, "checksum differs"),
         ({"reconstruct": [good], "export": [{"format": "png", "run": "good", "output": "p", "projector": "no"}]}, "no"),
         ({"reconstruct": [good], "export": [{"format": "png", "run": "imported", "output": "p"}]}, "imported frames"),

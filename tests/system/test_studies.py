@@ -63,7 +63,6 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
         ),
         ("models", (), "use `mitsim calibrate SCENE --model wave`"),
         ("diffraction", (), "use `mitsim study calibration SCENE`"),
-        ("separation", (), "is no study of its own any more; use `mitsim study reflectivity`"),
         ("regularisation", (), "use `mitsim study sweep SCENE --over method=tikhonov,tv`"),
         ("sweep", ("--over", "method=mcmc"), "--over method=mcmc: use tikhonov"),
         ("no_such.module", (), "cannot be used"),

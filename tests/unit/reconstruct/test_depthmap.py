@@ -378,13 +378,13 @@ def test_frames_of_too_many_pixels_are_refused() -> None:
         PixelDepths(Cubic(130, 2), 1e-4, 1e-4)  # type: ignore[arg-type]
 
 
-def narrow(whole: Capture) -> Capture:
-    """Return a capture of a window of fewer columns: the others are black."""
-    left, right = whole.patterns
-    return DerivedCapture(whole, (left, right[:COLUMNS]))
-
-
 COLUMNS = 32
+
+
+class Narrow(DerivedCapture):
+    """A capture of a window of fewer columns: the others are black."""
+
+    patterns = property(lambda self: (self.whole.patterns[0], self.whole.patterns[1][:COLUMNS]))  # type: ignore[assignment]
 
 
 def test_an_oblong_window_has_a_depth_for_each_pixel() -> None:
@@ -393,7 +393,7 @@ def test_an_oblong_window_has_a_depth_for_each_pixel() -> None:
     above = BASELINE[1], 0.0
     scene = np.where(np.arange(N) < COLUMNS, PRINT, 0.0)
     surface = ((np.ones((N, N), bool), *sides(430.0, above)),)
-    run = narrow(Layers(*sides(400.0, above), surfaces=surface).run("dots:8x4", scene, 0))
+    run = Narrow(Layers(*sides(400.0, above), surfaces=surface).run("dots:8x4", scene, 0))
     square = calibrated(above)
     assert square.manifest.parallax is not None
     first, last = square.manifest.parallax.column_tan
@@ -412,6 +412,6 @@ def test_a_pixel_of_parallax_is_that_of_the_axis_that_moves_more(axis: int) -> N
     baseline = (60.0, 0.0) if axis == 0 else (0.0, 60.0)
     square = calibrated(baseline)
     factors = replace(square, right=square.right[:, :COLUMNS])
-    run = narrow(shots(np.full((N, N), 400.0), "dots:8", baseline))
+    run = Narrow(shots(np.full((N, N), 400.0), "dots:8", baseline))
     pixel = 0.3 / (N, COLUMNS)[axis] / 60
     assert Arrivals(run, factors, (-2e-4, 2e-4), 0.0).pixel == pytest.approx(pixel)

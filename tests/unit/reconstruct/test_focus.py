@@ -134,20 +134,6 @@ def test_columns_without_falloff_are_found_even() -> None:
     assert np.array_equal(dark.brightness(np.arange(N)), np.ones(N))
 
 
-def test_columns_beside_the_window_are_the_shadow_there() -> None:
-    """Against the shadow of a wider window, away from the sensor's own ends: 2.2 % of its contrast are left, 4 % by a
-    line between columns. (Planted: left and right exchanged.)"""
-    margin = 6
-    edges = centred_edges(N + 2 * margin, WINDOW / N) * 400
-    wide = scene_factor(mls_mask().terms[0][1], 0.06, centred_edges(PIXELS, PITCH), edges, 2.0, 400.0)
-    own = wide[:, margin:-margin]
-    found = FactorOfDepths(own, PARALLAX, 1).beyond(margin)[0]
-    assert np.array_equal(found[:, margin:-margin], own)
-    inner = slice(8, -8)
-    error = np.sqrt(np.mean(np.square((found - wide)[inner])))
-    assert error < 0.03 * float(wide.std())
-
-
 def test_without_a_baseline_both_sides_of_the_sensor_are_alike() -> None:
     """Only the place on the sensor moves columns then, from its middle. (Planted: half a sensor pixel off it.)"""
     shared = PARALLAX.model_copy(update={"row_mm": (0.0, 0.0)})

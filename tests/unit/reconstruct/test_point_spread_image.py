@@ -130,7 +130,6 @@ def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_conver
     refused += [
         ("--psf", str(tmp_path / "none.npy")),
         (*psf, "--method", "tv", "--bounds", "1:0"),
-        (*psf, "--margin", "1"),
     ]
     refused += [(*psf, "--bounds", "x", "--method", "tv"), (*psf, "--mosaic", "half")]
     for words in refused:

@@ -24,37 +24,33 @@ from mitsim.reconstruct.request import (
 from mitsim.reconstruct.solvers import SOLVERS
 
 TAKEN = [
-    *(("auto", method, None, 0) for method in SOLVERS),
-    *((lam, "tikhonov", None, 0) for lam in (0.0, 1e-300, 5)),
-    *(("auto", "tikhonov", focus, 0) for focus in ("auto", "map", 1e-3, 400)),
-    *(("auto", method, 400.0, 0) for method in SOLVERS),
-    *(("auto", "tikhonov", None, margin) for margin in (1, 2)),
+    *(("auto", method, None) for method in SOLVERS),
+    *((lam, "tikhonov", None) for lam in (0.0, 1e-300, 5)),
+    *(("auto", "tikhonov", focus) for focus in ("auto", "map", 1e-3, 400)),
+    *(("auto", method, 400.0) for method in SOLVERS),
 ]
 REFUSED = [
-    *((("auto", method, None, 0), "method", "use tikhonov, markov") for method in ("gram", "")),
-    *(((lam, "tv", None, 0), "lam", "at least 0, or auto") for lam in (-1e-300, math.inf, math.nan)),
-    (("none", "tv", None, 0), "lam", "give a number or 'auto'"),
-    *((("auto", "tv", focus, 0), "focus", "above 0 mm") for focus in (0.0, -1.0, math.inf, math.nan)),
-    (("auto", "tv", "near", 0), "focus", "give a number or 'auto' or 'map'"),
-    *((("auto", method, "map", 0), "method", "tikhonov alone") for method in ("markov", "nonnegative", "tv")),
-    *((("auto", "tikhonov", None, margin), "margin", "at least 0") for margin in (-1, 1.0, True, False)),
-    *((("auto", "tikhonov", focus, 1), "margin", "leave out focus") for focus in ("auto", "map", 400.0)),
-    *((("auto", method, None, 1), "margin", "tikhonov at the calibrated depth alone") for method in ("markov", "tv")),
+    *((("auto", method, None), "method", "use tikhonov, markov") for method in ("gram", "")),
+    *(((lam, "tv", None), "lam", "at least 0, or auto") for lam in (-1e-300, math.inf, math.nan)),
+    (("none", "tv", None), "lam", "give a number or 'auto'"),
+    *((("auto", "tv", focus), "focus", "above 0 mm") for focus in (0.0, -1.0, math.inf, math.nan)),
+    (("auto", "tv", "near"), "focus", "give a number or 'auto' or 'map'"),
+    *((("auto", method, "map"), "method", "tikhonov alone") for method in ("markov", "nonnegative", "tv")),
 ]
 
 
 @pytest.mark.parametrize("asked", TAKEN)
-def test_what_an_image_may_be_asked_by_is_taken(asked: tuple[float | str, str, float | str | None, int]) -> None:
-    ImageRequest(**dict(zip(("lam", "method", "focus", "margin"), asked, strict=True)))
+def test_what_an_image_may_be_asked_by_is_taken(asked: tuple[float | str, str, float | str | None]) -> None:
+    ImageRequest(**dict(zip(("lam", "method", "focus"), asked, strict=True)))
 
 
 @pytest.mark.parametrize(("asked", "name", "reported"), REFUSED)
 def test_what_no_image_is_made_by_is_refused(
-    asked: tuple[float | str, str, float | str | None, int], name: str, reported: str
+    asked: tuple[float | str, str, float | str | None], name: str, reported: str
 ) -> None:
     """By the name of the argument, and by what it may be. (Planted: 0 taken for a depth, a bool for a number.)"""
     with pytest.raises(ArgumentError, match=reported) as refusal:
-        ImageRequest(**dict(zip(("lam", "method", "focus", "margin"), asked, strict=True)))
+        ImageRequest(**dict(zip(("lam", "method", "focus"), asked, strict=True)))
     assert refusal.value.argument == name
 
 

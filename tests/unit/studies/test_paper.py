@@ -27,7 +27,7 @@ from mitsim.studies.framework.experiment import (
     values_of,
 )
 from mitsim.studies.framework.panels import Images, Section, build_page, flag_warnings
-from mitsim.studies.light_studies import DEPTHS, ERROR_SOURCES, EXPOSURES, GLOSS_FAMILIES
+from mitsim.studies.light_studies import ERROR_SOURCES, EXPOSURES, GLOSS_FAMILIES
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))
@@ -53,8 +53,7 @@ MEASURED: dict[str, Value] = {
 }  # fmt: skip
 """Columns of any study, each with a number that it may have."""
 VARIED: dict[str, list[dict[str, Value]]] = {
-    "gloss": [{"patterns": "dots:7", "exposure": exposure} for exposure in EXPOSURES],
-    "global light": [{"depth": depth} for depth in DEPTHS],
+    "reflectivity": [{"patterns": "dots:7", "exposure": exposure} for exposure in EXPOSURES],
     "quality": [{"exposure": exposure} for exposure in ("equal peak", "equal frame")],
     "multishot": [{"exposure": exposure} for exposure in ("equal peak", "equal frame")],
 }

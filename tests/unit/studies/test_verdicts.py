@@ -148,14 +148,6 @@ def lamps(hadamard_db: float, dots_range: float = 0.5) -> list[Row]:
     return found
 
 
-def lit(**gains: float) -> list[Row]:
-    return [
-        row
-        for name, value in gains.items()
-        for row in level("gain_db", part="global light", subject=name, patterns="dots:7", depth="as it is")(value)
-    ]
-
-
 def drifted(value: float) -> list[Row]:
     case = {"kind": "power", "unit": "1", "amount": 0.1, "model": RENDERED, "predicted_error_db": 0.0}
     predicted = {name: offset for name, offset in zip("abc", PRINTS_DB, strict=True)}
@@ -249,7 +241,6 @@ BORDERS = [
     ("ambient", 0, lambda value: lamps(1.0, 0.5 + value), -math.inf, 0.0),
     ("ambient", 1, lamps, 0.0, math.inf),
     ("ambient", 2, lamps, -math.inf, 0.0),
-    ("reflectivity", 2, lambda value: [*glossy(), *lit(corner=value, cookie_bag=9.0)], 0.0, math.inf),
     ("drift", 0, drifted, -drift_study.AGREE_DB, drift_study.AGREE_DB),
     ("waterfall", 0, lambda value: fallen(lost=value), -math.inf, 2.0),
     ("waterfall", 1, lambda value: fallen(gained=value), 0.0, math.inf),
