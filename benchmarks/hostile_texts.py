@@ -68,7 +68,7 @@ def arguments(good: Good) -> Make:
             (*imported, "--exposure", word),
             ("export", run, "--format", chance.choice(("png", "hdf5", word)), "--projector", word, "-o", out),
             ("reconstruct", run, "--calibration", cal, "--lambda", word, "-o", out),
-            ("plan", "photograph", chance.choice("--patterns --accuracy --seconds --effects -D".split()), word),
+            ("plan", "photograph", chance.choice("--patterns --accuracy --effects -D".split()), word),
             ("characterise", "imx249", "-o", out, chance.choice("--pixels --steps --frames".split()), "-" + word),
         )
         return chance.choice(commands)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from mitsim.bench.request import (
-    AUTO,
     MOSAIC,
     NO,
     Exposure,
@@ -51,7 +50,7 @@ from mitsim.core.configuration import (
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.job import Job
-from mitsim.core.manifests import BANDS, LINES, RUN, bands_of
+from mitsim.core.manifests import BANDS, RUN, bands_of
 from mitsim.core.manifests import MOSAIC as MOSAIC_RUN
 from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
@@ -136,8 +135,6 @@ def in_colour(bench: Bench, colour: str) -> Bench:
 
 def plan_in(bench: Bench, colour: str, request: Planned) -> Plan:
     """Return the plan of a ``request`` on a ``bench``, for light in a ``colour``."""
-    if colour == AUTO:
-        return bench.choose_colour(**request.given).plan
     if colour == NO:
         return bench.plan(**request.given)
     from mitsim.acquire.spectral import SpectralBench
@@ -171,12 +168,6 @@ def capture_in(
         from mitsim.acquire.capture import expose
 
         return expose(light, str(what), output, job, resume, **request)
-    if colour == AUTO:
-        from mitsim.light.cost_model import first_shadow
-
-        with job.planning(str(what), first_shadow(bench, Request(**request).effects)):
-            chosen = bench.choose_colour(str(what), **request)
-        bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
     if by_line(colour):
         return in_colour(bench, colour).capture_lines(what, output, resume, job, **request)
     take: Any = bench.capture_mosaic if colour == MOSAIC else bench.capture

@@ -27,7 +27,7 @@ from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.runs import AMBIENT, CLOSING, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
+from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
@@ -37,7 +37,6 @@ from mitsim.light.light_file import read_light, write_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
-from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner.planner import known_losses
 
 if TYPE_CHECKING:
@@ -127,8 +126,6 @@ def expose(
     resume: bool = False,
     **request: Any,
 ) -> Capture:
-    if request.get("noise_fraction") is not None:
-        raise ArgumentError("noise_fraction", f"{request['noise_fraction']}: light is traced already; leave it out")
     own = replace(light.plan, request=light.plan.known_request.with_values(patterns=patterns, seed=light.seed))
     bench = SpectralBench(light.bench)
     return capture(bench, request_of(own, request), Task.of(output, resume, job), lights=[light]).runs[0]
@@ -258,9 +255,7 @@ def _run(
     ambient = None
     with job.clock.stage("ambient frame"):
         if exposure.takes_ambient_frame(request.ambient_frame, family, expected):
-            ambient = exposure.AmbientFrame.expose(
-                exposer, expected, request.ambient_shots or exposure.ambient_shots(family)
-            )
+            ambient = exposure.AmbientFrame.expose(exposer, expected, exposure.ambient_shots(family))
     if ambient:
         single = {"DN": ambient.digital, "electrons": ambient.electrons}
         channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
@@ -271,7 +266,6 @@ def _run(
     if ambient:
         part, noise = shooting.ambient_part, shooting.noise_to_signal
         ambient_file = manifests.AmbientFile(file=AMBIENT, shots=ambient.shots, part=part, noise=noise)
-    closing = _close(light, shooting, expected, request)
     total = light.plan.total(totals.noise)
     manifest = manifests.RunManifest(
         configuration=head.configuration,
@@ -280,7 +274,6 @@ def _run(
         digital=digital_of(bench.sensor, exposure_s),
         patterns=patterns,
         ambient_frame=ambient_file,
-        closing_frame=closing,
         plan=plan.block(),
         mc_error=totals.mc_error,
         total_error=total.value,
@@ -305,29 +298,6 @@ def _run(
     if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run
         warnings.warn(foreign, stacklevel=5)
     return Capture.from_recorder(recorder, manifest)
-
-
-def _close(
-    light: SampledLight, shooting: exposure.Shooting, expected: ExpectedFrames, request: Request
-) -> manifests.ClosingFile | None:
-    """Record the closing frame of a run if requested: the first shot again, for a shorter time if it is too bright."""
-    if request.closing_frame is None:
-        return None
-    names: tuple[str | int, ...] = ("closing",)
-    family, exposer = shooting.family, shooting.exposer
-    if request.closing_frame == "first":
-        frame, names = next(iter(expected)), family.shots[0].names
-    else:
-        lit = Lighting(family.lighting.labels, np.ones_like(family.lighting.weights[:1]))
-        (frame,) = light.frames(lit, request.seed)
-        peak, seconds = float(frame.irradiance.max()), exposer.exposure_s
-        if np.isfinite(exposer.devices.sensor.full_well_e) and peak > 0:
-            seconds = min(seconds, replace(request.timing, seconds=None).choose(exposer.devices, peak))
-        exposer = replace(exposer, exposure_s=seconds, speckle=light.speckle())
-    electrons = exposer.shot_electrons(frame, *names)
-    channels = exposure.frame_channels(exposer.digital(electrons, "closing"), electrons)
-    shooting.recorder.write(CLOSING, channels, {"exposure_s": exposer.exposure_s, "seed": request.seed})
-    return manifests.ClosingFile(kind=request.closing_frame, file=CLOSING, exposure_s=exposer.exposure_s)
 
 
 @contextmanager
@@ -374,7 +344,7 @@ def _warnings(
     predicted_warnings = {*light.plan.warnings} - {*known_losses(light.bench.loaded, request.effects), *planned}
     if not light.reached:
         yield from light.unreached
-    elif total.bound > accuracy and not predicted_warnings and request.noise_fraction is None:
+    elif total.bound > accuracy and not predicted_warnings:
         reason = _foreign(light, totals, request)
         yield (
             f"the total error is up to {total.bound:.1e} (95 %); the accuracy {accuracy:g} was not reached"

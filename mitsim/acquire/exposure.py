@@ -103,23 +103,18 @@ def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
         yield [first, *islice(remaining, frames_at_once(first[-1].irradiance.size) - 1)]
 
 
-@dataclass(frozen=True)
-class NoiseTarget:
-    devices: Devices
-    exposure: Exposure
-    fraction: float
-
-    def __call__(self, expected: ExpectedFrames) -> float:
-        peak = peak_irradiance(expected)
-        if peak <= 0:
-            return np.inf
-        exposer = Exposer(self.devices, self.exposure.choose(self.devices, peak), 0)
-        noise = energy = 0.0
-        for frame in expected:
-            electrons = exposer.electrons(frame)
-            noise += exposer.sensor_noise(electrons) ** 2 * electrons.size
-            energy += float(np.square(electrons).sum())
-        return self.fraction * float(np.sqrt(noise / energy))
+def relative_noise(devices: Devices, exposure: Exposure, expected: ExpectedFrames) -> float:
+    """Return the sensor's noise over all ``expected`` frames, relative to them; infinite for dark frames."""
+    peak = peak_irradiance(expected)
+    if peak <= 0:
+        return math.inf
+    exposer = Exposer(devices, exposure.choose(devices, peak), 0)
+    noise = energy = 0.0
+    for frame in expected:
+        electrons = exposer.electrons(frame)
+        noise += exposer.sensor_noise(electrons) ** 2 * electrons.size
+        energy += float(np.square(electrons).sum())
+    return float(np.sqrt(noise / energy))
 
 
 def peak_irradiance(expected: ExpectedFrames) -> float:

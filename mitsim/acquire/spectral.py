@@ -12,33 +12,31 @@ counts lamps' light itself (:mod:`mitsim.devices.projector`): a count c is an ir
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Generic
+from typing import Any
 
 import numpy as np
 
-from mitsim.acquire.exposure import NoiseTarget
-from mitsim.bench.apparatus import Apparatus, Opened, reopen
+from mitsim.bench.apparatus import Apparatus, Opened
 from mitsim.bench.effects import present
 from mitsim.bench.layout import obstacles
-from mitsim.bench.request import Request, check_untimed
+from mitsim.bench.request import Request
 from mitsim.core import manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import SPECTRA_NM, Band, CountedLamps, Lines, Response, Spectrum, line_units
-from mitsim.light.cost_model import frame_seconds, frames_cost, traced_for
+from mitsim.light.cost_model import frame_seconds, frames_cost
 from mitsim.light.light import SampledLight, Sampling
-from mitsim.light.plan import ColourCandidate, ColourChoice, Plan
+from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, expected_of
+from mitsim.light.simulation import Simulation
 from mitsim.light.truth import Truth, trace_truths
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.planner.planner import make_plan, plan_within
+from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.colour import PLANES, behind
 from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.records import PathSamples
@@ -95,15 +93,12 @@ class SpectralBench:
         return [MosaicLight.of(self.whole, lights, self.manifest.wavelengths_nm)]
 
     def sampling(self, request: Request) -> Sampling:
-        fraction = request.noise_fraction
-        target = NoiseTarget(self.whole.devices, request.timing, fraction) if fraction else None
-        return Sampling(by_pixel=False, target=target, excess=excess_behind_filters if self.whole.filters else None)
+        return Sampling(by_pixel=False, excess=excess_behind_filters if self.whole.filters else None)
 
     def check(self, request: Request) -> None:
         request.timing.check(self.whole.sensor, self.whole.devices.camera_file)
         if self.manifest is None:
             return
-        check_untimed(request.seconds)
         projector = self.whole.projector
         add_speckle = request.effects.get("speckle", True) and (projector.speckle_contrast or projector.speckle)
         if self.whole.filters and add_speckle:  # each line has its own, and each filter another mixture of them
@@ -173,11 +168,7 @@ def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
     family, effects = bench.family(request.patterns, request.seed), request.effects
     lighting = family.lighting
     exposing = frame_seconds(bench, lines * len(lighting.weights))
-    if request.seconds is None:
-        plan = make_plan(bench, lighting, request.accuracy, request.seed, effects, lines)
-    else:
-        plan = plan_within(bench, lighting, request.seconds, request.seed, effects)
-    plan = plan.taking(**exposing)
+    plan = make_plan(bench, lighting, request.accuracy, request.seed, effects, lines).taking(**exposing)
     cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, lines=lines)
     warnings = (*plan.warnings, *obstacles(bench, family))
     return replace(plan, request=request, cost=cost, made_of=bench.deciding, warnings=warnings)
@@ -413,154 +404,3 @@ class _LampRuns:
             some = weights[lit] if weights.any() else np.ones(len(weights))
             spectra.append(Spectrum(wavelengths[lit], some / some.sum()))
         return cls(light.sum(axis=1), tuple(spectra), unknown)
-
-
-# -------- Choice of the colours to simulate: mono, bands or lines of light, with its plan
-#
-# A monochrome camera that sees all lines l of a projector at once makes electrons from their irradiances E_l in
-# proportion to sum_l q_l lambda_l E_l, with its quantum efficiency q. A band of lines is simulated as one line at their
-# mean wavelength; *mono* replaces all by one panchromatic reflectance behind the mean of their shadows. The error of
-# either is the relative rms difference of its frames from the sum over lines. Both are formed from the same few rays of
-# a projector pixel, so that the difference contains no noise of the geometry; only direct light is compared.
-
-_RAYS_OF_BANDS, _SHOTS = 4, 4
-"""Rays per pixel (a tenth of a second), and shots that are compared."""
-_NONE = 1e-6
-"""Difference that counts as none in single precision (photograph: 3e-8)."""
-_PART = 0.5
-"""Part of the accuracy that colours may use: the frames then keep 0.87 of it, at a third more paths."""
-_ONCE, _TRACED = ("start", "plan"), ("transport", "truth")
-"""Stages that lines share, and stages in which they share paths."""
-
-
-@dataclass(frozen=True)
-class Coloured(Generic[Opened]):
-    plan: Plan
-    bench: Opened
-
-    @property
-    def mono(self) -> bool:
-        return self.plan.colour is not None and self.plan.colour.chosen == manifests.MONO
-
-
-def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
-    """Choose the fastest of mono, bands and lines that is predicted to keep the accuracy.
-
-    See :meth:`mitsim.api.bench.Bench.choose_colour`, also for errors.
-    """
-    check_untimed(request.seconds)
-    manifests.check_undecided(bench.variant)
-    started, runs = time.perf_counter(), _runs(bench)
-    if not bench.loaded.coloured and bench.sensor.quantum_efficiency_curve is None:
-        errors, spectral = {name: 0.0 for name in runs if name in (manifests.MONO, manifests.LINES)}, None
-    else:
-        pilot = _ColourPilot(bench, request)
-        errors, spectral = pilot.errors(runs), pilot.spectral
-    most = _PART * request.accuracy
-    chosen = next((name for name in errors if errors[name] <= most), min(errors, key=lambda name: errors[name]))
-    looked = time.perf_counter() - started
-    left = request
-    if 0 < errors[chosen] <= most:
-        left = request.with_values(accuracy=math.sqrt(request.accuracy**2 - errors[chosen] ** 2))
-    if chosen == manifests.MONO:
-        own = reopen(bench, bench.variant) if spectral else bench
-        plan = plan_request(own, left)
-    else:
-        whole = spectral or reopen(bench, manifests.spectral_of(bench.variant))
-        own = whole if chosen == manifests.LINES else whole.in_bands(manifests.bands_of(chosen))
-        plan = SpectralBench.of(own, manifests.RUN).plan(left)
-    plan = plan.taking(plan=plan.predicted["plan"] + looked)
-    parted = bool(bench.loaded.parting)
-    each = [(name, _seconds(plan.predicted, runs[chosen], runs[name], parted)) for name in errors]
-    choice = ColourChoice(chosen, tuple(ColourCandidate(name, errors[name], seconds) for name, seconds in each))
-    error, mono, warnings = choice.taken.error or 0.0, choice.candidates[0].error, plan.warnings
-    if error > _PART * request.accuracy:
-        warnings = (
-            *warnings,
-            f"colour: {chosen} leaves {error:.1e} of a band's light, more than half of the accuracy "
-            f"{request.accuracy:g}, and no more than {manifests.MOST_LINES} bands are traced; ask for less, or give a "
-            "projector of fewer lines",
-        )
-    rows = plan.effects
-    if mono:
-        reason = f"{chosen} leaves {error:.1e}, mono {mono:.1e}"
-        changed = [replace(row, reason=reason, error_if_off=mono) if row.name == "spectrum" else row for row in rows]
-        rows = tuple(changed)
-    return Coloured(replace(plan, colour=choice, effects=rows, warnings=warnings), own)
-
-
-def _seconds(predicted: Mapping[str, float], runs: int, others: int, parted: bool) -> float:
-    shared, traced = (sum(predicted.get(stage, 0.0) for stage in stages) for stages in (_ONCE, _TRACED))
-    own = sum(predicted.values()) - shared - traced
-    return shared + traced_for(others, parted) / traced_for(runs, parted) * traced + others / runs * own
-
-
-def _runs(bench: Apparatus) -> dict[str, int]:
-    lines = bench.projector.lines
-    bands = range(1, min(len(lines.shining.shares) - 1, manifests.MOST_LINES) + 1)
-    every = {manifests.LINES: len(lines.shares)} if len(lines.shares) <= manifests.MOST_LINES else {}
-    return {manifests.MONO: 1} | {f"{manifests.BANDS}:{count}": count for count in bands} | every
-
-
-class _ColourPilot(Generic[Opened]):
-    def __init__(self, bench: Opened, request: Request) -> None:
-        family = bench.family(request.patterns, request.seed).lighting
-        shots = len(family.weights)
-        chosen = np.unique(np.linspace(0, shots - 1, min(shots, _SHOTS)).astype(int))
-        # Pixels that these shots light alike are one class.
-        weights, classes = np.unique(family.weights[chosen], axis=1, return_inverse=True)
-        self._lighting = Lighting(classes.ravel()[family.labels], weights)
-        self._bench, self._seed = bench, integer(request.seed, "colour")
-        diffracts = bench.geometry.diffracts and request.effects.get("diffraction", True)
-        effects = frozenset({"diffraction"} if diffracts else ())
-        self._settings = Settings(bench.geometry.scene_distance, effects=effects)
-
-    @cached_property
-    def spectral(self) -> Opened:
-        return reopen(self._bench, manifests.spectral_of(self._bench.variant))
-
-    def errors(self, names: Iterable[str]) -> dict[str, float]:
-        mono = self._electrons(self._bench, self._path_samples(self._bench)[0])  # before another variant is set
-        lines = self._bench.projector.lines.shining
-        cut = {name: lines.bands(manifests.bands_of(name)) for name in names if name.startswith(manifests.BANDS)}
-        bands = {band for each in cut.values() for band in each if band.several}
-        sums = {band: np.zeros_like(mono) for band in bands | {lines}}
-        for line, frames in self._of_lines(lines.single):
-            for band, whole in sums.items():
-                if line.wavelengths_nm[0] in band.wavelengths_nm:
-                    whole += frames
-        merged = {Lines((band.mean_nm,), (sum(band.shares),)): band for band in bands}
-        left = {merged[line]: _relative(frames, sums[merged[line]]) for line, frames in self._of_lines(tuple(merged))}
-        errors = {name: max(left.get(band, 0.0) for band in each) for name, each in cut.items()}
-        known = {manifests.MONO: _relative(mono, sums[lines]), **errors, manifests.LINES: 0.0}
-        return {name: known[name] for name in names}
-
-    def _of_lines(self, lines: tuple[Lines, ...]) -> Iterator[tuple[Lines, FloatArray]]:
-        for first in range(0, len(lines), manifests.MOST_LINES):
-            some = lines[first : first + manifests.MOST_LINES]
-            together = Lines(tuple(line.wavelengths_nm[0] for line in some), tuple(line.shares[0] for line in some))
-            lit = self._path_samples(replace(self.spectral, lines=together))
-            for line, path_samples in zip(some, lit, strict=True):
-                yield line, self._electrons(line_alone(self.spectral, line), path_samples)
-
-    def _path_samples(self, bench: Apparatus) -> list[PathSamples]:
-        found = Simulation(bench, self._settings).direct.trace(self._seed, 0, _RAYS_OF_BANDS)
-        return found.by_line(1 if bench.lines is None else len(bench.lines.shares))
-
-    def _electrons(self, bench: Apparatus, path_samples: PathSamples) -> FloatArray:
-        simulation, lighting = Simulation(bench, self._settings), self._lighting
-        accumulated = simulation.accumulate("direct", path_samples, lighting.labels, _RAYS_OF_BANDS)
-        rows = np.arange(lighting.weights.shape[1])
-        frames = expected_of([(simulation, [accumulated])], rows, lighting, self._seed, leaking=False)
-        wavelength = bench.projector.effective_wavelength_nm
-        each = bench.sensor.efficiency(wavelength) * wavelength
-        return np.stack([frame.irradiance for frame in frames]) * each
-
-
-def _relative(found: FloatArray, true: FloatArray) -> float:
-    whole = float(np.linalg.norm(true))
-    error = float(np.linalg.norm(found - true)) / whole if whole else 0.0
-    if error < _NONE:
-        return 0.0
-    digit = 10.0 ** (math.floor(math.log10(error)) - 1)
-    return float(f"{math.ceil(round(error / digit, 6)) * digit:.1e}")

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from mitsim.acquire.capture import Light
     from mitsim.acquire.reference import Rendered
-    from mitsim.acquire.spectral import Coloured
     from mitsim.bench.request import ExposureKeys, RequestKeys, SessionKeys
     from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.devices.session import BoardShape
@@ -188,7 +187,7 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            Name of the family, or a plan of :meth:`choose_colour`.
+            Name of the family, or a plan of all lines.
         output
             Folder of a run's folder for each line, and colour.json; None keeps the runs in memory.
         resume, job
@@ -206,26 +205,6 @@ class Bench(Apparatus):
 
         known = None if isinstance(patterns, str) else patterns
         return capture_lines(self, request_of(patterns, request), task, known)
-
-    @takes(Request, without="patterns")
-    def choose_colour(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Coloured[Self]:
-        """Choose the cheapest of mono, bands and lines that is predicted to leave at most half of the accuracy as error
-        of colours. It looks at the scene in this variant and in the spectral one, and sets the variant of the bench
-        that it returns.
-
-        Parameters
-        ----------
-        patterns
-            Name of the family.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`capture_lines` where lines or bands are called for; for a bench in a spectral variant.
-        """
-        from mitsim.acquire.spectral import choose_colour
-
-        return choose_colour(self, Request(patterns=patterns, **request))
 
     @check_arguments
     def in_variant(self, variant: str) -> Bench:

@@ -33,7 +33,7 @@ from mitsim.core.environment import DEFAULT_VARIANT, check_variant
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
-from mitsim.core.manifests import BANDS, LINES, MOST_SHOTS, bands_of, check_undecided, spectral_of
+from mitsim.core.manifests import BANDS, LINES, bands_of, spectral_of
 from mitsim.core.seeds import check_root
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 """Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
 worth its name."""
-LONGEST_S = 1e6
-"""Seconds that may be asked for: eleven days, far beyond what any accuracy takes."""
 PSNR_DB = 1.0, 100.0
 """PSNR that may be asked of an image: below, its error is its whole range; above, the truth is not known."""
 REFERENCE, FACTORED = ESTIMATORS = ("reference", "factored")
@@ -58,8 +56,6 @@ FEWEST_PASSES = 4
 """Passes of the reference are compared to tell the noise; four tell it to 40 %."""
 MOST_SAMPLES = 2**20
 """An error of a thousandth of one sample's: an hour a pixel row, beyond use."""
-_LEAST_NOISE = 1e-3
-"""Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
 
 
 @dataclass(frozen=True)
@@ -155,13 +151,6 @@ def check_samples(estimator: str, spp: int | None) -> None:
         raise ArgumentError("spp", f"{spp}: give at least {FEWEST_PASSES} samples a pixel, at most {MOST_SAMPLES}")
 
 
-def check_untimed(seconds: float | None) -> None:
-    """Refuse ``seconds`` for a run in colour."""
-    if seconds is not None:
-        problem = f"{seconds:g}: runs in colour are not planned by time"
-        raise ArgumentError("seconds", f"{problem}; give an accuracy, or leave colour out")
-
-
 def _switches(effects: object) -> dict[str, bool]:
     """Return effects that are switched on or off, by name; MitsimError for anything else."""
     found = parse_switches(effects) if isinstance(effects, str) else effects
@@ -205,12 +194,8 @@ class ExposureKeys(SampledKeys, total=False):
 
     exposure: float | Literal["auto"]
     exposure_fraction: float
-    seconds: float | None
     effects: dict[str, bool] | str
-    noise_fraction: float | None
     ambient_frame: Literal["auto", "yes", "no"]
-    ambient_shots: int | None
-    closing_frame: Literal["first", "uniform"] | None
 
 
 class RequestKeys(ExposureKeys, total=False):
@@ -264,35 +249,14 @@ class Timed(Seeded):
 class Planned(Sampled, Family):
     """Which light is simulated, and how finely."""
 
-    seconds: float | None = option(
-        None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
-    )
     effects: Effects = option({}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY)
-
-    def model_post_init(self, context: object) -> None:
-        """Refuse an accuracy beside the seconds that decide it."""
-        super().model_post_init(context)
-        if self.seconds is not None and "accuracy" in self.model_fields_set:
-            problem = f"{self.seconds:g}: the accuracy is what they buy"
-            raise ArgumentError("seconds", f"{problem}; give seconds or an accuracy, not both")
 
 
 class Request(Timed, Planned):
     """Which shots of a scene are wanted, and how well."""
 
-    noise_fraction: float | None = option(
-        None, "stop sampling at this part of the sensor's noise", metavar="PART", panel=QUALITY, ge=_LEAST_NOISE, le=1
-    )
     ambient_frame: Literal["auto", "yes", "no"] = option(
         "auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no"
-    )
-    ambient_shots: int | None = option(
-        None, "shots of that frame; by the patterns if not given", metavar="N", ge=1, le=MOST_SHOTS
-    )
-    closing_frame: Literal["first", "uniform"] | None = option(
-        None,
-        "frame at the end that checks lamp, camera and scene: the first one again, or a uniform one",
-        metavar="first|uniform",
     )
 
     @classmethod
@@ -304,25 +268,10 @@ class Request(Timed, Planned):
         """Return the request with other ``values`` of some fields."""
         return Request.of(**{**self.model_dump(exclude_unset=True), **values})
 
-    def refuse_idle(self) -> None:
-        """Refuse options that have no effect beside others that are given."""
-        super().refuse_idle()
-        if self.ambient_frame == "no":
-            self.refuse(["ambient_shots"], "with ambient_frame no")
-
     @property
     def deciding(self) -> dict[str, Any]:
         """Return the fields that decide frames, as the manifest's configuration holds them."""
-        unused = {"accuracy" if self.seconds is not None else "seconds"}
-        # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
-        return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
-
-    def model_post_init(self, context: object) -> None:
-        """Refuse a second rule that ends sampling beside seconds."""
-        super().model_post_init(context)
-        if self.seconds is not None and self.noise_fraction is not None:
-            problem = f"{self.noise_fraction:g}: stops sampling by another rule than seconds"
-            raise ArgumentError("noise_fraction", f"{problem}; give one of both")
+        return self.model_dump(mode="json")
 
 
 class SessionRequest(Sampled):
@@ -335,7 +284,7 @@ class SessionRequest(Sampled):
 
 # ---- A scene and its devices ----
 
-NO, MOSAIC, AUTO = "no", "mosaic", "auto"
+NO, MOSAIC = "no", "mosaic"
 """Words of ``colour`` beside ``lines`` and ``bands:K``."""
 
 
@@ -401,7 +350,7 @@ class Opening(LitScene):
 
     def traced_in(self, colour: str) -> str:
         """Return the variant that traces light for a ``colour``: one that knows wavelengths if lines are told apart."""
-        return self.variant if colour in (NO, AUTO) else spectral_of(self.variant)
+        return self.variant if colour == NO else spectral_of(self.variant)
 
     def check(
         self,
@@ -409,7 +358,6 @@ class Opening(LitScene):
         patterns: str | None = None,
         timing: Exposure | None = None,
         colour: str = NO,
-        seconds: float | None = None,
     ) -> None:
         """Refuse, before the renderer is imported, what the scene and its devices cannot have.
 
@@ -419,8 +367,8 @@ class Opening(LitScene):
             Scene of the bench, and a family that its projector is to show; None for no family.
         timing
             Exposure; None where nothing is exposed.
-        colour, seconds
-            Which light is told apart, and how long a capture is to take.
+        colour
+            Which light is told apart.
         """
         from mitsim.bench.apparatus import check_devices, check_scene
 
@@ -433,10 +381,6 @@ class Opening(LitScene):
             problem = f"{colour}: camera {camera} has a mosaic {sensor.mosaic}, whose frames show all lines at once"
             raise ArgumentError("colour", f"{problem}; use colour mosaic")
         if colour != NO:
-            check_untimed(seconds)
-        if colour == AUTO:
-            check_undecided(self.variant)
-        elif colour != NO:
             from mitsim.devices.projector import ProjectorModel  # here: it imports numpy
 
             light = load_model(projector, ProjectorModel)
@@ -467,8 +411,8 @@ def _known_colour(colour: str) -> None:
     """Refuse a word of ``colour`` that is not known."""
     if colour.startswith(f"{BANDS}:"):
         bands_of(colour)
-    elif colour not in (NO, LINES, MOSAIC, AUTO):
-        raise ArgumentError("colour", f"{colour!r}: use {NO}, {LINES}, {BANDS}:K, {MOSAIC} or {AUTO}")
+    elif colour not in (NO, LINES, MOSAIC):
+        raise ArgumentError("colour", f"{colour!r}: use {NO}, {LINES}, {BANDS}:K or {MOSAIC}")
 
 
 class Coloured(Options):
@@ -477,20 +421,9 @@ class Coloured(Options):
     colour: Annotated[str, validated_by(_known_colour)] = option(
         NO,
         "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K bands of "
-        "its lines; mosaic: all lines at once, by a camera under colour filters; auto: no, bands or lines, as the "
-        "accuracy needs (not calibrate); no: light that is not told apart",
-        metavar="no|lines|bands:K|mosaic|auto",
+        "its lines; mosaic: all lines at once, by a camera under colour filters; no: light that is not told apart",
+        metavar="no|lines|bands:K|mosaic",
     )
-
-
-class FixedColour(Coloured):
-    """Which of the projector's light is told apart, without a choice."""
-
-    def model_post_init(self, context: object) -> None:
-        """Refuse a colour that a plan would have to choose."""
-        super().model_post_init(context)
-        if self.colour == AUTO:
-            raise ArgumentError("colour", f"{AUTO!r}: use {NO}, {LINES}, {BANDS}:K or {MOSAIC}")
 
 
 # ---- What `mitsim sense` takes ----

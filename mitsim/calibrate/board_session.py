@@ -28,7 +28,6 @@ from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
 from mitsim.light.cost_model import (
-    FIXED,
     Numbers,
     first_shadow,
     forming_seconds,
@@ -253,7 +252,7 @@ def _lines(n: int) -> Lighting:
 # -------- Cost of a calibration session
 # The reason of each figure is how :class:`mitsim.calibrate.session.LitSession` works.
 
-_UNIT_COSTS = replace(FIXED, product=1.1e-11)
+_PRODUCT_S = 1.1e-11
 """Cost of a multiplication in products as large as those of stripes: half of that in small ones."""
 _MIXED_S, _FORMED_S = 8e-9, 1e-8
 """Seconds per pixel of a frame beside its multiplications."""
@@ -293,12 +292,12 @@ def session_seconds(
     )
     numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
     frames = n if mixed else count
-    seconds = 2 * float(forming_seconds(forming, numbers, frames, _UNIT_COSTS))
+    seconds = 2 * float(forming_seconds(forming, numbers, frames, _PRODUCT_S))
     if 1 < largest_terms < math.inf:
         of_anchors = (settings.anchors > 1) * settings.anchors * settings.coarse_cells
         lit_cells = cells * len(settings.depths) + n * of_anchors
         seconds += 2 * frames * _READ_S * largest_terms * lit_cells * pixels
-    each = n * _UNIT_COSTS.product + _MIXED_S if mixed else _FORMED_S
+    each = n * _PRODUCT_S + _MIXED_S if mixed else _FORMED_S
     return {
         "optics": seconds + 2 * count * pixels**2 * each,
         "sensor": _UNWRITTEN * frame_seconds(board, shots)["sensor"],

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import mitsim
-from mitsim.bench.request import AUTO, NO, Coloured, LitScene, Opening, Planned, Request, Task, by_line
+from mitsim.bench.request import NO, Coloured, LitScene, Opening, Planned, Request, Task, by_line
 from mitsim.cli.commands import (
     LINES,
     Common,
@@ -29,7 +29,7 @@ from mitsim.cli.commands import (
 )
 from mitsim.core.configuration import LIMITS, OUTPUT, QUALITY, WHAT, option
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import MONO, RUN, read_colours
+from mitsim.core.manifests import RUN, read_colours
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.requests import PairOptions
@@ -38,9 +38,6 @@ from mitsim.verbs import DemoRequest, RunOptions, StudyOptions, capture_in, open
 
 if TYPE_CHECKING:
     from mitsim.light.plan import Plan, PlanRow
-
-_ACCURACY = shown(accuracy={"default": None, "show_default": "0.001"})
-"""How an accuracy is shown that seconds may take the place of."""
 
 # ---- demo, run, view, study and doctor -------------------------------------------------------------------------------
 
@@ -220,7 +217,6 @@ class Planning(OfScene, Planned, Coloured, Opening, Overwritten, Common):
     """Options of `mitsim plan`."""
 
     FIRST = "scene patterns colour"
-    CHANGES = _ACCURACY
 
     output: Path | None = to_make(None, "file to make, for capture --plan", "FILE.json")
     everything: bool = option(False, "all effects, and all of their reasons", "--all", panel=OUTPUT)
@@ -240,7 +236,7 @@ def plan(asked: Planning) -> int:
     from mitsim.core.job import compiled_kernels, running_seconds
 
     output = asked.output
-    asked.check(asked.scene, asked.patterns, None, asked.colour, asked.seconds)
+    asked.check(asked.scene, asked.patterns, None, asked.colour)
     with nullcontext() if output is None else output_file(output, asked.overwrite) as place, asked.job() as job:
         bench = open_as(asked.scene, asked, job, asked.colour)
         if place is not None:
@@ -287,11 +283,7 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
     most = math.hypot(plan.systematic_bound, plan.sampling_target)
     gist = f"Plan at accuracy {plan.accuracy:g}: {plan.predicted_seconds:.3g} s, error up to {most:.1e}"
     stages = ", ".join(f"{name} {seconds:.3g}" for name, seconds in plan.predicted.items())
-    after = [f"Seconds: {stages}", *filter(None, [plan.range_words]), *plan.notes]
-    if plan.colour is not None and (everything or len(plan.colour.candidates) > 1):
-        after.append(plan.colour.words)
-    if plan.asked_seconds is not None:
-        after.append(f"Accuracy {plan.accuracy:g} is the finest that {plan.asked_seconds:g} s buy")
+    after = [f"Seconds: {stages}", *plan.notes]
     if plan.cost:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
         after.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
@@ -315,8 +307,8 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
 class Capturing(OfScene, Request, KnownPlan, Resumed, Coloured, Opening, LimitedPictured):
     """Options of `mitsim capture`."""
 
-    FIRST = "scene patterns exposure exposure_fraction noise_fraction ambient_frame ambient_shots closing_frame"
-    CHANGES = shown(patterns={"default": None, "help": f"{pattern_names()}; needed without --plan"}, **_ACCURACY)
+    FIRST = "scene patterns exposure exposure_fraction ambient_frame"
+    CHANGES = shown(patterns={"default": None, "help": f"{pattern_names()}; needed without --plan"})
 
     output: Path = to_make(..., "run folder to make", "RUN")
     light: Path | None = option(
@@ -331,11 +323,10 @@ def capture(asked: Capturing) -> int:
     Renders, exposes and writes them; in colour, one for each pattern and line of the projector.
 
     $ mitsim capture photograph -o run --patterns dots:7
-    $ mitsim capture cookie_bag -o bag --patterns hadamard:8 --seconds 20
+    $ mitsim capture cookie_bag -o bag --patterns hadamard:8 --accuracy 0.003
     $ mitsim capture photograph -o again --plan plan.json
     """
     from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.core.manifests import MANIFEST
 
     asked.refuse_idle()
     given, colour, output = asked.given_of(Request), asked.colour, asked.output
@@ -349,13 +340,8 @@ def capture(asked: Capturing) -> int:
         raise MitsimError("Missing option '--patterns': give it, or a plan with --plan")
     known = asked.read(given, colour != NO)
     request = asked.part(Request) if known is None else known.request_with(given)
-    if known is not None and colour == AUTO:
-        if known.colour is None:
-            raise MitsimError("--colour auto: the plan was made with another word of --colour; give that")
-        colour = NO if known.colour.chosen == MONO else known.colour.chosen
-    begun_in_one = (output / MANIFEST).is_file()  # which auto may decide for
-    check_work(output, asked.resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
-    asked.check(asked.scene, request.patterns, request.timing, colour, request.seconds)
+    check_work(output, asked.resume, "capture", several=by_line(colour))
+    asked.check(asked.scene, request.patterns, request.timing, colour)
     advise(RESUME)
     with asked.job() as job:
         bench = open_as(asked.scene, asked, job, colour)
@@ -402,7 +388,6 @@ def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output
         "kind": colours.kind,
         "channels": [{**line.model_dump(), **results[line.name]} for line in colours.channels],
         **{name: results[colours.names[-1]].get(name) for name in ("seconds", "kernels")},
-        **{name: results[colours.names[0]].get(name) for name in ("colour",) if kind == RUN},
         "warnings": tuple(f"{name}: {text}" for name, result in results.items() for text in result["warnings"]),
         "output": str(output),
     }
@@ -435,12 +420,12 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
         bound, seconds = part["total_error_bound"], part["exposure_s"]
         return f"{first} {part['mc_error']:.1e}, total error up to {bound:.1e}, exposure {seconds:.3g} s a frame"
 
-    taken, choice, lines = payload["seconds"], payload.get("colour"), list[str]()
+    taken, lines = payload["seconds"], list[str]()
     if payload.get("kind") == RUN:
         each = (f"{part['name']}: {frames(part)}, {errors(part, 'Monte Carlo error')}" for part in payload["channels"])
         lines = [total_of_lines(payload), *each, *_kernel_lines(payload["kernels"])]
     elif "mosaic" in payload:
-        count, choice = len(payload["channels"]), None
+        count = len(payload["channels"])
         lines = [
             f"{frames(payload)} behind {payload['mosaic']} filters, {count} lines at once, in {taken['total']:.1f} s: "
             f"{payload['output']}",
@@ -459,17 +444,6 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
             ),
             *_kernel_lines(payload["kernels"]),
         ]
-    if choice is not None and len(choice["candidates"]) > 1:
-        left = ", ".join(f"{each['name']} {each['error']:.1e}" for each in choice["candidates"])
-        lines.append(f"Colour: {choice['chosen']} (error that each leaves: {left})")
-    if payload.get("asked_seconds") is not None and "mosaic" not in payload:
-        lines.append(
-            f"Asked for {payload['asked_seconds']:g} s, predicted {payload['predicted_seconds']:.1f}, taken "
-            f"{taken['total']:.1f}: accuracy {payload['accuracy']:g}, total error up to "
-            f"{payload['total_error_bound']:.1e}"
-        )
-    if (closing := payload.get("closing_frame")) and "mosaic" not in payload:
-        lines.append(f"Closing frame: {closing['kind']}, exposed for {closing['exposure_s']:.3g} s")
     if ambient := payload.get("ambient_frame"):
         lines.append(
             f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
@@ -485,7 +459,7 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
 class Rendering(OfScene, Planned, LitScene, LimitedPictured):
     """Options of `mitsim render`."""
 
-    FIRST, HIDDEN = "scene output estimator spp", "patterns seconds"
+    FIRST, HIDDEN = "scene output estimator spp", "patterns"
 
     output: Path = to_make(..., "frame to write", "FRAME.exr")
     estimator: str = option("reference", "reference or factored", metavar="NAME", panel=QUALITY)
@@ -540,7 +514,6 @@ class Tracing(OfScene, Planned, KnownPlan, Overwritten, Opening, Limited):
     """Options of `mitsim transport`."""
 
     FIRST = "scene output patterns"
-    CHANGES = _ACCURACY
 
     output: Path = to_make(..., "HDF5 file to make", "FILE.h5")
 
@@ -582,7 +555,7 @@ def transport(asked: Tracing) -> int:
 class Pairing(OfScene, PairOptions, Request, Resumed, Opening, Limited):
     """Options of `mitsim pairs`."""
 
-    FIRST, HIDDEN = "scene output count", "seconds noise_fraction closing_frame"
+    FIRST = "scene output count"
     CHANGES = shown(exposure={"help": "seconds a frame, or auto: each pair for itself"})
 
     output: Path = to_make(..., "folder to make", "DIR")

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitsim.bench.request import NO, Exposure, FixedColour, Opening, Request, SessionRequest, Task
+from mitsim.bench.request import NO, Coloured, Exposure, Opening, Request, SessionRequest, Task
 from mitsim.cli.bench_verbs import check_work, memory_line, payload_of_lines, total_of_lines
 from mitsim.cli.commands import LimitedPictured, Resumed, command, option_name, scene_named, to_make
 from mitsim.core.configuration import OUTPUT, WHAT, option
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
 
-class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed):
+class Calibrating(SessionRequest, Coloured, Opening, LimitedPictured, Resumed):
     """Options of `mitsim calibrate`."""
 
     PANEL = WHAT

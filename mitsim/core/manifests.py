@@ -504,8 +504,8 @@ _COMMANDS = {
     MOSAIC: "capture --colour mosaic",
 }
 """Commands that make a folder of each kind."""
-MONO, LINES, BANDS = "mono", "lines", "bands"
-"""Ways to simulate a projector's light: one effective wavelength, each line, or ``bands:K`` of lines."""
+LINES, BANDS = "lines", "bands"
+"""Ways to simulate a projector's light by wavelength: each line, or ``bands:K`` of lines."""
 MOST_LINES = 4
 """Lines traced together: wavelengths of a path in Mitsuba's spectral variants."""
 JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
@@ -523,12 +523,6 @@ def bands_of(name: str) -> int:
 
 def spectral_of(variant: str) -> str:
     return f"{variant.rpartition('_')[0]}_spectral"
-
-
-def check_undecided(variant: str) -> None:
-    """Raise ArgumentError for a spectral ``variant``, in which colours cannot be compared with mono light."""
-    if variant.endswith("_spectral"):
-        raise ArgumentError("variant", f"{variant}: open the bench with a mono variant; colours are looked at too")
 
 
 class Line(BaseModel):

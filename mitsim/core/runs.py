@@ -227,6 +227,7 @@ class Capture:
     def summary(self) -> dict[str, Any]:
         """Return the facts that the command line reports; unknown ones are None."""
         manifest = self.manifest
+        # The second, fourth and last are of plans of earlier versions.
         planned = "accuracy", "asked_seconds", "predicted_seconds", "predicted_range", "colour"
         known = (
             "mc_error", "total_error", "total_error_bound", "total_error_of_projector",

@@ -462,7 +462,7 @@ class _Maker:
             count=asked.count,
             pictures=self._pictures.source,
             photographs=self._pictures.photographs,
-            ambient_shots=(capture.ambient_shots or ambient_shots(self._family)) if taken else 0,
+            ambient_shots=ambient_shots(self._family) if taken else 0,
             groups=tuple(self._groups) if asked.vary else (),
             shards=shards,
             versions=versions(),

@@ -84,10 +84,6 @@ class PairsRequest(PairOptions):
 
     def check(self) -> None:
         capture, vary = self.capture, self.vary
-        if capture.seconds is not None or capture.noise_fraction is not None:
-            raise ArgumentError("seconds", "pairs share their light; give an accuracy")
-        if capture.closing_frame is not None:
-            raise ArgumentError("closing_frame", "pairs have none; leave it out")
         if self.pictures is not None:
             picture_files(Path(self.pictures))
         if vary is None:

@@ -1,7 +1,7 @@
 """Predicted seconds, memory and disk of a capture, before anything is simulated.
 
-Plans compare their choices at the :data:`FIXED` unit costs, because the same seed must give the same settings. Measured
-costs only scale the prediction that people read.
+Unit costs are fixed, near those of two cores, because the same seed must give the same settings. Only their ratios
+matter for a choice.
 """
 
 from __future__ import annotations
@@ -74,21 +74,9 @@ _ALLOTTED = 0.5
 """Part of the rays that the truth needs, because samples go where they help most (photograph 0.5, gift_card 0.3)."""
 
 
-@dataclass(frozen=True)
-class UnitCosts:
-    passes: Mapping[str, float]
-    frame: float
-    product: float
-    entry: float
-    accumulated: float
-    ray: float
-    pixel: float = 0.0
-
-
-FIXED = UnitCosts(
-    {name: row.unit_cost for name, row in PASSES.items()}, 2.2e-3, 2.1e-11, 3.5e-8, 1e-8, ray=4e-8, pixel=4e-9
-)
-"""Near the measured costs of two cores; only their ratios decide."""
+_FRAME_S, PRODUCT_S, _ENTRY_S, _ACCUMULATED_S, _RAY_S, _PIXEL_S = 2.2e-3, 2.1e-11, 3.5e-8, 1e-8, 4e-8, 4e-9
+"""Time of a frame, a multiplication in a large product, an entry of a shadow, an entry that is accumulated, a ray of
+the truth, and a pixel of a frame that is read again."""
 
 
 @dataclass(frozen=True)
@@ -116,10 +104,6 @@ class Numbers:
         return self.coarse[0] / FOLLOWED_WIDTH
 
     @classmethod
-    def coarsest(cls) -> Numbers:
-        return cls(*[1.0] * 6)
-
-    @classmethod
     def of_counts(
         cls, counts: Sequence[Number], effects: frozenset[str], occluded: int = 0, raster_cells: int = 0
     ) -> Numbers:
@@ -130,8 +114,8 @@ class Numbers:
     def of(cls, settings: Settings) -> Numbers:
         direct = settings.anchors, len(settings.depths), settings.subdivision
         counts = *direct, settings.followed_anchors, settings.occluded_anchors, settings.coarse_layers
-        occluded, each = len(settings.with_own_anchors), [float(count) for count in counts]
-        return cls.of_counts(each, settings.effects, occluded, settings.raster_cells)
+        occluded = len(settings.with_own_anchors)
+        return cls.of_counts([*map(float, counts)], settings.effects, occluded, settings.raster_cells)
 
 
 def in_waves(effects: frozenset[str]) -> bool:
@@ -153,7 +137,7 @@ def _by_fft(forming: Forming, numbers: Numbers) -> float:
     return numbers.raster_cells**2 or forming.phases
 
 
-def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: UnitCosts) -> Number:
+def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, product_s: float = PRODUCT_S) -> Number:
     phases, pixels, waves = _by_fft(forming, numbers), forming.pixels, bool(numbers.waves)
 
     def multiplications(lit: Sequence[Number], cells: Number, layers: Number, anchors: Number) -> Number:
@@ -186,10 +170,10 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: U
     products = sum(formed * multiplications(*grid) for formed, *grid in by_grid)
     if mixes(forming.classes, forming.shots, pixels):
         products = products + numbers.mixed * forming.classes * pixels**2
-    return cast(Number, forming.lines * frames * (costs.frame + costs.product * products))
+    return cast(Number, forming.lines * frames * (_FRAME_S + product_s * products))
 
 
-def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
+def optics_seconds(forming: Forming, numbers: Numbers) -> Number:
     phases, waves = _by_fft(forming, numbers), bool(numbers.waves)
     # Entries of all shadows, in wave-optical ones.
     coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
@@ -200,31 +184,30 @@ def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Numb
         many = forming.geometric_terms > FEW
         geometric = _MANY_ENTRIES * forming.geometric_terms if many else _GEOMETRIC_ENTRIES
         terms = forming.terms * numbers.waves + geometric * (1 - numbers.waves)
-        shadows = costs.entry * (2 * forming.pixels * forming.cells * sides * terms)
+        shadows = _ENTRY_S * (2 * forming.pixels * forming.cells * sides * terms)
     else:
-        slower = costs.product / FIXED.product
-        drawing = forming.drawing[waves] * slower
+        drawing = forming.drawing[waves]
         if not waves:
             drawing *= phases / forming.phases
         else:  # Waves are squared at as many points whatever the cells.
-            drawing += slower * _CELL_S * forming.pixels**2 * phases
+            drawing += _CELL_S * forming.pixels**2 * phases
         # The pilot has drawn a shadow of one layer in the fewest cells if there is no other way. Coarse light of
         # several layers is seen at a depth of its own.
         several = np.asarray(numbers.layers) > 1
         drawn = ~several & (forming.correlated[waves] and phases == forming.phases)
         shadows = cast(Number, drawing * (numbers.layers + several - drawn))
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)
-    seen = costs.pixel * forming.shots * forming.pixels**2
-    return forming.lines * (shadows + seen) + forming_seconds(forming, numbers, frames, costs)
+    seen = _PIXEL_S * forming.shots * forming.pixels**2
+    return forming.lines * (shadows + seen) + forming_seconds(forming, numbers, frames)
 
 
-def checking_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
+def checking_seconds(forming: Forming, numbers: Numbers) -> Number:
     rounds = ROUNDS + numbers.indirect
     if tells_all(forming.classes, forming.shots, forming.pixels):
         # The result of the last check is reused when frames are formed.
-        return forming_seconds(forming, numbers, _CHECK * (rounds - 1) * forming.classes, costs)
+        return forming_seconds(forming, numbers, _CHECK * (rounds - 1) * forming.classes)
     few, many = (min(shots, forming.shots) for shots in (CHECKED_SHOTS, MOST_CHECKED))
-    return forming_seconds(forming, numbers, _CHECK * rounds * (few + numbers.indirect * (many - few)), costs)
+    return forming_seconds(forming, numbers, _CHECK * rounds * (few + numbers.indirect * (many - few)))
 
 
 def tells_all(classes: int, shots: int, pixels: float) -> bool:
@@ -234,12 +217,12 @@ def tells_all(classes: int, shots: int, pixels: float) -> bool:
 # -------- Tracing, accumulating and the truth
 
 
-def tracing_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
+def tracing_seconds(pilot_result: PilotResult, settings: Settings) -> dict[str, float]:
     found, lines = {}, traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
     for name, cost in sample_costs(pilot_result, settings.effects).items():
         row = PASSES[name]
         samples, connections = float(row.whole(row.predicted_samples(settings))), float(row.connections(settings))
-        found[name] = lines * GROUPS * samples * cost.paths * costs.passes[name] * connections
+        found[name] = lines * GROUPS * samples * cost.paths * row.unit_cost * connections
     return found
 
 
@@ -251,18 +234,15 @@ def traced_for(lines: int, parted: bool = False) -> float:
     return lines if parted else 1 + _FURTHER_LINE * (lines - 1)
 
 
-def predicted_rays(pixels: int, samples: float, rate: float) -> float:
-    """Return the rays of the truth for both fluxes (:mod:`mitsim.light.truth`)."""
+def truth_seconds(pilot_result: PilotResult, settings: Settings) -> float:
+    """Return the time of the truth's rays for both fluxes (:mod:`mitsim.light.truth`)."""
+    row, direct = PASSES["direct"], pilot_result.sample_costs["direct"]
+    rate = (pilot_result.spread if settings.anchors > 1 else direct).rate
+    pixels, samples = direct.paths, float(row.whole(row.predicted_samples(settings)))
     first = TRUTH_GROUPS * pixels * (TRUTH_SAMPLES + BOARD_SAMPLES)
     wanted = _ALLOTTED * GROUPS * pixels * samples * float(TRUTH_PART ** (-1 / rate))
-    return min(first + wanted, max(MOST_RAYS, MOST_SAMPLES * pixels))
-
-
-def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> float:
-    row, direct = PASSES["direct"], pilot_result.sample_costs["direct"]
-    rate = (pilot_result.spread if settings.anchors > 1 else direct).noise.rate
-    ray = traced_for(pilot_result.forming.lines, pilot_result.forming.parted) * costs.ray
-    return ray * predicted_rays(direct.paths, float(row.whole(row.predicted_samples(settings))), rate)
+    rays = min(first + wanted, max(MOST_RAYS, MOST_SAMPLES * pixels))
+    return traced_for(pilot_result.forming.lines, pilot_result.forming.parted) * _RAY_S * rays
 
 
 def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Mapping[str, Number]) -> Number:
@@ -296,11 +276,11 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
     return cast(Number, pixels * found)
 
 
-def accumulation_seconds(forming: Forming, numbers: Numbers, entries_of_group: Number, costs: UnitCosts) -> Number:
+def accumulation_seconds(forming: Forming, numbers: Numbers, entries_of_group: Number) -> Number:
     cells, layers = numbers.coarse
     accumulator = forming.classes * np.square(forming.cells * cells) * layers
     passed = numbers.indirect * _PASSED * np.where(accumulator < MOST_PLACES, accumulator, 0.0)
-    return cast(Number, forming.lines * GROUPS * costs.accumulated * (entries_of_group + passed))
+    return cast(Number, forming.lines * GROUPS * _ACCUMULATED_S * (entries_of_group + passed))
 
 
 # -------- Memory and disk of forming, exposing and writing frames
@@ -348,12 +328,10 @@ def frames_cost(
     """
     (shots, classes), geometry = lighting.weights.shape, bench.geometry
 
-    def file_bytes(rows: int, pixels: int) -> float:
-        return float(_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
+    def file_bytes(rows: int, columns: int) -> float:
+        return float(_BYTES_PER_PIXEL * rows * columns + _BYTES_PER_ROW * rows + _HEADER_BYTES)
 
-    files = shots * file_bytes(geometry.frame_shape[0], math.prod(geometry.frame_shape)) + file_bytes(
-        bench.n, bench.n**2
-    )
+    files = shots * file_bytes(*geometry.frame_shape) + file_bytes(bench.n, bench.n)
     held = light_bytes(bench, classes, settings, lines) + frames_bytes(classes, shots, geometry.frame_side)
     return Cost(seconds=seconds, memory_bytes=held, disk_bytes=max(lines * files - on_disk, 0.0))
 
@@ -370,13 +348,10 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
         # The largest terms of a drawn shadow: of all cells, and of the cells that a shot lights.
         largest = 2 * min(SUMMED_BYTES, 8.0 * MOST_TERMS * cells * sum(geometry.frame_shape))
         factors = max(0.0 if settings.raster else factors, drawn) + largest
-    held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * path_sample_bytes(settings)
-    return factors + _LAUNCH_BYTES + _FOLLOWED_BYTES * followed + held
-
-
-def path_sample_bytes(settings: Settings) -> float:
     parts = min(len(settings.depths), 2) * (4 if settings.sharp else 1)
-    return max(_PATH_SAMPLE_BYTES, _PATH_BYTES + parts * _PART_BYTES)
+    path_bytes = max(_PATH_SAMPLE_BYTES, _PATH_BYTES + parts * _PART_BYTES)
+    held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * path_bytes
+    return factors + _LAUNCH_BYTES + _FOLLOWED_BYTES * followed + held
 
 
 # -------- Drawing a mask's shadow on a raster

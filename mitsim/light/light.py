@@ -31,8 +31,6 @@ from mitsim.optics.frames import ExpectedFrames
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import DeviceSums, PathSamples
 
-Target = Callable[[ExpectedFrames], float]
-"""Relative Monte Carlo error at which sampling stops, from the frames so far."""
 _TOLD, _OF_HEAVY = 1.2, 0.55
 """Ratio of bound and error beyond which few heavy paths dominate both; the bound then falls with power 0.8 to 0.93."""
 _VIEW_SAMPLES = 64
@@ -51,7 +49,6 @@ class Sampling:
 
     purpose: str = "scene"
     by_pixel: bool = True
-    target: Target | None = None
     excess: Callable[[Sequence[SampledLight]], float] | None = None
 
 
@@ -221,18 +218,14 @@ def trace_lines(
         trace_groups(groups, samples, report)
         lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
         last = lines[0].paths >= MOST_PATHS
-        enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
+        target = plan.sampling_target
+        enough = math.inf if last or sampling.excess else target
         checks = _checks(lines, partial(_parts, groups), lighting, followed, enough, predicted)
         lights, near, worst, excess = dict[int, SampledLight](), 1.0, 0, 0.0
         more = sampling.excess([checks[line].light for line in sorted(checks)]) if sampling.excess else 1.0
         for line, check in checks.items():
             light, error = check.light, check.light.sampling_error
-            # The plan's budget limits the error's bound; a user's own target limits the expected error.
-            if sampling.target:
-                target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
-            else:
-                target = plan.sampling_target
-            seen = more * (error if sampling.target else check.bound)
+            seen = more * check.bound
             lights[line] = replace(light, reached=seen <= target)
             beyond = seen / target  # by which the next round must lower the error
             if followed:  # Of direct light no path is heavy.

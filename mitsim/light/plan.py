@@ -19,7 +19,6 @@ from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.files import MOST_BYTES, json_text, plain, read_json, write_text
 from mitsim.core.images import from_above, table
 from mitsim.core.job import Cost
-from mitsim.core.manifests import MONO
 from mitsim.light.settings import Estimate, Settings
 from mitsim.version import __version__
 
@@ -31,7 +30,7 @@ _REPORTED = (
     "effects", "accuracy", "predicted_seconds", "predicted", "settings", "warnings", "predicted_range",
     "sampling_target", "systematic_error", "systematic_bound", "asked_seconds", "colour", "notes",
 )  # fmt: skip
-"""Keys of the command line's JSON, besides bytes."""
+"""Keys of the command line's JSON, besides bytes; those that plans no longer have are null."""
 FORMAT = 1
 """Version of a plan's file."""
 
@@ -46,40 +45,6 @@ class PlanRow:
 
 
 @dataclass(frozen=True)
-class ColourCandidate:
-    """One way to simulate colours: ``mono``, ``bands:K`` or ``lines``.
-
-    ``error`` is the relative rms error of the noise-free frames in electrons, of direct light in the worst band; None
-    if not measured.
-    """
-
-    name: str
-    error: float | None
-    seconds: float
-
-
-@dataclass(frozen=True)
-class ColourChoice:
-    chosen: str
-    candidates: tuple[ColourCandidate, ...]
-
-    @property
-    def taken(self) -> ColourCandidate:
-        return next(each for each in self.candidates if each.name == self.chosen)
-
-    def later(self, seconds: float) -> ColourChoice:
-        return replace(self, candidates=tuple(replace(e, seconds=e.seconds + seconds) for e in self.candidates))
-
-    @property
-    def words(self) -> str:
-        errors = ", ".join(
-            f"{each.name} {'not known' if each.error is None else f'{each.error:.1e}' if each.error else '0'}"
-            for each in self.candidates
-        )
-        return f"Colour: {self.chosen} (error that each leaves: {errors})"
-
-
-@dataclass(frozen=True)
 class Plan:
     """Settings of the factored estimator for one capture, with their reasons.
 
@@ -89,8 +54,6 @@ class Plan:
         A row for each effect and each number.
     predicted_seconds, predicted
         Time from start to finish, and seconds by stage.
-    predicted_range
-        Seconds between which nine of ten runs end, if few heavy paths bring most of the noise; else None.
     accuracy, sampling_target
         Relative error that is to be kept, and the Monte Carlo error at which sampling stops.
     systematic_error, systematic_bound
@@ -99,8 +62,6 @@ class Plan:
         Reasons why a result will be flagged, and choices that were made safely instead of measured more closely.
     request, cost, made_of
         Request, predicted cost, and properties of the bench that the plan depends on; None without a request.
-    asked_seconds
-        Time of the whole run, for which the accuracy is the best possible; None if the accuracy was asked for.
     """
 
     accuracy: float
@@ -112,11 +73,8 @@ class Plan:
     systematic_bound: float
     warnings: tuple[str, ...]
     predicted: Mapping[str, float] = field(default_factory=dict)
-    predicted_range: tuple[float, float] | None = None
     request: Request | None = None
     cost: Cost | None = None
-    asked_seconds: float | None = None
-    colour: ColourChoice | None = None
     notes: tuple[str, ...] = ()
     made_of: Mapping[str, Any] | None = None
 
@@ -135,14 +93,9 @@ class Plan:
 
     @check_arguments
     def taking(self, **seconds: float) -> Plan:
+        """Return the plan with other predicted ``seconds`` of some stages."""
         stages = {**self.predicted, **seconds}
-        more = sum(stages.values()) - sum(self.predicted.values())
-        colour = self.colour and self.colour.later(more)
-        least, most = self.predicted_range or (0.0, 0.0)
-        ends = self.predicted_range and (least + more, most + more)
-        return replace(
-            self, predicted=stages, predicted_seconds=sum(stages.values()), predicted_range=ends, colour=colour
-        )
+        return replace(self, predicted=stages, predicted_seconds=sum(stages.values()))
 
     def block(self) -> dict[str, Any]:
         from mitsim.light.passes import PASSES  # with what traces them: a plan that is read needs no renderer
@@ -151,7 +104,7 @@ class Plan:
         derived = {name: getattr(self.settings, name) for name in ("coarse_cells", "followed_width")}
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects), **derived, **samples}
         del settings["samples"]
-        own = replace(self, request=None, cost=None, made_of=None, colour=self.colour or self._uncoloured)
+        own = replace(self, request=None, cost=None, made_of=None)
         return {**{name: value for name, value in asdict(own).items() if value is not None}, "settings": settings}
 
     # ---- In a file, and for another bench
@@ -179,7 +132,7 @@ class Plan:
 
     def as_text(self) -> str:
         known = self.known_request
-        asked = {name: getattr(known, name) for name in ("patterns", "seconds", "seed", "effects")}
+        asked = {name: getattr(known, name) for name in ("patterns", "seed", "effects")}
         asked |= known.model_dump(mode="json", exclude_unset=True)
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
         own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
@@ -223,10 +176,7 @@ class Plan:
         """
         planned = self.known_request
         request = planned.with_values(**changes)
-        left = self.colour.taken.error or 0.0 if self.colour else 0.0
-        if left and math.isclose(request.accuracy, math.hypot(planned.accuracy, left)):
-            request = request.with_values(accuracy=planned.accuracy)  # what colours leave of the accuracy asked for
-        for name in ("accuracy", "seconds", "effects"):
+        for name in ("accuracy", "effects"):
             if getattr(request, name) != getattr(planned, name):
                 raise ArgumentError(name, f"{_words(getattr(request, name))}: {self.made_for(name)}")
         return request
@@ -260,23 +210,6 @@ class Plan:
             **{f"predicted_{what}_bytes": count for what, count in cost.items()},
         }
 
-    @property
-    def range_words(self) -> str:
-        if self.predicted_range is None:
-            return ""
-        least, most = self.predicted_range
-        return (
-            "Few heavy paths over sharp gloss bring most of the noise, so the samples are not known beforehand: "
-            f"nine of ten such runs take {least:.0f} to {most:.0f} s."
-        )
-
-    @property
-    def _uncoloured(self) -> ColourChoice | None:
-        row = next((row for row in self.effects if row.name == "spectrum"), None)
-        if row is None or row.state != "off":
-            return None
-        return ColourChoice(MONO, (ColourCandidate(MONO, row.error_if_off, self.predicted_seconds),))
-
     @check_arguments
     def plot(self, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
         """Draw the error of omitting each effect, or the seconds of each stage, and return the axes."""
@@ -299,7 +232,7 @@ class Plan:
         ]
         facts = (
             "Error if off: relative rms change of the frames without the effect.",
-            f"Predicted: {self.predicted_seconds:.2f} s. {self.range_words} What is left out or made coarse adds up to "
+            f"Predicted: {self.predicted_seconds:.2f} s. What is left out or made coarse adds up to "
             f"{self.systematic_error:.1e}, at most {self.systematic_bound:.1e}.",
         )
         headings = ("effect", "state", "reason", "error if off", "time [s]")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, NamedTuple
 
@@ -135,27 +135,25 @@ RASTER_RATE = 1.5
 
 
 @dataclass(frozen=True)
-class Noise:
-    """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate.
-
-    ``spread`` is the relative variance of its square, ``heavy`` the number of equal paths that would cause it as
-    unevenly.
-    """
+class SampleCost:
+    """Monte Carlo error of a pass: ``error`` at ``samples`` a cell, falling with samples^-rate, and paths a sample."""
 
     error: float
     samples: float
-    rate: float
-    spread: float = 0.0
-    heavy: float = math.inf
+    paths: int
+    rate: float = 0.5
 
     @classmethod
-    def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
-        energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
-        mean = float(energies.mean())
-        spread = float(energies.var(ddof=1)) / mean**2 if mean else 0.0
-        squares = np.square(paths)
-        heavy = float(squares.sum()) ** 2 / float(np.square(squares).sum() or 1.0)
-        return cls(math.sqrt(float(energies.sum()) / (len(seen) - 1)) / light, samples, 0.5, spread, heavy)
+    def none(cls) -> SampleCost:
+        return cls(0.0, 1, 0)
+
+    @classmethod
+    def relative(cls, error: float, light: float, samples: int, paths: int, rate: float = 0.5) -> SampleCost:
+        return cls(error / light if light else 0.0, samples, paths, rate)
+
+    @property
+    def variance(self) -> float:
+        return self.samples * self.error**2
 
     def samples_for(self, target: Number) -> Number:
         if self.error <= 0:
@@ -164,25 +162,6 @@ class Noise:
 
     def error_left(self, samples: Number) -> Number:
         return self.error * (samples / self.samples) ** -self.rate
-
-
-@dataclass(frozen=True)
-class SampleCost:
-    noise: Noise
-    paths: int
-    seconds: float = 0.0
-
-    @classmethod
-    def none(cls) -> SampleCost:
-        return cls(Noise(0.0, 1, 0.5), 0)
-
-    @classmethod
-    def relative(cls, error: float, light: float, samples: int, paths: int, rate: float = 0.5) -> SampleCost:
-        return cls(Noise(error / light if light else 0.0, samples, rate), paths)
-
-    @property
-    def variance(self) -> float:
-        return self.noise.samples * self.noise.error**2
 
 
 @dataclass(frozen=True, order=True)
@@ -243,9 +222,8 @@ class Forming:
     """Quantities that determine the cost of forming frames, besides settings.
 
     Pairs are without diffraction and with it; pixels and cells are along an axis. ``lit`` is the part of the rows of
-    cells that have light in a frame, ``product`` the time of a multiplication in a large product [s], ``drawing`` that
-    of a shadow's layer. With ``correlated``, frames are never sums of separable terms; with ``parted``, lines share no
-    paths.
+    cells that have light in a frame, ``drawing`` the time of a shadow's layer [s]. With ``correlated``, frames are
+    never sums of separable terms; with ``parted``, lines share no paths.
     """
 
     pixels: float
@@ -254,7 +232,6 @@ class Forming:
     terms: float
     shots: int
     classes: int
-    product: float = 0.0
     geometric_terms: float = 1.0
     correlated: tuple[bool, bool] = (False, False)
     phases: float = 16.0
@@ -309,7 +286,6 @@ class PilotResult:
     unresolved: float = 0.0
     left_out: float = 0.0
     unresolved_specular: float = 0.0
-    mirror: int | None = None
     shared: bool = False
     repeats: tuple[int, ...] = ()
     reach: float | None = None
@@ -317,9 +293,6 @@ class PilotResult:
     occluded: tuple[int, ...] = ()
     raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
     hits: float = math.inf
-
-    def with_sample_costs(self, found: Mapping[str, SampleCost]) -> PilotResult:
-        return replace(self, sample_costs={**self.sample_costs, **found})
 
     def forms(self, waves: bool) -> tuple[int, ...]:
         drawn = self.raster[waves]

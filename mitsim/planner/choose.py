@@ -7,7 +7,6 @@ predicted with signs, then the samples that keep the rest of the budget, and the
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.bench.effects import EFFECTS, names
-from mitsim.bench.request import HIGHEST_ACCURACY
 from mitsim.core.arrays import FloatArray
 from mitsim.light import cost_model
 from mitsim.light.passes import FOLLOWED, PASSES
@@ -30,7 +28,6 @@ from mitsim.light.settings import (
     Estimate,
     Number,
     PilotResult,
-    SampleCost,
     Settings,
 )
 
@@ -46,11 +43,14 @@ _ONE_HIT = 0.25
 """Part of the Monte Carlo error that one hit of a small target may be."""
 _OFF_BY_HITS = Estimate(0.75, 1.5)
 """Error of a small target's light [hits in a group] beyond the spread of groups: rms of 40 runs, and twice that."""
+SHARP_LOBES, MIRRORS_TWICE, SMALL_MIRRORS = (
+    "light over lobes too sharp to sample, of which the frames lack most",
+    "light over a mirror or curved glass twice, or once and a sharp lobe (left out)",
+    "light over mirrors and curved glass alone, in beams too fine to be placed on the sensor",
+)
+"""Light that frames lack."""
 _BOUND_OVER_ERROR = 1.1
 """Ratio of the 95 % bound, by which sampling stops, to the error (measured: 1.04 to 1.3)."""
-_UNEVEN_GROUPS = 2.717430025
-"""Growth of (bound / error)^2 per relative deviation of the groups' noise: Student's 95 % of 4 groups x (4/3)^(1/2)."""
-_SETTLED = 8
 
 
 @dataclass(frozen=True)
@@ -97,31 +97,22 @@ class Candidates:
             for cells in pilot_result.forms(cost_model.in_waves(frozenset(always | set(several))))
         ]
 
-    def best(self, accuracy: float, sure: float = SURE) -> _Prediction:
-        # Most combinations omit light for which no choice of numbers compensates.
-        accurate = [table for table in self._tables if table.accurate(accuracy, sure).any()]
-        found = [table.predict(accuracy, sure) for table in accurate]
-        if not any(each.fits[each.best] for each in found):
-            found = [table.predict(accuracy, sure) for table in self._tables]
-        return min(found, key=lambda each: each.rank)
-
     def choice(self, accuracy: float, sure: float = SURE) -> Candidate:
         """Return the choice of least work that keeps ``accuracy``, or of least error if none does.
 
         Errors that no choice avoids are ignored. ``sure`` is the number of standard errors added to each estimate.
         """
         if (accuracy, sure) not in self._chosen:
-            found = self.best(accuracy, sure)
-            table = found.table
-            alone = table.rows[[found.best]]
+            # Most combinations omit light for which no choice of numbers compensates.
+            accurate = [table for table in self._tables if table.accurate(accuracy, sure).any()]
+            found = [table.predict(accuracy, sure) for table in accurate]
+            if not any(each.fits[each.best] for each in found):
+                found = [table.predict(accuracy, sure) for table in self._tables]
+            best = min(found, key=lambda each: each.rank)
+            table, alone = best.table, best.table.rows[[best.best]]
             one = _Table(self.pilot_result, table.effects, table.raster_cells, alone, table.given)
             self._chosen[accuracy, sure] = one.candidate(accuracy, sure)
         return self._chosen[accuracy, sure]
-
-    def seconds(self, accuracy: float) -> tuple[float, bool]:
-        found = self.best(accuracy)
-        truth = cost_model.truth_seconds(self.pilot_result, found.settings, cost_model.FIXED)
-        return float(found.work[found.best]) + truth, bool(found.fits[found.best])
 
 
 def predicted_candidate(
@@ -274,7 +265,7 @@ class _Table:
         # ---- Samples of a group: the least work for a sum of variances
         lines = cost_model.traced_for(forming.lines, forming.parted)
         work_of_sample = {
-            name: lines * GROUPS * cost_model.FIXED.passes[name] * cost.paths * PASSES[name].connections(numbers)
+            name: lines * GROUPS * PASSES[name].unit_cost * cost.paths * PASSES[name].connections(numbers)
             for name, cost in cost_model.sample_costs(result, self.effects).items()
         }
         parts = {
@@ -286,7 +277,7 @@ class _Table:
         for name, part in parts.items():
             # Light without noise takes no share; a share of one keeps the division defined.
             share = np.sqrt(np.divide(part, every, out=np.ones(len(every)), where=part > 0))
-            needed = self._by_row(name, _samples_for, single * share)
+            needed = self._by_row(name, lambda cost, most: cost.samples_for(most), single * share)
             if name == "direct":
                 needed = np.maximum(needed, 1 / (result.hits * _ONE_HIT * target))
             # A pass that needs less than one sample does not get two when all others grow.
@@ -299,10 +290,8 @@ class _Table:
             + none
         )
         tracing = sum(samples[name] * price for name, price in work_of_sample.items())
-        accumulating = cost_model.accumulation_seconds(forming, numbers, held, cost_model.FIXED)
-        shown = cost_model.optics_seconds(forming, numbers, cost_model.FIXED) + cost_model.checking_seconds(
-            forming, numbers, cost_model.FIXED
-        )
+        accumulating = cost_model.accumulation_seconds(forming, numbers, held)
+        shown = cost_model.optics_seconds(forming, numbers) + cost_model.checking_seconds(forming, numbers)
         work = np.asarray(tracing + accumulating + shown)
         fits = (avoidable < _MARGIN * accuracy) & (held <= _MOST_ENTRIES)
         chosen = fits
@@ -318,12 +307,12 @@ class _Table:
         result, found = self.pilot_result, self.predict(accuracy, sure)
         noise = np.zeros(len(self.rows))
         for name, count in found.samples.items():
-            left = self._by_row(name, lambda cost, own: cost.noise.error_left(own), count)
+            left = self._by_row(name, lambda cost, own: cost.error_left(own), count)
             noise = noise + (PASSES[name].connections(self.numbers) > 0) * np.square(left) / GROUPS
         lacking = {
-            "light over sharp lobes": result.unresolved,
-            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": result.left_out,
-            "light over small mirrors alone (not resolved)": result.unresolved_specular,
+            SHARP_LOBES: result.unresolved,
+            MIRRORS_TWICE: result.left_out,
+            SMALL_MIRRORS: result.unresolved_specular,
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.
@@ -348,16 +337,6 @@ class _Table:
         return np.asarray(found)
 
 
-def _samples_for(kind: SampleCost, target: Number) -> Number:
-    noise = kind.noise
-    light = needed = noise.samples_for(target)
-    if noise.spread:
-        for _ in range(_SETTLED):
-            above = 1 + _UNEVEN_GROUPS * np.sqrt(noise.spread * noise.samples / needed)
-            needed = light * np.maximum(above / _BOUND_OVER_ERROR**2, 1.0)
-    return needed
-
-
 def counts_of(settings: Settings) -> tuple[int, ...]:
     numbers = cost_model.Numbers.of(settings)
     return tuple(int(getattr(numbers, name)) for name in COUNTED)
@@ -373,49 +352,3 @@ def _omissions(switches: Mapping[str, bool]) -> frozenset[Approximation]:
 def costly_effects() -> frozenset[str]:
     traced = frozenset[str]().union(*(row.effects for row in PASSES.values()))
     return traced | names(lambda effect: effect.in_shadow) | {cost_model.MIXING}
-
-
-def unit_costs_of(pilot_result: PilotResult) -> cost_model.UnitCosts:
-    # All matrix work is as much slower or faster as the products.
-    slower = (pilot_result.forming.product or cost_model.FIXED.product) / cost_model.FIXED.product
-    measured = {name: cost.seconds for name, cost in pilot_result.sample_costs.items() if cost.seconds}
-    matrices = {
-        name: slower * getattr(cost_model.FIXED, name) for name in ("frame", "product", "entry", "accumulated", "pixel")
-    }
-    ray = pilot_result.spread.seconds * cost_model.FIXED.ray / cost_model.FIXED.passes["direct"] or cost_model.FIXED.ray
-    return cost_model.UnitCosts(passes={**cost_model.FIXED.passes, **measured}, ray=ray, **matrices)
-
-
-# -------- The finest accuracy that a time buys
-# Accuracies are tried on a grid, by bisection: more seconds never buy a coarser one.
-
-FIRST_ACCURACY = 1e-3
-"""Accuracy of the first pilot run; a looser accuracy takes as long."""
-_STEPS, _DECADES = 10, 5
-"""Tried accuracies per decade, and decades. The finest, 1e-5, is near the end of the ladders of anchors and cells."""
-
-
-@dataclass(frozen=True)
-class AccuracyForTime:
-    accuracy: float
-    seconds: float
-    fits: bool
-
-
-def accuracies(finest: float) -> list[float]:
-    steps = (float(f"{10 ** (-step / _STEPS):.3g}") for step in range(_DECADES * _STEPS + 1))
-    return [HIGHEST_ACCURACY, *(each for each in steps if finest <= each < HIGHEST_ACCURACY)]
-
-
-def accuracy_for_time(candidates: Candidates, seconds: float, finest: float, kept: bool = True) -> AccuracyForTime:
-    """Return the finest accuracy whose light, frames and truth take at most ``seconds``, or the loosest."""
-    grid = accuracies(finest)
-
-    def fails(place: int) -> bool:
-        taken, keeps = candidates.seconds(grid[place])
-        return taken > seconds or (kept and not keeps)
-
-    place = bisect_left(range(len(grid)), True, key=fails) - 1
-    taken, _ = candidates.seconds(grid[max(place, 0)])
-    # If no accuracy at all is kept, the plan is flagged; here only time counts.
-    return AccuracyForTime(grid[max(place, 0)], taken, taken <= seconds)

@@ -17,7 +17,7 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
+from mitsim.light.cost_model import Numbers, forming_seconds
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import (
     REPLICATES,
@@ -25,7 +25,6 @@ from mitsim.light.settings import (
     ErrorCovariance,
     Forming,
     PilotResult,
-    SampleCost,
     Settings,
     SharpPixels,
 )
@@ -51,8 +50,6 @@ _OF_FOLLOWED = 0.5
 """Part of the accuracy at which more anchors of followed light are no longer tried."""
 _FRAMES_AS_MANY = 20.0
 _OF_EFFECTS = 3
-_OVER_WORK, _LESS_S = 4.2, 0.6
-"""Ratio and offset [s] of a pilot's time to the work of its samples."""
 _LOBE_RAYS = 2**22
 """Rays that search for sharp lobes, 0.5 s."""
 _CAUSTIC_PATHS = 2**20
@@ -111,7 +108,8 @@ class PilotRuns:
         self.occluded: PenumbraRuns | None = None
         for run in RUNS:
             self._measure(run)
-        if not self._rough:
+        few = ErrorCovariance.between(self.anchored.until(math.inf), self.switched.light**2)
+        if few.estimate([Approximation("anchors", SMOOTH)]).bound <= _ROUGH * accuracy:
             return
         occluded = occluded_pixels(Simulation(bench, self._base), accuracy, integer(seed, "pilot", "occluded"))
         shown = np.isin(sample.shown, occluded)
@@ -134,9 +132,9 @@ class PilotRuns:
         now, finer = self.samples[run], self.samples[run].finer
         if (finer.fine, finer.direct) == (now.fine, now.direct):
             return math.inf
-        costs, sample_costs = FIXED.passes, self.switched.sample_costs
-        followed = {name: cost.paths for name, cost in sample_costs.items() if name != "sharp"}
-        one = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED)
+        costs = {name: row.unit_cost for name, row in PASSES.items()}
+        followed = {name: cost.paths for name, cost in self.switched.sample_costs.items() if name != "sharp"}
+        one = forming_seconds(self.forming, Numbers(*[1.0] * 6), _FRAMES_AS_MANY)
         if run == "cells":
             paths, changes = costs["direct"] * len(finer.shown) * finer.fine, len(self.fine.changes)
         elif run == "anchors":
@@ -156,23 +154,6 @@ class PilotRuns:
             paths = costs["direct"] * self.bench.n**2 * finer.direct + indirect * finer.followed
             changes = _OF_EFFECTS * len(self.present)
         return REPLICATES * paths + changes * float(one)
-
-    @property
-    def seconds(self) -> float:
-        repeats = [work / FINER for work in map(self.work, RUNS) if math.isfinite(work)]
-        return max(_OVER_WORK * sum(repeats) - _LESS_S, 0.0)
-
-    @property
-    def _rough(self) -> bool:
-        few = ErrorCovariance.between(self.anchored.until(math.inf), self.switched.light**2)
-        return few.estimate([Approximation("anchors", SMOOTH)]).bound > _ROUGH * self.accuracy
-
-    def heavy(self, samples: int) -> dict[str, SampleCost]:
-        found = {
-            "from_camera": self.switched.with_more(samples),
-            "camera_residual": self.followed.with_more(self.switched.light, samples),
-        }
-        return {name: sample_cost for name, sample_cost in found.items() if sample_cost.noise.error}
 
     # ---- Measured quantities, and the frames for them ----
 
@@ -239,7 +220,7 @@ class PilotRuns:
         if self.bench.loaded.mirrors:
             each = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
             missed = left_out_light(simulation.setup, simulation.aim, integer(self.seed, "pilot", "caustics"), each)
-        left_out, mirror = missed.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
+        left_out, _ = missed.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         # Light over mirrors alone, and the part that is in no frame or may be in the wrong pixels.
         mirrors = self.bench.loaded.mirrors
         alone, unsure = self.bench.specular.irradiance(self.bench.geometry) if mirrors else (0.0, 0.0)
@@ -265,7 +246,6 @@ class PilotRuns:
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
             unresolved_specular=unsure / (found + unsure) if unsure else 0.0,
-            mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
             occluded=self._base.occluded,

@@ -6,7 +6,6 @@ Replicates show the same change with independent noise, so the mean product of t
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,8 +27,7 @@ from mitsim.optics.fft_shadow import cells_per_pixel, raster
 from mitsim.optics.image_formation import Entries, number_of_terms, raster_error
 from mitsim.optics.shadow import Places
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer
-from mitsim.transport.records import AMBIENT, Bundle, PathSamples
+from mitsim.transport.records import Bundle, PathSamples
 
 Known = dict[Hashable, tuple[Sequence[PathSamples], FloatArray]]
 """Frames that were formed already, with their light."""
@@ -42,7 +40,6 @@ _DIGITS = 12  # of a pattern's light, without rounding
 _SPARSE = 8  # places per entry of light above which entries are sorted
 _PIXELS = 64**2  # Fewer pixels get more samples each.
 _MOST_PATHS = 2**20  # of one replicate in memory: 60 MB
-_AT_ONCE = 2**19  # paths of a longer replicate in memory: 30 MB
 _CLOSER = 16  # times the samples of a replicate
 _SHARP_PATHS = 2**18
 _MOST_SHARP = 256  # samples of a sharp pixel: an error of 3e-3
@@ -65,9 +62,6 @@ _JUDGING = 4
 _FLAT = 1e-4
 _STEEPEST = 0.9
 """Largest exponent of the error against samples."""
-_SIDE, _PRODUCTS, _MOST_TRIALS = 256, 4, 12
-_BETTER = 0.9
-"""A trial faster than this fraction of the best is followed by two more, because idle processors start slowly."""
 _SURE_OF_RASTER = 1.5
 """Largest error of a raster over that of a few pixels about the axis (measured: 1.04 to 1.11)."""
 _OF_FINER = (1.0, 1.75)
@@ -269,14 +263,6 @@ def norm(seen: FloatArray) -> float:
     return math.sqrt(max(product(seen, seen), 0.0))
 
 
-def heavy_paths(tracer: FromCameraTracer | CombinedTracer, seeds: Sequence[int], samples: int) -> list[PathSamples]:
-    each, found = max(1, _AT_ONCE // tracer.paths_per_sample), []
-    for own in (integer(seed, "heavy") for seed in seeds):
-        parts = [tracer.trace(own, first, min(each, samples - first)) for first in range(0, samples, each)]
-        found.append(PathSamples.join([part.where(part.kind != AMBIENT) for part in parts]))
-    return found
-
-
 def noise(seen: FloatArray) -> float:
     """Return the norm of the error of one replicate."""
     return math.sqrt(float(np.square(seen - seen.mean(axis=0)).sum()) / (len(seen) - 1))
@@ -366,7 +352,6 @@ class DirectRuns:
             terms=float(len(self.bench.spectrum.weights) * geometry.mask_terms),
             shots=len(family.weights),
             classes=family.weights.shape[1],
-            product=_product_seconds(),
             geometric_terms=float(geometry.mask_terms),
             correlated=(geometry.is_drawn(waves=False), geometry.is_drawn(geometry.diffracts)),
             phases=float(cells_per_pixel(geometry) ** 2),
@@ -409,20 +394,6 @@ class DirectRuns:
     def _form(self, simulation: Simulation, light: list[PathSamples], samples: int) -> FloatArray:
         emitted = emission(simulation.physics, self.sample.lighting)
         return self.sample.frames(simulation.grids["fine"], light, samples, emitted, self._known)
-
-
-def _product_seconds() -> float:
-    matrix, best, last = np.ones((_SIDE, _SIDE)), math.inf, 2
-    for trial in range(_MOST_TRIALS):
-        started = time.perf_counter()
-        in_threads(lambda _: matrix @ matrix, range(_PRODUCTS))
-        taken = time.perf_counter() - started
-        if taken < _BETTER * best:
-            last = trial + 2
-        best = min(best, taken)
-        if trial >= last:
-            break
-    return best / (_PRODUCTS * _SIDE**3)
 
 
 def shown_pixels(settings: Settings, sample: Sample) -> Labels:

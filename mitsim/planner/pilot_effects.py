@@ -17,7 +17,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.passes import PASSES, Grid
-from mitsim.light.settings import REPLICATES, WIDE, Approximation, ErrorCovariance, Noise, SampleCost, Settings
+from mitsim.light.settings import REPLICATES, WIDE, Approximation, ErrorCovariance, SampleCost, Settings
 from mitsim.light.simulation import Simulation, emission
 from mitsim.planner.pilot_direct import (
     EVEN_CELLS,
@@ -26,7 +26,6 @@ from mitsim.planner.pilot_direct import (
     Known,
     Sample,
     coarsening_changes,
-    heavy_paths,
     ladder,
     noise,
     norm,
@@ -136,12 +135,12 @@ class AnchorRuns:
         return self._beyond(self._simulation(self.few, cells, layers), self._few, known)
 
     def _beyond(
-        self, simulation: Simulation, seen: Sequence[PathSamples], frames: FloatArray | None = None, samples: int = 0
+        self, simulation: Simulation, seen: Sequence[PathSamples], frames: FloatArray | None = None
     ) -> FloatArray:
         weights, grids = simulation.mean_weights(self.few), self._grids(simulation)
         mean = [replicate.average(weights) for replicate in seen]
-        frames = self._form(grids, seen, samples) if frames is None else frames
-        return frames - self._form([grid.of_mean for grid in grids], mean, samples)
+        frames = self._form(grids, seen) if frames is None else frames
+        return frames - self._form([grid.of_mean for grid in grids], mean)
 
     @cached_property
     def _few(self) -> list[PathSamples]:
@@ -168,10 +167,9 @@ class AnchorRuns:
             self.traced[anchors] = tracer.replicates(self._seeds, self._samples)[0]
         return self.traced[anchors]
 
-    def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int = 0) -> FloatArray:
-        samples = samples or self._samples
-        frames = self.sample.frames(grids[0], replicates, samples)
-        return frames + self.sample.lamps(grids[1], replicates, samples) if len(grids) > 1 else frames
+    def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples]) -> FloatArray:
+        frames = self.sample.frames(grids[0], replicates, self._samples)
+        return frames + self.sample.lamps(grids[1], replicates, self._samples) if len(grids) > 1 else frames
 
 
 class PenumbraRuns(AnchorRuns):
@@ -226,17 +224,6 @@ class FollowedRuns(AnchorRuns):
     @cached_property
     def _from_camera(self) -> FloatArray:
         return self._beyond(self._simulation(self.few), self._few_by_tracer[1])
-
-    def with_more(self, light: float, samples: int) -> SampleCost:
-        simulation = self._simulation(self.few)
-        tracer, one = simulation.at_anchors[1], self._simulation().at_anchors[1]
-        if tracer is None or one is None or not self.changes or not light:
-            return SampleCost.none()
-        seen = heavy_paths(tracer, self._seeds, samples)
-        frames = self._beyond(simulation, seen, samples=samples)
-        # The heaviest paths come to one anchor of several: each connection counts.
-        found = Noise.among(frames, light, samples, np.concatenate([replicate.value for replicate in seen]))
-        return SampleCost(found, one.paths_per_sample)
 
     @cached_property
     def _few(self) -> list[PathSamples]:
@@ -362,7 +349,7 @@ class EffectRuns:
         value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
         wanted = math.ceil(first.samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
         cost = SampleCost.relative(self._noise_of_bounced(first), self.light, first.samples, 1)
-        most = _OF_INDIRECT * float(cost.noise.samples_for(self.accuracy)) / REPLICATES
+        most = _OF_INDIRECT * float(cost.samples_for(self.accuracy)) / REPLICATES
         more = min(wanted, self.sample.closer(tracer.paths_per_sample), math.ceil(most))
         if more <= first.samples:
             return first, first
@@ -381,15 +368,6 @@ class EffectRuns:
         effects = self.everything.effects
         return {name: self.simulation.physics.speckle for name in effects if not EFFECTS[name].in_frames}
 
-    def with_more(self, samples: int) -> SampleCost:
-        tracer = self.simulation.from_camera
-        if tracer is None or not self.light:
-            return SampleCost.none()
-        seen = heavy_paths(tracer, self.seeds, samples)
-        frames = self._form(self.simulation, followed=self._by_kind({"from_camera": seen}), samples=samples)
-        paths = np.concatenate([replicate.value for replicate in seen])
-        return SampleCost(Noise.among(frames, self.light, samples, paths), tracer.paths_per_sample)
-
     def indirect_cost(self) -> tuple[SampleCost, bool, tuple[int, ...]]:
         """Return the cost of indirect light, True if pixels share paths, and the paths of each block."""
         sample_cost, shared = self._shared_or_not
@@ -402,14 +380,14 @@ class EffectRuns:
         if variance * paths > _WORTH_REPEATING:
             return sample_cost, shared, ()
         repeats = tuple(int(count) for count in adaptive_counts(np.sum(moments, axis=0)).ravel())
-        noise_left = replace(sample_cost.noise, error=sample_cost.noise.error * math.sqrt(variance))
-        return replace(sample_cost, noise=noise_left, paths=math.ceil(sample_cost.paths * paths)), shared, repeats
+        error = sample_cost.error * math.sqrt(variance)
+        return replace(sample_cost, error=error, paths=math.ceil(sample_cost.paths * paths)), shared, repeats
 
     @cached_property
     def _shared_or_not(self) -> tuple[SampleCost, bool]:
         plain = self.sample_costs["indirect"]
-        taken = plain.noise.samples_for(self.accuracy) * plain.paths * PASSES["indirect"].unit_cost
-        if not plain.noise.error or taken < _WORTH_SHARING_S:
+        taken = plain.samples_for(self.accuracy) * plain.paths * PASSES["indirect"].unit_cost
+        if not plain.error or taken < _WORTH_SHARING_S:
             return plain, False
         tracer = self.sample.simulation(self.bench, replace(self.everything, shared=True)).indirect
         if not isinstance(tracer, PathReuseTracer) or not tracer.shares():

@@ -1,4 +1,4 @@
-"""The plan of a capture, made from a short pilot run for a given accuracy or a given time.
+"""The plan of a capture, made from a short pilot run for a given accuracy.
 
 Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels, from
 sampling, omissions and coarse numbers.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -23,52 +22,27 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light import cost_model
-from mitsim.light.passes import FOLLOWED
+from mitsim.light.passes import FOLLOWED, PASSES
 from mitsim.light.plan import Plan, PlanRow, State
-from mitsim.light.settings import (
-    COUNTED,
-    GROUPS,
-    MOST_PATHS,
-    REPLICATES,
-    WIDE,
-    Estimate,
-    PilotResult,
-    SampleCost,
-    Settings,
-)
+from mitsim.light.settings import COUNTED, GROUPS, WIDE, Estimate, PilotResult, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.diffraction import check_openings
 from mitsim.optics.fft_shadow import check_waves
 from mitsim.planner import choose, pilot
 from mitsim.transport.connect import part_of_view, shines_in
-from mitsim.transport.missed import polished_shapes
 from mitsim.transport.plugins.base import turn_and_origin
 
 if TYPE_CHECKING:
     from mitsim.scene.load import LoadedScene
-    from mitsim.scene.outline import Tag
 
-OPENING_S = 1.5
-"""Seconds to start the program and open a scene (1.2 to 1.6 on two cores)."""
-_LONGER = 2.0
-"""Seconds of a second, finer pilot over those of the first."""
-_REHEARSED = 2**16
+_TIMED = 2**18
+"""Paths that measure the pace of this machine."""
+_FOR_HEAVY_PATHS = 2**21
+"""Paths from the camera that a run with sharp lobes has at least: half a second."""
 _SELDOM = 3.0
 """Ratio of what a closer run may save to its work below which it is not made: it seldom saves that."""
 _OF_RUN = 0.2
 """Part of the work on light and frames that closer runs may take in total."""
-_MORE, _OF_ALL, _TIMED = 4, 0.1, 0.02
-_MOSTLY = 0.75
-_USUAL = 1.5
-"""Ratio to its fixed cost from which a launch was disturbed, and is repeated."""
-_LEAST_SLOPE = 0.25
-"""Smallest part of a path's seconds in a launch that grows with the paths."""
-_HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
-"""First and largest number of paths that search for heavy paths, 0.1 s and 1 s."""
-_FEW, _FEWEST = 8.0, 4.0
-_LEAST, _MOST = 0.7, 5.0
-"""Ratios of actual to planned work on few heavy paths: nine of ten runs lie between."""
-_HEAVIER = 1.25
 
 
 @single_threaded_blas()
@@ -81,26 +55,21 @@ def make_plan(
     lines: int = 1,
 ) -> Plan:
     check_accuracy(accuracy)
-    _refuse_unfit(bench, switches or {})
-    started = time.perf_counter()
+    switches = switches or {}
+    if bench.loaded.unfit.factored is not None:
+        raise bench.loaded.unfit.factored
+    if bench.geometry.diffracts and switches.get("diffraction") is not False:
+        check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
+        check_waves(bench.geometry, bench.spectrum)
+    started, spent, notes = time.perf_counter(), 0.0, tuple[str, ...]()
     runs = pilot.PilotRuns(bench, lighting, accuracy, seed, lines)
-    candidates, notes = _refine(runs, accuracy, switches or {})
-    plan = _decide(runs, accuracy, candidates).taking(plan=time.perf_counter() - started)
-    return replace(plan, notes=notes)
-
-
-def _refine(
-    runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]
-) -> tuple[choose.Candidates, tuple[str, ...]]:
-    """Repeat pilot runs with more samples while that is worth its work; return candidates and notes."""
-    spent = 0.0
-    while True:
+    while True:  # Pilot runs are repeated with more samples while that is worth its work.
         candidates = choose.Candidates(runs.pilot_result, switches)
         worth, part = choose.value_of_refining(accuracy, candidates)
         run = pilot.run_of(part)
         work = runs.work(run)
         if _SELDOM * work > worth:
-            return candidates, ()
+            break
         spent += work
         whole = candidates.choice(accuracy).work
         if spent > _OF_RUN * whole:
@@ -108,173 +77,42 @@ def _refine(
                 f"{part.name.replace('_', ' ')} and all that hangs on them are chosen safely: to look closer would "
                 f"take {spent:.1f} s, more than a fifth of the {whole:.1f} s of light and frames"
             )
-            return candidates, (note,)
+            notes = (note,)
+            break
         runs.refine(run)
-
-
-@single_threaded_blas()
-def plan_within(
-    bench: Apparatus, lighting: Lighting, seconds: float, seed: int, switches: Mapping[str, bool] | None = None
-) -> Plan:
-    """Make the plan of the finest accuracy that is predicted to take at most ``seconds`` from the program's start.
-
-    Predictions use fixed unit costs, so that the same time gives the same plan.
-    """
-    started, switches = time.perf_counter(), switches or {}
-    _refuse_unfit(bench, switches)
-    around = OPENING_S + sum(cost_model.frame_seconds(bench, len(lighting.weights)).values())
-    runs = pilot.PilotRuns(bench, lighting, choose.FIRST_ACCURACY, seed)
-    around += runs.seconds
-    again = _LONGER * runs.seconds
-    candidates = choose.Candidates(runs.pilot_result, switches)
-    found = choose.accuracy_for_time(candidates, seconds - around, choose.FIRST_ACCURACY)
-    # A pilot run predicts the cost of finer accuracies than its own, but not whether they are kept.
-    aim = choose.accuracy_for_time(candidates, seconds - around - again, 0.0, kept=False)
-    if found.fits and aim.fits and aim.accuracy < choose.FIRST_ACCURACY:
-        around += again
-        closer = pilot.PilotRuns(bench, lighting, aim.accuracy, seed)
-        others = choose.Candidates(closer.pilot_result, switches)
-        finer = choose.accuracy_for_time(others, seconds - around, aim.accuracy)
-        # The closer runs may keep no accuracy at all, and then give the loosest.
-        if finer.fits and finer.accuracy <= found.accuracy:
-            runs, candidates, found = closer, others, finer
-    plan = _decide(runs, found.accuracy, candidates).taking(plan=time.perf_counter() - started)
-    warnings = plan.warnings
-    if not found.fits:
-        warnings = (
-            f"{seconds:g} seconds are too few: even accuracy {found.accuracy:g}, which was taken, is predicted to take "
-            f"{found.seconds + around:.1f} s from start to finish; give more",
-            *warnings,
-        )
-    return replace(plan, asked_seconds=seconds, warnings=warnings)
-
-
-def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
-    if bench.loaded.unfit.factored is not None:
-        raise bench.loaded.unfit.factored
-    if bench.geometry.diffracts and switches.get("diffraction") is not False:
-        check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
-        check_waves(bench.geometry, bench.spectrum)
-
-
-def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: choose.Candidates) -> Plan:
-    pilot_result, switches, bench = candidates.pilot_result, candidates.switches, runs.bench
     chosen = candidates.choice(accuracy)
-    if pilot_result.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
-        pilot_result, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
+    if runs.pilot_result.sharp is not None:
+        # Light over two sharp lobes comes in paths so rare that nothing shows it where the first samples meet none.
+        samples, costs = dict(chosen.settings.samples), runs.pilot_result.sample_costs
+        for name in ("from_camera", "camera_residual"):
+            if samples.get(name) and costs[name].paths:
+                samples[name] = max(samples[name], _FOR_HEAVY_PATHS / (GROUPS * costs[name].paths))
+        chosen = replace(chosen, settings=replace(chosen.settings, samples=samples))
     simulation = Simulation(bench, chosen.settings)
-    timed = _time_paths(pilot_result, simulation, runs.lighting.labels, runs.seed)
-    plan = explain_plan(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
-    plan = replace(plan, predicted_range=_range(timed, plan))
+    pace = _measure_pace(runs.pilot_result, simulation, lighting.labels, integer(seed, "pilot", "paces"))
+    facts = SceneFacts.of(bench, switches)
+    plan = explain_plan(accuracy, runs.pilot_result, facts, switches, chosen, pace)
     if simulation.physics.mirrors:
         # The pilot formed the frames of other shots, or of fewer effects, from the same beams.
         plan = plan.taking(optics=plan.predicted["optics"] + bench.specular.seconds)
-    return plan
+    return replace(plan.taking(plan=time.perf_counter() - started), notes=notes)
 
 
-def _with_heavy_paths(
-    runs: pilot.PilotRuns, accuracy: float, chosen: choose.Candidate, switches: Mapping[str, bool]
-) -> tuple[PilotResult, choose.Candidate]:
-    plain = cost_model.tracing_seconds(runs.pilot_result, chosen.settings, cost_model.FIXED)
-    paths = _HEAVY_PATHS
-    while True:
-        known = runs.pilot_result.sample_costs
-        heavier = {
-            name: replace(known[name], noise=sample_cost.noise)
-            for name, sample_cost in runs.heavy(max(1, paths // (REPLICATES * known["from_camera"].paths))).items()
-            if sample_cost.variance > known[name].variance
-        }
-        pilot_result = runs.pilot_result.with_sample_costs(heavier)
-        planned = choose.predicted_candidate(accuracy, pilot_result, chosen.settings, switches)
-        seconds = cost_model.tracing_seconds(pilot_result, planned.settings, cost_model.FIXED)
-        if sum(seconds.values()) <= _HEAVIER * sum(plain.values()):
-            return runs.pilot_result, chosen
-        paths *= _MORE
-        asked = {name: seconds[name] / cost_model.FIXED.passes[name] for name in heavier}
-        few = any(sample_cost.noise.heavy < _FEW for sample_cost in heavier.values())
-        if paths > (_MOST_HEAVY_PATHS if few else min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values()))):
-            samples = dict(planned.settings.samples)
-            samples |= {name: MOST_PATHS / count * samples[name] for name, count in asked.items() if count > MOST_PATHS}
-            return pilot_result, replace(planned, settings=replace(planned.settings, samples=samples))
-
-
-def _range(pilot_result: PilotResult, plan: Plan) -> tuple[float, float] | None:
-    """Return the seconds between which nine of ten runs end, if few heavy paths make most of their noise."""
-    costs, least, most = choose.unit_costs_of(pilot_result), 0.0, 0.0
-    for name, seconds in cost_model.tracing_seconds(pilot_result, plan.settings, costs).items():
-        heavy = pilot_result.sample_costs[name].noise.heavy
-        if seconds and math.isfinite(heavy):
-            limit = MOST_PATHS * costs.passes[name]
-            least += (_LEAST - 1) * seconds
-            most += max((min(_MOST * seconds, limit) if heavy >= _FEWEST else limit) - seconds, 0.0)
-    total = plan.predicted_seconds
-    return (total + least, total + most) if most else None
-
-
-def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, samples: int) -> float:
-    accumulator = simulation.accumulator(name, labels, 1)
-    started = time.perf_counter()
-    simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulator), labels, samples)
-    # Sums on the device run asynchronously.
-    dr.sync_thread()
-    return time.perf_counter() - started
-
-
-def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
-    own, spread = integer(seed, "pilot", "paces"), pilot_result.spread
-    fixed = {name: 0.0 for name in simulation.passes} | cost_model.tracing_seconds(
-        pilot_result, simulation.settings, cost_model.FIXED
-    )
-    timed, ratios, ray = dict[str, float](), dict[str, float](), 0.0
-    for name in sorted(simulation.passes, key=lambda name: -fixed[name]):
-        rest = sum(seconds for other, seconds in fixed.items() if other not in timed)
-        if timed and rest <= (1 - _MOSTLY) * sum(fixed.values()):
-            break
-        # A path of shared light counts for several.
-        own_paths = simulation.passes[name].tracer.paths_per_sample
-        paths = pilot_result.sample_costs[name].paths if name == "indirect" else own_paths
-        seconds, alone = _pace(simulation, name, labels, own)
-        timed[name], ratios[name] = seconds / paths, seconds / paths / cost_model.FIXED.passes[name]
-        if name == "direct":
-            ray = alone / paths
-    whole = sum(fixed[name] for name in timed)
-    # If no pass takes any time, all timed passes have equal weight.
-    by = {name: fixed[name] / whole if whole else 1 / len(timed) for name in timed}
-    slower = sum(by[name] * ratio for name, ratio in ratios.items()) if timed else 1.0
-    found = {
-        name: replace(
-            pilot_result.sample_costs.get(name, SampleCost.none()),
-            seconds=timed.get(name, slower * cost_model.FIXED.passes[name]),
-        )
-        for name in simulation.passes
-    }
-    spread = replace(spread, seconds=ray or slower * cost_model.FIXED.passes["direct"])
-    return replace(pilot_result.with_sample_costs(found), spread=spread)
-
-
-def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:
-    each, at_once = simulation.passes[name], simulation.paths_at_once
-    planned, paths_per_sample = each.whole, each.tracer.paths_per_sample
-    every = GROUPS * planned
-
-    def once(samples: int) -> float:
-        seconds = _seconds(simulation, name, seed, labels, samples)
-        # The first launch may compile the kernel, and a short disturbance would be multiplied.
-        unusual = seconds > _USUAL * samples * paths_per_sample * cost_model.FIXED.passes[name]
-        again = unusual and (samples == 1 or samples <= _TIMED * every)
-        return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
-
-    launch = once(1)
-    samples = max(1, _REHEARSED // paths_per_sample)
-    longest = once(samples) if samples > 1 else launch
-    least = longest / samples
-    while _MORE * samples * paths_per_sample <= at_once and _MORE * samples <= _TIMED * every:
-        samples *= _MORE
-        longest = once(samples)
-        least = min(least, longest / samples)
-    slope = min(max((longest - launch) / (samples - 1), _LEAST_SLOPE * least), least) if samples > 1 else launch
-    launches = cost_model.ROUNDS * math.ceil(planned / max(1, at_once // paths_per_sample))
-    return slope + max(launch - slope, 0.0) * launches / planned, slope
+def _measure_pace(result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> float:
+    """Return the ratio of the measured to the fixed time of a path, in the pass that is predicted to take longest."""
+    planned = cost_model.tracing_seconds(result, simulation.settings)
+    name = max(simulation.passes, key=lambda name: planned.get(name, 0.0))
+    row, each, seconds = PASSES[name], simulation.passes[name], list[float]()
+    samples = max(1, min(_TIMED // each.tracer.paths_per_sample, each.whole))
+    for _ in range(2):  # The first launch may compile the kernel.
+        started = time.perf_counter()
+        found = each.trace(seed, 0, samples, simulation.accumulator(name, labels, 1))
+        simulation.accumulate(name, found, labels, samples)
+        dr.sync_thread()  # Sums on the device run asynchronously.
+        seconds.append(time.perf_counter() - started)
+    # A path of shared light counts for several.
+    paths = result.sample_costs[name].paths if name == "indirect" else each.tracer.paths_per_sample
+    return min(seconds) / (samples * paths * row.unit_cost * float(row.connections(simulation.settings)))
 
 
 # -------- The table of a plan
@@ -283,22 +121,25 @@ _FEW_WAVELENGTHS = 2
 """Mean width of a mask's openings, in wavelengths, below which scalar diffraction is a guess."""
 _VAGUE = 2.0
 """An error is reported as a bound if its bound is larger than this multiple of its estimate."""
-_FALLOFF = "falloff, gloss and parallax"
-_FOLLOWED = "light over several surfaces, in mirrors and of lamps"
-_CELLS = "{n}x{n} cells of even light a projector pixel"
-_HIDDEN = "{hidden} projector pixels are hidden from part of the sensor"
-# Separate anchors for hidden pixels save time: as many anchors for all pixels would take far more.
-_NUMBERS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
-    "anchors": (f"{_FALLOFF} over the sensor: one anchor", f"{_FALLOFF}: {{n}}x{{n}} anchors",
-                {"anchors": 1, "occluded_anchors": 1}),
-    "layers": ("the light is seen at {depth:.1f} mm; one layer",
-               "the light is seen from {near:.0f} to {far:.0f} mm; {n} layers", {"layers": ()}),
-    "cells": (_CELLS, _CELLS, {}),
-    "followed_anchors": (f"{_FOLLOWED}: one point", f"{_FOLLOWED}: {{n}}x{{n}} in cells of {{width}}x{{width}} pixels",
-                         {"followed_anchors": 1}),
-    "occluded_anchors": (f"{_HIDDEN}: one anchor", f"{_HIDDEN}: {{n}}x{{n}} anchors", {}),
+_NUMBERS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "anchors": ("falloff, gloss and parallax over the sensor: {n}x{n} anchors", {"anchors": 1, "occluded_anchors": 1}),
+    "layers": ("light from {near:.0f} to {far:.0f} mm: {n} of its depths", {"layers": ()}),
+    "cells": ("{n}x{n} cells of even light a projector pixel", {}),
+    "followed_anchors": ("light over several surfaces, in mirrors and of lamps: {n}x{n} points, in cells of "
+                         "{width}x{width} pixels", {"followed_anchors": 1}),
+    # Separate anchors for hidden pixels save time: as many anchors for all pixels would take far more.
+    "occluded_anchors": ("{hidden} projector pixels are hidden from part of the sensor: {n}x{n} anchors", {}),
 }  # fmt: skip
-"""Numbers that a plan chooses: words for one and for several, and the settings with one."""
+"""Numbers that a plan chooses: their words, and the settings with one."""
+_REMEDIES = {
+    choose.SHARP_LOBES: "give those surfaces more roughness, or make them perfect mirrors (conductor)",
+    choose.MIRRORS_TWICE: (
+        "turn those surfaces away, make them rough, or give the projector a lens (aperture_radius_mm) with the effect "
+        "interreflection"
+    ),
+    choose.SMALL_MIRRORS: "use fewer or larger mirrors and glasses, move them apart, or make them rough",
+}
+"""What helps against light that is missing, by its cause."""
 
 
 def explain_plan(
@@ -307,91 +148,86 @@ def explain_plan(
     facts: SceneFacts,
     switches: Mapping[str, bool] | None = None,
     chosen: choose.Candidate | None = None,
+    pace: float = 1.0,
 ) -> Plan:
+    """Return the plan of a choice, with its reasons; a path takes ``pace`` times as long as its fixed cost."""
     check_accuracy(accuracy)
     switches = switches or {}
     chosen = chosen or choose.Candidates(pilot_result, switches).choice(accuracy)
-    stages = _stages(pilot_result, chosen.settings, choose.unit_costs_of(pilot_result))
+    stages = _stages(pilot_result, chosen.settings, pace)
     return Plan(
         accuracy=accuracy,
-        effects=tuple(_rows(pilot_result, chosen.settings, facts, switches)),
+        effects=tuple(_rows(pilot_result, chosen.settings, facts, switches, pace)),
         predicted_seconds=sum(stages.values()),
         settings=chosen.settings,
         sampling_target=chosen.target,
         systematic_error=chosen.systematic.value,
         systematic_bound=chosen.systematic.bound,
-        warnings=(*facts.warnings, *_shortfall(accuracy, pilot_result, chosen, facts)),
+        warnings=(*facts.warnings, *_shortfall(accuracy, pilot_result, chosen)),
         predicted=stages,
     )
 
 
-def _stages(pilot_result: PilotResult, settings: Settings, costs: cost_model.UnitCosts) -> dict[str, float]:
+def _stages(pilot_result: PilotResult, settings: Settings, pace: float) -> dict[str, float]:
     forming, numbers = pilot_result.forming, cost_model.Numbers.of(settings)
     held = cost_model.entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
+    tracing = sum(cost_model.tracing_seconds(pilot_result, settings).values())
+    accumulating = float(cost_model.accumulation_seconds(forming, numbers, held))
+    checking = float(cost_model.checking_seconds(forming, numbers))
     return {
-        "transport": sum(cost_model.tracing_seconds(pilot_result, settings, costs).values())
-        + float(cost_model.accumulation_seconds(forming, numbers, held, costs))
-        + float(cost_model.checking_seconds(forming, numbers, costs)),
-        "truth": cost_model.truth_seconds(pilot_result, settings, costs),
-        "optics": float(cost_model.optics_seconds(forming, numbers, costs)),
+        "transport": pace * tracing + accumulating + checking,
+        "truth": pace * cost_model.truth_seconds(pilot_result, settings),
+        "optics": float(cost_model.optics_seconds(forming, numbers)),
     }
 
 
 def _rows(
-    result: PilotResult, settings: Settings, facts: SceneFacts, switches: Mapping[str, bool]
+    result: PilotResult, settings: Settings, facts: SceneFacts, switches: Mapping[str, bool], pace: float
 ) -> Iterator[PlanRow]:
-    costs, costly, waves = choose.unit_costs_of(result), choose.costly_effects(), cost_model.in_waves(settings.effects)
-    now = _stages(result, settings, costs)
-
-    def stages(**changes: Any) -> dict[str, float]:
-        return _stages(result, replace(settings, **changes), costs)
+    costly, waves = choose.costly_effects(), cost_model.in_waves(settings.effects)
+    now = sum(_stages(result, settings, pace).values())
 
     def saved(**changes: Any) -> float:
-        return max(sum(now.values()) - sum(stages(**changes).values()), 0.0)
+        return max(now - sum(_stages(result, replace(settings, **changes), pace).values()), 0.0)
 
     for name, count in zip(COUNTED, choose.counts_of(settings), strict=True):
-        one, several, with_one = _NUMBERS[name]
+        words, with_one = _NUMBERS[name]
         errors, row = result.ladders[name], name.replace("_", "-")
-        if name == "followed_anchors" and not settings.effects & FOLLOWED:
-            reason = "no light over several surfaces, in mirrors or of lamps is followed"
-            yield PlanRow(row, "off", reason, 0.0, 0.0)
-        elif name == "occluded_anchors" and not result.occluded:
-            yield PlanRow(row, "off", "few anchors serve all projector pixels", 0.0, 0.0)
-        else:
-            reason = (one if count == 1 else several).format(
-                n=count, depth=result.depth, near=settings.depths[-1], far=settings.depths[0],
-                width=settings.followed_width, hidden=len(result.occluded),
-            )  # fmt: skip
-            left = _words(errors[count])
-            if name == "cells":
-                worst = max(error.value for error in errors.values())
-                yield PlanRow(row, "approximate", f"{reason} leave {left}", worst, 0.0)
-            elif count == 1:
-                yield PlanRow(row, "off", f"{reason} leaves {left}", errors[1].value, 0.0)
-            else:
-                yield PlanRow(row, "approximate", f"{reason} leave {left}", errors[1].value, saved(**with_one))
+        unused = {
+            "followed_anchors": "no light over several surfaces, in mirrors or of lamps is followed",
+            "occluded_anchors": "few anchors serve all projector pixels",
+        }
+        called_for = {"followed_anchors": settings.effects & FOLLOWED, "occluded_anchors": result.occluded}
+        if not called_for.get(name, True):
+            yield PlanRow(row, "off", unused[name], 0.0, 0.0)
+            continue
+        reason = words.format(
+            n=count, near=settings.depths[-1], far=settings.depths[0], width=settings.followed_width,
+            hidden=len(result.occluded),
+        )  # fmt: skip
+        state: State = "off" if count == 1 and name != "cells" else "approximate"
+        if_off = max(error.value for error in errors.values()) if name == "cells" else errors[1].value
+        seconds = saved(**with_one) if count > 1 else 0.0
+        yield PlanRow(row, state, f"{reason}, which leaves {_words(errors[count])}", if_off, seconds)
 
     drawn = result.raster[waves]
-    left_by_raster = drawn.error_left(settings.raster_cells)
-    if left_by_raster is not None:  # The mask has more than two separable terms.
-        fewest, terms = drawn.cells[0], f"{result.forming.geometric_terms:.0f} separable terms"
-        cells = settings.raster_cells or fewest
-        by_fft, with_fewest, sums = (
-            stages(raster=count > 0, raster_cells=count)["optics"] for count in (cells, fewest, 0)
+    left = drawn.error_left(settings.raster_cells)
+    if left is not None:  # The mask has more than two separable terms.
+        cells = settings.raster_cells or drawn.cells[0]
+        by_fft, sums = (
+            float(cost_model.optics_seconds(result.forming, cost_model.Numbers.of(replace(settings, raster_cells=own))))
+            for own in (cells, 0)
         )
-        formed = f"by FFT on a raster of {cells} cells a pixel, which leaves {_words(left_by_raster)}"
-        if drawn.needed:
-            yield PlanRow("mask-shadow", "approximate", formed, None, max(by_fft - with_fewest, 0.0))
-        elif settings.raster:
-            reason = f"{terms}: {formed}, in {by_fft:.2g} s; their sum takes {sums:.2g} s"
-            yield PlanRow("mask-shadow", "approximate", reason, 0.0, max(by_fft, 0.0))
+        if settings.raster or drawn.needed:
+            reason = f"by FFT on a raster of {cells} cells a pixel, which leaves {_words(left)}"
+            yield PlanRow("mask-shadow", "approximate", reason, None if drawn.needed else 0.0, by_fft)
         else:
-            reason = f"{terms} are summed, in {sums:.2g} s; {formed}, in {by_fft:.2g} s"
-            yield PlanRow("mask-shadow", "exact", reason, left_by_raster.value, sums)
+            reason = f"{result.forming.geometric_terms:.0f} separable terms are summed; by FFT it takes {by_fft:.2g} s"
+            yield PlanRow("mask-shadow", "exact", reason, left.value, sums)
 
     for name, effect in EFFECTS.items():
         on, error = name in settings.effects, result.effects.get(name)
-        state: State = "exact" if on else "off"
+        state = "exact" if on else "off"
         if error is None:
             yield PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
             continue
@@ -415,61 +251,28 @@ def _words(error: Estimate) -> str:
     return f"{error.value:.1e}" if error.bound < _VAGUE * error.value else f"less than {error.bound:.1e}"
 
 
-def _shortfall(accuracy: float, result: PilotResult, chosen: choose.Candidate, facts: SceneFacts) -> list[str]:
-    """Return the reasons why the choice misses the accuracy, with remedies; empty if it is kept."""
+def _shortfall(accuracy: float, result: PilotResult, chosen: choose.Candidate) -> list[str]:
+    """Return why the choice misses the accuracy, with a remedy where light is missing; empty if it is kept."""
     if chosen.total.bound <= accuracy:
         return []
-    settings, found = chosen.settings, list[str]()
-    parts = {
-        f"{name.replace('_', ' ')} ({count}{'' if name == 'layers' else f'x{count}'})": result.ladders[name][
-            count
-        ].bound
-        for name, count in zip(COUNTED, choose.counts_of(settings), strict=True)
-    }
-    width, raster = (
-        settings.followed_width,
-        result.raster[cost_model.in_waves(settings.effects)].error_left(settings.raster_cells),
-    )
-    if width > 1:
-        parts[f"cells of their light ({width} pixels)"] = result.error(WIDE).bound / settings.coarse_cells**2
+    settings, counts = chosen.settings, zip(COUNTED, choose.counts_of(chosen.settings), strict=True)
+    parts = {f"{name.replace('_', ' ')} ({count})": result.ladders[name][count].bound for name, count in counts}
+    raster = result.raster[cost_model.in_waves(settings.effects)].error_left(settings.raster_cells)
+    if settings.followed_width > 1:
+        wide = f"cells of their light ({settings.followed_width} pixels)"
+        parts[wide] = result.error(WIDE).bound / settings.coarse_cells**2
     if raster and settings.raster:
         parts["the mask's raster"] = raster.bound
     if sharp := settings.sharp:
-        parts[f"anchors of sharp light ({sharp.anchors}x{sharp.anchors})"] = sharp.left
-    off = {f"{name} (off)": error.bound for name, error in result.effects.items() if name not in settings.effects}
-    parts |= {**chosen.lacking, **off}
+        parts[f"anchors of sharp light ({sharp.anchors})"] = sharp.left
+    parts |= {f"{name} (off)": error.bound for name, error in result.effects.items() if name not in settings.effects}
+    parts |= chosen.lacking
     largest = max(parts, key=lambda name: parts[name])
-    counts = min(accuracy, parts[largest])
-    if result.unresolved > accuracy:
-        found.append(
-            f"{result.unresolved:.0%} of the direct light comes over lobes too sharp to sample, and the frames "
-            "lack most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)"
-        )
-    if result.mirror is not None and facts.shapes and result.left_out >= counts:
-        rule = (
-            f"{result.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a sharp "
-            "lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; "
-            "turn it away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect "
-            "interreflection"
-        )
-        found.append(_refusal(facts.shapes[result.mirror], rule))
-    if facts.mirrors and result.unresolved_specular >= counts:
-        kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in facts.mirrors)
-        among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
-        rule = (
-            f"{result.unresolved_specular:.2g} of the light comes over the scene's mirrors and curved glass "
-            f"alone ({among}; this is the first), in beams too fine to be placed on the sensor: it is left "
-            "out, or in the wrong pixels; use fewer or larger ones, move them apart, or make them rough"
-        )
-        found.append(_refusal(facts.mirrors[0], rule))
-    return found or [
-        f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
-        f"largest: {largest}, {parts[largest]:.1e}"
+    remedy = f"; {_REMEDIES[largest]}" if largest in _REMEDIES else ""
+    return [
+        f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; largest: "
+        f"{largest}, {parts[largest]:.1e}{remedy}"
     ]
-
-
-def _refusal(tag: Tag, rule: str, place: str = "shape") -> str:
-    return str(tag.refusal(place, repr(tag.attributes.get("type", "")), rule))
 
 
 # -------- Facts about a bench that a plan reports
@@ -483,8 +286,6 @@ class SceneFacts:
     notes: Mapping[str, str]
     keystone: float
     warnings: tuple[str, ...] = ()
-    shapes: tuple[Tag, ...] = ()
-    mirrors: tuple[Tag, ...] = ()
     spectrum: PlanRow = field(default_factory=lambda: PlanRow("spectrum", "off", _GREY, 0.0, 0.0))
 
     @classmethod
@@ -492,8 +293,6 @@ class SceneFacts:
         loaded, off = bench.loaded, {name for name, on in (switches or {}).items() if not on}
         warnings = (*known_losses(loaded, switches or {}), *_limits(bench, off))
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        polished = polished_shapes(loaded.scene) if loaded.mirrors and loaded.shapes else ()
-        mirrors = tuple(loaded.shapes[number] for number in polished)
         spectrum = PlanRow("spectrum", "off", _GREY, 0.0, 0.0)
         if bench.lines is not None:
             nanometres = ", ".join(f"{wave:g}" for wave in bench.lines.wavelengths_nm)
@@ -501,12 +300,12 @@ class SceneFacts:
         elif loaded.coloured:
             may = f"{len(loaded.coloured)} of the scene's tags may have colours"
             first = f"the first {loaded.coloured[0].path.name}:{loaded.coloured[0].line}"
-            reason = f"one panchromatic reflectance; {may}, {first}; what that leaves out: --colour auto"
+            reason = f"one panchromatic reflectance; {may}, {first}; --colour lines tells them apart"
             spectrum = PlanRow("spectrum", "off", reason, None, 0.0)
         elif bench.sensor.quantum_efficiency_curve is not None:
-            reason = f"{_GREY}, but the camera does; what that leaves: --colour auto"
+            reason = f"{_GREY}, but the camera does; --colour lines tells them apart"
             spectrum = PlanRow("spectrum", "off", reason, None, 0.0)
-        return cls(notes, loaded.pixels.keystone, warnings, loaded.shapes, mirrors, spectrum)
+        return cls(notes, loaded.pixels.keystone, warnings, spectrum)
 
 
 def _limits(bench: Apparatus, off: Collection[str]) -> Iterator[str]:
@@ -583,7 +382,7 @@ def unseen_lamps(loaded: LoadedScene, paths: float, estimator: str) -> Iterator[
                 f"it shines on the sensor itself, and {estimator} has no light of a lamp but over surfaces, so that is "
                 "missing; keep it out of the view, or use a light that has a surface (area)"
             )
-            yield _refusal(tag, rule, "light")
+            yield str(tag.refusal("light", repr(tag.attributes.get("type", "")), rule))
     for tag, shape in zip(loaded.shapes, loaded.scene.shapes(), strict=True) if loaded.shapes else ():
         part = part_of_view(loaded.scene, loaded.camera, shape) if shape.is_emitter() else 0.0
         if 0 < part * paths < _FEWEST:

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import tomli_w
 from pydantic.fields import FieldInfo
 
-from mitsim.bench.request import NO, Family, FixedColour, Opening, Planned, Request, Sampled, SessionRequest
+from mitsim.bench.request import NO, Coloured, Family, Opening, Planned, Request, Sampled, SessionRequest
 from mitsim.core.configuration import (
     FilePath,
     Mistake,
@@ -86,11 +86,11 @@ class _Plan(_Placed, Planned):
     pass
 
 
-class _Capture(_Placed, Request, FixedColour):
+class _Capture(_Placed, Request, Coloured):
     pass
 
 
-class _Calibration(_Placed, SessionRequest, FixedColour):
+class _Calibration(_Placed, SessionRequest, Coloured):
     recipe: Annotated[Any, validated_by(_recipe)] = None
 
 
@@ -469,7 +469,7 @@ def _check_step(session: Session, step: Step, place: Place, found: _Mistakes) ->
     values, capture = step.values, session.step("capture")
     colour, plan, light = values.get("colour", NO), session.step("plan"), session.step("transport")
     if step.verb == "capture" and (above := light or plan):
-        for name in ("accuracy", "seconds", "effects", *(("noise_fraction",) if light else ())):
+        for name in ("accuracy", "effects"):
             if name in values:
                 found.say((*place, name), f"is the {above.verb}'s; give it in [{above.verb}]")
         if plan is not None and light is not None:

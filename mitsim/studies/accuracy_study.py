@@ -73,12 +73,8 @@ class Probe:
     accuracy: float
 
     @cached_property
-    def pilot_runs(self) -> pilot.PilotRuns:
-        return pilot.PilotRuns(self.bench, self.family.lighting, self.accuracy, self.seed)
-
-    @property
     def pilot_result(self) -> PilotResult:
-        return self.pilot_runs.pilot_result
+        return pilot.PilotRuns(self.bench, self.family.lighting, self.accuracy, self.seed).pilot_result
 
     def plan(self, accuracy: float) -> Plan:
         return explain_plan(accuracy, self.pilot_result, SceneFacts.of(self.bench))
@@ -166,7 +162,7 @@ def measure_run(judge: Judge, accuracy: float, opening_s: float) -> dict[str, Va
     """Return the row of a whole capture, with the median of repeated times and stages."""
     probe, stages, errors = judge.probe, [], []
     bench, plan = probe.bench, probe.plan(accuracy)
-    around = probe.pilot_runs.seconds + sum(frame_seconds(bench, len(probe.family.shots)).values())
+    around = sum(frame_seconds(bench, len(probe.family.shots)).values())
     known: dict[str, Value] = {"estimator": RUN, "setting": f"accuracy {accuracy:g}", "accuracy": accuracy}
     if (predicted := plan.predicted_seconds + around) > LONGEST_S:
         by = f"not measured, predicted to take {predicted:.0f} s"

@@ -200,12 +200,6 @@ class _MissedPaths(CameraPaths[_MissedState]):
         return going
 
 
-def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
-    polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
-    shapes = enumerate(scene.shapes())
-    return tuple(number for number, shape in shapes if shape.bsdf() is not None and shape.bsdf().flags() & polished)
-
-
 # -------- Highlights of glossy balls
 #
 # The light that a ball of radius r sends to a point comes from a spot of some alpha r: rays that are spread over the

@@ -62,7 +62,7 @@ def bench_of(write: Write, rows: int, columns: int, crop: dict[str, int], tall: 
 
 def frames_of(bench: Bench, plan: Plan) -> np.ndarray:
     """(5, rows, columns) expected irradiance of light that is sampled as the ``plan`` says, and no further."""
-    light = trace_light(bench, plan, LIGHTING, 11, Sampling(by_pixel=False, target=lambda _: np.inf))
+    light = trace_light(bench, replace(plan, sampling_target=np.inf), LIGHTING, 11, Sampling(by_pixel=False))
     return np.stack([frame.irradiance for frame in light.frames(LIGHTING, 0)])
 
 

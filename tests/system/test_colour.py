@@ -194,9 +194,8 @@ def test_each_line_is_calibrated_for_itself(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--colour", "bands"), "--colour 'bands': use no, lines, bands:K, mosaic or auto"),
+        (("--colour", "bands"), "--colour 'bands': use no, lines, bands:K or mosaic"),
         (("--colour", "bands:5"), "--colour 'bands:5': give bands:1 to bands:4"),
-        (("--colour", "lines", "--seconds", "5"), "not planned by time"),
     ],
 )
 def test_what_colour_cannot_do_is_refused(
@@ -209,80 +208,3 @@ def test_what_colour_cannot_do_is_refused(
     scene = coloured("sheet")
     assert words in shell("capture", scene, "-o", tmp_path / "run", "--patterns", "dots:2", *options).refusal
     assert not (tmp_path / "run").exists()
-
-
-def luminance(reflectance: Callable[[float], float]) -> float:
-    """What mono variants see of a ``reflectance`` by wavelength: its luminance under D65 (CIE 1931)."""
-    from colour import MSDS_CMFS, SDS_ILLUMINANTS
-
-    observer, daylight = MSDS_CMFS["CIE 1931 2 Degree Standard Observer"], SDS_ILLUMINANTS["D65"]
-    seen = observer.values[:, 1] * np.interp(observer.wavelengths, daylight.wavelengths, daylight.values)
-    return float(seen @ [reflectance(nm) for nm in observer.wavelengths] / seen.sum())
-
-
-def test_the_error_of_mono_and_of_bands_is_that_of_their_reflectances(
-    shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
-) -> None:
-    """An even sheet without a mask: frames differ by the photons that come back, which its spectrum tells."""
-    whole, scene = projector(tmp_path / "all.toml", LINES), coloured("sheet")
-    bare = scene.with_name("bare.xml")
-    bare.write_text(scene.read_text().replace('name="mask" value="separable"', 'name="mask" value="open"'))
-    options = "--colour", "auto", "--projector", whole, "--patterns", "dots:2", "--accuracy", 0.05, "--json"
-    choice = shell("plan", bare, *options).payload["colour"]
-    reported = {each["name"]: each["error"] for each in choice["candidates"]}
-    ends = min(SHEET) - 40, *sorted(SHEET), max(SHEET) + 40
-
-    def sheet(nm: float) -> float:
-        known = [SHEET[min(max(wave, min(SHEET)), max(SHEET))] for wave in ends]
-        return float(np.interp(nm, ends, known, left=0, right=0))
-
-    def photons(*lines: int, mean: bool = False) -> float:
-        power = sum(LINES[nm] for nm in lines)
-        middle = sum(LINES[nm] * nm for nm in lines) / power
-        return power * middle * sheet(middle) if mean else sum(LINES[nm] * nm * sheet(nm) for nm in lines)
-
-    true, mono = photons(*LINES), sum(nm * part for nm, part in LINES.items()) * luminance(sheet)
-    left = {
-        "mono": abs(mono - true) / true,
-        "bands:1": abs(photons(*LINES, mean=True) - true) / true,
-        "bands:2": abs(photons(520, 445, mean=True) / photons(520, 445) - 1),
-        "lines": 0.0,
-    }
-    assert [*reported] == [*left]
-    for name, error in left.items():
-        assert 0.999 * error <= reported[name] <= 1.1 * error, name  # rounded up to two digits
-    assert choice["chosen"] == "bands:2" and max(left["mono"], left["bands:1"]) > 0.025 > left["bands:2"]
-
-
-def test_a_scene_in_greys_is_captured_as_without_colour(
-    call: Callable[..., Any], shared_scene: Callable[..., Path], tmp_path: Path
-) -> None:
-    """`--colour auto` of what has no colours: mono, the same frames, and that it leaves nothing."""
-    scene = shared_scene("greys")
-    common = "--patterns", "uniform", "--accuracy", 0.05, "--json"
-    plain = call("capture", scene, "-o", tmp_path / "plain", *common).payload
-    auto = call("capture", scene, "-o", tmp_path / "auto", *common, "--colour", "auto").payload
-    assert np.array_equal(electrons(tmp_path / "plain"), electrons(tmp_path / "auto"))
-    assert plain["colour"]["chosen"] == auto["colour"]["chosen"] == "mono"
-    assert [(each["name"], each["error"]) for each in plain["colour"]["candidates"]] == [("mono", 0.0)]
-    assert [(each["name"], each["error"]) for each in auto["colour"]["candidates"]] == [("mono", 0.0), ("lines", 0.0)]
-    manifest = json.loads((tmp_path / "auto" / "manifest.json").read_text())
-    assert manifest["plan"]["colour"]["candidates"][0]["error"] == 0.0
-
-
-@pytest.mark.slow
-def test_what_auto_chooses_is_captured_and_calibrated(
-    shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
-) -> None:
-    """Two bands of three lines, whose folders fit a calibration with as many; a resumed run finds the same choice."""
-    whole, scene = projector(tmp_path / "all.toml", LINES), coloured("sheet")
-    common = "--projector", whole, "--accuracy", 0.05
-    run = "capture", scene, "-o", tmp_path / "run", "--patterns", "dots:2", "--colour", "auto", *common
-    payload = shell(*run, "--json").payload
-    chosen = payload["colour"]["chosen"]
-    assert chosen == "bands:2" and [line["wavelength_nm"] for line in payload["channels"]] == [490.0, 638.0]
-    (lost := tmp_path / "run" / "490nm" / "frame_00002.exr").unlink()
-    (tmp_path / "run" / "colour.json").unlink()
-    assert shell(*run, "--resume").code == 0 and lost.exists()
-    assert shell("calibrate", scene, "-o", tmp_path / "cal", "--colour", chosen, *common).code == 0
-    assert shell("reconstruct", tmp_path / "run", "--calibration", tmp_path / "cal").code in (0, 1)

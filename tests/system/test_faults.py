@@ -273,12 +273,3 @@ def test_a_home_that_takes_no_kernels(
     assert outcome.payload["mean"] == call(*options, tmp_path / "kept.exr").payload["mean"]
     ours, theirs = (read_frame(tmp_path / f"{name}.exr")[0] for name in ("anew", "kept"))
     assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
-
-
-# ---- numbers ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("fraction", ["1e-300", "1e-323"])
-def test_a_part_of_the_noise_that_nothing_reaches(refused: Callable[..., str], lab: Any, fraction: str) -> None:
-    line = refused("capture", *lab.arguments, "-o", "new", "--patterns", "dots:4", "--noise-fraction", fraction)
-    assert "noise-fraction" in line and fraction in line

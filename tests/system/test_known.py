@@ -64,7 +64,6 @@ def test_a_plan_is_written_and_captured(
         (("--patterns", "dots:2"), ("--patterns 'dots:2': the plan was made for 'dots:4'; plan anew",)),
         (("--accuracy", "1e-3"), ("--accuracy 0.001: the plan was made for 0.005",)),
         (("--effects=-diffraction",), ("--effects -diffraction: the plan was made for none",)),
-        (("--colour", "auto"), ("--colour auto: the plan was made with another word",)),
         (("--light", "light.h5"), ("--plan", "leave out --plan or --light")),
     ):
         mentions(refused("capture", *devices, "--plan", file, *options, "-o", tmp_path / "new"), *fragments)
@@ -99,7 +98,6 @@ def test_light_is_written_and_captured(
     for options, fragments in (
         (("--patterns", "dots:8"), ("--patterns 'dots:8': its shots light", "trace light for dots:8")),
         (("--patterns", "dots:2", "--accuracy", "1e-3"), ("--accuracy 0.001",)),
-        (("--patterns", "dots:2", "--noise-fraction", "0.1"), ("--noise-fraction 0.1: light is traced already",)),
     ):
         mentions(refused("capture", *devices, "--light", file, *options, "-o", tmp_path / "new"), *fragments)
     lit = refused("capture", lab.scene, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "new")
@@ -181,24 +179,6 @@ def same_run(one: Path, other: Path) -> bool:
 
 
 @pytest.mark.slow
-def test_what_auto_chose_is_captured_by_its_plan(
-    shell: Callable[..., Any], sheet: tuple[object, ...], tmp_path: Path
-) -> None:
-    """Two bands, and not chosen again; said again or not, they are captured as --colour auto itself does. (Planted:
-    the accuracy that colours left taken for the one asked for; bands captured as lines.)"""
-    file, options = tmp_path / "plan.json", OF_COLOUR
-    assert shell("plan", *sheet, *options, "--colour", "auto", "-o", file).payload["colour"]["chosen"] == "bands:2"
-    known = "capture", *sheet, "--plan", file
-    done = shell(*known, "--colour", "auto", *options, "-o", tmp_path / "run").payload
-    assert [line["wavelength_nm"] for line in done["channels"]] == [490.0, 638.0]
-    assert shell("capture", *sheet, *options, "--colour", "auto", "-o", tmp_path / "own").code == 0
-    assert same_run(tmp_path / "run", tmp_path / "own")
-    refusal = shell(*known, "-o", tmp_path / "none").refusal
-    mentions(refusal, '--plan was made of another colour: {"filters": false', "none here")
-    assert not (tmp_path / "none").exists()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("colour", ["bands:2", "lines", "mosaic"])
 def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
     shell: Callable[..., Any], sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path, colour: str
@@ -211,11 +191,10 @@ def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
     for name, more in (("run", ("--plan", file)), ("own", ())):
         assert shell("capture", *sheet, *options, *more, "--colour", colour, "-o", tmp_path / name).code == 0
     assert same_run(tmp_path / "run", tmp_path / "own")
-    for other in {"no", "auto", "bands:1", "lines", "mosaic"} - {colour}:
+    for other in {"no", "bands:1", "lines", "mosaic"} - {colour}:
         devices = filters if other == "mosaic" else ()
         line = shell("capture", *sheet, "--plan", file, "--colour", other, *devices, "-o", tmp_path / "none").refusal
-        asked_auto = "--colour auto: the plan was made with another word of --colour; give that"
-        mentions(line, asked_auto if other == "auto" else "--plan was made of another colour: ")
+        mentions(line, "--plan was made of another colour: ")
     for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
         line = shell("transport", *sheet, "--plan", file, "--variant", variant, "-o", tmp_path / "none").refusal
         mentions(line, "--plan was made of another colour: ")
@@ -233,7 +212,6 @@ def test_light_is_of_no_colour(
     known = "capture", *sheet, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "none"
     for options, sentence in (
         (("--colour", "lines"), "--colour: has no effect on --light"),
-        (("--colour", "auto"), "--colour: has no effect on --light"),
         (("--colour", "mosaic", *filters), "--colour: has no effect on --light"),
         (filters, "has a mosaic GBRG"),
         (("--variant", "llvm_ad_spectral"), "--light was made of another variant: llvm_ad_mono there"),

@@ -155,7 +155,7 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
         (
             "capture",
             ("--colour", "red", "--patterns", "dots:2"),
-            "--colour 'red': use no, lines, bands:K, mosaic or auto",
+            "--colour 'red': use no, lines, bands:K or mosaic",
         ),
     ],
 )

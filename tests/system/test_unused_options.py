@@ -45,9 +45,7 @@ CASES = [
     ("patterns dots:3 -o {out}", "--signed-capture pair"),
     ("patterns stripes --camera imx249 --exposure 1 -o {out}", "--seed 1"),
     ("capture photograph --patterns dots:3 --exposure 0.1 -o {out}", "--exposure-fraction 0.5"),
-    ("capture photograph --patterns dots:3 --ambient-frame no -o {out}", "--ambient-shots 4"),
     ("pairs photograph --count 2 --exposure 0.1 -o {out}", "--exposure-fraction 0.5"),
-    ("pairs photograph --count 2 --ambient-frame no -o {out}", "--ambient-shots 4"),
     ("characterise imx249 -o {out}", "--wavelength 550"),
     ("sense {folder}/light.npy --camera imx249 --exposure 1 -o {out}.npy", "--exposure-fraction 0.8"),
     *(
@@ -76,11 +74,3 @@ def test_an_option_without_effect_is_refused(
     assert found.code == 2 and len(found.err.strip().splitlines()) == 1, found.err
     assert option.split()[0] in found.err and "has no effect" in found.err and "leave it out" in found.err
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize("verb", ["plan photograph", "capture photograph -o {out}", "transport photograph -o {out}.h5"])
-def test_time_or_accuracy_decides(call: Callable[..., Any], tmp_path: Path, verb: str) -> None:
-    """(Planted: an accuracy passed over where there are seconds.)"""
-    line = f"{verb} --patterns dots:3 --seconds 5 --accuracy 0.01".format(out=tmp_path / "out")
-    found = call(*line.split())
-    assert found.code == 2 and "--seconds 5" in found.err and "not both" in found.err

@@ -236,8 +236,6 @@ def test_light_that_does_not_fit_is_refused(bench: Bench, light: Light, tmp_path
         found.check_serves("dots:5")
     for patterns in ("dots:3", "dots:2", "uniform", "hadamard:4"):
         found.check_serves(patterns)
-    with pytest.raises(ArgumentError, match=r"^noise_fraction 0\.1: light is traced already"):
-        found.expose("dots:2", noise_fraction=0.1)
     with pytest.raises(ArgumentError, match=r"^accuracy 0\.001"):
         found.expose("dots:2", accuracy=1e-3)
 

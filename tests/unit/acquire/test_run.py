@@ -198,73 +198,32 @@ def test_resume_makes_the_missing_frames_and_keeps_the_rest(bench: Bench, captur
     assert all(checksum(folder / name) == value for name, value in checksums.items())
 
 
-def test_seconds_buy_an_accuracy_that_the_manifest_states(
-    bench: Bench, captured: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The choice knows no clock: made again by a machine that looks far slower, it is the same."""
-    shots = bench.capture("dots:3", tmp_path / "run", seconds=3.0, seed=5)
-    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
-    assert manifest["configuration"]["seconds"] == 3.0 and "accuracy" not in manifest["configuration"]
-    summary = shots.summary()
-    assert summary["asked_seconds"] == manifest["plan"]["asked_seconds"] == 3.0
-    assert summary["accuracy"] == manifest["plan"]["accuracy"] < 0.3 and summary["predicted_seconds"] > 0
-    assert summary["total_error_bound"] <= summary["accuracy"] and not shots.warnings
-    assert captured.summary()["asked_seconds"] is None and captured.summary()["accuracy"] == ACCURACY
-
-    monkeypatch.setattr("mitsim.planner.planner._seconds", lambda *_: 100.0)
-    whole = pixels(tmp_path / "run")
-    for name in FILES[3:]:
-        (tmp_path / "run" / name).unlink()
-    with pytest.raises(MitsimError, match="other"):
-        bench.capture("dots:3", tmp_path / "run", seconds=4.0, seed=5, resume=True)
-    resumed = bench.capture("dots:3", tmp_path / "run", seconds=3.0, seed=5, resume=True)
-    assert pixels(tmp_path / "run") == whole and resumed.summary()["accuracy"] == summary["accuracy"]
-
-
-def test_too_few_seconds_flag_the_loosest_plan(bench: Bench) -> None:
-    plan = bench.plan("dots:3", seconds=0.01, seed=5)
-    assert plan.accuracy == 0.3 and any("0.01 seconds are too few" in line for line in plan.warnings)
-    assert plan.payload()["asked_seconds"] == 0.01
-    for other, reported in (({"seconds": 20.0}, "0.01; plan anew"), ({"accuracy": 1e-3}, "not both")):
-        with pytest.raises(MitsimError, match=reported):
-            bench.capture(plan, **other)
-
-
-@pytest.mark.parametrize(
-    ("asked", "maker", "handed"),
-    [
-        ({"seconds": 3.0}, "plan_within", (3.0, 5, {"blur": False})),
-        ({"accuracy": 2e-2}, "make_plan", (2e-2, 5, {"blur": False}, 1)),
-        ({}, "make_plan", (1e-3, 5, {"blur": False}, 1)),
-    ],
-)
+@pytest.mark.parametrize(("asked", "accuracy"), [({"accuracy": 2e-2}, 2e-2), ({}, 1e-3)])
 def test_a_plan_is_made_of_what_is_asked(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, asked: dict[str, object], maker: str, handed: tuple[object, ...]
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, asked: dict[str, float], accuracy: float
 ) -> None:
-    """By the one way or the other. (Planted: no seed, or no effects, for a plan within seconds.)"""
+    """(Planted: no seed, or no effects.)"""
 
     def planned(seen: Bench, lighting: object, *rest: object) -> None:
         raise MitsimError(repr((seen is bench, *rest)))
 
-    monkeypatch.setattr(spectral, maker, planned)
+    monkeypatch.setattr(spectral, "make_plan", planned)
     for begin in (bench.plan, bench.light, bench.capture):
         with pytest.raises(MitsimError) as caught:
             begin("dots:3", seed=5, effects="-blur", **asked)
-        assert str(caught.value) == repr((True, *handed))
+        assert str(caught.value) == repr((True, accuracy, 5, {"blur": False}, 1))
 
 
 def test_what_a_plan_was_made_for_is_not_changed() -> None:
     """What would need another plan is refused by name; what the plan does not hang on may change. (Planted: each of the
     three left out.)"""
     made = replace(invented_plan(), request=Request.of(patterns="dots:3", accuracy=2e-2, effects="-blur", seed=3))
-    timed = replace(made, request=Request.of(seconds=3.0))
-    for own, changes in ((made, {"accuracy": 1e-2}), (made, {"effects": {}}), (timed, {"seconds": 4.0})):
+    for changes in ({"accuracy": 1e-2}, {"effects": {}}):
         (name,) = changes
         with pytest.raises(ArgumentError, match="plan anew") as caught:
-            capture.request_of(own, changes)
+            capture.request_of(made, changes)
         assert caught.value.argument == name
     assert capture.request_of(made, {"exposure": 0.01, "accuracy": 2e-2}) == made.request.with_values(exposure=0.01)
-    assert capture.request_of(timed, {"exposure": 0.01}) == Request.of(seconds=3.0, exposure=0.01)
 
 
 def test_frames_of_another_run_are_not_kept(bench: Bench, captured: Capture, tmp_path: Path) -> None:
@@ -278,7 +237,7 @@ def test_frames_of_another_run_are_not_kept(bench: Bench, captured: Capture, tmp
 @pytest.mark.parametrize(
     "changed",
     [
-        *({"seed": 6}, {"patterns": "dots:4"}, {"accuracy": 2e-2}, {"exposure": 0.01}, {"noise_fraction": 0.5}),
+        *({"seed": 6}, {"patterns": "dots:4"}, {"accuracy": 2e-2}, {"exposure": 0.01}),
         *({"effects": {"diffraction": False}}, {"effects": {"blur": True}}),
     ],
 )
@@ -438,27 +397,6 @@ def test_effects_are_switched_by_the_user(bench: Bench, captured: Capture, tmp_p
     assert change > 0.1
     # The pilot looks with cells of a whole projector pixel, half a mask feature here: too coarse for the fringes.
     assert 0.6 < row["error_if_off"] / change < 2
-
-
-def test_sampling_stops_at_a_part_of_the_sensors_noise(bench: Bench, tmp_path: Path) -> None:
-    """Exposures of 0.8 of full well have a noise of about a percent: 0.05 of it needs more paths than all of it."""
-    paths = {}
-    for fraction in (1.0, 0.05):
-        folder = tmp_path / str(fraction)
-        done = bench.capture("dots:3", folder, accuracy=ACCURACY, noise_fraction=fraction)
-        # Stopped by eight of the nine frames, and by an estimate that is good to some percent.
-        assert 0 < done.manifest.mc_error < 1.1 * fraction * done.manifest.sensor_noise
-        manifest = json.loads((folder / "manifest.json").read_text())
-        assert manifest["configuration"]["noise_fraction"] == fraction
-        paths[fraction] = manifest["paths"]
-    assert paths[0.05] > 1.5 * paths[1.0]
-
-
-@pytest.mark.parametrize("fraction", [0.0, -0.1, 1.5, np.nan])
-def test_noise_fractions_that_make_no_sense(bench: Bench, tmp_path: Path, fraction: float) -> None:
-    with pytest.raises(MitsimError, match="noise_fraction"):
-        bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, noise_fraction=fraction)
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

@@ -7,16 +7,15 @@ from typing import Any
 
 import pytest
 
-from mitsim.bench.request import HIGHEST_ACCURACY, LONGEST_S, LOWEST_ACCURACY, Exposure, Request
+from mitsim.bench.request import HIGHEST_ACCURACY, LOWEST_ACCURACY, Exposure, Request
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.manifests import MOST_SHOTS
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S
 
 
 def test_what_is_asked_by_default() -> None:
     request = Request.of()
     assert (request.patterns, request.accuracy, request.seed, request.exposure) == ("dots:7", 1e-3, 0, "auto")
-    assert (request.exposure_fraction, request.effects, request.noise_fraction) == (0.8, {}, None)
+    assert (request.exposure_fraction, request.effects) == (0.8, {})
     assert request.timing == Exposure(None, 0.8)
     assert Request.of(exposure=0.01).timing == Exposure(0.01, 0.8)
 
@@ -37,32 +36,12 @@ def test_a_request_is_a_value() -> None:
     assert Request.of(**request.model_dump(mode="json")) == request, "as the manifest holds it"
 
 
-def test_seconds_or_an_accuracy() -> None:
-    """Not both; the manifest holds the one that was asked for, and reads back as the same request."""
-    request = Request.of(seconds=10.0, seed=2)
-    assert request.with_values(patterns="uniform") == Request.of(seconds=10.0, seed=2, patterns="uniform")
-    assert Request.of(**request.deciding) == request and "accuracy" not in request.deciding
-    assert "seconds" not in Request.of().deciding and Request.of().deciding["accuracy"] == 1e-3
-    for seconds in (1e-6, 10.0, LONGEST_S):
-        for other, named, reported in (
-            ({"accuracy": 1e-3}, "seconds", "give seconds or an accuracy, not both"),
-            ({"noise_fraction": 0.1}, "noise_fraction", "give one of both"),
-        ):
-            for ask in (Request.of, Request.of(seconds=seconds).with_values):
-                with pytest.raises(ArgumentError, match=f"^{named} .*: .*{reported}$") as caught:
-                    ask(seconds=seconds, **other)
-                assert caught.value.argument == named
-
-
 @pytest.mark.parametrize(
     ("argument", "ends"),
     [
-        ("seconds", (5e-324, LONGEST_S)),
         ("accuracy", (LOWEST_ACCURACY, HIGHEST_ACCURACY)),
-        ("noise_fraction", (1e-3, 1.0)),
         ("exposure", EXPOSURE_S),
         ("exposure_fraction", EXPOSURE_FRACTION),
-        ("ambient_shots", (1, MOST_SHOTS)),
     ],
 )
 def test_the_ends_of_a_range_are_within_it(argument: str, ends: tuple[float, float]) -> None:
@@ -73,14 +52,11 @@ def test_the_ends_of_a_range_are_within_it(argument: str, ends: tuple[float, flo
 @pytest.mark.parametrize(
     ("argument", "value", "allowed"),
     [
-        *(("seconds", value, "above 0, at most 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
         *(("accuracy", value, "from 1e-06 to 0.3") for value in (0.0, -1e-3, 0.5, math.nan, math.inf)),
-        *(("noise_fraction", value, "from 0.001 to 1") for value in (1e-300, 0.0, -0.1, 1.5, math.nan, 5e-324)),
         *(("exposure", value, "to 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
         *(("exposure_fraction", value, "to 1") for value in (0.0, -0.5, 1.01, math.nan)),
         *(("effects", value, "diffraction") for value in ("fog", "+fog", "diffraction", {"fog": True})),
         ("effects", "+ambient,-ambient", "keep one"),
-        *(("ambient_shots", value, f"from 1 to {MOST_SHOTS}") for value in (0, MOST_SHOTS + 1)),
         *(("ambient_frame", value, "give 'auto', 'yes' or 'no'") for value in ("maybe", "", True)),
     ],
 )

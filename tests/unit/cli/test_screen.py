@@ -211,7 +211,7 @@ ROWS = [
     ("diffraction", "exact", "a mask feature's Fresnel number is 3.2 at 562 nm, 3 lines", 7.9e-2),
     ("blur", "off", "the projector's pixels are sharp", 0.0),
     ("black-level", "exact", "", 6e-4),
-    ("spectrum", "off", "one panchromatic reflectance; what that leaves out: --colour auto", None),
+    ("spectrum", "off", "one panchromatic reflectance; --colour lines tells them apart", None),
     ("sensor-noise", "exact", "Poisson, full well, read noise and quantisation of each frame", None),
 ]  # fmt: skip
 """Of cookie_bag, as `mitsim plan` has them."""

@@ -88,8 +88,6 @@ def test_programs_make_the_same_pairs(lab: Lab) -> None:
     assert float(np.max(bench.capture("dots:1", accuracy=1e-2).truth)) < 0.6
     with pytest.raises(MitsimError, match="own"):
         ms.make_pairs(bench, folder, 2, "dots:2")
-    with pytest.raises(MitsimError, match="share their light"):
-        ms.make_pairs(bench, lab.folder / "timed", 2, seconds=3.0)
     with pytest.raises(MitsimError, match="nowhere: is no folder"):
         ms.make_pairs(bench, lab.folder / "timed", 2, pictures="nowhere", idealised=True)
     with pytest.raises(MitsimError, match="count 0: give a number from 1 to"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.light.passes import even
-from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, Noise
+from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, SampleCost
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT, SIZES, changes, plan, rows
 
 
@@ -51,10 +51,10 @@ def test_a_change_that_cannot_be_told_is_told_as_a_bound() -> None:
 
 def test_noise_says_how_many_samples_it_takes() -> None:
     """Error 2e-3 at 16 samples, falling with their power -0.8: a tenth needs 10^(1/0.8) times as many."""
-    noise = Noise(2e-3, 16, 0.8)
+    noise = SampleCost(2e-3, 16, 1, 0.8)
     assert noise.samples_for(2e-3) == pytest.approx(16)
     assert noise.samples_for(2e-4) == pytest.approx(16 * 10**1.25)
-    assert 0 < Noise(0.0, 16, 1.0).samples_for(1e-9) <= 1
+    assert 0 < SampleCost(0.0, 16, 1, 1.0).samples_for(1e-9) <= 1
 
 
 @pytest.mark.parametrize(

@@ -16,16 +16,14 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
-from mitsim.core.arrays import Labels
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import cost_model
 from mitsim.light import light as module
-from mitsim.light.cost_model import FIXED
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, PilotResult, Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, TracedPass
 from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.planner import choose, planner
@@ -77,28 +75,6 @@ def test_light_by_class_serves_no_other_family(bench: Bench, plan: Plan, family:
     # Uniform light never splits a class: it is the sum of all of them.
     (white,) = stacked(by_class.frames(uniform, 0))
     assert np.allclose(white, stacked(by_class.frames(family, 0)).sum(axis=0), rtol=1e-9)
-
-
-def test_a_target_stops_the_sampling(
-    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is asked with the frames seen so far, here eight of the sixteen, and its answer is the error to stop at.
-
-    The error of all sixteen is told by random signs alone, the frames' energy too: 0.7 % off here.
-    """
-    monkeypatch.setattr("mitsim.light.light.CHECKED_SHOTS", 8)
-    asked: list[float] = []
-
-    def target(frames: ExpectedFrames) -> float:
-        assert len(frames) == 8
-        asked.append(monte_carlo_error(frames))
-        return math.inf if len(asked) == 1 else 0.0
-
-    found = trace_light(bench, replace(plan, sampling_target=1e-9), family, 3, Sampling(target=target))
-    assert found.reached and len(asked) == 1
-    assert found.sampling_error == pytest.approx(monte_carlo_error(found.frames(family, 3, leaking=False)), rel=0.03)
-    tighter = trace_light(bench, plan, family, 3, Sampling(target=lambda _: found.sampling_error / 3))
-    assert tighter.sampling_error <= found.sampling_error / 3 and tighter.paths > found.paths
 
 
 @pytest.mark.parametrize(("classes_tell", "effects", "looked_at"), [(True, (), 16), (False, (), 8), (False, FAR, 16)])
@@ -436,23 +412,20 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
     assert max(ratios(heavy, [0, 5, 14])) == 1.0, "what is checked is in the error already"
 
 
-def test_unit_costs_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Direct light and its anchors, of a machine half as fast as the fixed one: only what takes most is timed, and the
-    other is taken to be as slow. Other kinds keep what they had. (Planted: seconds of a sample, not of a path; fixed
-    seconds for what is not timed.)"""
-    timed_passes = set()
+def test_the_pace_is_that_of_the_pass_that_takes_longest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each launch takes twice its fixed seconds, but the first, which compiles. (Planted: the first launch counts;
+    seconds of a sample, not of a path.)"""
+    simulation, labels = Simulation(bench, Settings(depth=400.0, anchors=2)), np.arange(bench.n**2)
+    clock, seen = [0.0], list[int]()
 
-    def seconds(made: Simulation, name: str, seed: int, labels: Labels, samples: int) -> float:
-        timed_passes.add(name)
-        return 2 * FIXED.passes[name] * made.passes[name].tracer.paths_per_sample * samples
+    def traced(self: TracedPass, seed: int, first: int, samples: int, accumulator: object = None) -> object:
+        seen.append(samples)
+        fixed = samples * self.tracer.paths_per_sample * self.row.unit_cost * float(self.row.connections(settings))
+        clock[0] += 2 * fixed if len(seen) > 1 else 9.0
+        return self.tracer.trace(seed, first, samples)
 
-    monkeypatch.setattr(planner, "_seconds", seconds)
-    simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
-    labels = np.arange(bench.n**2)
-    timed = planner._time_paths(PILOT_RESULT, simulation, labels, 0)
-    assert len(timed_passes) == 1
-    for name in ("direct", "anchor_residual"):
-        assert timed.sample_costs[name].seconds == pytest.approx(2 * FIXED.passes[name])
-    assert timed.spread.seconds == pytest.approx(2 * FIXED.passes["direct"])
-    for name in ("indirect", "indirect_residual"):
-        assert timed.sample_costs[name] == PILOT_RESULT.sample_costs[name]
+    settings = simulation.settings
+    monkeypatch.setattr(TracedPass, "trace", traced)
+    monkeypatch.setattr(simulation, "accumulator", lambda *_: None)
+    monkeypatch.setattr(planner.time, "perf_counter", lambda: clock[0])
+    assert planner._measure_pace(PILOT_RESULT, simulation, labels, 0) == pytest.approx(2.0) and len(seen) == 2

@@ -25,7 +25,7 @@ PROGRAM = """
 import json, pathlib, sys
 import numpy as np
 import mitsim as ms
-from mitsim.light.cost_model import FIXED, tracing_seconds
+from mitsim.light.cost_model import tracing_seconds
 from mitsim.light.light import trace_light
 from mitsim.light.light_file import write_light
 from mitsim.light.light import next_samples
@@ -46,9 +46,9 @@ for name in ("plain", "veiled"):
         "plan": plan.payload(),
         "samples": dict(light.samples),
         "grown": grown,
-        "noise": sample_cost.noise.error,
+        "noise": sample_cost.error,
         "paths": sample_cost.paths,
-        "seconds": tracing_seconds(result, plan.settings, FIXED)["veil"],
+        "seconds": tracing_seconds(result, plan.settings)["veil"],
         "reached": light.reached,
     }
 print(json.dumps(found))

@@ -9,8 +9,8 @@ import pytest
 from mitsim.bench.effects import EFFECTS, SWITCHES
 from mitsim.bench.request import check_accuracy
 from mitsim.core.errors import MitsimError
-from mitsim.light.cost_model import FIXED, Numbers, optics_seconds
-from mitsim.light.plan import ColourCandidate, ColourChoice, Plan, PlanRow
+from mitsim.light.cost_model import Numbers, optics_seconds
+from mitsim.light.plan import Plan
 from mitsim.light.settings import Approximation, Drawn, Estimate
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
@@ -108,21 +108,6 @@ def test_a_plan_is_json_with_the_promised_keys() -> None:
     assert all(set(effect) == {"name", "state", "reason", "error_if_off", "seconds"} for effect in block["effects"])
 
 
-def test_frames_in_grey_are_the_only_way_where_no_other_was_asked_for() -> None:
-    """A plan as JSON always says what was taken of colours; light of some lines has nothing to choose from. (Planted:
-    monochrome for lines too.)"""
-    grey = plan()
-    only = {"name": "mono", "error": 0.0, "seconds": grey.predicted_seconds}
-    assert grey.row("spectrum").state == "off" and grey.block()["colour"] == {"chosen": "mono", "candidates": (only,)}
-    lines = plan(facts=replace(FACTS, spectrum=PlanRow("spectrum", "exact", "at 450, 620 nm", None, 0.0)))
-    assert "colour" not in lines.block() and "colour" not in replace(grey, effects=()).block()
-
-
-def test_the_way_that_is_taken_is_the_one_of_its_name() -> None:
-    ways = ColourCandidate("mono", 0.1, 1.0), ColourCandidate("bands:3", 0.01, 3.0), ColourCandidate("lines", 0.0, 9.0)
-    assert [ColourChoice(way.name, ways).taken for way in ways] == [*ways]
-
-
 @pytest.mark.parametrize(
     ("keystone", "state", "words"), [(0.0, "off", "squarely"), (2.5, "exact", "2.5 of its pixels")]
 )
@@ -196,7 +181,7 @@ def test_a_raster_has_as_many_cells_as_the_accuracy_needs() -> None:
     assert "12 cells a pixel" in row.reason and "leaves 1.1e-03" in row.reason and row.seconds > 0
     assert found[2e-3].block()["settings"]["raster_cells"] == 12
     fewest = found[1e-2].row("mask-shadow")
-    assert "leaves 3.0e-03" in fewest.reason and fewest.seconds == 0, "with none to compare with"
+    assert "leaves 3.0e-03" in fewest.reason and 0 < fewest.seconds < row.seconds
     (warning,) = plan(1e-3, drawn).warnings
     assert "the mask's raster, 1.4e-03" in warning
 
@@ -214,7 +199,7 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
     assert not shown(5e-4, 200.0).settings.raster and not shown(1e-2, 200.0, drawing=100.0).settings.raster
     assert few.row("mask-shadow").state == "exact" and "3 separable terms are summed" in few.row("mask-shadow").reason
     row = many.row("mask-shadow")
-    assert row.state == "approximate" and "200 separable terms: by FFT" in row.reason
+    assert row.state == "approximate" and "by FFT" in row.reason
     assert many.block()["settings"]["raster"] is True
 
 
@@ -224,36 +209,13 @@ def test_a_shadow_that_the_pilot_has_drawn_is_not_drawn_again() -> None:
     forming = replace(PILOT_RESULT.forming, correlated=(True, True), phases=36.0)
 
     def drawing(**numbers: float) -> float:
-        some = replace(Numbers.coarsest(), **numbers)
-        each = [optics_seconds(replace(forming, drawing=(seconds, seconds)), some, FIXED) for seconds in (5.0, 0.0)]
+        some = replace(Numbers(*[1.0] * 6), **numbers)
+        each = [optics_seconds(replace(forming, drawing=(seconds, seconds)), some) for seconds in (5.0, 0.0)]
         return float(each[0] - each[1])
 
     assert drawing() == 0
     assert drawing(raster_cells=8.0) == pytest.approx(5) and drawing(layers=2.0) == pytest.approx(15)
     assert drawing(raster_cells=12.0, waves=0.0) == pytest.approx(5 * 144 / 36)
-
-
-def test_seconds_of_more_stages_move_all_that_is_predicted() -> None:
-    """(Planted: one end of the range; the ways of colours stay.)"""
-    ways = ColourChoice("mono", (ColourCandidate("mono", None, 2.0), ColourCandidate("lines", 0.0, 5.0)))
-    before = replace(plan(1e-3), predicted_range=(1.5, 4.0), colour=ways)
-    after = before.taking(start=1.0, transport=before.predicted["transport"] + 0.5)
-    assert after.predicted_seconds == pytest.approx(sum(before.predicted.values()) + 1.5)
-    assert after.predicted_range == pytest.approx((3.0, 5.5)) and after.colour is not None
-    assert [each.seconds for each in after.colour.candidates] == pytest.approx([3.5, 6.5])
-
-
-def test_settings_do_not_depend_on_the_machines_pace() -> None:
-    """Bit-equal repetition and --resume need it: the same seed must mean the same settings."""
-    sample_costs = {
-        name: replace(PILOT_RESULT.sample_costs[name], seconds=1e-4)
-        for name in ("direct", "anchor_residual", "indirect", "from_camera")
-    }
-    slow = replace(PILOT_RESULT.with_sample_costs(sample_costs), forming=replace(PILOT_RESULT.forming, product=1e-8))
-    for accuracy in ACCURACIES:
-        one, other = plan(accuracy), plan(accuracy, slow)
-        assert one.settings == other.settings and one.sampling_target == other.sampling_target
-        assert one.predicted_seconds < other.predicted_seconds
 
 
 @pytest.mark.parametrize("accuracy", [0.0, -1e-3, 1e-7, 0.5, math.nan, math.inf])

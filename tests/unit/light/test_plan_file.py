@@ -16,7 +16,7 @@ from mitsim.bench.request import Request
 from mitsim.core.environment import deciding_versions
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Cost
-from mitsim.light.plan import ColourCandidate, ColourChoice, Plan
+from mitsim.light.plan import Plan
 from mitsim.light.settings import SharpPixels
 from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
@@ -47,10 +47,8 @@ def planned() -> Plan:
     return replace(
         plan,
         settings=settings,
-        predicted_range=(1.5, 4.0),
         request=Request.of(patterns="dots:3", accuracy=1e-3, seed=2**63, effects="-blur"),
         cost=Cost(3.0, 2.0**30, 1e6),
-        colour=ColourChoice("mono", (ColourCandidate("mono", None, 2.0), ColourCandidate("lines", 0.0, 5.0))),
         made_of=MADE_OF,
     )
 
@@ -66,10 +64,8 @@ def test_what_is_read_is_what_was_written(file: Path) -> None:
     found = Plan.load(file)
     assert found == planned() and hash(found.settings) == hash(planned().settings)
     assert found.request is not None and planned().request is not None
-    assert found.request.model_fields_set <= {*planned().request.model_fields_set, "seconds"}  # type: ignore[union-attr]
+    assert found.request.model_fields_set == planned().request.model_fields_set  # type: ignore[union-attr]
     assert found.payload() == planned().payload()
-    timed = replace(planned(), request=Request.of(seconds=3.0), asked_seconds=3.0)
-    assert Plan.load(timed.save(file)) == timed
 
 
 Edit = Callable[[dict[str, Any]], object]
@@ -154,8 +150,7 @@ def test_a_file_is_written_whole_or_not_at_all(file: Path, tmp_path: Path, monke
 
 
 def test_what_is_said_again_is_taken_and_what_needs_another_plan_is_not() -> None:
-    """(Planted: the accuracy that colours were left of is refused when it is said again; other seconds taken.)"""
-    plan = replace(planned(), colour=None)
+    plan = planned()
     again = plan.request_with({"accuracy": 1e-3, "effects": {"blur": False}, "seed": 5, "exposure": 0.1})
     assert (again.seed, again.exposure, again.patterns, again.accuracy) == (5, 0.1, "dots:3", 1e-3)
     for changes, sentence in (
@@ -165,14 +160,6 @@ def test_what_is_said_again_is_taken_and_what_needs_another_plan_is_not() -> Non
     ):
         with pytest.raises(ArgumentError, match=sentence):
             plan.request_with(changes)
-    timed = replace(plan, request=Request.of(seconds=3.0))
-    with pytest.raises(ArgumentError, match=r"seconds 4\.0: the plan was made for 3\.0"):
-        timed.request_with({"seconds": 4.0})
-    bands = ColourChoice("bands:1", (ColourCandidate("bands:1", 4e-4, 1.0),))
-    left = replace(plan, request=Request.of(accuracy=math.sqrt(1e-6 - 16e-8)), colour=bands)
-    assert left.request_with({"accuracy": 1e-3}) == left.request
-    with pytest.raises(ArgumentError, match=r"accuracy 0\.002"):
-        left.request_with({"accuracy": 2e-3})
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.light.cost_model import FIXED, SHARED_COST
+from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.light import Group, SampledPass, cheapest_samples, first_samples, next_samples, trace_groups
-from mitsim.light.passes import EVEN, even
+from mitsim.light.passes import EVEN, PASSES, even
 from mitsim.transport.path_reuse import PathReuseTracer
 
 LIGHTS = (
@@ -167,7 +167,10 @@ def test_work_is_that_of_paths_at_fixed_unit_costs() -> None:
     the one of less work grows. (Planted: one pace for all, shared light counted once.)"""
     shared = PathReuseTracer.__new__(PathReuseTracer)
     shared.adaptive, shared.projector = None, SimpleNamespace(n=8)  # type: ignore[assignment]
-    cheap, dear = shared.paths_per_sample * SHARED_COST * FIXED.passes["indirect"], 100 * FIXED.passes["from_camera"]
+    cheap, dear = (
+        shared.paths_per_sample * SHARED_COST * PASSES["indirect"].unit_cost,
+        100 * PASSES["from_camera"].unit_cost,
+    )
     simulation = simulated(indirect=(shared, 1.0), from_camera=(of_lanes(100), 1.0))
     found = next_samples(
         simulation, dict.fromkeys(("indirect", "from_camera"), 1000), {"indirect": 1, "from_camera": 1}, 1.5
@@ -175,5 +178,5 @@ def test_work_is_that_of_paths_at_fixed_unit_costs() -> None:
     assert found["indirect"] / found["from_camera"] == pytest.approx(math.sqrt(dear / cheap), rel=2e-3)
     simulation = simulated(camera_residual=(of_lanes(100), 1.0), from_camera=(of_lanes(100), 1.0))
     found = next_samples(simulation, dict.fromkeys(simulation.passes, 1000), dict.fromkeys(simulation.passes, 1), 1.5)
-    ratio = math.sqrt(FIXED.passes["from_camera"] / FIXED.passes["camera_residual"])
+    ratio = math.sqrt(PASSES["from_camera"].unit_cost / PASSES["camera_residual"].unit_cost)
     assert found["camera_residual"] / found["from_camera"] == pytest.approx(ratio, rel=2e-3)

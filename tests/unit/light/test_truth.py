@@ -160,7 +160,7 @@ def test_it_shares_no_error_with_the_frames(bench: Bench, printed: np.ndarray) -
     lighting = parse_patterns("dots:4", N).lighting
     plan = make_plan(bench, lighting, 1e-2, 0, dict.fromkeys(EFFECTS, False))
     plan = replace(plan, settings=replace(plan.settings, samples={"direct": float(module.TRUTH_SAMPLES)}))
-    light = trace_light(bench, plan, lighting, 3, Sampling(by_pixel=False, target=lambda _: np.inf))
+    light = trace_light(bench, replace(plan, sampling_target=np.inf), lighting, 3, Sampling(by_pixel=False))
     assert light.paths == GROUPS * N**2 * module.TRUTH_SAMPLES, "the first round is what was predicted"
     found, answer = trace_truth(bench, plan.settings, 3, np.full(N * N, np.inf)), exact(printed / 255)
     of_frames = (light.flux / found.board_flux).reshape(N, N) - answer

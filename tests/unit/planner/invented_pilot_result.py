@@ -12,7 +12,6 @@ import numpy as np
 from mitsim.bench.effects import parse_switches
 from mitsim.light.cost_model import (
     Numbers,
-    UnitCosts,
     accumulation_seconds,
     checking_seconds,
     entries,
@@ -27,7 +26,6 @@ from mitsim.light.settings import (
     Approximation,
     ErrorCovariance,
     Forming,
-    Noise,
     PilotResult,
     SampleCost,
     Settings,
@@ -69,14 +67,14 @@ PILOT_RESULT = PilotResult(
     layers={1: (380.0,), 2: (400.0, 300.0), 3: (400.0, 343.0, 300.0), 4: (400.0, 369.0, 327.0, 300.0)},
     changes=changes(SIZES),
     sample_costs={
-        "direct": SampleCost(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
-        "anchor_residual": SampleCost(Noise(3e-4, 4, 0.5), 16_384, 1e-7),
-        "indirect": SampleCost(Noise(4e-3, 2, 0.5), 16_384, 2e-7),
-        "from_camera": SampleCost(Noise(1e-2, 2, 0.5), 20_000, 6e-7),
-        "indirect_residual": SampleCost(Noise(2e-3, 2, 0.5), 36_384, 6e-7),
+        "direct": SampleCost(2e-3, 16, 16_384, 0.8),
+        "anchor_residual": SampleCost(3e-4, 4, 16_384),
+        "indirect": SampleCost(4e-3, 2, 16_384),
+        "from_camera": SampleCost(1e-2, 2, 20_000),
+        "indirect_residual": SampleCost(2e-3, 2, 36_384),
         "camera_residual": SampleCost.none(),
     },
-    spread=SampleCost(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
+    spread=SampleCost(2e-3, 16, 16_384, 0.8),
     forming=Forming(pixels=512, cells=150, lit=0.2, terms=3.0, shots=49, classes=49),
     apart=APART,
 )
@@ -93,30 +91,37 @@ def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, 
 
 
 def plan(
-    accuracy: float = 1e-3, pilot_result: PilotResult = PILOT_RESULT, effects: str = "", facts: SceneFacts = FACTS
+    accuracy: float = 1e-3,
+    pilot_result: PilotResult = PILOT_RESULT,
+    effects: str = "",
+    facts: SceneFacts = FACTS,
+    pace: float = 1.0,
 ) -> Plan:
-    return explain_plan(accuracy, pilot_result, facts, parse_switches(effects))
+    return explain_plan(accuracy, pilot_result, facts, parse_switches(effects), pace=pace)
 
 
 def rows(found: Plan) -> dict[str, PlanRow]:
     return {effect.name: effect for effect in found.effects}
 
 
-def stages(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
+def stages(pilot_result: PilotResult, settings: Settings, pace: float = 1.0) -> dict[str, float]:
     """Seconds of each stage: paths, accumulating of what they bring, looks at the error; rays of the truth; frames."""
     forming, numbers = pilot_result.forming, Numbers.of(settings)
     held = entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
-    accumulating = accumulation_seconds(forming, numbers, held, costs)
-    looking = checking_seconds(forming, numbers, costs)
+    rest = float(accumulation_seconds(forming, numbers, held)) + float(checking_seconds(forming, numbers))
     return {
-        "transport": sum(tracing_seconds(pilot_result, settings, costs).values()) + accumulating + looking,
-        "truth": truth_seconds(pilot_result, settings, costs),
-        "optics": optics_seconds(forming, numbers, costs),
+        "transport": pace * sum(tracing_seconds(pilot_result, settings).values()) + rest,
+        "truth": pace * truth_seconds(pilot_result, settings),
+        "optics": float(optics_seconds(forming, numbers)),
     }
+
+
+def with_sample_costs(pilot_result: PilotResult, **costs: SampleCost) -> PilotResult:
+    return replace(pilot_result, sample_costs={**pilot_result.sample_costs, **costs})
 
 
 def with_occluded(sizes: dict[int, float]) -> PilotResult:
     """150 pixels that leave so much by the number of their anchors."""
     found = changes(SIZES | {Approximation("occluded_anchors", count): size for count, size in sizes.items()})
-    light = SampleCost(Noise(1e-4, 4, 0.5), 150)
-    return replace(ONE_CLASS, changes=found, occluded=tuple(range(150))).with_sample_costs({"penumbra": light})
+    several = replace(ONE_CLASS, changes=found, occluded=tuple(range(150)))
+    return with_sample_costs(several, penumbra=SampleCost(1e-4, 4, 150))

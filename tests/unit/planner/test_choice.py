@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.bench.effects import parse_switches
-from mitsim.light.cost_model import FIXED, Numbers, entries
+from mitsim.light.cost_model import Numbers, entries
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import (
     COUNTED,
@@ -16,13 +16,12 @@ from mitsim.light.settings import (
     WIDE,
     Approximation,
     ErrorCovariance,
-    Noise,
     PilotResult,
     SampleCost,
     Settings,
     SharpPixels,
 )
-from mitsim.planner.choose import _UNEVEN_GROUPS, Candidates, counts_of, predicted_candidate, value_of_refining
+from mitsim.planner.choose import Candidates, counts_of, predicted_candidate, value_of_refining
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
@@ -36,6 +35,7 @@ from tests.unit.planner.invented_pilot_result import (
     rows,
     stages,
     with_occluded,
+    with_sample_costs,
 )
 
 COSTLY = {"interreflection", "ambient", "diffraction", "black-level"}
@@ -49,11 +49,10 @@ def random_pilot_result(seed: int) -> PilotResult:
     mixed *= (np.array(list(sizes.values())) / np.linalg.norm(mixed, axis=1))[:, None]
     replicates = mixed[:, None] + 3e-5 * rng.normal(size=(len(sizes), REPLICATES, 6))
     names = "direct", "spread", "anchor_residual", "indirect", "from_camera", "indirect_residual"
-    noises = {name: Noise(10 ** rng.uniform(-4, -1.5), 4, 0.5) for name in names}
-    spread = replace(PILOT_RESULT.spread, noise=noises.pop("spread"))
-    sample_costs = {name: replace(PILOT_RESULT.sample_costs[name], noise=noise) for name, noise in noises.items()}
+    costs = {name: PILOT_RESULT.sample_costs.get(name, PILOT_RESULT.spread) for name in names}
+    costs = {name: SampleCost(10 ** rng.uniform(-4, -1.5), 4, cost.paths) for name, cost in costs.items()}
     found = ErrorCovariance.between(dict(zip(sizes, replicates, strict=True)), 1.0)
-    return replace(PILOT_RESULT, changes=found, spread=spread).with_sample_costs(sample_costs)
+    return with_sample_costs(replace(PILOT_RESULT, changes=found, spread=costs.pop("spread")), **costs)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -131,7 +130,7 @@ def test_opposite_errors_are_left_together() -> None:
 def test_work_is_transport_and_optics_at_fixed_unit_costs(accuracy: float) -> None:
     """Truth is the same for all choices, and none of it."""
     chosen = cheapest(accuracy, PILOT_RESULT, {})
-    expected = stages(PILOT_RESULT, chosen.settings, FIXED)
+    expected = stages(PILOT_RESULT, chosen.settings)
     assert chosen.work == pytest.approx(expected["transport"] + expected["optics"])
 
 
@@ -224,7 +223,7 @@ def test_occluded_pixels_have_several_anchors_where_the_others_do(accuracy: floa
 def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
     """Ten times the noise takes so many more samples where there are several anchors, and none where there is one.
     (Planted: the centre's noise for both; spread noise with one anchor.)"""
-    noisy = replace(PILOT_RESULT, spread=SampleCost(Noise(2e-2, 16, 0.5), 16_384))
+    noisy = replace(PILOT_RESULT, spread=SampleCost(2e-2, 16, 16_384))
     for switches, factor in (({"anchors": False}, 1.0), ({"anchors": True}, 10.0)):
         quiet, loud = (cheapest(3e-3, pilot_result, switches) for pilot_result in (PILOT_RESULT, noisy))
         assert (loud.settings.anchors > 1) == (factor > 1)
@@ -253,19 +252,16 @@ def test_samples_take_the_least_work_for_the_target() -> None:
 
     N is in proportion to sqrt(v / unit cost): the least sum of costs. Whole numbers make both a little better.
     """
-    noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "anchor_residual", "indirect_residual")}
-    noises["from_camera"] = Noise(3e-2, 2, 0.5)
-    pilot_result = replace(
-        PILOT_RESULT.with_sample_costs(
-            {name: replace(PILOT_RESULT.sample_costs[name], noise=n) for name, n in noises.items()}
-        ),
-        spread=replace(PILOT_RESULT.spread, noise=Noise(0.0, 1, 0.5)),
-    )
+    silent = {"error": 0.0, "samples": 1, "rate": 0.5}
+    costs = {name: replace(PILOT_RESULT.sample_costs[name], **silent)
+             for name in ("direct", "anchor_residual", "indirect_residual")}  # fmt: skip
+    costs["from_camera"] = SampleCost(3e-2, 2, 20_000)
+    pilot_result = with_sample_costs(replace(PILOT_RESULT, spread=replace(PILOT_RESULT.spread, **silent)), **costs)
     found = cheapest(1e-3, pilot_result, parse_switches("+interreflection"))
     settings = found.settings
     counts = settings.samples["indirect"], settings.samples["from_camera"]
     variances = pilot_result.sample_costs["indirect"].variance, pilot_result.sample_costs["from_camera"].variance
-    unit_costs = 16_384 * FIXED.passes["indirect"], 20_000 * FIXED.passes["from_camera"]
+    unit_costs = 16_384 * PASSES["indirect"].unit_cost, 20_000 * PASSES["from_camera"].unit_cost
     kinds = list(zip(variances, counts, unit_costs, strict=True))
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) == pytest.approx(found.target / 1.1, rel=0.01)
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) < found.target / 1.1
@@ -279,10 +275,10 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
     many = {
         Approximation("followed_anchors", count): size for count, size in {1: 7e-3, 2: 3e-3, 5: 6e-4, 8: 2e-5}.items()
     }
-    followed = SampleCost(Noise(2e-2, 2, 0.5), 36_384)
+    followed = SampleCost(2e-2, 2, 36_384)
     sizes = {part: size for part, size in SIZES.items() if part.name != "followed_anchors"} | many
     without, found = (
-        replace(PILOT_RESULT, changes=changes(each)).with_sample_costs({"indirect_residual": followed})
+        with_sample_costs(replace(PILOT_RESULT, changes=changes(each)), indirect_residual=followed)
         for each in (sizes, sizes | {WIDE: 5e-5})
     )
     chosen = cheapest(5e-4, found, {})
@@ -295,7 +291,7 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
     assert one.settings.followed_width == 1, "one anchor sees nothing beyond its mean"
     alone = predicted_candidate(1e-2, without, one.settings, {}).systematic.value
     assert one.systematic.value == pytest.approx(alone, rel=1e-9)
-    assert "8x8 in cells of 4x4 pixels leave" in rows(plan(5e-4, found))["followed-anchors"].reason
+    assert "8x8 points, in cells of 4x4 pixels, which leaves" in rows(plan(5e-4, found))["followed-anchors"].reason
 
 
 def test_one_hit_of_a_small_target_is_a_quarter_of_the_noise_and_counts_beside_it() -> None:
@@ -324,19 +320,6 @@ def test_doubt_of_the_pilot_is_in_the_bound_alone() -> None:
     assert found == pytest.approx(doubtful.changes.estimate(left)) and found.bound > 1.002 * found.value
 
 
-def test_noise_of_few_heavy_paths_takes_samples_until_its_bound_is_the_target() -> None:
-    """The bound lies the further above the error the fewer paths make it. (Planted: twice as
-    many samples at least; the bound of many paths.)"""
-    heavy = replace(PILOT_RESULT.sample_costs["indirect"], noise=Noise(0.3, 2, 0.5, spread=60.0))
-    silent = {name: replace(cost, noise=Noise(0.0, 1, 0.5)) for name, cost in PILOT_RESULT.sample_costs.items()}
-    uneven = PILOT_RESULT.with_sample_costs({**silent, "indirect": heavy})
-    uneven = replace(uneven, spread=replace(PILOT_RESULT.spread, noise=Noise(0.0, 1, 0.5)))
-    found = cheapest(1e-2, uneven, parse_switches("+interreflection"))
-    spread = 60.0 * 2 / found.settings.samples["indirect"]
-    assert 0.05 < spread < 0.2
-    assert found.noise * math.sqrt(1 + _UNEVEN_GROUPS * math.sqrt(spread)) == pytest.approx(found.target, rel=2e-3)
-
-
 def test_the_value_of_refining_coarse_cells_names_them() -> None:
     """Indirect light in coarse cells may be 2e-3 off or not at all: to know it saves fine cells. (Planted: doubt about
     effects and numbers alone.)"""
@@ -351,12 +334,12 @@ def test_the_value_of_refining_coarse_cells_names_them() -> None:
 def test_what_interpolation_leaves_of_sharp_light_counts() -> None:
     """Points for sharp lobes leave 6e-4 of the light between them. (Planted: nothing left.)"""
     sharp = SharpPixels((3, 4), 7, (-0.1, 0.1, -0.1, 0.1), 6e-4)
-    light = SampleCost(Noise(1e-4, 4, 0.75), 98)
+    light = SampleCost(1e-4, 4, 98, 0.75)
     found, exact = (
-        replace(ONE_CLASS, sharp=each).with_sample_costs({"sharp": light}) for each in (sharp, replace(sharp, left=0.0))
+        with_sample_costs(replace(ONE_CLASS, sharp=each), sharp=light) for each in (sharp, replace(sharp, left=0.0))
     )
     chosen = cheapest(1e-3, found, {})
     without = predicted_candidate(1e-3, exact, replace(chosen.settings, sharp=exact.sharp), {})
     assert chosen.fits and chosen.systematic.value == pytest.approx(math.hypot(without.systematic.value, 6e-4))
     assert not cheapest(5e-4, found, {}).fits
-    assert any("anchors of sharp light (7x7), 6.0e-04" in warning for warning in plan(5e-4, found).warnings)
+    assert any("anchors of sharp light (7), 6.0e-04" in warning for warning in plan(5e-4, found).warnings)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.light.cost_model import Numbers, entries, light_bytes, path_sample_bytes
+from mitsim.light.cost_model import Numbers, entries, light_bytes
 from mitsim.light.light import Group, trace_groups
 from mitsim.light.settings import GROUPS, PATHS_AT_ONCE, Settings, SharpPixels
 from mitsim.light.simulation import Simulation
@@ -48,7 +48,7 @@ def test_a_block_takes_no_more_than_is_counted(between: bool, layers: tuple[floa
     # fetched.
     taken = tracemalloc.get_traced_memory()[1] + held
     tracemalloc.stop()
-    assert taken <= PATHS * path_sample_bytes(settings)
+    assert taken <= PATHS * (800 if between and layers else 500)
 
 
 def test_rounds_beyond_the_plan_trace_no_larger_blocks_than_are_counted(

@@ -121,7 +121,7 @@ def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
     bench: Bench, shows: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The sample then tells of one kind alone. (Planted: apart all the same; nobody knew of several anchors.)"""
-    monkeypatch.setattr("mitsim.planner.pilot.PilotRuns._rough", True)
+    monkeypatch.setattr("mitsim.planner.pilot._ROUGH", -1.0)
     lit = np.zeros(N**2, dtype=bool)
     lit[: 8 * N] = True  # above the card
     if shows != "none":

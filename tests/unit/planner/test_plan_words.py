@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench
-from mitsim.bench.effects import EFFECTS
 from mitsim.light.settings import Approximation, PilotResult, Settings
-from mitsim.planner.choose import unit_costs_of
-from mitsim.planner.planner import SceneFacts, explain_plan
+from mitsim.planner.planner import SceneFacts
 from mitsim.scene.limits import Unfit
 from mitsim.scene.outline import Tag
 from tests.unit.planner.invented_pilot_result import (
@@ -99,38 +97,24 @@ def test_what_grey_frames_leave_of_colours_is_none_where_nothing_differs_by_wave
     assert (surfaces.state, surfaces.error_if_off) == ("off", None) and "the first a.xml:7" in surfaces.reason
 
 
-def test_light_over_mirrors_that_is_not_resolved_is_told_with_their_kinds_and_the_first() -> None:
-    mirrors = tuple(Tag(Path("a.xml"), line, "shape", {"type": kind}) for line, kind in ((7, "disk"), (9, "sphere")))
-    facts = SceneFacts({}, 0.0, mirrors=(*mirrors, mirrors[1]))
-    (warning,) = explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=0.2), facts).warnings
-    assert warning.startswith("a.xml:7: shape: got 'disk'")
-    assert "0.2 of the light" in warning and "2 sphere, 1 disk" in warning
-    assert not explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=1e-4), facts).warnings
-    (other,) = explain_plan(1e-6, ONE_CLASS, facts).warnings
-    assert "largest: layers (4)" in other, "mirrors whose light is all resolved are no reason"
-    (nameless,) = explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=0.2), SceneFacts({}, 0.0)).warnings
-    assert "largest: light over small mirrors alone (not resolved), 2.0e-01" in nameless
-
-
-def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:
-    """Where it breaks the accuracy: by itself, as the largest part, beside sharp lobes; else it is a part of all."""
-    shapes = tuple(Tag(Path("a.xml"), line, "shape", {"type": "sphere"}) for line in (3, 7))
-    place = "a.xml:7: shape: got 'sphere' in <shape type='sphere'>; "
-
-    def message(shapes: tuple[Tag, ...] = shapes, **lacking: float) -> tuple[str, ...]:
-        facts = SceneFacts(dict.fromkeys(EFFECTS, ""), 0.0, shapes=shapes)
-        return explain_plan(1e-2, replace(PILOT_RESULT, mirror=1, **lacking), facts).warnings
-
-    assert message(left_out=1e-4) == ()
-    for part in (9.9e-3, 0.1):
-        (warning,) = message(left_out=part)
-        assert warning.startswith(f"{place}{part:.2g} of the light") and "left out of the frames" in warning
-    lobes, mirror = message(left_out=0.1, unresolved=0.2)
-    assert "lobes too sharp" in lobes and mirror.startswith(place)
-    (lobes,) = message(left_out=5e-3, unresolved=0.2)
-    assert "lobes too sharp" in lobes
-    (unknown,) = message((), left_out=0.1)
-    assert "largest: light over mirrors or curved glass both ways" in unknown
+@pytest.mark.parametrize(
+    ("lacking", "words"),
+    [
+        (
+            {"unresolved": 0.2, "left_out": 0.1},
+            "of which the frames lack most, 2.0e-01; give",
+        ),
+        ({"left_out": 9.9e-3}, "a mirror or curved glass twice, or once and a sharp lobe (left out), 9.9e-03; turn"),
+        ({"unresolved_specular": 0.2}, "alone, in beams too fine to be placed on the sensor, 2.0e-01; use fewer"),
+    ],
+)
+def test_light_that_frames_lack_is_told_with_its_part_and_a_remedy(lacking: dict[str, float], words: str) -> None:
+    """Where it breaks the accuracy, as the largest part; else it is a part of all."""
+    (warning,) = plan(1e-2, replace(PILOT_RESULT, **lacking)).warnings
+    assert "largest: light over" in warning and words in warning
+    assert not plan(1e-2, replace(PILOT_RESULT, **dict.fromkeys(lacking, 1e-4))).warnings
+    (other,) = plan(1e-6, ONE_CLASS).warnings
+    assert "largest: layers (4)" in other, "light that is all resolved is no reason"
 
 
 def test_a_plan_as_json_leaves_out_what_it_was_decided_without() -> None:
@@ -163,14 +147,17 @@ FOLLOWS = replace(PILOT_RESULT, changes=changes(SIZES | {Approximation("ambient"
 
 
 def seconds(settings: Settings, pilot_result: PilotResult = FOLLOWS) -> float:
-    return sum(stages(pilot_result, settings, unit_costs_of(pilot_result)).values())
+    return sum(stages(pilot_result, settings).values())
 
 
-def test_seconds_are_those_of_every_stage_once() -> None:
-    found = plan(pilot_result=FOLLOWS)
-    expected = stages(FOLLOWS, found.settings, unit_costs_of(FOLLOWS))
+@pytest.mark.parametrize("pace", [1.0, 3.0])
+def test_seconds_are_those_of_every_stage_once(pace: float) -> None:
+    """Paths at the machine's pace, which decides nothing: resuming needs the same settings everywhere."""
+    found = plan(pilot_result=FOLLOWS, pace=pace)
+    expected = stages(FOLLOWS, found.settings, pace)
     assert found.predicted == pytest.approx(expected) and min(expected.values()) > 0
-    assert found.predicted_seconds == pytest.approx(seconds(found.settings))
+    assert found.predicted_seconds == pytest.approx(sum(expected.values()))
+    assert found.settings == plan(pilot_result=FOLLOWS).settings
 
 
 def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
@@ -201,7 +188,7 @@ def test_the_row_of_occluded_pixels_tells_their_number_and_what_they_leave() -> 
     assert several.error_if_off == pytest.approx(6e-3)
     left = pilot_result.ladders["occluded_anchors"][count].value
     hidden = "150 projector pixels are hidden from part of the sensor"
-    assert several.reason == f"{hidden}: {count}x{count} anchors leave {left:.1e}"
+    assert several.reason == f"{hidden}: {count}x{count} anchors, which leaves {left:.1e}"
     one = rows(plan(0.1, pilot_result, "-anchors"))["occluded-anchors"]
     assert (one.state, one.seconds) == ("off", 0) and one.error_if_off == pytest.approx(6e-3)
-    assert one.reason == f"{hidden}: one anchor leaves 6.0e-03"
+    assert one.reason == f"{hidden}: 1x1 anchors, which leaves 6.0e-03"
