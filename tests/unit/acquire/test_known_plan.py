@@ -86,7 +86,6 @@ def test_another_seed_exposure_and_the_same_classes_may_be_asked_for(bench: Benc
         ({"patterns": "hadamard:4"}, "^patterns 'hadamard:4': the plan was made for 'dots:3'"),
         ({"accuracy": 1e-3}, "^accuracy 0.001: the plan was made for 0.02; plan anew"),
         ({"effects": "-ambient"}, "^effects -ambient: the plan was made for none"),
-        ({"seconds": 4.0}, "^seconds 4: the accuracy is what they buy"),
     ],
 )
 def test_what_needs_another_plan_is_refused(
