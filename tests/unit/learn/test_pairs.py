@@ -379,7 +379,6 @@ def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) 
     ("own", "words"),
     [
         ({"count": 0}, "count 0: give a number from 1 to"),
-        ({"seconds": 5.0, "accuracy": None}, "pairs share their light"),
         ({"idealised": True, "vary": Variation(groups=1)}, "the idealised model has no bench"),
         ({"vary": Variation(groups=3)}, "3 groups of 2 pairs"),
         ({"vary": Variation(groups=1, exposure_fraction=(0.1, 2.0))}, "exposure_fraction 2.0: give a part of"),
