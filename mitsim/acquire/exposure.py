@@ -12,7 +12,6 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.request import Exposure
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel
@@ -101,20 +100,6 @@ def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
     remaining = iter(items)
     for first in remaining:
         yield [first, *islice(remaining, frames_at_once(first[-1].irradiance.size) - 1)]
-
-
-def relative_noise(devices: Devices, exposure: Exposure, expected: ExpectedFrames) -> float:
-    """Return the sensor's noise over all ``expected`` frames, relative to them; infinite for dark frames."""
-    peak = peak_irradiance(expected)
-    if peak <= 0:
-        return math.inf
-    exposer = Exposer(devices, exposure.choose(devices, peak), 0)
-    noise = energy = 0.0
-    for frame in expected:
-        electrons = exposer.electrons(frame)
-        noise += exposer.sensor_noise(electrons) ** 2 * electrons.size
-        energy += float(np.square(electrons).sum())
-    return float(np.sqrt(noise / energy))
 
 
 def peak_irradiance(expected: ExpectedFrames) -> float:
