@@ -83,8 +83,6 @@ def invented(name: str) -> Results:
     rng, experiment = np.random.default_rng(1), find(name)
     points = experiment.points(scope)
     rows = [row for point in points for row in rows_of(point, rng)]
-    if name == "waterfall":
-        rows = [{**row, "model": model} for row in rows for model in ("assumed", "calibrated")]
     arrays = {(point.key, array): rng.random((4, 4)) for point in points for array in (IMAGE, TRUTH, *OTHERS)}
     return Results(rows, arrays, scope)
 

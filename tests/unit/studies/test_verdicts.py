@@ -149,7 +149,7 @@ def lamps(hadamard_db: float, dots_range: float = 0.5) -> list[Row]:
 
 
 def drifted(value: float) -> list[Row]:
-    case = {"kind": "power", "unit": "1", "amount": 0.1, "model": RENDERED, "predicted_error_db": 0.0}
+    case = {"kind": "power", "what": "power, 10 %", "amount": 0.1, "model": RENDERED, "predicted_error_db": 0.0}
     predicted = {name: offset for name, offset in zip("abc", PRINTS_DB, strict=True)}
     found = rows(value, "lost_db", jitter=True, absolute=False, **case)
     return [{**row, "predicted_lost_db": predicted[str(row["picture"])]} for row in found]
@@ -157,18 +157,11 @@ def drifted(value: float) -> list[Row]:
 
 def fallen(lost: float = 5.0, gained: float = 5.0) -> list[Row]:
     """From the idealised image to a rendered one of calibrated factors, beside one of assumed ones."""
-    found: list[Row] = []
-    for model, last in (("assumed", 40 - lost - gained), ("calibrated", 40 - lost)):
-        for way in ("alone", "in order"):
-            for effect in EFFECTS:
-                shown = rows(
-                    last, "with_db", jitter=model == "calibrated", absolute=False, model=model, way=way, effect=effect
-                )
-                found += [
-                    {**row, "ideal_db": 40 + offset, "change_db": -1.0}
-                    for row, offset in zip(shown, PRINTS_DB, strict=True)
-                ]
-    return found
+    shown = rows(40 - lost, "calibrated_db", jitter=True, absolute=False, way="in order", effect=EFFECTS[-1], model="")
+    return [
+        {**row, "ideal_db": 40 + offset, "with_db": 40 - lost - gained + offset}
+        for row, offset in zip(shown, PRINTS_DB, strict=True)
+    ]
 
 
 def glossy(card: float = 40.0, disc: float = 10.0) -> list[Row]:
