@@ -564,7 +564,7 @@ SIZES = {
     "scene": (8, 1434),
     "sensor": (5, 1191),
     "sessions": (4, 1019),
-    "studies": (25, 6481),
+    "studies": (25, 6397),
     "transport": (21, 4485),
     "verbs": (1, 332),
     "version": (1, 1),
