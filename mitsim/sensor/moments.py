@@ -284,12 +284,15 @@ def _average_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
     nodes = _grid(expected)
     deviates = np.linspace(-8, 8, 129)
     weights = np.exp(-np.square(deviates) / 2)
+    weights /= weights.sum()
     start, _ = _read_out(nodes, model)
     first, second = np.zeros_like(nodes), np.zeros_like(nodes)
-    for z, weight in zip(deviates, weights / weights.sum(), strict=True):
-        level, variance = _read_out(poisson_quantile(nodes, z), model)
-        first += weight * (level - start)
-        second += weight * (np.square(level - start) + variance)
+    # All quantiles of few nodes in one call; of many nodes, a few quantiles at a time, because of memory.
+    for some in np.array_split(np.arange(deviates.size), min(nodes.size // 10_000 + 1, deviates.size)):
+        counts = poisson_quantile(nodes, deviates[some, None])
+        level, variance = _read_out(counts, model)
+        first += weights[some] @ (level - start)
+        second += weights[some] @ (np.square(level - start) + variance)
     return _between(expected, nodes, start + first, np.maximum(second - first**2, 0.0))
 
 
