@@ -562,7 +562,7 @@ SIZES = {
     "reconstruct": (22, 6376),
     "report": (9, 2180),
     "scene": (8, 1434),
-    "sensor": (5, 1191),
+    "sensor": (5, 1193),
     "sessions": (4, 1019),
     "studies": (25, 6397),
     "transport": (21, 4485),
