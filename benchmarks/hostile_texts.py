@@ -204,8 +204,7 @@ def devices(good: Good) -> Make:
     texts = {name: (good.folder / f"{name}.toml").read_text("utf-8") for name in ("camera", "projector", "recipe")}
     mask = (
         "\n[mask]\nkind = {!r}\nfeature_mm = 0.06\nfeatures = 101\nopen_part = 0.5\nseed = 3\nfile = 'a.png'\n"
-        "over_etch_um = 1.0\nedge_blur_um = 1.0\nopaque_transmission = 0.1\nrotation_deg = 1.0\ntilt_row_mrad = 1.0\n"
-        "dust_per_mm2 = 1.0\ndust_radius_um = 10.0\n"
+        "edge_blur_um = 1.0\nopaque_transmission = 0.1\nrotation_deg = 1.0\ntilt_row_mrad = 1.0\n"
     )
 
     def make(chance: random.Random, folder: Path) -> Sequence[str]:
@@ -254,11 +253,9 @@ def masks(good: Good) -> Make:
             fields["features"] = chance.choice(("1", "3", "101", "4093", "4096"))
         if kind != "psf":
             for name, values in (
-                ("over_etch_um", ("479.0", "-479.0", "0.1", "-30.0")),
                 ("edge_blur_um", ("1000.0", "1e-9")),
                 ("rotation_deg", ("45.0", "180.0", "-90.0", "1e-12")),
                 ("tilt_row_mrad", ("300.0", "-300.0")),
-                ("dust_per_mm2", ("1e4", "1e-6")),
             ):
                 if chance.random() < 0.2:
                     fields[name] = chance.choice(values)

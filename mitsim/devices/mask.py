@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import ByValue, FloatArray
-from mitsim.core.errors import MitsimError
 
 MaskKind = Literal["separable", "flatcam", "open"]
 CameraMask = Literal["separable", "flatcam", "open", "plate"]
@@ -32,43 +31,19 @@ _TAPS = {
 
 # ---- Flaws of making and mounting a mask ----
 #
-# Over-etching moves the edges of all openings outward and under-etching inward; corners stay square. Edge blur is a
-# Gaussian over the transmission of power. Dust on the mask is discs that transmit less light. Then the mask is turned
-# in its plane, and tilted to the sensor.
+# Edge blur is a Gaussian over the transmission of power. The blurred mask is turned in its plane, and tilted to the
+# sensor.
 
 _REACH = 8.3
-_LINES = 16
-"""Lines that cross a disc of dust; they leave 1e-3 of its shadow."""
-_CHORDS = 16
-_MOST_DISCS = 100
-
-
-@dataclass(frozen=True, eq=False)
-class Dust(ByValue):
-    """Discs on a mask: (k, 2) centres, one radius, and one opacity, also where discs overlap."""
-
-    centres_mm: FloatArray
-    radius_mm: float
-    opacity: float
-
-    def __post_init__(self) -> None:
-        self._hold(centres_mm=np.array(self.centres_mm, dtype=np.float64))
-
-    def turn(self, quarters: int) -> Dust:
-        row, column = self.centres_mm.T
-        for _ in range(quarters % 4):
-            row, column = -column, row
-        return Dust(np.stack((row, column), axis=1), self.radius_mm, self.opacity)
 
 
 @dataclass(frozen=True)
 class Flaws:
-    """Flaws of a mask: blur of its edges, turn from rows to columns, tilt along rows and along columns, and dust."""
+    """Flaws of a mask: blur of its edges, turn from rows to columns, and tilt along rows and along columns."""
 
     blur_mm: float = 0.0
     turn_deg: float = 0.0
     tilt_mrad: tuple[float, float] = (0.0, 0.0)
-    dust: Dust | None = None
 
     @property
     def margin_mm(self) -> float:
@@ -201,56 +176,3 @@ def mls_code(order: int) -> npt.NDArray[np.int8]:
 
 def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int = 9) -> Mask:
     return Mask(kind, feature_mm, mls_code(order))
-
-
-# ---- Etching and dust ----
-
-
-def etch(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Return lines (2 N + 2,) and values (2 N + 1, 2 N + 1) of a mask whose openings grew on each side.
-
-    Every place gets the greatest transmission within a square of half-side ``grow_mm``, or the least if negative.
-    """
-    count = len(values)
-    even = (np.arange(count + 1) - count / 2) * feature_mm
-    lines = np.unique(np.concatenate((even - abs(grow_mm), even + abs(grow_mm))))
-    middles, reach = (lines[1:] + lines[:-1]) / 2 / feature_mm + count / 2, abs(grow_mm) / feature_mm
-    first = np.floor(middles - reach).astype(np.intp)
-    last = np.ceil(middles + reach).astype(np.intp) - 1
-    choose = np.maximum if grow_mm > 0 else np.minimum
-    for _ in ("rows", "columns"):
-        padded = np.concatenate((np.zeros((1, values.shape[1])), values, np.zeros((1, values.shape[1]))))
-        found = padded[np.clip(first + 1, 0, count + 1)]
-        for further in range(1, int((last - first).max()) + 1):
-            found = choose(found, padded[np.clip(np.minimum(first + further, last) + 1, 0, count + 1)])
-        values = found.T
-    return lines, values
-
-
-def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Return a mask's lines (N + 1,) and transmissions (N, N) with the dust within ``reach_mm`` of the centre.
-
-    Raises MitsimError for more dust than can be drawn.
-    """
-    centres = dust.centres_mm[(np.abs(dust.centres_mm) < reach_mm + dust.radius_mm).all(axis=1)]
-    if len(centres) > _MOST_DISCS:
-        problem = f"mask: {len(centres)} discs of dust are in sight, and at most {_MOST_DISCS} are drawn"
-        raise MitsimError(f"{problem}; set a lower dust_per_mm2, or fewer pixels")
-    if not len(centres):
-        return lines, values
-    across = dust.radius_mm * -np.cos(np.linspace(0, np.pi, _LINES + 1))  # closer where a disc's edge is steep
-    finer = np.unique(np.concatenate((lines, (centres.ravel()[:, None] + across).ravel())))
-    finer = finer[(finer >= lines[0]) & (finer <= lines[-1])]
-    place = np.searchsorted(lines, (finer[1:] + finer[:-1]) / 2) - 1
-    result, radius = np.asarray(values[np.ix_(place, place)]), dust.radius_mm
-    edges: list[tuple[float, Literal["left", "right"]]] = [(-radius, "right"), (radius, "left")]
-    for centre in centres:
-        row_lines, column_lines = (finer - at for at in centre)
-        near = [[int(np.searchsorted(at, end, side)) for end, side in edges] for at in (row_lines, column_lines)]
-        rows, columns = (slice(max(start - 1, 0), stop) for start, stop in near)  # cells that the disc meets
-        r, c = row_lines[rows.start : rows.stop + 1], column_lines[columns.start : columns.stop + 1]
-        chords = r[:-1, None] + np.diff(r)[:, None] * ((np.arange(_CHORDS) + 0.5) / _CHORDS)
-        half = np.sqrt(np.maximum(radius**2 - chords**2, 0))[:, :, None]
-        within = np.diff(np.clip(c, -half, half), axis=2).mean(axis=1)
-        result[rows, columns] *= 1 - dust.opacity * np.minimum(within / np.diff(c), 1)
-    return finer, result

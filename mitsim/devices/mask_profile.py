@@ -18,7 +18,7 @@ from mitsim.core.images import image_size, read_image
 from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Dust, Flaws, MaskKind, etch, mls_mask
+from mitsim.devices.mask import Flaws, MaskKind, mls_mask
 from mitsim.devices.patterns import is_prime
 from mitsim.devices.plate import LARGEST, Plate, make_square, read_drawing
 
@@ -41,14 +41,10 @@ _OWN = {
 }
 """Fields that each kind has beside its name and the feature size; those with ! are required."""
 _FLAWS = {
-    "over_etch_um", "edge_blur_um", "opaque_transmission", "clear_transmission", "rotation_deg", "tilt_row_mrad",
-    "tilt_column_mrad", "dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed",
-}  # fmt: skip
+    *("edge_blur_um", "opaque_transmission", "clear_transmission", "rotation_deg", "tilt_row_mrad", "tilt_column_mrad"),
+}
 """The fields that every kind has."""
-_DUST = {"dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed"}
 _QUARTER = 90
-_MOST_ETCHED = LARGEST // 2
-_MOST_GROWTH = 8
 
 
 class MaskProfile(Configuration):
@@ -76,8 +72,6 @@ class MaskProfile(Configuration):
     """Psf: area of the mask that lets light through."""
     psf_reduce: int = Field(default=1, ge=1, le=1024)
     """Psf: pixels a side of the picture that become one."""
-    over_etch_um: float = Field(default=0.0, ge=-1000, le=1000)
-    """How far every opening has grown on each side [um]; below 0 shrunk."""
     edge_blur_um: float = Field(default=0.0, ge=0, le=1000)
     """Standard deviation of a Gaussian blur of the transmission [um]."""
     opaque_transmission: float = Field(default=0.0, ge=0, le=1)
@@ -90,14 +84,6 @@ class MaskProfile(Configuration):
     """How its distance grows down the rows [mrad]."""
     tilt_column_mrad: float = Field(default=0.0, ge=-300, le=300)
     """The same along the columns [mrad]."""
-    dust_per_mm2: float = Field(default=0.0, ge=0, le=1e4)
-    """Discs of dust, mean number on a square millimetre."""
-    dust_radius_um: float = Field(default=10.0, gt=0, le=1e5)
-    """Their radius [um]."""
-    dust_opacity: float = Field(default=1.0, gt=0, le=1)
-    """Part of the light that a disc takes."""
-    dust_seed: int = Field(default=0, ge=0, le=2**63 - 1)
-    """Which of all such dusts."""
 
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> MaskProfile:
@@ -114,8 +100,6 @@ class MaskProfile(Configuration):
         if self.opaque_transmission >= self.clear_transmission:
             problem = f"opaque_transmission: got {self.opaque_transmission:g}"
             raise ValueError(f"{problem}; give less than clear_transmission, {self.clear_transmission:g}")
-        if abs(self.over_etch_um) * 1e-3 >= _MOST_GROWTH * self.feature_mm:
-            raise ValueError(f"over_etch_um: got {self.over_etch_um:g}; give less than {_MOST_GROWTH} features")
         return self
 
     def plate(self, folder: Path) -> Plate:
@@ -123,28 +107,13 @@ class MaskProfile(Configuration):
         drawn = self.plate_drawing(folder)
         if not self._stated:
             return drawn
-        values, lines, feature = drawn.values, None, drawn.feature_mm
-        if self.over_etch_um:
-            if len(values) > _MOST_ETCHED:
-                problem = f"{drawn.words}: has {len(values)} features a side, and over_etch_um is worked out for"
-                raise MitsimError(f"{problem} at most {_MOST_ETCHED}; draw the part that the sensor sees")
-            lines, values = etch(values, feature, self.over_etch_um * 1e-3)
-        values = self.opaque_transmission + (self.clear_transmission - self.opaque_transmission) * values
-        extent = drawn.extent_mm + 2 * max(self.over_etch_um, 0.0) * 1e-3
-        dust = None
-        if self.dust_per_mm2:
-            draws = stream(self.dust_seed, "dust")
-            count = int(draws.poisson(self.dust_per_mm2 * extent**2))
-            centres = (draws.random((count, 2)) - 0.5) * extent
-            dust = Dust(centres, self.dust_radius_um * 1e-3, self.dust_opacity)
+        values = self.opaque_transmission + (self.clear_transmission - self.opaque_transmission) * drawn.values
         turn = self.rotation_deg
         if turn % _QUARTER == 0:
-            quarters = int(turn // _QUARTER)
-            values, turn = np.rot90(values, quarters), 0.0
-            dust = dust and dust.turn(quarters)
-        flaws = Flaws(self.edge_blur_um * 1e-3, turn, (self.tilt_row_mrad, self.tilt_column_mrad), dust)
+            values, turn = np.rot90(values, int(turn // _QUARTER)), 0.0
+        flaws = Flaws(self.edge_blur_um * 1e-3, turn, (self.tilt_row_mrad, self.tilt_column_mrad))
         stated = [f"{name} {getattr(self, name):g}" for name in type(self).model_fields if name in self._stated]
-        return Plate(feature, values, ", ".join([drawn.words, *stated]), lines, flaws)
+        return Plate(drawn.feature_mm, values, ", ".join([drawn.words, *stated]), flaws)
 
     def plate_of_light(self, folder: Path, mask_distance_mm: float) -> Plate:
         """Return the light behind a phase mask as a plate: brightness relative to light without a mask.
@@ -167,8 +136,7 @@ class MaskProfile(Configuration):
 
     @property
     def _stated(self) -> set[str]:
-        named = {name for name in _FLAWS - _DUST if getattr(self, name) != type(self).model_fields[name].default}
-        return named | (_DUST if self.dust_per_mm2 else set())
+        return {name for name in _FLAWS if getattr(self, name) != type(self).model_fields[name].default}
 
     def plate_drawing(self, folder: Path) -> Plate:
         if self.kind in get_args(MaskKind):

@@ -22,7 +22,7 @@ from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, own_end, read_image
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
-from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, draw_dust, mean_opening
+from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, mean_opening
 
 LEFT_OUT = 1e-7
 """Part of a transmission (rms) that singular vectors may leave: a tenth of the finest accuracy of a plan."""
@@ -41,7 +41,7 @@ _MOST_DECOMPOSED = 1024
 """Most distinct rows and columns for singular vectors: 4096 take six minutes, and correlations are then faster."""
 LARGEST = 4096
 """Features a side: a transmission takes 128 MiB."""
-_MOST_LINES = 2 * LARGEST
+_MOST_CELLS = 2 * LARGEST
 _ROUNDING = 1e-12
 _GRIDS = 4
 
@@ -51,38 +51,32 @@ class Plate(ByValue):
     """A square plate of square features, each with its own transmission; MitsimError for values out of range.
 
     ``values`` (N, N) are transmissions of power, read-only, or of any size with ``irradiance``: the light behind the
-    plate, which includes waves. ``lines_mm`` (N + 1,) separate features that are not equal. Light is always averaged
-    over ``averaged`` features, the side of a sensor pixel. ``words`` describe the plate in manifests.
+    plate, which includes waves. Light is always averaged over ``averaged`` features, the side of a sensor pixel.
+    ``words`` describe the plate in manifests.
     """
 
     feature_mm: float
     values: FloatArray = field(repr=False)
     words: str
-    lines_mm: FloatArray | None = field(default=None, repr=False)
     flaws: Flaws = NO_FLAWS
     irradiance: bool = False
     averaged: int = 1
 
     def __post_init__(self) -> None:
         values = np.array(self.values, dtype=np.float64)
-        most = LARGEST if self.lines_mm is None and not self.irradiance else _MOST_LINES
+        most = _MOST_CELLS if self.irradiance else LARGEST
         if values.ndim != 2 or values.shape[0] != values.shape[1] or not 1 <= len(values) <= most:
             raise MitsimError(f"{self.words}: has shape {values.shape}; give a square of 1 to {most} features a side")
         if not values.max() > (0 if self.irradiance else _ROUNDING):
             raise MitsimError(f"{self.words}: no feature lets light through; open some")
         self._hold(values=values)
-        if self.lines_mm is not None:
-            self._hold(lines_mm=np.array(self.lines_mm, dtype=np.float64))
 
     def _values(self) -> tuple[object, ...]:
         return self.feature_mm, self.words, self.digest, self.flaws, self.irradiance, self.averaged
 
     @cached_property
     def digest(self) -> str:
-        digest = hashlib.sha256(np.ascontiguousarray(self.values).tobytes())
-        if self.lines_mm is not None:
-            digest.update(self.lines_mm.tobytes())
-        return digest.hexdigest()
+        return hashlib.sha256(np.ascontiguousarray(self.values).tobytes()).hexdigest()
 
     @property
     def identity(self) -> str:
@@ -90,12 +84,10 @@ class Plate(ByValue):
 
     @property
     def extent_mm(self) -> float:
-        return len(self.values) * self.feature_mm if self.lines_mm is None else float(np.ptp(self.lines_mm))
+        return len(self.values) * self.feature_mm
 
     @cached_property
     def lines(self) -> FloatArray:
-        if self.lines_mm is not None:
-            return self.lines_mm
         return np.asarray((np.arange(len(self.values) + 1) - len(self.values) / 2) * self.feature_mm)
 
     @property
@@ -104,11 +96,11 @@ class Plate(ByValue):
 
     @property
     def even(self) -> bool:
-        return self.lines_mm is None and not self.blur_mm
+        return not self.blur_mm
 
     @property
     def plain(self) -> bool:
-        return self.lines_mm is None and self.flaws == NO_FLAWS
+        return self.flaws == NO_FLAWS
 
     @property
     def open_part(self) -> float:
@@ -158,7 +150,7 @@ class Plate(ByValue):
         if self.many:
             patterns, which = np.unique(self.values, axis=0, return_inverse=True)
             return tuple((1.0, (which.ravel() == k) * 1.0, pattern) for k, pattern in enumerate(patterns)), 0.0
-        (rows, columns), weights, weighted = _distinct(self.values, self.lines_mm)
+        (rows, columns), weights, weighted = _distinct(self.values)
         if self.symmetric:
             singular, left = np.linalg.eigh(weighted)
             singular, left = (each[..., np.argsort(-np.abs(singular))] for each in (singular, left))
@@ -188,10 +180,24 @@ class Plate(ByValue):
 
     @cached_property
     def residuals(self) -> tuple[float, float]:
-        width = None if self.lines_mm is None else np.diff(self.lines_mm)
-        centred = self.values - np.average(self.values, axis=0, weights=width)
-        centred -= np.average(centred, axis=1, weights=width)[:, None]
-        return _beyond_one(self.values, self.lines_mm), _beyond_one(centred, self.lines_mm)
+        """Return the relative part beyond one term, of the mask and of the mask without means of rows and columns."""
+
+        def beyond_one(values: FloatArray) -> float:
+            *_, weighted = _distinct(values)
+            total = np.linalg.norm(weighted)
+            if not total:
+                return 0.0
+            if min(weighted.shape) > _MOST_DECOMPOSED:
+                from scipy.sparse.linalg import svds  # here: only the largest masks need it
+
+                left, singular, right = svds(weighted, k=1, v0=np.ones(min(weighted.shape)))
+                return float(np.linalg.norm(weighted - singular * left * right) / total)
+            singular = np.linalg.svd(weighted, compute_uv=False)
+            rest = float(np.linalg.norm(singular[1:]) / total)
+            return rest if rest > _ROUNDING * len(values) else 0.0
+
+        centred = self.values - self.values.mean(axis=0)
+        return beyond_one(self.values), beyond_one(centred - centred.mean(axis=1, keepdims=True))
 
     @property
     def centred(self) -> bool:
@@ -212,8 +218,7 @@ class Plate(ByValue):
 
     @property
     def mirrored(self) -> tuple[bool, bool]:
-        even = self.lines_mm is None or np.array_equal(self.lines_mm, -self.lines_mm[::-1])
-        return tuple(even and np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
+        return tuple(np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
 
     @cached_property
     def symmetric(self) -> bool:
@@ -231,7 +236,7 @@ class Plate(ByValue):
 
     @cached_property
     def grids(self) -> tuple[tuple[BoolArray, BoolArray], ...] | None:
-        """Return at most 4 grids of openings that do not overlap; None for more, and without even features."""
+        """Return at most 4 grids of openings that do not overlap; None for more, and with flaws."""
         if not self.binary or not self.plain:
             return None
         patterns, which = np.unique(self.values[self.values.any(axis=1)], axis=0, return_inverse=True)
@@ -243,7 +248,7 @@ class Plate(ByValue):
 
     @property
     def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
-        """Return grids that hold all openings; for uneven or turned features, a square of :attr:`cover`."""
+        """Return grids that hold all openings; with flaws, a square of :attr:`cover`."""
         if self.grids is not None:
             return self.grids
         rows, columns = (np.asarray(self.values.any(axis=axis)) for axis in (1, 0))
@@ -255,11 +260,8 @@ class Plate(ByValue):
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
         count = len(self.values)
-        s_row, s_col = self.flaws.turned_back(np.asarray(s_row), np.asarray(s_col))
-        if self.lines_mm is None:
-            row, column = (np.floor(np.asarray(s) / self.feature_mm + count / 2) for s in (s_row, s_col))
-        else:
-            row, column = (np.searchsorted(self.lines_mm, s, side="right") - 1.0 for s in (s_row, s_col))
+        turned = self.flaws.turned_back(np.asarray(s_row), np.asarray(s_col))
+        row, column = (np.floor(np.asarray(s) / self.feature_mm + count / 2) for s in turned)
         inside = (row >= 0) & (row < count) & (column >= 0) & (column < count)
         place = (np.where(inside, at, 0).astype(np.intp) for at in np.broadcast_arrays(row, column))
         return np.asarray(np.where(inside, self.values[tuple(place)], 0.0))
@@ -270,18 +272,9 @@ def within(plate: Plate, reach_mm: float) -> Plate:
     flaws = plate.flaws
     if flaws.turn_deg:
         reach_mm *= 2**0.5
-    seen = reach_mm + flaws.margin_mm
-    if flaws.dust is not None:
-        lines, values = draw_dust(plate.lines, plate.values, flaws.dust, seen)
-        return within(replace(plate, lines_mm=lines, values=values, flaws=replace(flaws, dust=None)), reach_mm)
     if plate.crosses is not None:
         return plate
-    if plate.lines_mm is not None:
-        inside = (plate.lines_mm[1:] > -seen) & (plate.lines_mm[:-1] < seen)
-        part, ends = plate.values[np.ix_(inside, inside)], np.append(inside, False) | np.append(False, inside)
-        if inside.all() or not part.any():
-            return plate
-        return replace(plate, values=part, lines_mm=plate.lines_mm[ends])
+    seen = reach_mm + flaws.margin_mm
     beyond, more = int((plate.extent_mm / 2 - seen) / plate.feature_mm), 1
     while beyond > 0:
         part = plate.values[beyond:-beyond, beyond:-beyond]
@@ -293,19 +286,18 @@ def within(plate: Plate, reach_mm: float) -> Plate:
 
 
 def _distinct(
-    values: FloatArray, lines: FloatArray | None = None
+    values: FloatArray,
 ) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
-    """Return the distinct rows and columns of ``values``, weighted by number and by widths between uneven ``lines``.
+    """Return the distinct rows and columns of ``values``, weighted by their number.
 
     The result has the (N,) index of each row and column, roots of the weights, and weighted (rows, columns) values.
     """
-    widths = np.ones(len(values)) if lines is None else np.diff(lines) * (len(lines) / np.ptp(lines))
     rows, first, row = np.unique(values, axis=0, return_index=True, return_inverse=True)
     if np.array_equal(values, values.T):
         columns, column = rows[:, first], row  # in the rows' order
     else:
         columns, column = np.unique(rows, axis=1, return_inverse=True)
-    weights = np.sqrt(np.bincount(row.ravel(), widths))[:, None], np.sqrt(np.bincount(column.ravel(), widths))
+    weights = np.sqrt(np.bincount(row.ravel()))[:, None], np.sqrt(np.bincount(column.ravel()))
     return (row.ravel(), column.ravel()), weights, weights[0] * columns * weights[1]
 
 
@@ -359,21 +351,6 @@ class LargestTerms:
         places = np.arange(len(self._values))
         first, beyond = (np.searchsorted(self._starts, places - less, "right") for less in (self._averaged, 0))
         return np.asarray((below[beyond] - below[first]) / self._averaged)
-
-
-def _beyond_one(values: FloatArray, lines: FloatArray | None) -> float:
-    *_, weighted = _distinct(values, lines)
-    total = np.linalg.norm(weighted)
-    if not total:
-        return 0.0
-    if min(weighted.shape) > _MOST_DECOMPOSED:
-        from scipy.sparse.linalg import svds  # here: only the largest masks need it
-
-        left, singular, right = svds(weighted, k=1, v0=np.ones(min(weighted.shape)))
-        return float(np.linalg.norm(weighted - singular * left * right) / total)
-    singular = np.linalg.svd(weighted, compute_uv=False)
-    rest = float(np.linalg.norm(singular[1:]) / total)
-    return rest if rest > _ROUNDING * len(values) else 0.0
 
 
 # -------- A drawing or scan of a mask

@@ -196,8 +196,8 @@ def test_a_plan_with_openings_below_half_a_wavelength_goes_without_diffraction(
 
 FINE = {
     "code": {"kind": "separable"},
-    "tilted, dusty": {"kind": "separable", "tilt_row_mrad": 300.0, "dust_per_mm2": 100.0},
-    "two terms": {"kind": "flatcam", "over_etch_um": 1e-7},
+    "tilted": {"kind": "separable", "tilt_row_mrad": 300.0},
+    "two terms": {"kind": "flatcam", "opaque_transmission": 1e-7},
     "MURA": {"kind": "mura", "features": 101},
     "random": {"kind": "random", "features": 1023},
     "turned": {"kind": "random", "features": 31, "rotation_deg": 3.0},

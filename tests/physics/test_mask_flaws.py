@@ -1,4 +1,4 @@
-"""Shadows of masks that are etched, blurred, dusty, turned and tilted, against drawings of them and rays counted.
+"""Shadows of masks that are blurred, turned and tilted, against drawings of them and rays counted.
 
 Rationale: a drawing of a flawed mask, in pixels of 1 um, is that mask; so is what the mask says of single points.
 """
@@ -8,11 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy import ndimage, special
 
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import NO_FLAWS, mls_mask
+from mitsim.devices.mask import mls_mask
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
@@ -33,10 +32,9 @@ def made(**fields: object) -> CameraGeometry:
     )
 
 
-def profile(grow: int = 0) -> np.ndarray:
-    """The code of order 5 in drawn pixels, openings grown by so many, 20 more on each side."""
-    bits = np.pad(mls_mask(order=5).bits.repeat(UNIT), 20)
-    return ndimage.grey_dilation(bits, 2 * grow + 1) if grow >= 0 else ndimage.grey_erosion(bits, 1 - 2 * grow)
+def profile() -> np.ndarray:
+    """The code of order 5 in drawn pixels, 20 more on each side."""
+    return np.pad(mls_mask(order=5).bits.repeat(UNIT), 20)
 
 
 def drawn(values: np.ndarray) -> CameraGeometry:
@@ -46,14 +44,6 @@ def drawn(values: np.ndarray) -> CameraGeometry:
 
 def whole(camera: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> np.ndarray:
     return sum(np.einsum("ij,kl->ikjl", *term) for term in shadow_terms(camera, AT, AT, depth, spectrum))
-
-
-@pytest.mark.parametrize("grow", [4, -9])
-def test_a_drawing_of_an_etched_mask_casts_its_shadow(grow: int) -> None:
-    """To rounding of antiderivatives, 1e-11. (Planted: lines that are taken for even ones.)"""
-    got = whole(made(over_etch_um=float(grow)), 90.0)
-    np.testing.assert_allclose(got, whole(drawn(profile(grow)), 90.0), rtol=0, atol=1e-10)
-    assert np.abs(got - whole(made(), 90.0)).max() > 0.05
 
 
 def test_a_drawing_of_a_blurred_mask_casts_its_shadow() -> None:
@@ -84,19 +74,18 @@ def mean_over(terms: list[SampledTerm], s: np.ndarray, width: float) -> np.ndarr
 
 
 def test_specular_chains_see_the_same_flaws() -> None:
-    """Samplers at points and over 12 um, of an etched and blurred mask off the axis, and of a turned one, whose raster
+    """Samplers at points and over 12 um, of a mask off the axis, sharp and blurred, and of a turned one, whose raster
     has edges a cell wide. (Planted: the mask's offset left out.)"""
     s = np.linspace(-0.5, 0.5, 41)
-    etched = made(over_etch_um=4.0)
-    mask = etched.build_mask()
-    expected = mask.transmission((s - 0.0131)[:, None], s)
-    np.testing.assert_array_equal(mean_over(geometric_samplers(etched), s, 0.0), expected)
+    grey = made(opaque_transmission=0.1)
+    expected = grey.build_mask().transmission((s - 0.0131)[:, None], s)
+    np.testing.assert_allclose(mean_over(geometric_samplers(grey), s, 0.0), expected, rtol=0, atol=1e-12)
     steps = s + np.linspace(-0.006, 0.006, 1201)[:, None]
-    smooth = ndimage.gaussian_filter1d(profile(4).astype(float), 3.0, truncate=9)
+    smooth = ndimage.gaussian_filter1d(profile().astype(float), 3.0, truncate=9)
     means = [
         np.interp(steps - at, (np.arange(len(smooth)) + 0.5 - len(smooth) / 2) * 1e-3, smooth) for at in (0.0131, 0)
     ]
-    got = mean_over(geometric_samplers(made(over_etch_um=4.0, edge_blur_um=3.0)), s, 0.012)
+    got = mean_over(geometric_samplers(made(edge_blur_um=3.0)), s, 0.012)
     np.testing.assert_allclose(got, np.outer(*(mean.mean(axis=0) for mean in means)), rtol=0, atol=2e-3)
     turned = made(rotation_deg=3.0)
     got = mean_over(geometric_samplers(turned), s, 0.012)
@@ -106,29 +95,19 @@ def test_specular_chains_see_the_same_flaws() -> None:
     assert np.abs(mean_over(wave_samplers(turned, LINES, 400.0, (0.0, 0.0)), s, 0.012) - seen).mean() < 0.2
 
 
-@pytest.mark.parametrize("kind", ["turned", "dusty", "both"])
-def test_a_frame_equals_rays_counted_through_a_turned_or_dusty_mask(kind: str) -> None:
-    """A point source: its rays to 30 x 30 points of each pixel. Of a disc the mask's own cells are asked, whose area
-    tests/unit/devices/test_flaws.py tells. (Planted: turned the other way; rows for columns; dust on the sensor's side
-    of the offset.)"""
-    flaws = {
-        "turned": {"rotation_deg": 3.0},
-        "dusty": {"dust_per_mm2": 6.0, "dust_radius_um": 30.0, "dust_opacity": 0.8},
-    }
-    fields = {**flaws["turned"], **flaws["dusty"]} if kind == "both" else flaws[kind]
-    random = {"kind": "random", "feature_mm": 0.06, "features": 31, **fields}
+def test_a_frame_equals_rays_counted_through_a_turned_mask() -> None:
+    """A point source: its rays to 30 x 30 points of each pixel. (Planted: turned the other way; rows for columns.)"""
+    random = {"kind": "random", "feature_mm": 0.06, "features": 31, "rotation_deg": 3.0}
     camera = MaskProfile.model_validate(random).put_on(BARE, Path())
     plate = camera.build_mask()
-    assert isinstance(plate, Plate) and (plate.flaws == NO_FLAWS) == (kind == "dusty")
     tau, depth = np.array([0.03, -0.02]), 30.0
     fine = (np.arange(40 * 30) + 0.5) / 30 * 0.01172 - camera.half_width
     row, column = (fine * (1 - 2 / depth) + at * 2 - off for at, off in zip(tau, camera.mask_offset, strict=True))
     counted = plate.transmission(row[:, None], column).reshape(40, 30, 40, 30).mean(axis=(1, 3))
     rows, columns = (Directions([at], 0.0) for at in tau)
     frame = sum(left @ right.T for left, right in shadow_terms(camera, rows, columns, depth))
-    # Counted to an edge of 1/60 of a pixel; the raster of a turned mask to its own smear, sqrt(1 / 6) / 4 pixel.
-    limit = 0.008 if kind == "dusty" else 0.02
-    assert np.sqrt(np.mean(np.square(frame - counted))) < limit and counted.std() > 0.2
+    # The raster of a turned mask has its own smear, sqrt(1 / 6) / 4 pixel.
+    assert np.sqrt(np.mean(np.square(frame - counted))) < 0.02 and counted.std() > 0.2
 
 
 def test_the_reference_meets_turned_blurred_and_tilted_masks(variant: str) -> None:
@@ -150,7 +129,7 @@ def test_the_reference_meets_turned_blurred_and_tilted_masks(variant: str) -> No
 
     camera = MaskProfile.model_validate(
         {"kind": "random", "feature_mm": 0.06, "features": 31, "rotation_deg": 5.0, "tilt_row_mrad": 40.0,
-         "tilt_column_mrad": -25.0, "over_etch_um": 3.0}
+         "tilt_column_mrad": -25.0}
     ).put_on(BARE, Path())  # fmt: skip
     origin, way, light = rays(camera)
     plate = camera.build_mask()

@@ -42,6 +42,12 @@ def made(**fields: object) -> CameraGeometry:
     return MaskProfile.model_validate({"feature_mm": 0.06, **fields}).put_on(BARE, Path())
 
 
+def as_plate(bare: CameraGeometry = BARE, **fields: object) -> CameraGeometry:
+    """A code of two terms at most as a plate, feature by feature."""
+    plate = MaskProfile.model_validate({"feature_mm": 0.06, **fields}).plate(Path())
+    return bare.model_copy(update={"mask": "plate", "mask_plate": plate, "mask_feature": plate.feature_mm})
+
+
 def irradiance(camera: CameraGeometry, tau: tuple[float, float], depth: float, degrees: float) -> np.ndarray:
     """(5, 5) light of a point on every eighth pixel from the third, by Fresnel integrals at 24 x 24 points."""
     values = MaskProfile(kind="random", feature_mm=0.06, features=31).plate(Path()).values
@@ -137,7 +143,7 @@ def test_terms_and_correlations_are_rays_counted(
 @pytest.mark.parametrize("kind", ["separable", "flatcam"])
 def test_the_raster_gives_the_closed_forms_frame(kind: str) -> None:
     """Of 40 x 40 cells of light, to 1e-3 of its mean. (Planted: a point's place in its cell.)"""
-    camera = made(kind=kind, order=7, over_etch_um=1e-9)
+    camera = as_plate(kind=kind, order=7)
     edges = np.linspace(-0.15, 0.15, 41)
     at, light = Directions.cells(edges), np.random.default_rng(0).random((40, 40))
     expected = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0, LINES))
@@ -161,7 +167,7 @@ def off_the_closed_form(camera: CameraGeometry, lines: Spectrum, cells: int) -> 
 def test_waves_beyond_a_small_mask_are_drawn(feature: float, order: int) -> None:
     """Masks of 0.2 and 0.1 mm, 2 mm off, light a sensor of 0.5 mm by waves, features far below a pixel: to 3e-3 of the
     closed form's frame. (Planted: a raster as wide as the mask: half of it is missing.)"""
-    camera = made(kind="separable", order=order, feature_mm=feature, over_etch_um=1e-6)
+    camera = as_plate(kind="separable", order=order, feature_mm=feature)
     assert off_the_closed_form(camera, LINES, 40) < 3e-3
 
 
@@ -175,8 +181,7 @@ def test_waves_of_too_many_points_are_refused() -> None:
 def test_fringes_of_far_edges_do_not_add_up() -> None:
     """Uniform light behind 511 features a side, of which the farthest are 15 mm away: to 5e-4 of its closed form.
     (Planted: the field at points, not its means from one to the next: 2.5e-3.)"""
-    profile = MaskProfile(kind="separable", feature_mm=0.06, over_etch_um=1e-9)
-    camera, line = profile.put_on(CameraGeometry(pixels=64), Path()), Spectrum(np.array([562.0]), np.ones(1))
+    camera, line = as_plate(CameraGeometry(pixels=64), kind="separable"), Spectrum(np.array([562.0]), np.ones(1))
     assert off_the_closed_form(camera, line, 64) < 5e-4
 
 
@@ -282,14 +287,12 @@ def judged(camera: CameraGeometry, at: Directions, light: np.ndarray) -> tuple[f
     "mask",
     [
         {"kind": "random", "features": 63},
-        {"kind": "random", "features": 63, "over_etch_um": 3.0, "edge_blur_um": 2.0},
-        {"kind": "separable", "order": 6, "dust_per_mm2": 3.0},
+        {"kind": "random", "features": 63, "edge_blur_um": 2.0},
         pytest.param({"kind": "separable", "order": 6, "rotation_deg": 0.3}, marks=pytest.mark.slow),
     ],
 )
 def test_what_a_raster_leaves_is_predicted(mask: dict[str, object]) -> None:
-    """Of dots, from 64 x 64 of 96 x 96 pixels; sums and FFT agree to it. (Planted: not sharpened; etched lines
-    taken for even ones.)"""
+    """Of dots, from 64 x 64 of 96 x 96 pixels; sums and FFT agree to it. (Planted: not sharpened.)"""
     camera = MaskProfile.model_validate({"feature_mm": 0.06, **mask}).put_on(CameraGeometry(pixels=96), Path())
     light = np.zeros((40, 40))
     light[3::7, 3::7] = 1
@@ -342,8 +345,7 @@ def test_a_mask_turned_by_all_but_a_right_angle_is_drawn_as_by_it() -> None:
     """About its centre, edges to a sixteenth of a cell, sharpened; the other's features are counted turned. (Planted:
     cells counted from the middle on; turned the other way.)"""
     right, nearly, other = (
-        raster(made(kind="random", features=11, over_etch_um=1.0, rotation_deg=turn), 400.0).values
-        for turn in (90.0, 90 - 1e-6, -90.0)
+        raster(made(kind="random", features=11, rotation_deg=turn), 400.0).values for turn in (90.0, 90 - 1e-6, -90.0)
     )
     np.testing.assert_allclose(nearly, right, rtol=0, atol=0.2)
     assert np.abs(other - right).max() > 0.9
@@ -361,7 +363,7 @@ def test_fields_have_a_grid_as_fine_as_waves_need(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(rasters, "EdgeWaves", ask)
     bare = CameraGeometry(pixels=4, pixel_pitch=0.03, mask_distance=20.0)
-    camera = MaskProfile(kind="separable", feature_mm=0.06, order=2, over_etch_um=1e-9).put_on(bare, Path())
+    camera = as_plate(bare, kind="separable", order=2)
     with pytest.raises(Asked) as asked:
         raster(camera, 400.0, Spectrum(np.array([550.0]), np.ones(1)))
     assert asked.value.args[0] <= grid_step(ShadowGeometry.of(camera, 400.0), 550.0)
