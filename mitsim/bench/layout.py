@@ -9,7 +9,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -28,8 +28,6 @@ from mitsim.transport.direct import DirectTracer
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays
 
-_TRIANGLES = 24_000
-"""Triangles into which meshes are divided that have fewer."""
 _RAYS = 48
 """Rays per side from each of six sides that hit a shape without triangles."""
 _JUMP = 3.0
@@ -64,8 +62,6 @@ class Surface:
         (k, 3) corners [mm].
     triangles
         (m, 3) indices of corners.
-    reflectance
-        (k, channels) diffuse reflectance at the corners, 0 to 1; 0.5 if unknown.
     is_lamp
         True if it emits.
     """
@@ -73,7 +69,6 @@ class Surface:
     name: str
     points: FloatArray
     triangles: npt.NDArray[np.int64]
-    reflectance: FloatArray
     is_lamp: bool
 
 
@@ -158,59 +153,31 @@ def layout_of(bench: Apparatus) -> Layout:
 
 def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[Surface, ...]:
     shapes, tags, found = bench.loaded.scene.shapes(), bench.loaded.shapes, []
-    area = sum(float(np.array(shape.surface_area()).ravel()[0]) for shape in shapes if shape.is_mesh())
     for number, shape in enumerate(shapes):
         name = shape.id()
         if not name or name.startswith("_"):
             kind = tags[number].attributes.get("type", "shape") if tags else shape.class_name().lower()
             name = f"{kind} {number + 1}"
-        parts = _of_mesh(shape, area) if shape.is_mesh() else _of_rays(bench.loaded.scene, shape)
-        points, triangles, reflectance = parts
+        if shape.is_mesh():
+            count = shape.face_count()
+            corners = shape.face_indices(dr.arange(mi.UInt32, count))
+            places = [vectors(shape.vertex_position(corner), count) for corner in corners]
+            points, triangles = np.concatenate(places), np.arange(3 * count).reshape(3, count).T
+        else:
+            points, triangles = _triangles_by_rays(bench.loaded.scene, shape)
         if len(triangles):
-            found.append(Surface(name, (points - origin) @ turn, triangles, reflectance, bool(shape.is_emitter())))
+            found.append(Surface(name, (points - origin) @ turn, triangles, bool(shape.is_emitter())))
     return tuple(found)
 
 
-_Triangles = tuple[FloatArray, npt.NDArray[np.int64], FloatArray]
-
-
-def _of_mesh(mesh: mi.Mesh, area: float) -> _Triangles:
-    count = mesh.face_count()
-    corners = mesh.face_indices(dr.arange(mi.UInt32, count))
-    own = float(np.array(mesh.surface_area()).ravel()[0])
-    parts = int(np.sqrt(_TRIANGLES * own / max(area, 1e-30) / count)) if count else 1
-    places = np.stack([vectors(mesh.vertex_position(corner), count) for corner in corners], axis=1)
-    uv = np.zeros((count, 3, 2))
-    if mesh.has_vertex_texcoords():
-        held = [mesh.vertex_texcoord(corner) for corner in corners]
-        uv = np.stack([np.stack([np.array(each.x), np.array(each.y)], axis=1) for each in held], axis=1)
-    weights, cells = _triangle_parts(max(parts, 1))
-    points = np.einsum("wc,tcx->twx", weights, places).reshape(-1, 3)
-    on_print = np.einsum("wc,tcx->twx", weights, uv).reshape(-1, 2)
-    triangles = (np.arange(count)[:, None, None] * len(weights) + cells).reshape(-1, 3)
-    at = dr.zeros(mi.SurfaceInteraction3f, len(points))
-    at.p, at.wi = mi.Point3f(*device_vectors(points)), mi.Vector3f(0, 0, 1)
-    at.uv = mi.Point2f(*(mi.Float(np.ascontiguousarray(axis, dtype=np.float32)) for axis in on_print.T))
-    return points, triangles, _reflectance(mesh.bsdf(), at, len(points))
-
-
-def _triangle_parts(parts: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    place = [(i, j) for i in range(parts + 1) for j in range(parts + 1 - i)]
-    number = {at: index for index, at in enumerate(place)}
-    weights = np.array([(parts - i - j, i, j) for i, j in place]) / parts
-    up = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in place if i + j < parts]
-    down = [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in place if i + j + 1 < parts]
-    return weights, np.array(up + down, dtype=np.int64)
-
-
-def _of_rays(scene: mi.Scene, shape: mi.Shape) -> _Triangles:
+def _triangles_by_rays(scene: mi.Scene, shape: mi.Shape) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     box = shape.bbox()
     low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
     size, sides = high - low, np.float64(np.linalg.norm(high - low))
     cells, corner = (np.arange(_RAYS) + 0.5) / _RAYS, (np.arange(_RAYS - 1)[:, None] * _RAYS + np.arange(_RAYS - 1))
     a = corner.ravel()
     squares = np.concatenate([np.stack([a, a + 1, a + _RAYS], 1), np.stack([a + 1, a + _RAYS + 1, a + _RAYS], 1)])
-    found: list[_Triangles] = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), np.zeros((0, 1)))]
+    found = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))]
     for axis, sign in itertools.product(range(3), (1.0, -1.0)):
         across = [other for other in range(3) if other != axis]
         if size[across].min() < _EDGE_ON * sides:
@@ -225,11 +192,11 @@ def _of_rays(scene: mi.Scene, shape: mi.Shape) -> _Triangles:
         places = np.where(valid[:, None], vectors(met.p, len(start)), np.nan)
         # NaN where a ray met nothing, which compares as false.
         joined = squares[np.ptp(places[squares][..., axis], axis=1) < _JUMP * size[across].max() / _RAYS]
-        before = sum(len(points) for points, _, _ in found)
-        found.append((np.nan_to_num(places), joined + before, _reflectance(met.bsdf(ray), met, len(start))))
-    points, triangles, reflectance = (np.concatenate(part) for part in zip(*(found[1:] or found), strict=True))
+        before = sum(len(points) for points, _ in found)
+        found.append((np.nan_to_num(places), joined + before))
+    points, triangles = (np.concatenate(part) for part in zip(*found, strict=True))
     used, triangles = np.unique(triangles, return_inverse=True)
-    return points[used], triangles.reshape(-1, 3), reflectance[used]
+    return points[used], triangles.reshape(-1, 3)
 
 
 def _meet(scene: mi.Scene, ray: mi.Ray3f, shape: mi.Shape) -> mi.SurfaceInteraction3f:
@@ -242,16 +209,6 @@ def _meet(scene: mi.Scene, ray: mi.Ray3f, shape: mi.Shape) -> mi.SurfaceInteract
         ray = mi.Ray3f(dr.select(other, met.spawn_ray(ray.d).o, ray.o), ray.d)
         met = scene.ray_intersect(ray)
     return dr.select((met.shape == own) | (met.instance == own), met, dr.zeros(mi.SurfaceInteraction3f))
-
-
-def _reflectance(bsdf: Any, at: mi.SurfaceInteraction3f, count: int) -> FloatArray:
-    try:
-        values = channels(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(at)), count)
-    except (RuntimeError, NotImplementedError, AttributeError):  # materials need not know it
-        return np.full((count, 1), 0.5)
-    if values.shape[1] != 3:
-        values = values.mean(axis=1, keepdims=True)
-    return np.clip(np.nan_to_num(values, nan=0.5), 0, 1)
 
 
 # -------- Pictures of the bench in its own light
@@ -331,7 +288,13 @@ def _picture(scene: mi.Scene, place: FloatArray, angle: float) -> FloatArray:
     met = scene.ray_intersect(ray)
     hit = host_values(met.is_valid(), side * side).astype(float)[:, None]
     cosine = np.abs(host_values(dr.dot(met.sh_frame.n, ray.d), side * side))[:, None]
-    lamp = _reflectance(met.bsdf(ray), met, side * side) * cosine * hit
+    try:
+        diffuse = channels(mi.unpolarized_spectrum(met.bsdf(ray).eval_diffuse_reflectance(met)), side * side)
+    except (RuntimeError, NotImplementedError, AttributeError):  # materials need not know it
+        diffuse = np.full((side * side, 1), 0.5)
+    if diffuse.shape[1] != 3:
+        diffuse = diffuse.mean(axis=1, keepdims=True)
+    lamp = np.clip(np.nan_to_num(diffuse, nan=0.5), 0, 1) * cosine * hit
     by_lamp, full = (
         np.asarray(values.reshape(_PIXELS, _EDGES, _PIXELS, _EDGES, -1).mean(axis=(1, 3))) for values in (lamp, hit)
     )

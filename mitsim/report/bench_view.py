@@ -1,15 +1,13 @@
-"""A drawing of a bench to scale, previews in its own light, and a model that can be turned."""
+"""A drawing of a bench to scale, with previews in its own light."""
 
 from __future__ import annotations
 
-import html
 import io
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -28,12 +26,8 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import check_arguments
 from mitsim.core.files import write_bytes
 from mitsim.core.images import lightness
-from mitsim.reconstruct.depth import SPARE
 from mitsim.report.pages import page_figure, render_page, typeset
 from mitsim.report.plots import BLACK, BLUE, GREY, ORANGE, PALE
-
-if TYPE_CHECKING:
-    from plotly.graph_objects import Figure as Model
 
 _DPI = 110
 _STYLE = {
@@ -51,15 +45,11 @@ _FEW = 60_000
 _FLAT = 1e-4
 _NO_PIXELS = 5e-3
 """Parallax [projector pixels] that no image shows."""
-_IN_SIGHT = 1.4
-_ACROSS = 7
-"""Period of dots across the baseline: the paper's."""
 _NAMES = 3
 _BESIDE, _BEHIND = 0.3, 1.2
 """Part of the scene that is drawn beside and behind the light."""
 _LAMP, _DARK = "#f0c419", "#9a6b00"
 _SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-_CLOSED = [0, 1, 2, 3, 0]
 _SMALL_GAP: dict[str, Any] = {"textcoords": "offset points"}
 
 
@@ -86,22 +76,15 @@ class BenchView:
         window = f"{height:.4g} x {width:.4g} mm at {aligned:.4g} mm, {n} x {n} pixels"
         if keystone := bench.loaded.pixels.keystone:
             window += f"; keystone: its corners are up to {keystone:.3g} pixels off a rectangle"
-        mirrors = bench.loaded.mirrors
-        light = "in mirrors alone" if mirrors else "nowhere"
+        light = "in mirrors alone" if bench.loaded.mirrors else "nowhere"
         if layout.depths is not None:
             near, far = layout.depths
             where = f"at {near:.4g} mm" if far - near < _FLAT * far else f"from {near:.4g} to {far:.4g} mm"
             light = f"{where}, of {layout.seen} of {n**2} projector pixels ({layout.seen / n**2:.1%})"
-            light += "; mirrors may show more" if mirrors and layout.seen < n**2 else ""
+            light += "; mirrors may show more" if bench.loaded.mirrors and layout.seen < n**2 else ""
         moves, depths = layout.parallax, "between these depths"
-        dots = {}
         if max(moves) < _NO_PIXELS:
             moves, depths = layout.parallax_between(0.99 * aligned, aligned), f"none; {0.01 * aligned:.3g} mm nearer"
-        else:  # no two depths are a period of the dots apart
-            period = 2 ** math.ceil(math.log2(max(moves) + SPARE))
-            name = f"dots:{_ACROSS}x{period}" if moves[1] >= moves[0] else f"dots:{period}x{_ACROSS}"
-            tells = f"{name} and reconstruct --focus map tell it; a shorter period may leave it off by one"
-            dots["depth map"] = tells if period <= n else "no dots tell it: parallax spans the window"
         rows, columns = ("0" if value < _NO_PIXELS else f"{value:.3g}" for value in moves)
         stop = f"{geometry.fov:g} degrees, {2 * geometry.tan_half_fov * aligned:.4g} mm wide there"
         if bench.field_stop_cuts:
@@ -109,12 +92,17 @@ class BenchView:
         (m, k), (row, column) = geometry.shape, geometry.pitches
         pitch = f"{column * 1e3:.4g} um" if row == column else f"{row * 1e3:.4g} x {column * 1e3:.4g} um"
         feature = geometry.build_mask().feature_mm * 1e3
+        sides = ("left of", "right of"), ("above", "below"), ("ahead", "behind")
+        place = ", ".join(
+            f"{abs(value):.4g} mm {plus if value > 0 else minus}"
+            for value, (plus, minus) in zip(layout.projector, sides, strict=True)
+            if abs(value) > _FLAT * float(np.linalg.norm(layout.projector))
+        )
         return {
-            "projector": _place_words(layout.projector),
+            "projector": f"{place} the camera's sensor" if place else "at the camera's sensor",
             "window": window,
             "light is seen": light,
             "parallax": f"{depths} the window moves by {rows} rows and {columns} columns of its pixels",
-            **dots,
             "field stop": stop,
             "sensor": f"{m} x {k} pixels of {pitch}: {m * row:.3g} x {k * column:.3g} mm",
             "mask": f"{geometry.mask_words}, {geometry.mask_distance:g} mm before the sensor, features of "
@@ -298,56 +286,11 @@ class BenchView:
         rows, columns = preview.picture.shape[:2]
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
 
-    # ---- As a model that can be turned ----
-
-    def model(self) -> Model:
-        from plotly import graph_objects
-
-        layout, geometry, end = self.layout, self.bench.geometry, self._end
-        figure = graph_objects.Figure()
-        for surface in layout.surfaces:
-            figure.add_trace(_mesh(surface))
-        stop = _field_at(geometry.tan_half_fov, end)
-        for name, eye, corners, color in (
-            ("projector and its light", layout.projector, layout.window_at(end), ORANGE),
-            ("camera and its field stop", np.zeros(3), stop, BLUE),
-        ):
-            sides = [
-                np.array([first, second, eye])
-                for first, second in zip(corners, np.roll(corners, -1, axis=0), strict=True)
-            ]
-            figure.add_trace(_line(name, np.concatenate([eye[None], *sides]), color))
-        figure.add_trace(_line("calibrated window", layout.window[_CLOSED], ORANGE, 6))
-        for name, half, z, color in (
-            ("sensor", geometry.half_sides, 0.0, BLUE),
-            ("mask", (geometry.build_mask().extent_mm / 2,) * 2, geometry.mask_distance, BLACK),
-        ):
-            corners = np.column_stack([_SQUARE * [half[1], half[0]], np.full(4, z)])
-            figure.add_trace(_line(name, corners[_CLOSED], color, 5))
-        for name, place in layout.lamps.items():
-            figure.add_trace(_line(name, place[None], _LAMP, 5, mode="markers"))
-        ends = np.array([[[min(side), max(side)] for side in (each.x, each.y, each.z)] for each in figure.data])
-        extents = ends[:, :, 1].max(axis=0) - ends[:, :, 0].min(axis=0)
-        # Plotly makes the sides' geometric mean 1. Therefore the eye moves back for a scene with one long side.
-        back = max(1.0, float(extents.max() / np.cbrt(extents.prod())) / _IN_SIGHT)
-        view_from = dict(zip("xyz", (-2.1 * back, -1.45 * back, 1.0 * back), strict=True))
-        titles = {"xaxis": "z, from the sensor [mm]", "yaxis": "x, to the left [mm]", "zaxis": "y, up [mm]"}
-        scene = {name: {"title": {"text": title}} for name, title in titles.items()}
-        figure.update_layout(
-            scene={**scene, "aspectmode": "data", "camera": {"eye": view_from, "center": {"x": 0, "y": 0, "z": -0.15}}},
-            legend={"orientation": "h", "y": 0, "yanchor": "top"},
-            margin={"l": 0, "r": 0, "t": 0, "b": 0},
-            height=560,
-        )
-        for trace in figure.data:  # plotly reads HTML in its texts, and a scene's names are any text
-            trace.name = html.escape(trace.name)
-        return figure
-
     # ---- As a file, and in a notebook ----
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the drawing to a PNG file, or all of it to a page without network (HTML).
+        """Write the drawing to a PNG file, or to a page (HTML).
 
         Raises MitsimError for another ending, and when the file cannot be written.
         """
@@ -356,7 +299,6 @@ class BenchView:
         return path
 
     def _page(self) -> str:
-        controls = {"displayModeBar": False, "responsive": True}
         pictures = {}
         for name, inches, draw in self._parts:
             with rc_context(_STYLE):
@@ -370,7 +312,6 @@ class BenchView:
             scene=str(self.bench.loaded.path),
             facts=self.facts,
             warnings=self.warnings,
-            model=self.model().to_html(full_html=False, include_plotlyjs=True, config=controls),
             pictures=pictures,
             versions=versions(),
         )
@@ -435,40 +376,3 @@ def _show(axes: Axes, preview: Preview, title: str) -> None:
     axes.set_title(title, loc="left")
     axes.spines[:].set_visible(True)
     axes.spines[:].set_color(PALE)
-
-
-def _mesh(surface: Surface) -> Any:
-    from plotly import graph_objects
-
-    z, x, y = surface.points.astype(np.float32).T[[2, 0, 1]]
-    shown = lightness(surface.reflectance)
-    color: dict[str, Any] = {"color": _LAMP}
-    if not surface.is_lamp and shown.shape[1] == 1:
-        grey = shown[:, 0].astype(np.float32)
-        color = {"intensity": grey, "colorscale": "gray", "cmin": 0, "cmax": 1, "showscale": False}
-    elif not surface.is_lamp:
-        color = {"vertexcolor": np.rint(255 * shown).astype(int).tolist()}
-    i, j, k = surface.triangles.astype(np.int32).T
-    light = {"ambient": 0.75, "diffuse": 0.35, "specular": 0.0}
-    common = {"name": surface.name, "showlegend": True, "lighting": light, "flatshading": True}
-    hover = "%{x:.4g} mm from the sensor<br>x %{y:.4g} mm, y %{z:.4g} mm"
-    return graph_objects.Mesh3d(x=z, y=x, z=y, i=i, j=j, k=k, hovertemplate=hover, **common, **color)
-
-
-def _line(name: str, points: FloatArray, color: str, width: float = 3, mode: str = "lines") -> Any:
-    from plotly import graph_objects
-
-    z, x, y = points.T[[2, 0, 1]]
-    style = {"color": color, "width" if mode == "lines" else "size": width}
-    key = "line" if mode == "lines" else "marker"
-    return graph_objects.Scatter3d(x=z, y=x, z=y, mode=mode, name=name, **{key: style})
-
-
-def _place_words(place: FloatArray) -> str:
-    sides = ("left of", "right of"), ("above", "below"), ("ahead", "behind")
-    words = [
-        f"{abs(value):.4g} mm {plus if value > 0 else minus}"
-        for value, (plus, minus) in zip(place, sides, strict=True)
-        if abs(value) > _FLAT * float(np.linalg.norm(place))
-    ]
-    return f"{', '.join(words)} the camera's sensor" if words else "at the camera's sensor"

@@ -82,16 +82,6 @@ def test_shapes_without_triangles_have_their_outlines(small_scene: Callable[...,
     assert np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).max() < 7  # nothing spans the gap of 7 mm
 
 
-def test_a_print_is_seen_on_its_surface(small_scene: Callable[..., Path]) -> None:
-    """A sheet whose upper left quarter is white, for one who looks along +z: +x is left, +y up."""
-    reflectance = np.full((16, 16), 51)
-    reflectance[:8, :8] = 255
-    (sheet,) = layout(small_scene(reflectance=reflectance)).surfaces
-    white = sheet.reflectance[:, 0] > 0.6
-    inside = (np.abs(sheet.points[:, :2]) > 4).all(axis=1)  # not on the borders
-    assert_allclose(white[inside], ((sheet.points[:, 0] > 0) & (sheet.points[:, 1] > 0))[inside])
-
-
 @pytest.mark.slow
 def test_a_preview_shows_what_the_camera_sees(
     small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
-import shutil
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +12,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from numpy.testing import assert_allclose
-from PIL import Image
-from scipy.ndimage import label
 
 from mitsim.api.bench import open_bench
 from mitsim.bench.layout import Layout, Preview, Surface
 from mitsim.core.errors import MitsimError
 from mitsim.report.bench_view import BenchView
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 CORNERS = np.array([[60.0, 60, 400], [-60, 60, 400], [-60, -60, 400], [60, -60, 400]])
 
 
@@ -32,9 +26,9 @@ def seen(shared_scene: Callable[..., Path], variant: str) -> BenchView:
     """Of a made layout: nothing is traced. A tower of 30 x 50 mm stands at 340 to 380 mm, a lamp far above."""
     box = np.array([[x, y, z] for x in (-10.0, 20) for y in (-60, -10) for z in (340, 380)])
     sides = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 3, 7], [2, 7, 6]]
-    tower = Surface("tower", box, np.array(sides), np.full((8, 1), 0.5), False)
-    sheet = Surface("sheet", CORNERS, np.array([[0, 1, 2], [0, 2, 3]]), np.full((4, 1), 0.8), False)
-    lamp = Surface("lamp", CORNERS + [0, 900, 0], np.array([[0, 1, 2]]), np.full((4, 1), 0.8), True)
+    tower = Surface("tower", box, np.array(sides), False)
+    sheet = Surface("sheet", CORNERS, np.array([[0, 1, 2], [0, 2, 3]]), False)
+    lamp = Surface("lamp", CORNERS + [0, 900, 0], np.array([[0, 1, 2]]), True)
     layout = Layout(
         surfaces=(tower, sheet, lamp),
         projector=np.array([60.0, 0, 0]),
@@ -93,7 +87,6 @@ def test_words_state_what_the_numbers_do(seen: BenchView) -> None:
     assert words["window"] == "120 x 120 mm at 400 mm, 16 x 16 pixels"
     assert words["light is seen"] == "from 340 to 400 mm, of 250 of 256 projector pixels (97.7%)"
     assert words["parallax"].endswith("by 0 rows and 1.41 columns of its pixels")
-    assert words["depth map"].startswith("dots:7x4 and reconstruct --focus map")
     said = json.loads(json.dumps(seen.summary()))
     assert (
         said["depths_mm"] == [340, 400]
@@ -104,27 +97,10 @@ def test_words_state_what_the_numbers_do(seen: BenchView) -> None:
     flat = replace(seen, layout=replace(seen.layout, depths=(400.0, 400.0)))
     assert flat.facts["light is seen"].startswith("at 400 mm, ")
     assert flat.facts["parallax"].startswith("none; 4 mm nearer the window moves by 0 rows and 0.0808 columns")
-    assert "depth map" not in flat.facts
-    near = replace(seen, layout=replace(seen.layout, depths=(200.0, 400.0)))
-    assert near.facts["depth map"].startswith("dots:7x16 ")
-    nearer = replace(seen, layout=replace(seen.layout, depths=(100.0, 400.0)))
-    assert nearer.facts["depth map"] == "no dots tell it: parallax spans the window"
-    above = replace(near, layout=replace(near.layout, moves=near.layout.moves[::-1]))
-    assert above.facts["depth map"].startswith("dots:16x7 ")
     far = replace(seen, layout=replace(seen.layout, projector=np.array([-5.0, 20, -30])))
     assert far.facts["projector"] == "5 mm right of, 20 mm above, 30 mm behind the camera's sensor"
     dark = replace(seen, layout=replace(seen.layout, depths=None, seen=0, obstacles=("no light",)))
     assert dark.facts["light is seen"] == "nowhere" and dark.warnings == ("no light",)
-
-
-def test_the_model_has_every_triangle_in_place(seen: BenchView) -> None:
-    """Plotly's x is z of the bench, its z is y. (Planted: y for x.)"""
-    meshes = {trace.name: trace for trace in seen.model().data if trace.type == "mesh3d"}
-    assert [*meshes] == ["tower", "sheet", "lamp"]
-    tower, surface = meshes["tower"], seen.layout.surfaces[0]
-    points = np.stack([tower.y, tower.z, tower.x], axis=1)
-    assert_allclose(points, surface.points)
-    assert_allclose(np.stack([tower.i, tower.j, tower.k], axis=1), surface.triangles)
 
 
 def test_a_view_is_written_whole_or_not_at_all(
@@ -145,46 +121,11 @@ def test_a_view_is_written_whole_or_not_at_all(
     assert (tmp_path / "bench.png").read_bytes() == b"before"
 
 
-def test_names_of_a_scene_are_no_html(seen: BenchView) -> None:
-    """Plotly reads tags and entities in its texts; a name is shown as it is, and requests nothing. Dollar signs are no
-    formula in the drawing. (Planted: names as the scene has them; a name with dollar signs in the title.)"""
+def test_names_of_a_scene_are_no_html(seen: BenchView, tmp_path: Path) -> None:
+    """A page requests nothing, and dollar signs are no formula. (Planted: a name with dollar signs in the title.)"""
     bad = "<b style=\"background:url(http://evil.example/x)\">s</b>&lt;img src='http://evil.example'&gt; $^{x$"
     shapes = [replace(surface, name=bad) for surface in seen.layout.surfaces]
-    layout = replace(seen.layout, surfaces=shapes, lamps={bad: np.array([0.0, 9000, 300])})
-    view = replace(seen, layout=layout)
-    figure = json.loads(view.model().to_json())
-    texts: list[str] = []
-
-    def collect(value: object) -> None:
-        if isinstance(value, str):
-            texts.append(value)
-        for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-            collect(each)
-
-    collect([figure["data"], {**figure["layout"], "template": None}])
-    named = [text for text in texts if "evil" in text]
-    assert len(named) == len(shapes) + 1
-    assert all("<" not in text and "&lt;b style" in text and "&amp;lt;img" in text for text in named)
-    drawn(view, 0).savefig(io.BytesIO())
-
-
-@pytest.mark.slow
-def test_a_page_needs_no_network_and_shows_the_model(seen: BenchView, tmp_path: Path) -> None:
-    """In Chromium with a renderer in software and no host that can be found the lamp's yellow is on the screen,
-    high as it is. (Planted: a black lamp; an eye that stays where it is.)"""
-    page = seen.save(tmp_path / "bench.html")
-    text = page.read_text()
+    layout = replace(seen.layout, surfaces=shapes, lamps={bad: np.array([0.0, 9000, 300])}, obstacles=(bad,))
+    text = replace(seen, layout=layout).save(tmp_path / "bench.html").read_text()
+    assert "<b style" not in text and "<script" not in text
     assert not re.search(r'<(script|link|img)[^>]*\b(src|href)="https?:', text)
-    if CHROMIUM is None:
-        pytest.skip("Chromium is not installed")
-    options = "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"
-    offline = "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}"
-    picture = tmp_path / "page.png"
-    command = [CHROMIUM, *options, *offline, "--virtual-time-budget=20000", f"--screenshot={picture}"]
-    done = subprocess.run([*command, "--window-size=1280,2400", page.as_uri()], capture_output=True, timeout=600)
-    assert done.returncode == 0 and picture.is_file(), done.stderr[-500:]
-    shown = np.asarray(Image.open(picture).convert("RGB")).astype(int)
-    # The lamp's yellow: a triangle in the model; in the legend and the drawings a square and stars.
-    yellow = (shown[..., 0] > 150) & (shown[..., 1] > 110) & (shown[..., 2] < 90) & (shown[..., 0] - shown[..., 1] < 70)
-    areas = np.bincount(label(yellow)[0][yellow])
-    assert areas.max() > 400, np.sort(areas)[-4:]
