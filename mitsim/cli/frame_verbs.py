@@ -22,7 +22,7 @@ from mitsim.cli.commands import (
 )
 from mitsim.core.configuration import CAMERA, DEVICES, OUTPUT, WHAT, option, shipped_names
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import JOINT, MOSAIC, RUN, SpectralFolder, check_way, is_coloured, open_lines
+from mitsim.core.manifests import MOSAIC, RUN, SpectralFolder, is_coloured, open_lines
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.exchange.capture_list import FrameFacts
@@ -66,19 +66,13 @@ class Reconstructing(ImageRequest, Pictured):
         "of a coloured run: the chart in the image that colours are fitted on, a scene's name or a file",
         metavar="NAME|FILE.json",
     )
-    mosaic: str | None = option(
-        None,
-        "of a run behind colour filters: how its images are found",
-        metavar="joint|half|demosaic",
-        show_default="joint",
-    )
     overwrite: bool = option(False, "replace an earlier image in the folder", panel=OUTPUT)
 
     def check_inputs(self, lines: SpectralFolder) -> None:
         """Refuse options that have no effect on a run of these ``lines``, and inputs that are missing."""
         run = lines.folder
         if self.psf is not None:
-            self.refuse(["calibration", "chart", "mosaic"], "with --psf")
+            self.refuse(["calibration", "chart"], "with --psf")
             if lines.colours:
                 raise MitsimError(f"--psf {self.psf}: {run} is coloured; reconstruct one of its lines, {run}/NAME")
             self.check_point_spread(self.reduce)
@@ -90,13 +84,10 @@ class Reconstructing(ImageRequest, Pictured):
         if self.calibration is None:
             raise MitsimError("--calibration: is missing; give the folder of `mitsim calibrate`, or --psf FILE")
         if not lines.colours:
-            self.refuse(["chart", "mosaic"], f"on {run}, which is not coloured")
-        elif not lines.filters:
-            self.refuse(["mosaic"], f"on {run}, which has a run for each line")
-        else:
+            self.refuse(["chart"], f"on {run}, which is not coloured")
+        elif lines.filters:
             from mitsim.reconstruct.request import check_joint
 
-            check_way(self.mosaic or JOINT)
             check_joint(self.lam)
             for name, value in self.given_of(ImageRequest).items():
                 if name != "lam" and value != ImageRequest.model_fields[name].default:
@@ -145,7 +136,7 @@ def reconstruct(asked: Reconstructing) -> int:
     with asked.job() as job:
         options = asked.given_of(ImageRequest)
         if lines.filters:
-            options = {"lam": asked.lam, "way": asked.mosaic or JOINT}
+            options = {"lam": asked.lam}
         where: Any = {"output": output, "overwrite": asked.overwrite, "job": job, **options}
         found: Any
         if asked.psf is not None:

@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -508,8 +507,8 @@ LINES, BANDS = "lines", "bands"
 """Ways to simulate a projector's light by wavelength: each line, or ``bands:K`` of lines."""
 MOST_LINES = 4
 """Lines traced together: wavelengths of a path in Mitsuba's spectral variants."""
-JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
-"""Ways from frames behind colour filters to images of lines, best first."""
+JOINT = "joint"
+"""Way from frames behind colour filters to images of lines, as image folders name it."""
 _Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -668,25 +667,6 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     if _kind(data) != kind:
         raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
     return validate(MosaicManifest if kind == MOSAIC else ColourManifest, data, f"{place}/{COLOUR}")
-
-
-def installed_ways() -> tuple[str, ...]:
-    """Return the :data:`WAYS` that are installed, because demosaicing is an extra."""
-    return WAYS if find_spec("colour_demosaicing") else WAYS[:-1]
-
-
-def check_way(way: str) -> str:
-    """Return ``way``; ArgumentError if it is none of :data:`WAYS` or not installed."""
-    installed = installed_ways()
-    if way not in WAYS:
-        raise ArgumentError("mosaic", f"{way!r}: use {', '.join(WAYS[:-1])} or {WAYS[-1]}")
-    if way not in installed:
-        raise ArgumentError(
-            "mosaic",
-            f"{way}: colour-demosaicing is not installed; pip install 'mitsim[mosaic]' (Python 3.11 or newer), or use "
-            f"{' or '.join(installed)}",
-        )
-    return way
 
 
 def write_colours(folder: Path, colours: ColourManifest, **more: Any) -> None:

@@ -21,7 +21,6 @@ from mitsim.core.images import png
 from mitsim.core.job import Job
 from mitsim.core.manifests import (
     COLOUR,
-    DEMOSAIC,
     IMAGE,
     JOINT,
     MOSAIC,
@@ -29,7 +28,6 @@ from mitsim.core.manifests import (
     CalibrationManifest,
     ColourManifest,
     check_lines,
-    check_way,
     is_coloured,
     open_lines,
     read_colours,
@@ -172,9 +170,8 @@ def reconstruct_colours(
     job
         Clock of the work.
     **options
-        Options of :func:`reconstruct`, for every line. Of a run behind colour filters: ``way``, one of
-        :data:`mitsim.core.manifests.WAYS`, and ``lam``, of each plane or channel where these are solved one by
-        one. ``page=False`` leaves out pictures and report.html, which :func:`mitsim.report_folder` makes later.
+        Options of :func:`reconstruct`, for every line; of a run behind colour filters, ``lam`` alone. ``page=False``
+        leaves out pictures and report.html, which :func:`mitsim.report_folder` makes later.
 
     Raises
     ------
@@ -258,10 +255,9 @@ def _solve_one_by_one(work: _Work, **options: Any) -> ColourImage:
 
 
 @single_threaded_blas()
-def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> ColourImage:
+def _solve_at_once(work: _Work, lam: Lambda = "auto") -> ColourImage:
     lines, run, calibration, output, board, _, overwrite, job = work
     check_joint(lam)
-    check_way(way)
     clock = job.apart("").clock
     with clock.stage("read"):
         mosaic = load_mosaic(run)
@@ -269,7 +265,7 @@ def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> Colou
         for each in factors.values():
             each.check_fit(shots)
     made_of = "-".join(each.fingerprint for each in factors.values())
-    inputs = {"run": shots.fingerprint, "calibration": made_of, "mosaic": way, "lambda": lam}
+    inputs = {"run": shots.fingerprint, "calibration": made_of, "mosaic": JOINT, "lambda": lam}
     replaces = is_coloured(output)
     if replaces:
         read_colours(output, IMAGE)
@@ -278,29 +274,28 @@ def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> Colou
     with output_folder(output, overwrite=replaces) as folder:
         with clock.stage("accumulate"):
             pairs = [(each.left, each.right) for each in factors.values()]
-            camera = MosaicCamera.of(pairs, mosaic.weights, mosaic.manifest.mosaic)
-            solver, data, noise = Solver(way, camera, shots.patterns), 0.0, 0.0
-            for datum in shots.pattern_measurements((len(camera.lefts[0]), len(camera.rights[0]))):
+            solver, data, noise = MosaicSolver(pairs, mosaic.weights, shots.patterns), 0.0, 0.0
+            for datum in shots.pattern_measurements((len(pairs[0][0]), len(pairs[0][1]))):
                 solver.add(datum.frame, datum.row, datum.column)
                 data += float(np.square(datum.frame).sum())
                 noise += float(np.maximum(shots.manifest.digital.variance(datum.light, datum.shots), 0.0).sum())
         with clock.stage("solve"):
-            solved = solver.images(lam)
+            solved, lam, residual = solver.solve(lam)
         # Part of the residual that the noise of frames and factors explains, relative to the data.
         explained = 0.0
         for each in factors.values():
             if (own := each.manifest.noise) is not None:
                 sides = (own.left, each.left), (own.right, each.right)
                 explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
-        unexplained = float(np.sqrt(max(solved.residual**2 - (noise / data if data else 0.0) - explained, 0.0)))
-        truth, joint, qualities = mosaic.truth(board), solved.joint, dict[str, Quality | None].fromkeys(lines.names)
+        unexplained = float(np.sqrt(max(residual**2 - (noise / data if data else 0.0) - explained, 0.0)))
+        truth, qualities = mosaic.truth(board), dict[str, Quality | None].fromkeys(lines.names)
         if truth is not None:
             for number, (name, known) in enumerate(mosaic.truths.items()):
                 error = float(np.sqrt(np.square(known.standard_error).mean())) * known.board / (board or known.board)
-                qualities[name] = Quality.of(solved.images[number], truth[..., number], error)
-        warnings, steps = [], joint and joint.iterations
-        if joint is not None and not joint.ok:
-            left = f"{joint.iterations} steps leave {joint.residual:.1e} of the normal equations"
+                qualities[name] = Quality.of(solved.image[number], truth[..., number], error)
+        warnings = []
+        if not solved.ok:
+            left = f"{solved.iterations} steps leave {solved.residual:.1e} of the normal equations"
             warnings.append(f"Not converged: {left}; raise lambda.")
         if unexplained > UNEXPLAINED:
             warnings.append(
@@ -311,28 +306,28 @@ def _solve_at_once(work: _Work, way: str = JOINT, lam: Lambda = "auto") -> Colou
         flags |= {f"The calibration of {name}": each.warnings for name, each in factors.items()}
         warnings += [f"{what} was flagged: {text.rstrip('.')}." for what, texts in flags.items() for text in texts]
         state_image(folder, lines, status="incomplete", inputs=inputs)
-        for name, image in zip(lines.names, solved.images, strict=True):
+        for name, image in zip(lines.names, solved.image, strict=True):
             with output_folder(folder / name, overwrite=True) as place:
-                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
+                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": lam})
                 write_bytes(place / PICTURE_FILE, png(image))
         return work.finish(
             folder,
-            images=np.moveaxis(solved.images, 0, -1),
+            images=np.moveaxis(solved.image, 0, -1),
             truth=truth,
             qualities=qualities,
             facts={
                 "frames": "all lines at once, behind colour filters",
-                "solved": way if steps is None else f"{way}, {steps} steps",
-                "lambda": f"{solved.lam:.3g}",
-                "residual of the frames": f"{solved.residual:.1e}, of which {unexplained:.1e} is unexplained",
+                "solved": f"{JOINT}, {solved.iterations} steps",
+                "lambda": f"{lam:.3g}",
+                "residual of the frames": f"{residual:.1e}, of which {unexplained:.1e} is unexplained",
             },
             warnings=tuple(warnings),
             seconds=clock.seconds(),
             solution={
-                "mosaic": way,
-                "lambda": solved.lam,
-                "steps": steps,
-                "residual": solved.residual,
+                "mosaic": JOINT,
+                "lambda": lam,
+                "steps": solved.iterations,
+                "residual": residual,
                 "unexplained": unexplained,
             },
             inputs=inputs,
@@ -356,128 +351,46 @@ def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
     return (" ".join([*parts, *flags]),) if parts else ()
 
 
-# -------- Ways from frames behind colour filters to images of the lines
-#
-# *Demosaiced*: every frame becomes three whole frames (colour-demosaicing), each channel is solved, and the channels'
-# images are separated into lines. *Half resolution*: each plane of filters is solved with its own rows of the factors,
-# so that no pixel is interpolated. *Joint*: all planes are solved for all lines (:mod:`mitsim.reconstruct.colour`). A
-# channel or plane that sees several lines has the one separable camera that is nearest to them; only the joint solve
-# knows that each line has its own.
-#
-# Lambda is chosen without a truth: each plane, or channel, chooses its own (:mod:`mitsim.reconstruct.solver`).
-# The joint solve takes the geometric mean of the planes' lambdas, because the planes have the same scene and nearly the
-# same noise.
+# -------- Images of the lines from frames behind colour filters
 
 Patterns = tuple[FloatArray, FloatArray]
 Lambda = float | Literal["auto"]
 
 
-@dataclass(frozen=True, eq=False)
-class MosaicCamera:
-    """A camera under a ``mosaic`` of 2 x 2 colour filters.
+class MosaicSolver:
+    """Joint solve of all pixels for all lines, each with its own factors, from frames behind 2 x 2 colour filters.
 
-    ``lefts`` (lines, m, n) and ``rights`` (lines, m', n') are factors without filters, ``weights`` (4, lines) the
-    responses of the four pixels.
+    ``factors`` are (m, n) and (m', n') of each line without filters, ``weights`` (4, lines) the responses of the four
+    pixels, and patterns the columns P_L (n, K) and P_R (n', K'). Lambda is chosen without a truth: a plane of filters
+    sees several lines, so that it has the one separable camera that is nearest to them, and chooses its own lambda
+    (:mod:`mitsim.reconstruct.solver`). The joint solve takes the geometric mean, because the planes have the same scene
+    and nearly the same noise.
     """
 
-    lefts: FloatArray
-    rights: FloatArray
-    weights: FloatArray
-    mosaic: str
-
-    @classmethod
-    def of(cls, factors: Sequence[tuple[FloatArray, FloatArray]], weights: FloatArray, mosaic: str) -> MosaicCamera:
+    def __init__(
+        self, factors: Sequence[tuple[FloatArray, FloatArray]], weights: FloatArray, patterns: Patterns
+    ) -> None:
         lefts, rights = (np.stack(side) for side in zip(*factors, strict=True))
-        return cls(lefts, rights, weights, mosaic)
-
-
-@dataclass(frozen=True, eq=False)
-class LineImages:
-    """Images (lines, n, n') of all lines by one way.
-
-    ``lam`` is that of the joint solve, or the geometric mean of the planes' or channels'. ``residual`` is ||Y - model||
-    / ||Y|| over all frames.
-    """
-
-    images: FloatArray
-    lam: float
-    residual: float
-    joint: Solution | None = None
-
-
-class Solver:
-    """Images of all lines from frames behind a camera's filters, by one of the ways.
-
-    Patterns are the columns P_L (n, K) and P_R (n', K'). The joint way needs the planes for lambda alone.
-    """
-
-    def __init__(self, way: str, camera: MosaicCamera, patterns: Patterns) -> None:
-        self._mosaic = camera.mosaic if check_way(way) == DEMOSAIC else None
-        self._joint = JointMosaic(camera.lefts, camera.rights, camera.weights, *patterns) if way == JOINT else None
-        self._gathered = np.zeros(self._joint.shape if self._joint else ())
-        channels = [camera.mosaic.index(name) for name in "RGB"] if self._mosaic else list(range(len(PLANES)))
-        lines = [*zip(camera.lefts, camera.rights, strict=True)]
-        weights = camera.weights[channels]
-        terms = [
-            best_term([(weight * left, right) for weight, (left, right) in zip(row, lines, strict=True)])
-            for row in weights
-        ]
-        # (channels, lines): part of each line's image in the image of the one separable camera.
-        mixing = np.array(
-            [
-                [
-                    weight * np.vdot(left, term.left) * np.vdot(right, term.right)
-                    for weight, (left, right) in zip(row, lines, strict=True)
-                ]
-                / (np.square(np.linalg.norm(term.left)) * np.square(np.linalg.norm(term.right)))
-                for row, term in zip(weights, terms, strict=True)
-            ]
-        )
-        self._undo = np.linalg.pinv(mixing)
-        sides = [(term.left, term.right) for term in terms]
-        if not self._mosaic:
-            sides = [(left[a::2], right[b::2]) for (left, right), (a, b) in zip(sides, PLANES, strict=True)]
-        self._models = [prepare(left, right, *patterns) for left, right in sides]
+        self._joint = JointMosaic(lefts, rights, weights, *patterns)
+        self._gathered, self._models = np.zeros(self._joint.shape), []
+        for row, (a, b) in zip(weights, PLANES, strict=True):
+            seen = best_term([(weight * left, right) for weight, left, right in zip(row, lefts, rights, strict=True)])
+            self._models.append(prepare(seen.left[a::2], seen.right[b::2], *patterns))
         self._sums = [model.accumulator() for model in self._models]
 
     def add(self, frame: FloatArray, row: int, column: int) -> None:
-        if self._joint:
-            self._gathered += self._joint.gather(frame, row, column)
-        if self._mosaic:
-            parts = [*np.moveaxis(demosaic(frame, self._mosaic), -1, 0)]
-        else:
-            parts = [frame[a::2, b::2] for a, b in PLANES]
-        for total, part in zip(self._sums, parts, strict=True):
-            total.add(part, row, column)
+        self._gathered += self._joint.gather(frame, row, column)
+        for total, (a, b) in zip(self._sums, PLANES, strict=True):
+            total.add(frame[a::2, b::2], row, column)
 
-    def images(self, lam: Lambda, relative: bool = False) -> LineImages:
-        pairs = [*zip(self._models, self._sums, strict=True)]
-        energy = sum(total.energy for total in self._sums)
+    def solve(self, lam: Lambda, relative: bool = False) -> tuple[Solution, float, float]:
+        """Return the solution, whose image is (lines, n, n'), lambda, and ||Y - model|| / ||Y|| over all frames."""
         if isinstance(lam, str):
+            pairs = zip(self._models, self._sums, strict=True)
             lambdas = [automatic_lambda(model.problem(total)) for model, total in pairs]
-        elif self._joint:
-            lambdas = [lam * (self._joint.scale if relative else 1)]
-        else:
-            lambdas = [lam * (model.problem(total).scale if relative else 1) for model, total in pairs]
-        shared = lambdas[0] if len(lambdas) == 1 else _geometric(lambdas)
-        if self._joint is None:
-            found = [model.solve(total, float(own)) for (model, total), own in zip(pairs, lambdas, strict=True)]
-            left = sum(each.residual**2 * total.energy for each, total in zip(found, self._sums, strict=True))
-            images = np.tensordot(self._undo, np.stack([each.image for each in found]), axes=1)
-            return LineImages(images, shared, float(np.sqrt(left / energy)))
-        joint = self._joint.solve(self._gathered, shared)
+            lam = float(np.exp(np.mean(np.log(lambdas)))) if min(lambdas) > 0 else 0.0
+        elif relative:
+            lam *= self._joint.scale
+        joint, energy = self._joint.solve(self._gathered, lam), sum(total.energy for total in self._sums)
         left = energy + float(np.vdot(joint.image, self._joint.normal(joint.image) - 2 * self._gathered))
-        return LineImages(joint.image, shared, float(np.sqrt(max(left, 0.0) / energy)), joint)
-
-
-def demosaic(frame: FloatArray, mosaic: str) -> FloatArray:
-    """Return the (m, m', 3) colours of a ``frame`` (Menon and others 2007); MitsimError without colour-demosaicing."""
-    check_way(DEMOSAIC)
-    from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007
-
-    return np.asarray(demosaicing_CFA_Bayer_Menon2007(frame, mosaic), dtype=np.float64)
-
-
-def _geometric(values: Sequence[float]) -> float:
-    logs = np.log(values) if all(value > 0 for value in values) else -np.inf
-    return float(np.exp(np.mean(logs)))
+        return joint, lam, float(np.sqrt(max(left, 0.0) / energy))

@@ -9,7 +9,6 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
-from mitsim.core.manifests import HALF, JOINT, WAYS, check_way
 from mitsim.core.runs import load_mosaic
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
@@ -56,31 +55,17 @@ def test_lines_come_apart_and_have_their_colours(pair: tuple[Path, Path], tmp_pa
     assert "data:image/png" in found._repr_html_() and "520nm" in found._repr_html_()
 
 
-def test_the_joint_solve_is_best_where_each_line_has_a_camera_of_its_own(
-    pair: tuple[Path, Path], tmp_path: Path
-) -> None:
-    """Lambda is found from the data: within half a decibel of the best of a ladder, of either way."""
-    quality = {}
-    for way in (JOINT, HALF):
-        found = solved(pair, tmp_path / way, way=way)
-        quality[way] = found.psnr_db
-        assert quality[way] is not None
-        ladder = [
-            solved(pair, tmp_path / way, way=way, lam=found.solution["lambda"] * step, overwrite=True).psnr_db
-            for step in (0.1, 0.3, 3.0, 10.0)
-        ]
-        assert quality[way] > max(ladder) - 0.5, (way, quality, ladder)
-    assert quality[JOINT] > quality[HALF] + 3
-
-
-def test_an_image_of_other_inputs_is_kept(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    solved(pair, tmp_path / "image")
+def test_lambda_is_found_from_the_data(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    """Within half a decibel of the best of a ladder. An image of other inputs is kept."""
+    found = solved(pair, tmp_path / "image")
     before = (tmp_path / "image" / "colour.json").read_bytes()
-    solved(pair, tmp_path / "image")
-    with pytest.raises(MitsimError, match=r"other inputs \(mosaic differ\)"):
-        solved(pair, tmp_path / "image", way=HALF)
+    with pytest.raises(MitsimError, match=r"other inputs \(lambda differ\)"):
+        solved(pair, tmp_path / "image", lam=1.0)
     assert json.loads(before)["inputs"] == json.loads((tmp_path / "image" / "colour.json").read_text())["inputs"]
-    assert solved(pair, tmp_path / "image", way=HALF, overwrite=True).solution["mosaic"] == HALF
+    lam = found.solution["lambda"]
+    steps = (0.1, 0.3, 3.0, 10.0)
+    ladder = [solved(pair, tmp_path / "image", lam=lam * step, overwrite=True).psnr_db for step in steps]
+    assert found.psnr_db > max(ladder) - 0.5, ladder
 
 
 def test_a_real_camera_has_no_truth(tmp_path: Path) -> None:
@@ -110,17 +95,11 @@ def test_the_command_line_tells_of_every_line(
     reported = json.loads(capsys.readouterr().out)
     assert [line["name"] for line in reported["channels"]] == ["638nm", "520nm", "445nm"]
     assert reported["mosaic"] == "joint" and reported["steps"] > 0 and reported["lambda"] > 0
-    assert main([*command, "--mosaic", "half", "--overwrite", "--verbose"]) == 1, (
-        "planes that see several lines have no camera"
-    )
-    half = capsys.readouterr()
-    assert "solved: half" in half.out.lower() and "Misfit" in half.err
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--mosaic", "fourth"), "--mosaic 'fourth': use joint, half or demosaic"),
         (("--method", "tv"), "--method tv: runs behind colour filters are solved by tikhonov"),
         (("--focus", "auto"), "--focus auto: runs behind colour filters"),
         (("--lambda", "0"), "--lambda 0.0: behind colour filters give a finite number above 0"),
@@ -135,9 +114,7 @@ def test_what_filters_do_not_allow_is_refused(
     assert not (tmp_path / "image").exists()
 
 
-def test_folders_that_do_not_fit_are_refused(
-    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folders_that_do_not_fit_are_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
     run, calibration = pair
     shutil.copytree(calibration, tmp_path / "cal")
     path = tmp_path / "cal" / "520nm" / "manifest.json"
@@ -149,9 +126,6 @@ def test_folders_that_do_not_fit_are_refused(
     (tmp_path / "cal" / "colour.json").write_text(json.dumps(named))
     with pytest.raises(MitsimError, match=r"its lines are 638nm, 520nm, but .* calibrate each line"):
         solved((run, tmp_path / "cal"), tmp_path / "image")
-    line = calibration / "638nm"
-    assert main(["reconstruct", str(line), "--calibration", str(line), "--mosaic", "joint"]) == 2
-    assert "which is not coloured; leave it out" in capsys.readouterr().err
 
 
 def test_a_manifest_has_a_weight_for_each_line(pair: tuple[Path, Path], tmp_path: Path) -> None:
@@ -161,10 +135,3 @@ def test_a_manifest_has_a_weight_for_each_line(pair: tuple[Path, Path], tmp_path
     path.write_text(json.dumps({**data, "weights": [row[:2] for row in data["weights"]]}))
     with pytest.raises(MitsimError, match="weights have 2, 2, 2, 2 numbers; give each of the four pixels one for each"):
         load_mosaic(tmp_path / "run")
-
-
-def test_a_way_that_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsim.core.manifests.find_spec", lambda name: None)
-    with pytest.raises(MitsimError, match=r"demosaic: colour-demosaicing is not installed; pip install 'mitsim\[mo"):
-        check_way(WAYS[-1])
-    assert check_way(JOINT) == JOINT

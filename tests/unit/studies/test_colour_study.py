@@ -16,16 +16,14 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import HALF, JOINT, CalibrationManifest
+from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.framelist import load_chart
 from mitsim.devices.patterns import parse_patterns
 from mitsim.metrics import psnr
-from mitsim.reconstruct.colour import PLANES, ColourModel, JointMosaic, chart, delta_e
+from mitsim.reconstruct.colour import ColourModel, JointMosaic, chart, delta_e
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.report.reconstruct_run import demosaic
 from mitsim.studies.colour_study import (
-    ARRAY,
     D65,
     ONE,
     OWN,
@@ -90,11 +88,11 @@ def test_an_exact_image_has_the_floors_colours() -> None:
 def test_verdicts_are_on_what_is_added_to_the_floor() -> None:
     """Images 2 % too bright are near it, 30 % are not. (Planted: the floor of another chart; ways changed for one
     another.)"""
-    good = STUDY.judge(results(own=1.02, one=1.3, dim=1.02, bright=1.3, half=0.9, demosaic=0.9, joint=1.01))
+    good = STUDY.judge(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
     assert [claim.verdict for claim in good[:3]] == ["confirmed", "confirmed", "not confirmed"]
     assert {claim.verdict for claim in good[3:]} == {"confirmed"}
     assert good[2].claim.startswith("Beside D65 of 600 lx, 49 dots add (markov) at most 0.5")
-    bad = STUDY.judge(results(own=1.3, one=1.01, dim=1.3, bright=1.01, half=1.01, demosaic=1.01, joint=0.9))
+    bad = STUDY.judge(results(own=1.3, one=1.01, dim=1.3, bright=1.01, joint=0.9))
     assert [claim.verdict for claim in bad[:3]] == ["not confirmed", "not confirmed", "confirmed"]
     assert {claim.verdict for claim in bad[3:]} == {"not confirmed"}
 
@@ -146,22 +144,18 @@ def seen_by(*shifts: float) -> tuple[Any, ...]:
     )
 
 
-def quality(way: str, *shifts: float) -> float:
-    """PSNR of a way for frames of three pictures under 3 x 3 dots, as the model has them."""
+def quality(*shifts: float) -> float:
+    """PSNR for frames of three pictures under 3 x 3 dots, as the model has them."""
     lines, family = seen_by(*shifts), parse_patterns("dots:3", N)
     left, right = (np.stack([getattr(line.factors, side) for line in lines]) for side in ("left", "right"))
     model = JointMosaic(left, right, filter_weights(lines), family.left.astype(float), family.right.astype(float))
     truth = np.stack([line.lit.truth for line in lines])
     frames = [(model.frame(truth, shot.row, shot.column), shot.row, shot.column) for shot in family.shots]
-    return psnr(mosaic_images(lines, family, frames, way).images.reshape(3, -1), truth.reshape(3, -1))
+    return psnr(mosaic_images(lines, family, frames).image.reshape(3, -1), truth.reshape(3, -1))
 
 
-def test_planes_are_exact_where_lines_share_a_camera() -> None:
-    assert quality(HALF, 0.0, 0.0, 0.0) > 60 and quality(JOINT, 0.0, 0.0, 0.0) > 60
-
-
-def test_only_the_joint_solve_knows_a_camera_for_each_line() -> None:
-    assert quality(JOINT, -0.3, 0.0, 0.3) > 100 and quality(HALF, -0.3, 0.0, 0.3) < 55
+def test_the_joint_solve_knows_a_camera_for_each_line() -> None:
+    assert quality(0.0, 0.0, 0.0) > 60 and quality(-0.3, 0.0, 0.3) > 100
 
 
 def test_pixels_see_a_line_as_their_filters_curves_say() -> None:
@@ -170,20 +164,6 @@ def test_pixels_see_a_line_as_their_filters_curves_say() -> None:
     assert weights.shape == (4, 3) and np.array_equal(weights[1], weights[2])
     assert weights[0].argmax() == 0 and weights[1].argmax() == 1 and weights[3].argmax() == 2
     assert weights[0, 0] == pytest.approx((0.2 * 0.405 + 0.8 * 0.352) / 0.5)  # 638 nm, between 630 and 640
-
-
-def test_a_demosaiced_frame_of_one_colour_is_that_colour() -> None:
-    pytest.importorskip("colour_demosaicing")
-    colour, frame = np.array([3.0, 5.0, 2.0]), np.zeros((12, 16))
-    for name, (a, b) in zip(ARRAY, PLANES, strict=True):
-        frame[a::2, b::2] = colour["RGB".index(name)]
-    assert np.allclose(demosaic(frame, ARRAY), colour, atol=1e-9)
-
-
-def test_demosaicing_names_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "colour_demosaicing", None)
-    with pytest.raises(MitsimError, match=r"pip install 'mitsim\[mosaic\]'"):
-        demosaic(np.zeros((4, 4)), ARRAY)
 
 
 def test_spectra_become_numbers(tmp_path: Path) -> None:
