@@ -66,7 +66,8 @@ DAYLIGHT_RADIANCE = 117.0
 """Radiance of the lamp [W m^-2 sr^-1] that lights the sheet as the projector's white does."""
 FULL_LX = 2.97 * 205.0
 """Illuminance of that light: 2.97 W/m^2 at the chart's middle, and 205 lm/W of D65 from 380 to 780 nm."""
-FILTERS, ARRAY = "ov5647", "RGGB"
+FILTERS = "ov5647"
+"""Camera whose array RGGB of filters lies over the pixels."""
 _COARSE = tuple(float(relative) for relative in np.logspace(-9, -3, 7))
 """Lambdas of the joint solve, relative to its largest eigenvalue."""
 Shots = Sequence[tuple[FloatArray, int, int]]
@@ -205,7 +206,7 @@ def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, shots: Shots)
 
 
 def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
-    """Return (4, lines) electrons behind each filter of :data:`ARRAY` relative to the camera without filters."""
+    """Return (4, lines) electrons behind each filter, R, G, G, B, relative to the camera without filters."""
     curves = load_model(locate(FILTERS, "calibration", ".toml", CAMERA), SensorModel)
     sensor = lines[0].lit.bench.sensor
     return np.array(
