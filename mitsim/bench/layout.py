@@ -5,10 +5,8 @@ Positions are in the camera's frame [mm]: +z to the scene, +y up, +x to the left
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
-from itertools import count
 from typing import NamedTuple
 
 import drjit as dr
@@ -21,19 +19,20 @@ from mitsim.bench.board import camera_place
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.devices.mask import Mask
-from mitsim.devices.patterns import PatternFamily, is_prime
+from mitsim.devices.patterns import PatternFamily
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.scene.load import why_dark
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
+from mitsim.transport.plugins.base import channels, host_values, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays
 
-_RAYS = 48
-"""Rays per side from each of six sides that hit a shape without triangles."""
-_JUMP = 3.0
-"""Cells between neighbouring rays' ends that count as one surface: 1.4 on a sphere."""
-_EDGE_ON, _PASSED = 1e-6, 8
-"""Part of a shape's size below which it has no width, and surfaces of others inside its box at most."""
+_GRID = 48
+"""Cells per side of a shape without faces, by its surface parameters."""
+_BOX = np.array([
+    *([0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4]),
+    *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 3, 7], [1, 7, 5]),
+])  # fmt: skip
+"""Triangles of a box's eight corners."""
 _FILL = 0.2
 """Part of a preview's light from a lamp at its camera, so that surroundings of the window are visible."""
 _PIXELS, _SAMPLES, _TURNS = 320, 32, 4
@@ -152,8 +151,8 @@ def layout_of(bench: Apparatus) -> Layout:
 
 
 def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[Surface, ...]:
-    shapes, tags, found = bench.loaded.scene.shapes(), bench.loaded.shapes, []
-    for number, shape in enumerate(shapes):
+    tags, found = bench.loaded.shapes, []
+    for number, shape in enumerate(bench.loaded.scene.shapes()):
         name = shape.id()
         if not name or name.startswith("_"):
             kind = tags[number].attributes.get("type", "shape") if tags else shape.class_name().lower()
@@ -164,51 +163,27 @@ def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[S
             places = [vectors(shape.vertex_position(corner), count) for corner in corners]
             points, triangles = np.concatenate(places), np.arange(3 * count).reshape(3, count).T
         else:
-            points, triangles = _triangles_by_rays(bench.loaded.scene, shape)
+            points, triangles = _triangles_without_faces(shape)
         if len(triangles):
             found.append(Surface(name, (points - origin) @ turn, triangles, bool(shape.is_emitter())))
     return tuple(found)
 
 
-def _triangles_by_rays(scene: mi.Scene, shape: mi.Shape) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+def _triangles_without_faces(shape: mi.Shape) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Return a shape on a grid of its surface parameters, or its bounding box where Mitsuba has none."""
+    line = np.linspace(1e-6, 1 - 1e-6, _GRID + 1).astype(np.float32)  # The middle of a disk is undefined.
+    u, v = (mi.Float(axis.ravel()) for axis in np.meshgrid(line, line))
+    corner = (np.arange(_GRID)[:, None] * len(line) + np.arange(_GRID)).reshape(-1, 1)
+    triangles = np.concatenate([corner + [0, 1, len(line)], corner + [1, len(line) + 1, len(line)]])
+    try:
+        at = shape.eval_parameterization(mi.Point2f(u, v))
+        if host_values(at.is_valid(), len(line) ** 2).all():
+            return vectors(at.p, len(line) ** 2), triangles
+    except RuntimeError:
+        pass
     box = shape.bbox()
-    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
-    size, sides = high - low, np.float64(np.linalg.norm(high - low))
-    cells, corner = (np.arange(_RAYS) + 0.5) / _RAYS, (np.arange(_RAYS - 1)[:, None] * _RAYS + np.arange(_RAYS - 1))
-    a = corner.ravel()
-    squares = np.concatenate([np.stack([a, a + 1, a + _RAYS], 1), np.stack([a + 1, a + _RAYS + 1, a + _RAYS], 1)])
-    found = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))]
-    for axis, sign in itertools.product(range(3), (1.0, -1.0)):
-        across = [other for other in range(3) if other != axis]
-        if size[across].min() < _EDGE_ON * sides:
-            continue
-        start, along = np.empty((_RAYS * _RAYS, 3)), np.zeros((_RAYS * _RAYS, 3))
-        grid = np.meshgrid(*(low[other] + size[other] * cells for other in across), indexing="ij")
-        start[:, across], along[:, axis] = np.stack([each.ravel() for each in grid], axis=1), sign
-        start[:, axis] = (low if sign > 0 else high)[axis] - sign * _EDGE_ON * sides
-        ray = mi.Ray3f(mi.Point3f(*device_vectors(start)), mi.Vector3f(*device_vectors(along)))
-        met = _meet(scene, ray, shape)
-        valid = host_values(met.is_valid(), len(start))
-        places = np.where(valid[:, None], vectors(met.p, len(start)), np.nan)
-        # NaN where a ray met nothing, which compares as false.
-        joined = squares[np.ptp(places[squares][..., axis], axis=1) < _JUMP * size[across].max() / _RAYS]
-        before = sum(len(points) for points, _ in found)
-        found.append((np.nan_to_num(places), joined + before))
-    points, triangles = (np.concatenate(part) for part in zip(*found, strict=True))
-    used, triangles = np.unique(triangles, return_inverse=True)
-    return points[used], triangles.reshape(-1, 3)
-
-
-def _meet(scene: mi.Scene, ray: mi.Ray3f, shape: mi.Shape) -> mi.SurfaceInteraction3f:
-    own = mi.ShapePtr(shape)
-    met = scene.ray_intersect(ray)
-    for _ in range(_PASSED):
-        other = met.is_valid() & (met.shape != own) & (met.instance != own)
-        if not dr.any(other):
-            break
-        ray = mi.Ray3f(dr.select(other, met.spawn_ray(ray.d).o, ray.o), ray.d)
-        met = scene.ray_intersect(ray)
-    return dr.select((met.shape == own) | (met.instance == own), met, dr.zeros(mi.SurfaceInteraction3f))
+    ends = np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)
+    return np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), _BOX
 
 
 # -------- Pictures of the bench in its own light
@@ -389,14 +364,10 @@ def mask_fault(bench: Apparatus) -> Fault | None:
     if mask.flaws.turn_deg:
         turned = f"the mask ({geometry.mask_words}) has no two factors as it is mounted, because the best separable"
         return Fault(f"{turned} one leaves {residual:.0%} of it", "mount it straight", residual)
-    least, feature = math.ceil(needed / mask.feature_mm), f"{mask.feature_mm * 1e3:g} um"
-    order = least.bit_length()
-    larger = f"use order {order} ({2**order - 1} features of {feature}), or larger features"
-    if geometry.mask_plate is not None:
-        larger = f"use at least {next(n for n in count(least) if n > 2 and is_prime(n))} features of {feature}"
     covers = f"covers {mask.extent_mm:.2g} mm of the {needed:.2g} mm that the sensor sees through it"
     reason = f"the mask {covers}, and its edge leaves {residual:.0%} of what is seen without factors"
-    return Fault(reason, larger, residual)
+    least, feature = math.ceil(needed / mask.feature_mm), f"{mask.feature_mm * 1e3:g} um"
+    return Fault(reason, f"use at least {least} features of {feature}, or larger ones", residual)
 
 
 def _beyond_one(values: FloatArray) -> float:
