@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mitsim.bench.request import (
     MOSAIC,
@@ -18,13 +18,10 @@ from mitsim.bench.request import (
     Family,
     Irradiance,
     Opening,
-    OpeningKeys,
     Planned,
     Request,
     Sampled,
-    SampledKeys,
     Seeded,
-    SeedKeys,
     SessionRequest,
     Task,
     by_line,
@@ -60,11 +57,8 @@ from mitsim.studies.emva_options import Procedure
 from mitsim.studies.twin_files import TwinFiles
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from mitsim.acquire.sense import Sensed
     from mitsim.api.bench import Bench
-    from mitsim.bench.request import IrradianceKeys
     from mitsim.core.arrays import FloatArray
     from mitsim.core.runs import Capture
     from mitsim.light.light import SampledLight
@@ -72,7 +66,6 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
     from mitsim.studies.characterise import Characterisation
     from mitsim.studies.demo import DemoResult
-    from mitsim.studies.emva_options import ProcedureKeys
     from mitsim.studies.framework.campaign import StudyResult
     from mitsim.studies.framework.experiment import Scope
 
@@ -194,18 +187,12 @@ class DemoRequest(Opening, Sampled, Family):
     VERB = "demo"
 
 
-class DemoKeys(OpeningKeys, SampledKeys, total=False):
-    """Keywords of :class:`DemoRequest`."""
-
-    patterns: str
-
-
 @takes(DemoRequest)
 def demo(
     scene: Path | str = "photograph",
     output: Path | str = "demo-output",
     job: Job | None = None,
-    **options: Unpack[DemoKeys],
+    **options: Any,
 ) -> DemoResult:
     """Plan, capture, calibrate and reconstruct one scene under five pattern families, and write report.html.
 
@@ -281,28 +268,13 @@ class StudyOptions(Opening, Seeded):
         return tuple(values_of(text) for text in self.over)
 
 
-class StudyKeys(OpeningKeys, SeedKeys, total=False):
-    """Keywords of :class:`StudyOptions`."""
-
-    patterns: str | None
-    recipe: Path | str | None
-    data: Path | str | None
-    experiment: str | None
-    quick: bool
-    shard: str
-    jobs: int | None
-    scheduler: str | None
-    over: Mapping[str, Any] | Sequence[str]
-    measure: str
-
-
 @takes(StudyOptions)
 def study(
     name: str,
     scene: Path | str | Sequence[Path | str] | None = None,
     output: Path | str = "study-output",
     job: Job | None = None,
-    **options: Unpack[StudyKeys],
+    **options: Any,
 ) -> StudyResult:
     """Run an experiment, and write its figures, CSV and JSON to a folder.
 
@@ -450,15 +422,6 @@ class RunOptions(Options):
     scheduler: str | None = option(None, "Dask scheduler that measures a sweep's points")
 
 
-class RunKeys(TypedDict, total=False):
-    """Keywords of :class:`RunOptions`."""
-
-    resume: bool
-    pictures: bool
-    shard: str
-    scheduler: str | None
-
-
 # ---- a camera's sensor alone -----------------------------------------------------------------------------------------
 
 
@@ -468,7 +431,7 @@ def characterise(
     output: Path | str | None = None,
     frames: int | Path | str = 100,
     job: Job | None = None,
-    **options: Unpack[ProcedureKeys],
+    **options: Any,
 ) -> Characterisation:
     """Measure a camera after EMVA 1288: on simulated frames, beside what its file sets, or on real frames.
 
@@ -531,7 +494,7 @@ def sense(
     image: Path | str | FloatArray,
     camera: Path | str,
     exposure: float | Literal["auto"] = "auto",
-    **options: Unpack[IrradianceKeys],
+    **options: Any,
 ) -> Sensed:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise.
 

@@ -9,7 +9,6 @@ import importlib
 import inspect
 import math
 import pydoc
-import typing
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -19,17 +18,10 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.bench import request
 from mitsim.bench.request import Request
 from mitsim.cli.commands import message_of
 from mitsim.core.configuration import Options
 from mitsim.core.errors import ArgumentError
-from mitsim.exchange.capture_list import FrameKeys
-from mitsim.exchange.formats import ExportKeys, PictureKeys
-from mitsim.learn.requests import PairKeys, TrainingKeys
-from mitsim.reconstruct.request import ImageKeys
-from mitsim.studies.emva_options import ProcedureKeys
-from mitsim.verbs import DemoKeys, RunKeys, StudyKeys
 from tests.exchanged import made
 
 CALLS = {
@@ -286,33 +278,6 @@ def test_options_of_every_model_are_checked() -> None:
                 model(**{name: object()})
             named = {each.argument for each in (refused.value, *refused.value.others)}
             assert name in named, (model, name, refused.value)
-
-
-@pytest.mark.parametrize(
-    ("call", "keys"),
-    [
-        (ms.Bench.capture, request.RequestKeys),
-        (ms.Bench.capture_lines, request.ExposureKeys),
-        (ms.Bench.calibrate, request.SessionKeys),
-        (ms.reconstruct, ImageKeys),
-        (ms.demo, DemoKeys),
-        (ms.study, StudyKeys),
-        (ms.run, RunKeys),
-        (ms.characterise, ProcedureKeys),
-        (ms.sense, request.IrradianceKeys),
-        (ms.export, ExportKeys),
-        (ms.import_frames, FrameKeys),
-        (ms.pattern_pictures, PictureKeys),
-        (ms.make_pairs, PairKeys),
-        (ms.train, TrainingKeys),
-    ],
-    ids=lambda each: each.__name__,
-)
-def test_type_checkers_see_the_keywords_of_a_call(call: Callable[..., Any], keys: Any) -> None:
-    """The signature has the models' fields, and type checkers read the same names. (Planted: a keyword that a model
-    lacks; a field without a keyword.)"""
-    named = {each.name for each in inspect.signature(call).parameters.values() if each.kind == each.KEYWORD_ONLY}
-    assert named == keys.__annotations__.keys() == typing.get_type_hints(keys).keys()
 
 
 def test_help_of_a_call_states_its_options() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -39,11 +39,6 @@ from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
 from mitsim.planner.planner import known_losses
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from mitsim.bench.request import ExposureKeys
-
 _FIREFLIES = 0.72
 """Part of the variance in one of four groups above which single paths dominate (heavy path 0.75, noise 0.3 to 0.5)."""
 _DROWNED = 1.0
@@ -70,7 +65,7 @@ class Light(SampledLight):
         patterns: str = "dots:7",
         output: Path | str | None = None,
         job: Job | None = None,
-        **request: Unpack[ExposureKeys],
+        **request: Any,
     ) -> Capture:
         """Expose one noisy frame for each shot of the family ``patterns``; ``output`` None keeps them in memory.
 

@@ -21,11 +21,10 @@ from mitsim.core.job import Job
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:
-    from typing_extensions import Self, Unpack
+    from typing_extensions import Self
 
     from mitsim.acquire.capture import Light
     from mitsim.acquire.reference import Rendered
-    from mitsim.bench.request import ExposureKeys, RequestKeys, SessionKeys
     from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.devices.session import BoardShape
     from mitsim.light.plan import Plan
@@ -92,7 +91,7 @@ class Bench(Apparatus):
     # ---- The plan, and light of the scene ----
 
     @takes(Request, without="patterns")
-    def plan(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Plan:
+    def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
         """Plan a simulation by a short look at the scene, with reasons and cost.
 
         Parameters
@@ -110,7 +109,7 @@ class Bench(Apparatus):
         return plan_request(self, Request(patterns=patterns, **request))
 
     @takes(Request, without="patterns")
-    def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Unpack[ExposureKeys]) -> Light:
+    def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Any) -> Light:
         """Trace the light of the scene by projector pixel, once, so that any family can be exposed in it.
 
         Parameters
@@ -141,7 +140,7 @@ class Bench(Apparatus):
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Unpack[RequestKeys],
+        **request: Any,
     ) -> Capture:
         """Take one noisy frame for each shot of a pattern family.
 
@@ -179,7 +178,7 @@ class Bench(Apparatus):
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Unpack[ExposureKeys],
+        **request: Any,
     ) -> dict[str, Capture]:
         """Take a capture for each spectral line of the projector, by the line's name, as ``638nm``. All lines are
         traced on the same paths. Each capture has the accuracy that is asked for. Needs a spectral variant.
@@ -218,7 +217,7 @@ class Bench(Apparatus):
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Unpack[SessionKeys],
+        **request: Any,
     ) -> dict[str, Factors]:
         """Estimate the camera's factors at each spectral line of the projector, by the line's name.
 
@@ -247,7 +246,7 @@ class Bench(Apparatus):
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Unpack[ExposureKeys],
+        **request: Any,
     ) -> MosaicCapture:
         """Take frames of all lines at once by a camera under a mosaic of colour filters: one frame for each shot. Needs
         a spectral variant, and a camera whose file has a ``mosaic``.
@@ -280,7 +279,7 @@ class Bench(Apparatus):
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Unpack[SessionKeys],
+        **request: Any,
     ) -> dict[str, Factors]:
         """Estimate the factors of a camera under colour filters at each spectral line of the projector, by the line's
         name. Each line has a session of its own, by the shipped recipe with four shots of each pattern if none is
@@ -311,7 +310,7 @@ class Bench(Apparatus):
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Unpack[SessionKeys],
+        **request: Any,
     ) -> Factors:
         """Estimate the camera's two factors from a rendered Hadamard session on a white board.
 
@@ -341,7 +340,7 @@ class Bench(Apparatus):
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Unpack[SessionKeys],
+        **request: Any,
     ) -> dict[float, Factors]:
         """Estimate the camera's two factors at each of a recipe's depths, by depth [mm].
 
@@ -362,7 +361,7 @@ class Bench(Apparatus):
         frames: Path | str,
         output: Path | str | None = None,
         job: Job | None = None,
-        **request: Unpack[SessionKeys],
+        **request: Any,
     ) -> Factors:
         """Calibrate as :meth:`calibrate` does, and write the session's frames as a user of a real camera has them, so
         that :func:`mitsim.calibrate_frames` makes the same factors of them.

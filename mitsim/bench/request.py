@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mitsim.bench.effects import check_switches, parse_switches
 from mitsim.core.configuration import (
@@ -171,39 +171,6 @@ class Seeded(Options):
     seed: Annotated[int, validated_by(check_root)] = option(0, "root of every random stream", panel=QUALITY)
 
 
-class SeedKeys(TypedDict, total=False):
-    """Keywords of :class:`Seeded`, for type checkers; tests/test_verbs.py compares such classes with their models."""
-
-    seed: int
-
-
-class SampledKeys(SeedKeys, total=False):
-    """Keywords of :class:`Sampled`."""
-
-    accuracy: float
-
-
-class SessionKeys(SampledKeys, total=False):
-    """Keywords of :class:`SessionRequest`."""
-
-    recipe: SessionRecipe | None
-
-
-class ExposureKeys(SampledKeys, total=False):
-    """Keywords of :class:`Request`, without the patterns."""
-
-    exposure: float | Literal["auto"]
-    exposure_fraction: float
-    effects: dict[str, bool] | str
-    ambient_frame: Literal["auto", "yes", "no"]
-
-
-class RequestKeys(ExposureKeys, total=False):
-    """Keywords of :class:`Request`."""
-
-    patterns: str
-
-
 class Family(Options):
     """Patterns that the projector shows."""
 
@@ -304,16 +271,6 @@ def _parameters(texts: Iterable[str]) -> dict[str, Any]:
             raise MitsimError(f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another")
         parameters[name] = value
     return parameters
-
-
-class OpeningKeys(TypedDict, total=False):
-    """Keywords of :class:`Opening`."""
-
-    variant: str
-    camera: Path | str | None
-    projector: Path | str | None
-    allow_outside_files: bool
-    parameters: Mapping[str, Any]
 
 
 class Variant(Options):
@@ -451,16 +408,6 @@ class Irradiance(Timed, Lit):
     )
     scale: float = option(1.0, "what its numbers are multiplied by", gt=0, lt=math.inf)
     channel: str | None = option(None, "of several channels, the one to take", metavar="NAME")
-
-
-class IrradianceKeys(SeedKeys, total=False):
-    """Keywords of :class:`Irradiance`, without the exposure time."""
-
-    exposure_fraction: float
-    wavelength: float
-    f_number: float | None
-    scale: float
-    channel: str | None
 
 
 def check_image(path: Path) -> None:

@@ -135,7 +135,7 @@ def checked_fields(made: C) -> C:
 
 def _kinds(annotation: object, function: Callable[..., object]) -> list[Kind]:
     """Return what an annotation such as ``float | Literal["auto"] | None`` allows; empty: anything."""
-    if not isinstance(annotation, str) or annotation.startswith("Unpack"):
+    if not isinstance(annotation, str):
         return []
     found: list[Kind] = []
     terms: list[ast.expr] = [ast.parse(annotation, mode="eval").body]

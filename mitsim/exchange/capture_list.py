@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -315,34 +315,6 @@ class FrameFacts(Options):
             given["turn_about"] = "centre"
         known = {name: value for name, value in listed if name in listed.model_fields_set}
         return validate(type(listed), {**known, **given}, "import")
-
-
-class FrameKeys(TypedDict, total=False):
-    list: Path | str | None
-    patterns: str | None
-    camera: Path | str | None
-    exposure: float | None
-    calibration: Path | str | None
-    projector_pixels: int | None
-    black_level: float | None
-    ambient_frame: Path | str | None
-    ambient_shots: int | None
-    closing_frame: Literal["first", "uniform"] | None
-    closing_exposure: float | None
-    order: str | None
-    shape: str | tuple[int, int] | None
-    bits: int | None
-    byte_order: str | None
-    channel: str | None
-    mosaic: str | None
-    divide: int | None
-    dark_frame: Path | str | None
-    flat_frame: Path | str | None
-    flat_dark_frame: Path | str | None
-    orientation: int | str | None
-    turn: float | None
-    crop: str | tuple[int, ...] | None
-    seed: int | None
 
 
 def _text_of(parts: str | tuple[int, ...], sign: str) -> str:

@@ -10,7 +10,7 @@ from contextlib import ExitStack, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.core import configuration
 from mitsim.core.configuration import FilePath, Options, option, takes
@@ -23,10 +23,7 @@ from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.exchange.capture_list import TURNED, FrameFacts
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from mitsim.core.job import Job
-    from mitsim.exchange.capture_list import FrameKeys
     from mitsim.exchange.packed import Run
 
 
@@ -72,18 +69,13 @@ class Exported(Options):
     )
 
 
-class ExportKeys(TypedDict, total=False):
-    overwrite: bool
-    projector: str | None
-
-
 @takes(Exported)
 def export(
     run: Path | str,
     format: str,
     output: Path | str,
     calibration: Path | str | None = None,
-    **options: Unpack[ExportKeys],
+    **options: Any,
 ) -> dict[str, Any]:
     """Write a run in a format that other programs read.
 
@@ -239,9 +231,7 @@ def _frames_of(run: Run) -> int:
 
 
 @takes(FrameFacts)
-def import_frames(
-    source: Path | str, output: Path | str, job: Job | None = None, **known: Unpack[FrameKeys]
-) -> dict[str, Any]:
+def import_frames(source: Path | str, output: Path | str, job: Job | None = None, **known: Any) -> dict[str, Any]:
     """Make a RUN folder from a real camera's frames, whole or not at all.
 
     Parameters
@@ -308,18 +298,8 @@ class Pictures(Options):
     )
 
 
-class PictureKeys(TypedDict, total=False):
-    projector: Path | str
-    projector_pixels: int
-    seed: int | None
-    closing_frame: Literal["first", "uniform"] | None
-    camera: Path | str | None
-    exposure: float | None
-    signed_capture: Literal["pair", "uniform"] | None
-
-
 @takes(Pictures)
-def pattern_pictures(patterns: str, output: Path | str, **options: Unpack[PictureKeys]) -> dict[str, Any]:
+def pattern_pictures(patterns: str, output: Path | str, **options: Any) -> dict[str, Any]:
     """Draw patterns, or a calibration's stripes, as pictures to show on a real projector.
 
     Parameters

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from mitsim.bench.request import Exposure, ExposureKeys, Request, Seeded, SeedKeys
+from mitsim.bench.request import Exposure, Request, Seeded
 from mitsim.core.configuration import LIMITS, QUALITY, Configuration, FilePath, Options, load_model, option, validate
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
 from mitsim.core.imagelist import PRINTS
@@ -106,11 +106,6 @@ class PairsRequest(PairOptions):
         return [self.vary.draw(self.capture.seed, group) for group in range(self.vary.groups)]
 
 
-class PairKeys(ExposureKeys, total=False):
-    idealised: bool
-    pictures: Path | str | None
-
-
 def picture_files(folder: Path) -> tuple[Path, ...]:
     """Return the pictures in a ``folder`` by their names; MitsimError if there are none."""
     if not folder.is_dir():
@@ -163,12 +158,3 @@ class Training(Schedule):
         for name in ("feature_weight", "adversary_weight"):
             if (value := getattr(self, name)) and self.method == PLUG_AND_PLAY:
                 raise ArgumentError(name, f"{value}: {PLUG_AND_PLAY} learns from noise alone; leave it out")
-
-
-class TrainingKeys(SeedKeys, total=False):
-    steps: int
-    batch: int
-    rate: float
-    device: str
-    feature_weight: float
-    adversary_weight: float

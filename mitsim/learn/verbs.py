@@ -17,12 +17,9 @@ from mitsim.core.job import Job
 from mitsim.learn.requests import CALIBRATION, PairOptions, PairsRequest, Schedule, Training
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from mitsim.api.bench import Bench
     from mitsim.learn.learned_solver import LearnedSolver
     from mitsim.learn.pair_store import PairStore
-    from mitsim.learn.requests import PairKeys, TrainingKeys
     from mitsim.learn.training import Trained
 
 
@@ -39,7 +36,7 @@ def make_pairs(
     patterns: str = "dots:7",
     resume: bool = False,
     job: Job | None = None,
-    **options: Unpack[PairKeys],
+    **options: Any,
 ) -> PairStore:
     """Make pairs to learn from: pictures on a scene's print, and the frames that the camera takes of them.
 
@@ -107,7 +104,7 @@ def train(
     calibration: Path | str | None = None,
     resume: bool = False,
     job: Job | None = None,
-    **options: Unpack[TrainingKeys],
+    **options: Any,
 ) -> Trained:
     """Train a network on pairs, and write its file.
 

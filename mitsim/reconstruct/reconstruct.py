@@ -40,11 +40,9 @@ from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertai
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from typing_extensions import Unpack
     from xarray import Dataset
 
     from mitsim.reconstruct.point_spread import PointSpreadFit
-    from mitsim.reconstruct.request import ImageKeys
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
@@ -283,7 +281,7 @@ def reconstruct(
     factors: Factors,
     lam: float | Literal["auto"] = "auto",
     method: str | Solver = TIKHONOV,
-    **options: Unpack[ImageKeys],
+    **options: Any,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration.
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mitsim.core.configuration import QUALITY, Options, option, validated_by
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
@@ -164,13 +164,6 @@ class ImageRequest(Options):
         asked |= {} if self.focus is None else {"focus": self.focus}
         asked |= {} if self.depth_range is None else {"depth_range": list(self.depth_range)}
         return {**asked, **self.plain}
-
-
-class ImageKeys(TypedDict, total=False):
-    focus: float | Literal["auto", "map"] | None
-    depth_range: tuple[float, float] | None
-    bounds: tuple[float, float] | None
-    iterations: int | None
 
 
 def plain_bounds(bounds: Bounds) -> list[float | None]:

@@ -58,12 +58,9 @@ from mitsim.sessions.session_file import (
 from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, open_as, prepare_study
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from mitsim.acquire.capture import Light
     from mitsim.api.bench import Bench
     from mitsim.light.plan import Plan
-    from mitsim.verbs import RunKeys
 
 KIND = "session"
 """What session.json says that the folder is."""
@@ -138,7 +135,7 @@ def run(
     output: Path | str = "session-output",
     values: Mapping[str, Any] | None = None,
     job: Job | None = None,
-    **options: Unpack[RunKeys],
+    **options: Any,
 ) -> SessionResult:
     """Run the steps of a session: plan, capture, calibrate, reconstruct, study and export, each into its own folder.
 

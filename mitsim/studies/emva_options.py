@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitsim.bench.request import Lit, Seeded, SeedKeys
+from mitsim.bench.request import Lit, Seeded
 from mitsim.core.configuration import option
 from mitsim.devices.sensor import SensorModel
 
@@ -32,9 +32,3 @@ class Procedure(Lit, Seeded):
     def efficiency(self, sensor: SensorModel) -> float:
         """Return electrons per photon; 1 if the sensor states none or has filters, because electrons are counted."""
         return sensor.efficiency(self.wavelength) if sensor.states_efficiency else 1.0
-
-
-class ProcedureKeys(SeedKeys, total=False):
-    pixels: int
-    steps: int
-    wavelength: float
