@@ -5,9 +5,10 @@ true depth, and others where dots of period k see their neighbours' light. So ev
 followed to its bottom, and valleys that chance or the model's misfit may have raised are reported as alternatives.
 
 *A depth for each pixel.* Every frame is first reconstructed at the calibrated depth as if all pixels along the
-baseline were lit, which shows where each dot's light arrives. Then the model is linear in (X, X o d), d a change of
-1/z, and each Gauss-Newton step, with the d of neighbours pooled, is one closed-form solve for each frame, whose normal
-matrix is (L^T L) o (R^T R). Depths whose parallax spans more than a period of the dots are ambiguous.
+baseline were lit, which shows where each dot's light arrives. Then two depths beside that of each pixel state slope and
+curvature of the energy that it explains; pooled over neighbours they give a step. At the end pixels take the depth of a
+neighbour where that explains more, which makes edges sharp. Depths whose parallax spans more than a period of the dots
+are ambiguous.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, median_filter, minimum_filter
 from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
-from mitsim.reconstruct.accumulation import FrameNoise, LitFrames, factor_energy
+from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
 from mitsim.reconstruct.factorisation import factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, pixels_of_parallax
+from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, parallax_of, pixels_of_parallax
 from mitsim.reconstruct.misfit import Misfit, weigh
 from mitsim.reconstruct.residuals import CHANCE
 from mitsim.reconstruct.solution import Solution, Status, Verdict
@@ -194,7 +195,7 @@ class CommonBasis:
         return centre_columns(columns) if self._centre else columns
 
 
-# ---- Parallax, dots and chance ---------------------------------------------------------------------------------------
+# ---- The search for the depth that leaves least ----------------------------------------------------------------------
 
 _STEP = 0.5
 
@@ -241,147 +242,102 @@ def _period(moves: FloatArray, patterns: Sequence[FloatArray]) -> float:
     return np.inf
 
 
-# ---- The search for the depth that leaves least ----------------------------------------------------------------------
-
-
 @single_threaded_blas()
 def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float] | None = None) -> Depth:
     """Return the depth, between two given ones [mm] or a quarter of 1/z either way, whose factors explain most.
 
     Raises MitsimError without a stated parallax, and ArgumentError for a range that too little of the sensor knows.
     """
-    search = _Search(shots, factors, depth_range)
-    basis, ends, pixel, inverse = search.basis, search.ends, search.pixel, 1 / parallax_of(factors).depth_mm
-    valleys = sorted(search.valleys(*ends))
-    valleys = sorted([*valleys, *search.beyond(valleys[0][1])])
-    (least, shift), unknowns = valleys[0], basis.shape[0] * basis.shape[1]
-    mm, range_mm = 1 / (inverse + shift), (1 / (inverse + ends[1]), 1 / (inverse + ends[0]))
+    (first, last), moves, beyond = _shifts_searched(factors, depth_range), _moves(factors), 0.0
+    inverse, stated = 1 / parallax_of(factors).depth_mm, factors.manifest.noise
+    if depth_range is None:
+        # A surface beyond the range, but for a period, is within it: only where a range is given that is excluded.
+        periodic = moves.any() and all(map(_are_dots, shots.patterns))
+        beyond = min(_period(moves, shots.patterns), last) if periodic else last
+    tried = first - beyond, last + beyond
+    basis = CommonBasis(shots, factors, tried)
+    groups, pixel = [group_pixels(lit) for lit in basis.patterns], 1 / max(side.reach for side in basis.sides)
+    unknowns = basis.shape[0] * basis.shape[1]
+
+    def left_over(shift: float) -> float:
+        left, right = (factorise(basis.side(axis, shift), basis.patterns[axis], groups[axis]) for axis in (0, 1))
+        measured = np.outer(left.singular, right.singular) > 0
+        return basis.energy - float(np.square(project_frames(left, right, basis.stack)[measured]).sum())
+
+    # Every valley that may be the lowest is followed to its bottom.
+    steps = max(int(np.ceil((tried[1] - tried[0]) / pixel)), _FEWEST)
+    shifts = np.linspace(*tried, steps + 1)
+    scores = np.array([left_over(shift) for shift in shifts])
+    beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
+    least, below, valleys = np.inf, np.inf, list[tuple[float, float]]()
+    for index in sorted(map(int, np.flatnonzero(scores <= beside)), key=lambda index: float(scores[index])):
+        if scores[index] - _SIMILAR * below > least:
+            break
+        bounds = shifts[max(index - 1, 0)], shifts[min(index + 1, steps)]
+        found = minimize_scalar(left_over, bounds=bounds, method="bounded", options={"xatol": _RESOLUTION * pixel})
+        valleys.append((float(found.fun), float(found.x)))
+        if found.fun < least:
+            least, half = float(found.fun), (shifts[1] - shifts[0]) / 2
+            below = max(left_over(float(np.clip(found.x + part, *tried))) for part in (-half, half)) - least
+    (least, shift), *others = sorted(valleys)
+    mm, range_mm = 1 / (inverse + shift), (1 / (inverse + last), 1 / (inverse + first))
     # The standard error follows from the curvature of the valley.
-    near, far, before, after = (search.left_over(shift + part * pixel) for part in (1, -1, -0.25, 0.25))
+    near, far, before, after = (left_over(shift + part * pixel) for part in (1, -1, -0.25, 0.25))
     curvature, variance = (before - 2 * least + after) / (pixel / 4) ** 2, least / max(basis.data - unknowns, 1)
     error = float(np.sqrt(2 * variance / curvature)) if curvature > 0 else float("inf")
-    rise = min(near, far) - least
+    rise, misfit = min(near, far) - least, 0.0
+    if basis.noise.stated and stated:
+        prepared = prepare(basis.side(0, shift), basis.side(1, shift), *basis.patterns)
+        sums = prepared.accumulator()
+        for each in basis.frames:
+            sums.add(each.frame, each.row, each.column)
+        image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
+        expected = float(basis.noise.variance.mean()) * (basis.data - image.size) + basis.part * basis.noise.rendering
+        expected += basis.smoothing(shift) * factor_energy(prepared, basis.patterns, stated, image)
+        misfit = max(least - expected, 0.0)
 
     def indifferent(difference: float) -> float:
         return max(chance_difference(difference, variance, unknowns), _OPPOSED * misfit)
 
-    def ties() -> list[tuple[float, float]]:
-        return [each for each in valleys[1:] if each[0] - least < indifferent(each[0] - least)]
-
-    misfit = search.misfit(shift, least)
-    if misfit and (ties() or rise < indifferent(rise)):
-        # Print finer than a pixel is no sign of another depth.
-        there = move_factors(factors, mm)
-        lit = LitFrames(there.factors.sides, basis.patterns)
-        for each in there.of(shots).pattern_measurements():
-            frame = centre_frame(each.frame) if there.factors.manifest.centre else each.frame
-            lit.collect(each, frame, float(basis.noise.variance[each.row, each.column]))
-        misfit *= 1 - float(np.nan_to_num(lit.print_part()))
-    others = [
-        Alternative(1 / (inverse + other), float(np.sqrt((left - least) / basis.energy))) for left, other in ties()
-    ]
-    at_end, doubt = min(abs(end - shift) for end in (*ends, *search.tried)) < search.margin, ""
-    if at_end or not ends[0] < shift < ends[1]:
+    alternatives = tuple(
+        Alternative(1 / (inverse + other), float(np.sqrt((left - least) / basis.energy)))
+        for left, other in others
+        if left - least < indifferent(left - least)
+    )
+    doubt, at_end = "", min(abs(end - shift) for end in (first, last, *tried)) < 2 * _RESOLUTION * pixel
+    if at_end or not first < shift < last:
         doubt = (
             f"End of range: {mm:.1f} mm explains most, and depths from {range_mm[0]:.0f} to {range_mm[1]:.0f} mm "
-            "were tried, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
+            "were asked for, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
             "NEAR:FAR or depth_range, or calibrate nearer to it."
         )
     elif not (error < pixel and rise > max(indifferent(rise), _LEAST_RISE * basis.energy)):
         doubt = "These patterns hardly tell depth: use shifting dots."
-    elif others:
-        named = " and ".join(f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in others)
+    elif alternatives:
+        named = " and ".join(
+            f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in alternatives
+        )
         doubt = (
             f"Depth may be another by whole periods of the dots: {mm:.1f} mm explains the measurements no better "
             f"than {named}, within chance and what no depth explains; use dots of a longer period, or give the "
             "range of depths."
         )
     local = float(np.hypot(error, _RESOLUTION * pixel)) * mm**2
-    error_mm = float(np.hypot(local, max((abs(other.mm - mm) for other in others), default=0.0)))
-    return Depth(mm, error_mm, doubt, range_mm, tuple(others), at_end)
-
-
-class _Search:
-    def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
-        self.ends, self._period, beyond = _shifts_searched(factors, depth_range), np.inf, 0.0
-        if depth_range is None:
-            # A surface beyond the range, but for a period, is within it: only where a range is given that is excluded.
-            moves = _moves(factors)
-            if moves.any() and all(map(_are_dots, shots.patterns)):
-                self._period = _period(moves, shots.patterns)
-            beyond = min(self._period, self.ends[1])
-        self.tried = self.ends[0] - beyond, self.ends[1] + beyond
-        self.basis, self._stated = CommonBasis(shots, factors, self.tried), factors.manifest.noise
-        self._groups = [group_pixels(patterns) for patterns in shots.patterns]
-        self.pixel = 1 / max(side.reach for side in self.basis.sides)
-        self.margin = 2 * _RESOLUTION * self.pixel
-
-    def left_over(self, shift: float) -> float:
-        left, right = (
-            factorise(self.basis.side(axis, shift), patterns, groups)
-            for axis, (patterns, groups) in enumerate(zip(self.basis.patterns, self._groups, strict=True))
-        )
-        measured = np.outer(left.singular, right.singular) > 0
-        return self.basis.energy - float(np.square(project_frames(left, right, self.basis.stack)[measured]).sum())
-
-    def valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
-        steps = max(int(np.ceil((last - first) / self.pixel)), _FEWEST)
-        shifts = np.linspace(first, last, steps + 1)
-        scores = np.array([self.left_over(shift) for shift in shifts])
-        beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
-        lows = sorted(map(int, np.flatnonzero(scores <= beside)), key=lambda index: float(scores[index]))
-        least = below = np.inf
-        for index in lows:
-            if scores[index] - _SIMILAR * below > least:
-                break
-            left, shift = self._bottom(shifts[max(index - 1, 0)], shifts[min(index + 1, steps)])
-            if left < least:
-                half = shifts[1] - shifts[0]
-                around = [self.left_over(float(np.clip(shift + part * half, first, last))) for part in (-0.5, 0.5)]
-                least, below = left, max(around) - left
-            yield left, shift
-
-    def beyond(self, shift: float) -> Iterator[tuple[float, float]]:
-        for end, tried, step in zip(self.ends, self.tried, (-self._period, self._period), strict=True):
-            if tried == end:
-                continue
-            if abs(shift - end) < self.margin:
-                yield from self.valleys(*sorted((end, tried)))
-            elif np.isfinite(self._period):
-                away = shift + step
-                while self.ends[0] <= away <= self.ends[1]:
-                    away += step
-                if abs(away) < abs(tried):
-                    yield self._bottom(away - self.pixel, away + self.pixel)
-
-    def misfit(self, shift: float, least: float) -> float:
-        basis, noise = self.basis, self.basis.noise
-        if not (noise.stated and self._stated):
-            return 0.0
-        prepared = prepare(basis.side(0, shift), basis.side(1, shift), *basis.patterns)
-        sums = prepared.accumulator()
-        for each in basis.frames:
-            sums.add(each.frame, each.row, each.column)
-        image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
-        expected = float(noise.variance.mean()) * (basis.data - image.size) + basis.part * noise.rendering
-        of_factors = basis.smoothing(shift) * factor_energy(prepared, basis.patterns, self._stated, image)
-        return float(max(least - expected - of_factors, 0.0))
-
-    def _bottom(self, first: float, last: float) -> tuple[float, float]:
-        options = {"xatol": _RESOLUTION * self.pixel}
-        least = minimize_scalar(self.left_over, bounds=(first, last), method="bounded", options=options)
-        return float(least.fun), float(least.x)
+    error_mm = float(np.hypot(local, max((abs(other.mm - mm) for other in alternatives), default=0.0)))
+    return Depth(mm, error_mm, doubt, range_mm, alternatives, at_end)
 
 
 # ---- The search for a depth of each projector pixel ------------------------------------------------------------------
 
-_STEPS, _STEP_POOLED = 4, 3.0
-_ROUNDS, _BESIDE = 4, 5
+_ROUNDS, _BESIDE, _STEP_POOLED = 6, 5, 3.0
+_FIRST_LENGTH, _SHORTEST = 0.3, 0.1
+"""Parts of the step, which is too long because pixels that are lit together share light."""
 _SURE = 25.0
 _RIVAL, _ASTRAY = 2.0, 0.05
 _RELIABLE = 0.5
 SPARE = 2.0
 _MEDIAN = 5
+_SMALL, _LARGEST = 1e-3, 1e-2
 
 
 @single_threaded_blas()
@@ -412,9 +368,9 @@ def depth_map(
     best = min(tried, key=lambda offset: tried[offset])
     rivals = [other for other, left in tried.items() if left < _RIVAL * tried[best]]
     shift, confidence = arrivals.most(best)
-    shift = _sharpen(pixels, _refine(pixels, shift, best * pixel, width, pixel))
+    shift, found = _improve(pixels, shift, (best * pixel - width / 2, best * pixel + width / 2), pixel)
     # The depths are doubted where they explain no more than the calibrated one, or where others explain as much.
-    reliable, found, doubt = confidence >= _RELIABLE, pixels.solve(shift), ""
+    reliable, doubt = confidence >= _RELIABLE, ""
     variance, unknowns = pixels.variance(found), 2 * shift.size
     less = found.left_over - pixels.solve(np.zeros(shift.shape)).left_over
     # Of a sheet at the calibrated depth either may leave more.
@@ -443,55 +399,46 @@ def depth_map(
             )
     if doubt:
         shift, confidence = np.zeros(shift.shape), np.zeros(shift.shape)
-    solved = pixels.solve(shift, None if lam == "auto" else lam)
-    solved = pixels.final(shift, solved) if lam == "auto" else solved
+        found = pixels.solve(shift)
+    if lam == "auto":
+        power = max(float(np.square(found.image).mean()), np.finfo(float).tiny)
+        solved = pixels.solve(shift, min(pixels.variance(found) / power, _LARGEST * pixels.scale))
+    else:
+        solved = pixels.solve(shift, lam)
     sizes, smoothing = (basis.energy, basis.data, basis.part), basis.smoothing(float(np.median(shift)))
-    return DepthMap(
-        solved.image,
-        1 / (inverse + shift),
-        confidence,
-        solved.lam,
-        solved.left_over,
-        *sizes,
-        doubt,
-        range_mm,
-        smoothing,
-    )
+    mm = 1 / (inverse + shift)
+    return DepthMap(solved.image, mm, confidence, solved.lam, solved.left_over, *sizes, doubt, range_mm, smoothing)
 
 
-def _refine(pixels: PixelDepths, shift: FloatArray, offset: float, width: float, pixel: float) -> FloatArray:
-    left_over = pixels.solve(shift).left_over
-    for _ in range(_STEPS):
-        image, moved = pixels.step(shift, pixel)
-        weight = gaussian_filter(np.square(image), _STEP_POOLED)
-        change = gaussian_filter(image * moved, _STEP_POOLED) / np.maximum(weight, np.finfo(float).tiny)
-        ahead = np.clip(shift + pixel * np.clip(change, -1, 1), offset - width / 2, offset + width / 2)
-        ahead = median_filter(ahead, _MEDIAN)
-        now = pixels.solve(ahead).left_over
-        if now >= left_over:
-            break
-        shift, left_over = ahead, now
-    return shift
-
-
-def _sharpen(pixels: PixelDepths, shift: FloatArray) -> FloatArray:
-    solved = pixels.solve(shift)
+def _improve(
+    pixels: PixelDepths, shift: FloatArray, limits: tuple[float, float], pixel: float
+) -> tuple[FloatArray, Solved]:
+    solved, length, apart = pixels.solve(shift), _FIRST_LENGTH, pixel / 4
+    for _ in range(_ROUNDS):
+        ahead, behind = pixels.gains(shift, solved.image, [shift + apart, shift - apart])
+        slope, curvature = (gaussian_filter(each, _STEP_POOLED) for each in (ahead - behind, -ahead - behind))
+        change = apart / 2 * slope / np.maximum(curvature, np.abs(slope) / 8 + np.finfo(float).tiny)
+        while length > _SHORTEST:
+            there = median_filter(np.clip(shift + length * change, *limits), _MEDIAN)
+            now = pixels.solve(there)
+            if now.left_over < solved.left_over:
+                shift, solved = there, now
+                break
+            length /= 2
     for _ in range(_ROUNDS):
         others = [of(shift, _BESIDE) for of in (minimum_filter, maximum_filter, median_filter)]
         gains = pixels.gains(shift, solved.image, others)
         sure = gains.max(axis=0) > _SURE * pixels.variance(solved)
-        ahead = np.where(sure, np.choose(gains.argmax(axis=0), others), shift)
-        now = pixels.solve(ahead)
+        there = np.where(sure, np.choose(gains.argmax(axis=0), others), shift)
+        now = pixels.solve(there)
         if now.left_over >= solved.left_over:
             break
-        shift, solved = ahead, now
-    return shift
+        shift, solved = there, now
+    return shift, solved
 
 
 # -------- The image at a depth for each pixel
 
-_SMALL = 1e-3
-_LARGEST = 1e-2
 _MOST_LIT = 4096
 _CUBIC = np.array([[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]]) / 6
 
@@ -515,10 +462,10 @@ class PixelDepths:
             )
         middle = len(self._shifts) // 2
         left, right = (float(np.square(table[:, middle]).sum(axis=1).mean()) for table in self._tables)
-        self._scale = left * right
+        self.scale = left * right
 
     def solve(self, shift: FloatArray, lam: float | None = None) -> Solved:
-        lam = _SMALL * self._scale if lam is None else lam
+        lam = _SMALL * self.scale if lam is None else lam
         image, left_over = np.zeros(shift.shape), self._basis.outside
         for frame, lit, left, right in self._columns_of_frames(shift):
             normal, data = (left @ left.T) * (right @ right.T), ((left @ frame) * right).sum(axis=1)
@@ -530,32 +477,13 @@ class PixelDepths:
     def variance(self, solved: Solved) -> float:
         return float(solved.left_over / max(self._basis.data - 2 * solved.image.size, 1))
 
-    def final(self, shift: FloatArray, solved: Solved) -> Solved:
-        ideal = self.variance(solved) / max(float(np.square(solved.image).mean()), np.finfo(float).tiny)
-        return self.solve(shift, min(ideal, _LARGEST * self._scale))
-
-    def step(self, shift: FloatArray, unit: float) -> tuple[FloatArray, FloatArray]:
-        """Return X and X o d, both (n, n'), that explain most together; d changes ``shift``, in ``unit`` [1/mm]."""
-        lam, image, moved = _SMALL * self._scale, np.zeros(shift.shape), np.zeros(shift.shape)
-        for frame, lit, u, v in self._columns_of_frames(shift):
-            du, dv = (unit * self._columns(axis, place, shift[lit], slope=True) for axis, place in enumerate(lit))
-            # Columns of the model are u v^T, and by d du v^T + u dv^T.
-            uu, uv, vv = u @ u.T, (u @ du.T, v @ dv.T), v @ v.T
-            across = uv[0] * vv + uu * uv[1]
-            own = (du @ du.T) * vv + uu * (dv @ dv.T) + uv[0].T * uv[1] + uv[0] * uv[1].T
-            normal = np.block([[uu * vv, across], [across.T, own]])
-            seen, slid = u @ frame, du @ frame
-            data = np.concatenate([(seen * v).sum(axis=1), (slid * v + seen * dv).sum(axis=1)])
-            image[lit], moved[lit] = np.split(np.linalg.solve(normal + lam * np.eye(len(data)), data), 2)
-        return image, moved
-
     def gains(self, shift: FloatArray, image: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
         """Return the energy (others, n, n') that each pixel alone explains more at other changes of 1/z."""
         explained = np.zeros((1 + len(others), *shift.shape))
         for frame, lit, left, right in self._columns_of_frames(shift):
             rest = frame - (left * image[lit][:, None]).T @ right
             for own, other in zip(explained, (shift, *others), strict=True):
-                u, v = (self._columns(axis, place, other[lit]) for axis, place in enumerate(lit))
+                u, v = (self.columns(axis, place, other[lit]) for axis, place in enumerate(lit))
                 light = image[lit] * (left * u).sum(axis=1) * (right * v).sum(axis=1)
                 size = np.square(u).sum(axis=1) * np.square(v).sum(axis=1)
                 own[lit] = np.square(((u @ rest) * v).sum(axis=1) + light) / size
@@ -567,17 +495,14 @@ class PixelDepths:
         for each in self._basis.frames:
             grid = np.meshgrid(self._lit[0][each.row], self._lit[1][each.column], indexing="ij")
             lit = tuple(place.ravel() for place in grid)
-            left, right = (self._columns(axis, place, shift[lit]) for axis, place in enumerate(lit))
+            left, right = (self.columns(axis, place, shift[lit]) for axis, place in enumerate(lit))
             yield each.frame, lit, left, right
 
-    def _columns(self, axis: int, pixels: npt.NDArray[np.intp], shift: FloatArray, slope: bool = False) -> FloatArray:
-        step, table = self._shifts[1] - self._shifts[0], self._tables[axis]
-        place = (shift - self._shifts[0]) / step
+    def columns(self, axis: int, pixels: npt.NDArray[np.intp], shift: FloatArray) -> FloatArray:
+        place = (shift - self._shifts[0]) / (self._shifts[1] - self._shifts[0])
         start = np.clip(np.floor(place).astype(np.intp), 1, len(self._shifts) - 3)
-        powers = (place - start) ** np.arange(4)[:, None]
-        if slope:
-            powers = np.arange(4)[:, None] / step * np.roll(powers, 1, axis=0)
-        weights = _CUBIC @ powers
+        weights = _CUBIC @ (place - start) ** np.arange(4)[:, None]
+        table = self._tables[axis]
         return np.asarray(sum(weight[:, None] * table[pixels, start + k - 1] for k, weight in enumerate(weights)))
 
 
@@ -608,35 +533,36 @@ class Arrivals:
         self.width = min(span, _period(np.where(self._open, moves, 0.0), shots.patterns))
         self.limited = self.width < span
         self.reach = beside + self.width / 2 + (max(_OFFSETS) + _BESIDE_LARGEST) * self.pixel
-        self.basis = CommonBasis(shots, factors, (-self.reach, self.reach))
+        self.basis = basis = CommonBasis(shots, factors, (-self.reach, self.reach))
         self._margin = int(np.ceil(self.reach / self.pixel)) + 1
         # Along the baseline each dot's frames have an image of their own, of all pixels as if they were lit.
-        self._classes = [
-            own.argmax(axis=1) if opened else np.zeros(len(own), np.intp)
-            for own, opened in zip(shots.patterns, self._open, strict=True)
-        ]
-        self._images = self._class_images()
-
-    def _class_images(self) -> FloatArray:
-        basis = self.basis
-        sides = [basis.side(axis, 0.0, self._margin if opened else 0) for axis, opened in enumerate(self._open)]
-        patterns, counts = list[FloatArray](), list[int]()
-        for side, own, opened in zip(sides, basis.patterns, self._open, strict=True):
-            patterns.append(np.ones((side.shape[1], 1)) if opened else own)
+        self._classes, sides, lit, counts = list[FloatArray](), list[FloatArray](), list[FloatArray](), list[int]()
+        for axis, (own, opened) in enumerate(zip(basis.patterns, self._open, strict=True)):
+            self._classes.append(own.argmax(axis=1) if opened else np.zeros(len(own)))
+            sides.append(basis.side(axis, 0.0, self._margin if opened else 0))
+            lit.append(np.ones((sides[-1].shape[1], 1)) if opened else own)
             counts.append(own.shape[1] if opened else 1)
-        prepared = prepare(sides[0], sides[1], patterns[0], patterns[1])
+        prepared = prepare(sides[0], sides[1], lit[0], lit[1])
         sums = {key: prepared.accumulator() for key in np.ndindex(*counts)}
         for each in basis.frames:
             (row, column), (down, across) = (each.row, each.column), self._open
             of_class = sums[row if down else 0, column if across else 0]
             of_class.add(each.frame, 0 if down else row, 0 if across else column)
         images = [prepared.solve(each, _SHARP * prepared.problem(each).scale).image for each in sums.values()]
-        return np.stack(images).reshape(*counts, *images[0].shape)
+        self._images = np.stack(images).reshape(*counts, *images[0].shape)
 
     def most(self, offset: float) -> tuple[FloatArray, FloatArray]:
+        """Return the change of 1/z (n, n') at which most light arrives, and its confidence (n, n')."""
         count = 2 * int(np.ceil(self.width / self.pixel / _STEP / 2)) + 1
         shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
-        light = np.stack([self._arriving(shift) for shift in shifts])
+        light = np.zeros((count, *self.basis.shape))
+        for shift, arriving in zip(shifts, light, strict=True):
+            (rows, columns) = (
+                np.arange(classes.size) + (side.edges * shift + self._margin if opened else 0.0)
+                for side, classes, opened in zip(self.basis.sides, self._classes, self._open, strict=True)
+            )
+            places = np.broadcast_arrays(self._classes[0][:, None], self._classes[1], rows[:, None], columns)
+            map_coordinates(self._images, np.stack(places), arriving, order=1, mode="nearest")
         light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
         place, step, peak = light.argmax(axis=0), shifts[1] - shifts[0], light.max(axis=0)
         beside = np.arange(count)[:, None, None] - place
@@ -647,19 +573,3 @@ class Arrivals:
         found = median_filter(shifts[place] + step * centroid, _MEDIAN)
         elsewhere = np.maximum(other, np.median(other))  # of a dark pixel alone it would be small by chance
         return found, np.where(dark, 0.0, np.maximum(1 - elsewhere / np.where(dark, 1.0, peak), 0.0))
-
-    def _arriving(self, shift: float) -> FloatArray:
-        places, parts = list[npt.NDArray[np.intp]](), list[FloatArray]()
-        for side, classes, opened in zip(self.basis.sides, self._classes, self._open, strict=True):
-            place = np.arange(classes.size) + (side.edges * shift + self._margin if opened else 0.0)
-            whole = np.floor(place).astype(np.intp)
-            whole = np.clip(whole, 0, max(self._images.shape[2 + len(places)] - 2, 0)) if opened else whole
-            places.append(whole)
-            parts.append(place - whole)
-        total = np.zeros(self.basis.shape)
-        for row in (0, 1) if self._open[0] else (0,):
-            for column in (0, 1) if self._open[1] else (0,):
-                weights = [part if end else 1 - part for part, end in zip(parts, (row, column), strict=True)]
-                rows, columns = (places[0] + row)[:, None], places[1] + column
-                total += np.outer(*weights) * self._images[self._classes[0][:, None], self._classes[1], rows, columns]
-        return total
