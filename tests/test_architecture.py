@@ -249,7 +249,7 @@ def test_what_a_capture_is_made_of_is_soon_imported() -> None:
 @pytest.mark.slow
 def test_a_capture_imports_nothing_slow(small_scene: Callable[..., Path], tmp_path: Path) -> None:
     """Nor where it is used. (Planted: the same inside the function that uses them.)"""
-    options = "--patterns dots:2 --accuracy 0.01 --effects=+diffraction --no-pictures".split()
+    options = ["--patterns", "dots:2", "--accuracy", "0.01", "--effects=+diffraction", "--no-pictures"]
     command = ("capture", small_scene(), "-o", tmp_path / "run", *options)
     done = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", "mitsim", *map(str, command)], capture_output=True, text=True
