@@ -74,23 +74,18 @@ if TYPE_CHECKING:
 
 
 @check_arguments
-def doctor(warm: bool = False, variant: str = DEFAULT_VARIANT) -> list[Check]:
-    """Check this machine; each check has ``ok``, what was found, and the command that mends it. It takes some ten
-    seconds. Checks that can crash or hang run in child processes.
+def doctor(variant: str = DEFAULT_VARIANT) -> list[Check]:
+    """Check this machine in about five seconds; each check has ``ok``, a finding, and the command that mends it.
 
     Parameters
     ----------
-    warm
-        True to compile the usual kernels into Dr.Jit's cache too, in half a minute.
     variant
-        Variant of Mitsuba that kernels are compiled for.
+        Variant of Mitsuba in which a test image is rendered.
     """
-    from mitsim.core.environment import check_variant, warm_up
-    from mitsim.core.environment import doctor as check_machine
+    from mitsim.core import environment
 
-    check_variant(variant)
-    checks = check_machine()
-    return [*checks, warm_up(variant)] if warm and all(check.ok for check in checks) else checks
+    environment.check_variant(variant)
+    return environment.doctor(variant)
 
 
 def scenes() -> dict[str, str]:
@@ -418,8 +413,6 @@ class RunOptions(Options):
 
     resume: bool = option(False, "go on where an interrupted one of the same options stopped", panel=OUTPUT)
     pictures: bool = option(True, "make pictures and pages", kind=False)
-    shard: str = option(WHOLE, "measure part I of N of a sweep's points", metavar="I/N")
-    scheduler: str | None = option(None, "Dask scheduler that measures a sweep's points")
 
 
 # ---- a camera's sensor alone -----------------------------------------------------------------------------------------

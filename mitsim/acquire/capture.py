@@ -107,7 +107,6 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None, seed: in
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)
     lighting = bench.family(request.patterns, request.seed).lighting
-    job.clock.predict({"transport": plan.predicted["transport"]})
     with job.clock.stage("transport"):
         light = trace_light(bench, plan, lighting, request.seed if seed is None else seed, progress=job.progress)
     return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
@@ -211,7 +210,6 @@ def capture(
         known = {"plan": spent.get("plan", 0.0)} if plan is not None else {}  # what this run took to have it
         plan = made.taking(start=starting, **known)
         check(plan.settings, exposing if lights else plan.predicted_seconds)
-        job.clock.predict(exposed if lights else plan.predicted)
         if not lights:
             with job.clock.stage("transport"):
                 sampling = bench.sampling(request)

@@ -223,7 +223,6 @@ def render(
         with job.planning(str(bench.loaded.path), first_shadow(bench, effects or {})):
             plan = make_plan(bench, uniform, accuracy, seed, effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
-        job.clock.predict({"transport": plan.predicted["transport"]})
         with job.clock.stage("transport"):
             light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
         warnings = (*light.warnings, *light.unreached)

@@ -223,7 +223,6 @@ class Session:
         exposures = len(self.recipe.exposure_ladder)
         cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds, exposures)
         cost.check("calibration", job.limits)
-        job.clock.predict(plan.predicted)
         return replace(plan, cost=cost)
 
     def trace(self, plan: Plan, job: Job) -> SampledLight:

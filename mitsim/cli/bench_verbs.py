@@ -27,7 +27,7 @@ from mitsim.cli.commands import (
     to_make,
     wrap_text,
 )
-from mitsim.core.configuration import LIMITS, OUTPUT, QUALITY, WHAT, option
+from mitsim.core.configuration import OUTPUT, QUALITY, WHAT, option
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import RUN, read_colours
 from mitsim.core.worker import RESUME, advise
@@ -82,7 +82,7 @@ class Running(RunOptions, LimitedPictured):
 def run_(asked: Running) -> int:
     """Take all steps of a session file, or write that of a folder.
 
-    Each step, such as capture or a sweep, has its folder in that of the session.
+    Each step, such as capture, has its folder in that of the session.
 
     $ mitsim run demo -o out
     $ mitsim run fig1.toml -o out -D capture.patterns=dots:5
@@ -112,7 +112,7 @@ def _repeat(asked: Running, folder: Path) -> int:
     """Print the session file that repeats a folder, or write it."""
     if asked.session is not None:
         raise MitsimError(f"--from {folder}: writes a session file, and {asked.session} is one; give one of both")
-    others = "values", "resume", "shard", "scheduler", "no_pictures", "variant", "max_seconds", "max_memory"
+    others = "values", "resume", "no_pictures", "variant", "max_seconds", "max_memory"
     asked.refuse(others, "with --from, which runs nothing")
     from mitsim.core.files import check_output
 
@@ -186,20 +186,14 @@ def study(asked: Studying) -> int:
     return asked.call(mitsim.study, asked.name, asked.scenes, asked.output, **asked.given_of(StudyOptions))
 
 
-class Examining(Common):
-    """Options of `mitsim doctor`."""
-
-    warm: bool = option(False, "compile the usual kernels into Dr.Jit's cache: half a minute", panel=LIMITS)
-
-
 @command
-def doctor(asked: Examining) -> int:
+def doctor(asked: Common) -> int:
     """What works on this machine, and what mends the rest.
 
     $ mitsim doctor
-    $ mitsim doctor --warm
+    $ mitsim doctor --variant llvm_ad_spectral
     """
-    checks = mitsim.doctor(asked.warm, asked.variant)
+    checks = mitsim.doctor(asked.variant)
     bad = [f"{check.name}: {check.detail}" for check in checks if not check.ok]
     lines = [f"{sum(check.ok for check in checks)} of {len(checks)} checks pass"]
     for check in checks:
@@ -249,7 +243,7 @@ def plan(asked: Planning) -> int:
         if place is not None:
             found.save(place)
     written = {} if output is None else {"output": str(output)}
-    kernels = asdict(compiled_kernels())
+    kernels = compiled_kernels()
     lines = [] if asked.as_json else plan_lines(found, asked.everything or asked.verbose)
     lines += [*(f"Plan: {text}" for text in written.values()), *_kernel_lines(kernels)]
     return asked.finish({**found.payload(), **written, "kernels": kernels}, lines, found.warnings)

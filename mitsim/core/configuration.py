@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import functools
 import inspect
-import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, ParamSpec, TypeVar, get_args
 
@@ -49,130 +48,35 @@ class Configuration(BaseModel):
 _MOST_MISTAKES = 20
 Place = tuple[str | int, ...]
 """Keys and list indices that lead to a part of nested data."""
-Mistake = tuple[int, str]
-"""Line of a mistake (0: unknown), and its message."""
 
 
-class Table(dict[str, Any]):
-    """Content of a file that a person wrote; all mistakes in it are reported together.
-
-    ``text`` is the TOML source, if known, and ``place`` has the names of the enclosing tables.
-    """
-
-    def __init__(self, values: Mapping[str, Any], text: str = "", place: Place = ()) -> None:
-        super().__init__(values)
-        self.text, self.place = text, place
-
-    def part(self, name: str) -> Table:
-        return Table(self[name], self.text, (*self.place, name))
-
-    def line(self, place: Place) -> int:
-        """Return the line on which the entry at ``place``, or its nearest parent, begins; 0 if unknown."""
-        wanted, table, counts, best = (*self.place, *place), Place(), dict[Place, int](), (0, 0)
-        for number, line in enumerate(self.text.split("\n"), 1):
-            if not (found := _NAMED.match(line)):
-                continue
-            parts = [part.strip(" \"'") for part in (found[2] or found[3]).split(".")]
-            here: Place = () if found[1] else table
-            for part in parts:
-                here = (*here, part)
-                if found[1] == "[[" and part is parts[-1]:
-                    counts[here] = counts.get(here, -1) + 1
-                if found[1] and here in counts:
-                    here = (*here, counts[here])
-            table = here if found[1] else table
-            if here == wanted[: len(here)] and len(here) > best[0]:
-                best = len(here), number
-        return best[1]
-
-
-_NAMED = re.compile(r"\s*(?:(\[\[?)([^\]]+)\]|([\w\"' .-]+?)\s*=)")
-
-
-def mistakes(model: type[BaseModel], data: Table) -> list[Mistake]:
-    try:
-        model.model_validate(data)
-    except ValidationError as error:
-        return _mistakes_in(model, error, data)
-    return []
-
-
-def refusal(model: type[BaseModel], error: ValidationError, where: str, data: object = None) -> MitsimError:
-    """Convert pydantic's ``error``: all mistakes of a :class:`Table`, the first one of data that programs write."""
-    found = _mistakes_in(model, error, data)
-    if isinstance(data, Table):
-        return refuse_together(where, found)
-    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    return MitsimError(f"{where}: {found[0][1]}{more}")
-
-
-def refuse_together(where: str, found: Sequence[Mistake]) -> MitsimError:
-    if len(found) == 1:
-        ((line, text),) = found
-        return MitsimError(f"{where}:{line}: {text}" if line else f"{where}: {text}")
-    ordered = sorted(found, key=lambda one: one[0] or math.inf)
-    listed = [f"line {line}: {text}" if line else text for line, text in ordered]
-    more = [f"and {len(listed) - _MOST_MISTAKES} more"] if len(listed) > _MOST_MISTAKES else []
-    return MitsimError(f"{where}: has {len(found)} mistakes:", *listed[:_MOST_MISTAKES], *more)
-
-
-def _mistakes_in(model: type[BaseModel], error: ValidationError, data: object) -> list[Mistake]:
-    """Convert pydantic's errors to mistakes, one for each place, misspelt names first."""
-    above = data.place if isinstance(data, Table) else ()
-    found, meant = dict[Place, Mistake](), set[Place]()
-    errors = error.errors(include_url=False)
-    for one in sorted(errors, key=lambda one: one["type"] != "extra_forbidden"):
-        place, kind = one["loc"], one["type"]
-        if kind == "too_short" and any(
-            len(each["loc"]) > len(place) and each["loc"][: len(place)] == place for each in errors
-        ):  # wrong items are missing from a list's length
-            continue
-        holder: Any = data
+def refusal(model: type[BaseModel], error: ValidationError, where: str, data: Any = None) -> MitsimError:
+    """Convert pydantic's ``error``: one sentence for each place, misspelt names first."""
+    found, meant = dict[Place, str](), set[Place]()
+    for one in sorted(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden"):
+        place, kind, value = one["loc"], one["type"], short_text(one["input"], 100)
+        holder = data
         for end, part in enumerate(place if kind not in ("missing", "extra_forbidden") else ()):
             try:
                 holder = holder[part]
             except (KeyError, IndexError, TypeError):  # the name of a union's alternative
                 place = place[:end] or place
                 break
-        field = ".".join(cut(str(part)) for part in (*above, *place))
-        line, value = data.line(place) if isinstance(data, Table) else 0, short_text(one["input"], 100)
+        fields = getattr(_model_at(model, place[:-1]), "model_fields", {})
         if kind == "value_error":  # a validator of ours, whose message has the value
-            text = f"{field}: {one['ctx']['error']}" if field else str(one["ctx"]["error"])
+            text = str(one["ctx"]["error"])
         elif kind == "missing":
             if place in meant:  # a misspelt name is both unknown and missing
                 continue
-            text = f"{field}: is missing"
+            text = "is missing"
         elif kind == "extra_forbidden":
-            known = [*getattr(_model_at(model, place[:-1]), "model_fields", ())]
-            near = near_name(str(place[-1]), known).strip()
-            if near:
-                meant.add((*place[:-1], near.removeprefix("did you mean ").removesuffix("?")))
-            hint = near or (f"known fields: {', '.join(known)}" if known else "remove it")
-            text = f"{field}: got {value}, no such field; {hint}"
+            text = f"got {value}, no such field; {known_names(str(place[-1]), fields) if fields else 'remove it'}"
+            meant |= {(*place[:-1], name) for name in fields if f"did you mean {name}?" in text}
         else:
-            rule, named = rule_of(one["msg"]), [part for part in one["loc"] if isinstance(part, str)]
-            if kind.startswith(("greater", "less")) and named:  # pydantic states the end that is crossed alone
-                of = getattr(_model_at(model, one["loc"][: one["loc"].index(named[-1])]), "model_fields", {})
-                limits = limits_of(of[named[-1]]) if named[-1] in of else ""
-                rule = f"give a number {limits}" if limits.startswith("from") or ", " in limits else rule
-            text = f"{field or 'contents'}: got {value}; {rule}"
-        found.setdefault(place, (line, text))
-    return [*found.values()]
-
-
-_PLAINER = {"a valid integer": "a whole number", "a valid string": "text", "a valid boolean": "true or false"}
-
-
-def rule_of(message: str) -> str:
-    rule = message.removeprefix("Value error, ")
-    if "pattern '^[^/" in rule:
-        return "give a name without folders"
-    if not rule.startswith("Input should be "):
-        return rule[0].lower() + rule[1:]
-    rule = re.split(", (?:got|unable)", rule.removeprefix("Input should be "))[0]
-    if rule.startswith(("greater", "less")):
-        return f"give a number {rule}"
-    return f"give {_PLAINER.get(rule, rule.replace(' valid ', ' '))}"
+            text = f"got {value}; {rule_of(one['msg'], fields.get(place[-1] if place else ''))}"
+        name = ".".join(cut(str(part)) for part in place)
+        found.setdefault(place, f"{name}: {text}" if name else text if kind == "value_error" else f"contents: {text}")
+    return refuse_together(where, [*found.values()])
 
 
 def _model_at(model: type[BaseModel] | None, place: Place) -> type[BaseModel] | None:
@@ -183,6 +87,33 @@ def _model_at(model: type[BaseModel] | None, place: Place) -> type[BaseModel] | 
                 kinds += get_args(kind)
             model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
     return model
+
+
+def refuse_together(where: str, mistakes: Sequence[str]) -> MitsimError:
+    if len(mistakes) == 1:
+        return MitsimError(f"{where}: {mistakes[0]}")
+    more = [f"and {len(mistakes) - _MOST_MISTAKES} more"] if len(mistakes) > _MOST_MISTAKES else []
+    return MitsimError(f"{where}: has {len(mistakes)} mistakes:", *mistakes[:_MOST_MISTAKES], *more)
+
+
+def known_names(name: str, known: Iterable[str], word: str = "known fields:") -> str:
+    """Return the nearest of the ``known`` names as a question, or all of them after a ``word``."""
+    return near_name(name, known).strip() or f"{word} {', '.join(known)}"
+
+
+_PLAINER = {"a valid integer": "a whole number", "a valid string": "text", "a valid boolean": "true or false"}
+
+
+def rule_of(message: str, field: FieldInfo | None = None) -> str:
+    """Return the rule in pydantic's ``message`` as a command, with both limits of a ``field``."""
+    if "pattern '^[^/" in message:
+        return "give a name without folders"
+    if not message.startswith("Input should be "):
+        return message[0].lower() + message[1:]
+    words = re.split(", (?:got|unable)", message.removeprefix("Input should be "))[0]
+    limits, crossed = limits_of(field) if field else "", words.startswith(("greater", "less"))
+    kind = f"a number{'' if limits else f' {words}'}" if crossed else _PLAINER.get(words, words.replace(" valid ", " "))
+    return f"give {kind} {limits}".rstrip()
 
 
 # ---- Reading files ---------------------------------------------------------------------------------------------------
@@ -198,26 +129,24 @@ def shipped_path(*parts: str) -> Path:
     return path
 
 
-def read_toml(path: Path | str) -> Table:
+def read_toml(path: Path | str) -> dict[str, Any]:
     try:
         text = read_text(path, _MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
         # The parser's time grows with the square of the parts of a dotted name.
         if any(line.count(".") > _MOST_DOTS for line in text.splitlines()):
             raise ValueError(f"a line with over {_MOST_DOTS} dots")
-        return Table(tomllib.loads(text), text)
+        return tomllib.loads(text)
     except RecursionError as error:
         raise MitsimError(f"file {path}: not valid TOML (it is nested too deep); flatten it") from error
     except ValueError as error:
         raise MitsimError(f"file {path}: not valid TOML ({error}); correct that line") from error
 
 
-def read_table(path: Path, what: str) -> Table:
-    if path.suffix.lower() != ".json":
-        return read_toml(path)
-    data = read_json(path)
+def read_table(path: Path, what: str) -> dict[str, Any]:
+    data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
     if not isinstance(data, dict):
         raise MitsimError(f"{what} {path}: holds a {type(data).__name__}; give a table of names and values")
-    return Table(data)
+    return data
 
 
 def load_model(path: Path | str, model: type[Model]) -> Model:
@@ -225,7 +154,7 @@ def load_model(path: Path | str, model: type[Model]) -> Model:
 
 
 def validate(model: type[Model], data: dict[str, Any], where: str, context: object = None) -> Model:
-    """Return ``data`` as a checked ``model``; MitsimError, beginning with ``where``, if it breaks a rule."""
+    """Return ``data`` as a checked ``model``; MitsimError, beginning with ``where``, if it breaks rules."""
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:
@@ -374,30 +303,23 @@ class Options(BaseModel):
         try:
             super().__init__(**{name: errors.plain_number(value) for name, value in values.items()})
         except ValidationError as error:
-            first, *others = self._refusals(error)
+            found, fields = dict[str, ArgumentError](), type(self).model_fields
+            problems = error.errors(include_url=False)
+            for one in sorted(problems, key=lambda one: one["type"] != "extra_forbidden"):
+                name, original = str(one["loc"][0]), one.get("ctx", {}).get("error")
+                if isinstance(original, _Refused):
+                    found.setdefault(name, original.of(name))
+                elif one["type"] == "extra_forbidden" and len(one["loc"]) == 1:
+                    found[name] = unknown_option(name, self.VERB, fields)
+                elif one["type"] == "missing":
+                    found.setdefault(name, ArgumentError(name, "is missing; give it"))
+                elif name not in found:
+                    rules = (rule_of(each["msg"], fields[name]) for each in problems if each["loc"][0] == name)
+                    rule = " or ".join(dict.fromkeys(rule.removeprefix("give ") for rule in rules))
+                    found[name] = ArgumentError(name, f"{short_text(one['input'])}: give {rule}")
+            first, *others = found.values()
             first.others = tuple(others)
             raise first from error
-
-    @classmethod
-    def _refusals(cls, error: ValidationError) -> list[ArgumentError]:
-        found: dict[str, ArgumentError] = {}
-        errors = error.errors(include_url=False)
-        for one in sorted(errors, key=lambda one: one["type"] != "extra_forbidden"):
-            name, original = str(one["loc"][0]), one.get("ctx", {}).get("error")
-            if isinstance(original, _Refused):
-                found.setdefault(name, original.of(name))
-            elif one["type"] == "extra_forbidden" and len(one["loc"]) == 1:
-                found[name] = unknown_option(name, cls.VERB, [*cls.model_fields])
-            elif one["type"] == "missing":
-                found.setdefault(name, ArgumentError(name, "is missing; give it"))
-            elif name not in found:
-                rules = (rule_of(each["msg"]).removeprefix("give ") for each in errors if each["loc"][0] == name)
-                rule, limits = " or ".join(dict.fromkeys(rules)), limits_of(cls.model_fields[name])
-                if limits:
-                    kind = "a number" if one["type"].startswith(("greater", "less")) else rule
-                    rule = f"{kind} {limits}"
-                found[name] = ArgumentError(name, f"{short_text(one['input'])}: give {rule}")
-        return [*found.values()]
 
     @property
     def given(self) -> dict[str, Any]:
@@ -467,6 +389,6 @@ def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]
     return decorate
 
 
-def unknown_option(name: str, function: str, known: Sequence[str]) -> ArgumentError:
+def unknown_option(name: str, function: str, known: Iterable[str]) -> ArgumentError:
     of = f"option of {function}" if function else "such option"
     return ArgumentError(name, f"is no {of}; {near_name(name, known)}use {', '.join(known)}")

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import io
 import os
 import shutil
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, cut, printable
-from mitsim.core.worker import OutOfTime, has_rows, is_stopped
+from mitsim.core.worker import has_rows
 
 if TYPE_CHECKING:
-    from rich.console import Console, ConsoleOptions
-    from rich.table import Table
+    from rich.progress import Progress as Bars
+    from rich.progress import TaskID
 
 Progress = Callable[[str, float], None]
 """Called with a stage's name and its finished fraction, 0 to 1."""
@@ -31,36 +28,22 @@ def silent(stage: str, fraction: float) -> None:
     """Ignore progress."""
 
 
-@dataclass(frozen=True)
-class CompiledKernels:
-    """Kernels that were not in a cache, and the wall ``seconds`` of compiling them."""
-
-    number: int = 0
-    seconds: float = 0.0
-
-    def since(self, earlier: CompiledKernels) -> CompiledKernels:
-        return CompiledKernels(self.number - earlier.number, self.seconds - earlier.seconds)
+_kernels, _counting = {"number": 0, "seconds": 0.0}, threading.Lock()
 
 
-_compiled, _counting = CompiledKernels(), threading.Lock()
-
-
-def compiled_kernels() -> CompiledKernels:
-    """Return all kernels compiled by this process, and clear Dr.Jit's history.
+def compiled_kernels() -> dict[str, float]:
+    """Return ``number`` and ``seconds`` of all kernels that this process compiled, and clear Dr.Jit's history.
 
     Dr.Jit keeps 0.2 MB of text for each launched kernel until its history is read, so call this now and then.
     """
-    global _compiled
     drjit = sys.modules.get("drjit")
     with _counting:
         if drjit is not None and hasattr(drjit, "kernel_history"):
-            new = [
-                launch["backend_time"] / 1000
-                for launch in drjit.kernel_history([drjit.KernelType.JIT])
-                if not (launch["cache_hit"] or launch["cache_disk"])
-            ]
-            _compiled = CompiledKernels(_compiled.number + len(new), _compiled.seconds + sum(new))
-        return _compiled
+            for launch in drjit.kernel_history([drjit.KernelType.JIT]):
+                if not (launch["cache_hit"] or launch["cache_disk"]):
+                    _kernels["number"] += 1
+                    _kernels["seconds"] += launch["backend_time"] / 1000
+        return dict(_kernels)
 
 
 class Watch:
@@ -71,9 +54,6 @@ class Watch:
 
     def end(self, stage: str, seconds: float) -> None:
         """Note that ``stage`` is over or pauses; ``seconds`` in total so far."""
-
-    def predict(self, seconds: Mapping[str, float]) -> None:
-        """Note the predicted ``seconds`` of coming stages."""
 
     def report(self, stage: str, fraction: float) -> None:
         """Note the finished ``fraction`` of a ``stage``, or of a loop over several: a :data:`Progress`."""
@@ -110,11 +90,6 @@ class Clock:
         finally:
             self._add(name, time.perf_counter() - started)
 
-    @check_arguments
-    def predict(self, stages: Mapping[str, float]) -> None:
-        """Report predicted seconds of the ``stages`` that have not begun."""
-        self._watch.predict({self._prefix + name: own for name, own in stages.items() if name not in self._stages})
-
     def apart(self, prefix: str) -> Clock:
         """Return a clock for a part of the work, with the same watch and ``prefix`` before its stages' names."""
         return Clock(0.0, self._watch, self._prefix + prefix)
@@ -139,7 +114,7 @@ class Clock:
 
         Later runs save this time because the kernels are then in Dr.Jit's cache.
         """
-        return asdict(compiled_kernels().since(self._compiled))
+        return {name: value - self._compiled[name] for name, value in compiled_kernels().items()}
 
     def _add(self, name: str, seconds: float) -> None:
         self._stages[name] = self._stages.get(name, 0.0) + seconds
@@ -229,54 +204,13 @@ class Job:
         """Enter the stage "plan"; MitsimError if planning, or the ``least`` cost known before, exceeds the limits."""
         if least is not None:
             least.check(what, self.limits)
-        try:
-            with self.clock.stage("plan"), within(self.limits.seconds - self.clock.seconds()["total"]):
-                yield
-        except OutOfTime:
+        with self.clock.stage("plan"):
+            yield
+        if self.clock.seconds()["total"] > self.limits.seconds:
             raise MitsimError(
                 f"{what}: was not planned within the {self.limits.seconds:.3g} s that are allowed; ask for less "
                 "accuracy or fewer frames, or raise max_seconds"
-            ) from None
-
-
-# ---- Interruption of work after a given time ----
-#
-# An alarm (SIGALRM) interrupts the main thread, or native code after its call, so that the many steps of unknown length
-# need no checks of their own.
-
-_AGAIN_S = 1.0
-"""The alarm repeats, because an exception inside a callback of native code is dropped."""
-
-
-@contextmanager
-def within(seconds: float) -> Iterator[None]:
-    """Raise :class:`mitsim.core.worker.OutOfTime` in the block after so many wall ``seconds``.
-
-    Without alarms (Windows, other threads than the main one), or if another alarm is set, the block runs to its end.
-    """
-    if seconds <= 0:
-        raise OutOfTime
-    if (
-        not hasattr(signal, "setitimer")
-        or threading.current_thread() is not threading.main_thread()
-        or signal.getitimer(signal.ITIMER_REAL)[0]
-    ):
-        yield
-        return
-
-    def ring(_: int, __: FrameType | None) -> None:
-        # Stopped by a signal, whose interrupt was lost: see mitsim.core.worker.
-        raise KeyboardInterrupt if is_stopped() else OutOfTime
-
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN_S)
-    try:
-        yield
-    finally:
-        while signal.getsignal(signal.SIGALRM) is ring:
-            with suppress(OutOfTime):  # it may ring while it is taken back
-                signal.setitimer(signal.ITIMER_REAL, 0)
-                signal.signal(signal.SIGALRM, before)
+            )
 
 
 # ---- Free memory and disk, and memory in use ----
@@ -294,19 +228,16 @@ def free_memory() -> float:
     """Return the bytes that the limits of machine, control group and process still allow."""
     import psutil  # here: it takes 10 ms to import, and no refusal needs it
 
+    process = psutil.Process()
+    soft, _ = process.rlimit(psutil.RLIMIT_AS)
     left = [float(psutil.virtual_memory().available)]
+    if soft != psutil.RLIM_INFINITY:
+        left.append(float(soft - process.memory_info().vms))
     for folder, limit, used, cached in _CGROUPS:
-        try:
+        with suppress(OSError, ValueError):  # no such group, or "max"
             counts = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
             taken = float((folder / used).read_text()) - float(counts.get(cached, 0))
             left.append(float((folder / limit).read_text()) - taken)
-        except (OSError, ValueError):  # no such group, or "max"
-            continue
-    if hasattr(psutil, "RLIMIT_AS"):  # Linux and FreeBSD
-        process = psutil.Process()
-        soft, _ = process.rlimit(psutil.RLIMIT_AS)
-        if soft != psutil.RLIM_INFINITY:
-            left.append(float(soft - process.memory_info().vms))
     return max(min(left), 0.0)
 
 
@@ -314,33 +245,25 @@ def memory_from_here() -> float:
     """Return the bytes of memory in use, and reset the peak where the system allows it."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")  # proc(5): the peak becomes what is held now
-    import psutil
-
-    return float(psutil.Process().memory_info().rss)
+    return _status_bytes("VmRSS")
 
 
 def memory_since(held: float) -> float:
     """Return the peak of memory beyond ``held`` since :func:`memory_from_here` [bytes]."""
-    try:
-        # Not getrusage, where there is this: its peak is inherited from the process that started this one.
-        lines = Path("/proc/self/status").read_text().splitlines()
-        peak = next(int(line.split()[1]) * 1024.0 for line in lines if line.startswith("VmHWM"))
-    except (OSError, StopIteration):
-        import resource  # not on Windows
+    return max(_status_bytes("VmHWM") - held, 0.0)
 
-        peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * (1 if sys.platform == "darwin" else 1024)
-    return max(peak - held, 0.0)
+
+def _status_bytes(name: str) -> float:
+    # Not getrusage: its peak is inherited from the process that started this one.
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024.0 for line in lines if line.startswith(name))
 
 
 def running_seconds() -> float:
-    try:
-        # proc(5): in ticks since boot. psutil adds the time of boot, which Linux rounds to seconds.
-        began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
-        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - began, 0.0)
-    except (OSError, AttributeError):  # not Linux
-        import psutil
-
-        return max(time.time() - float(psutil.Process().create_time()), 0.0)
+    """Return the seconds since this process began."""
+    # proc(5): in ticks since boot. psutil adds the time of boot, which Linux rounds to seconds.
+    began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+    return max(time.clock_gettime(time.CLOCK_BOOTTIME) - began, 0.0)
 
 
 def free_disk(path: Path) -> float:
@@ -352,21 +275,16 @@ def size_text(count: float) -> str:
     return f"{count / 2**30:.3g} GiB" if count >= 1000 * 2**20 else f"{count / 2**20:.3g} MiB"
 
 
-# -------- Progress on a terminal, in a notebook or in a log
+# -------- Progress on a terminal or in a log
 
 SECONDS_A_LINE = 60.0
 """Least time between two lines of progress in a log [s]."""
-_SHORTEST_S = 0.05
-"""Shorter stages get no row, because they would show 0.0 s."""
-_REFRESHES = 5
-"""Updates per second; eight rows take 1.3 % of a processor."""
-_BAR = 24
 
 
 @check_arguments
 @contextmanager
 def progress(limits: Limits | None = None, hidden: bool = False, start: float = 0.0) -> Iterator[Job]:
-    """Yield a job that shows its progress: rows on a terminal and in a notebook, else a line a minute on stderr.
+    """Yield a job that shows its progress: rows on a terminal, else a line a minute on stderr.
 
     Parameters
     ----------
@@ -388,19 +306,19 @@ def progress(limits: Limits | None = None, hidden: bool = False, start: float = 
     >>> with ms.progress(ms.Limits(seconds=600)) as job:  # doctest: +SKIP
     ...     shots = ms.open_bench("photograph").capture("dots:7", job=job)
     """
-    interactive = sys.modules.get("IPython")
-    in_notebook = getattr(interactive and interactive.get_ipython(), "kernel", None) is not None
-    with ExitStack() as stack:
-        watch: Watch = Watch() if hidden else _Cell(start) if in_notebook else _Rows(start) if has_rows() else _Log()
-        if isinstance(watch, _Cell):
-            stack.callback(watch.show)
-        elif isinstance(watch, _Rows):
-            from rich.console import Console
-            from rich.live import Live
-
-            live = Live(watch, console=Console(stderr=True), transient=True, refresh_per_second=_REFRESHES)
-            stack.enter_context(live)
+    if hidden or not has_rows():
+        watch = Watch() if hidden else _Log()
         yield Job(Clock(start, watch), watch.report, limits or Limits())
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    spent = TextColumn("{task.fields[spent]}", justify="right")
+    columns = TextColumn("{task.description}", markup=False), BarColumn(24), spent, TimeRemainingColumn(compact=True)
+    with Bars(*columns, console=Console(stderr=True), transient=True, refresh_per_second=5) as bars:
+        rows = _Rows(bars)
+        yield Job(Clock(start, rows), rows.report, limits or Limits())
 
 
 class _Log(Watch):
@@ -414,129 +332,25 @@ class _Log(Watch):
             sys.stderr.flush()
 
 
-@dataclass
-class _Row:
-    words: str
-    spent: float = 0.0
-    begun: float | None = None
-    origin: tuple[float, float] = (0.0, 0.0)
-    ends: float | None = None
-
-    def seconds(self, now: float) -> float:
-        return self.spent + (0.0 if self.begun is None else now - self.begun)
-
-    def rest(self, now: float) -> float:
-        """Return the remaining seconds; 0 if unknown."""
-        return 0.0 if self.ends is None else max(self.ends - self.seconds(now), 0.0)
-
-
 class _Rows(Watch):
-    """Progress as rows of a terminal: bar, elapsed seconds, and remaining seconds by rate or plan.
+    """Progress as rows of a terminal: a stage's bar, its seconds, and the seconds that remain at its rate."""
 
-    A loop over several stages that take turns reports under its own name; its row shows the remaining time of the loop.
-    """
-
-    def __init__(self, start: float) -> None:
-        self._rows: dict[str, _Row] = {}
-        self._loop: _Row | None = None
-        self._started = time.monotonic() - start
+    def __init__(self, bars: Bars) -> None:
+        self._tasks: dict[str, TaskID] = {}
+        self._bars, self._lock = bars, threading.Lock()
 
     def begin(self, stage: str) -> None:
-        row = self._rows.setdefault(stage, _Row(stage))
-        if row is self._loop:
-            self._loop = None
-        row.begun, row.origin = time.monotonic(), (row.spent, 0.0)
-        self._show_again()
+        self._task(stage)
 
     def end(self, stage: str, seconds: float) -> None:
-        row = self._rows.setdefault(stage, _Row(stage))
-        row.spent, row.begun = seconds, None
-        self._show_again()
-
-    def predict(self, seconds: Mapping[str, float]) -> None:
-        for stage, own in seconds.items():
-            row = self._rows.setdefault(stage, _Row(stage))
-            row.ends = row.spent + own
+        self._bars.update(self._task(stage), total=1.0, completed=1.0, spent=f"{seconds:.1f} s")
 
     def report(self, stage: str, fraction: float) -> None:
-        name, now = stage.partition(":")[0], time.monotonic()
-        row = self._rows.setdefault(name, _Row(name))
-        row.words = stage.partition(",")[0]
-        if row.begun is None:  # a loop, which may go on from where an earlier run left it
-            self._end_loop(now)
-            self._loop, row.begun, row.origin = row, now, (row.spent, min(fraction, 0.999))
-        seconds, first = row.origin
-        done, taken = (fraction - first) / (1 - first), row.seconds(now) - seconds
-        if done > 0 and taken > 0:
-            row.ends = seconds + taken / done
-        if row is self._loop and fraction >= 1:
-            self._end_loop(now)
-        self._show_again()
+        words = printable(stage.partition(",")[0])
+        self._bars.update(self._task(stage.partition(":")[0]), description=words, total=1.0, completed=fraction)
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-        from rich.text import Text
-
-        now, table, loop = time.monotonic(), Table.grid(padding=(0, 2)), self._loop
-        table.add_column(no_wrap=True, overflow="ellipsis", min_width=18)
-        for _ in range(3):
-            table.add_column(no_wrap=True, justify="right")
-
-        def left(seconds: float) -> str:
-            return f"{_text(seconds)} left" if seconds >= _SHORTEST_S else ""
-
-        known = list(self._rows.values())  # which another thread may add to
-        rests = {id(row): row.rest(now) for row in known if row.begun is not None or not row.spent or loop}
-        rows = [row for row in known if row.begun is not None or max(row.spent, rests.get(id(row), 0)) >= _SHORTEST_S]
-        if len(rows) > (most := console.size.height - 2):  # the last one and the cursor's
-            rows = [row for row in rows if id(row) in rests][:most]
-        for row in rows:
-            rest, elapsed = rests.get(id(row)), row.seconds(now)
-            part = 1.0 if rest is None else elapsed / (elapsed + rest) if rest else None if elapsed else 0.0
-            # With 16 colours rich shows finished and unfinished parts alike by default.
-            bar = ProgressBar(1.0, part or 0.0, _BAR, pulse=part is None, finished_style="green")
-            table.add_row(Text(printable(row.words)), bar, _text(elapsed) if elapsed else "", left(rest or 0.0))
-        # The end is unknown where a stage goes on for an unknown time.
-        unknown = any(row.begun is not None and not rests[id(row)] for row in known)
-        rest = loop.rest(now) if loop else 0.0 if unknown else sum(rests.values())
-        table.add_row("total", "", _text(now - self._started), left(rest))
-        yield table
-
-    def _end_loop(self, now: float) -> None:
-        if self._loop is not None:
-            self._loop.spent, self._loop.begun, self._loop = self._loop.seconds(now), None, None
-
-    def _show_again(self) -> None:
-        """Do nothing, because rich refreshes a terminal's rows itself."""
-
-
-class _Cell(_Rows):
-    _handle: Any = None
-    _written = 0.0
-
-    def _show_again(self) -> None:
-        if time.monotonic() - self._written >= 1 / _REFRESHES:
-            self.show()
-
-    def show(self) -> None:
-        self._written = time.monotonic()
-        from IPython.display import HTML, display
-        from rich.console import Console
-
-        console = Console(file=io.StringIO(), record=True, width=80, force_jupyter=False, color_system="truecolor")
-        console.print(self)
-        page = '<pre style="font-family:monospace;line-height:1.3">{code}</pre>'
-        html = HTML(console.export_html(inline_styles=True, code_format=page))
-        if self._handle is None:
-            self._handle = display(html, display_id=True)
-        else:
-            self._handle.update(html)
-
-
-def _text(seconds: float) -> str:
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+    def _task(self, stage: str) -> TaskID:
+        with self._lock:  # several threads may report
+            if stage not in self._tasks:
+                self._tasks[stage] = self._bars.add_task(printable(stage), total=None, spent="")
+            return self._tasks[stage]

@@ -7,7 +7,6 @@ worker's end to an exit status and, if it died, one line.
 
 from __future__ import annotations
 
-import atexit
 import gc
 import mmap
 import os
@@ -45,13 +44,8 @@ _WHOLE = "\r\x1b[J\x1b[?25h"
 """Clears the line and shows the cursor of a terminal after the worker died."""
 
 
-class OutOfTime(BaseException):
-    """Raised in work whose time is over; no Exception, so that the work does not handle it as a failure."""
-
-
 _stopped_by: int | None = None
 _advice: mmap.mmap | None = None
-_status: int | None = None
 
 
 def enter_worker() -> None:
@@ -99,7 +93,6 @@ def enter_worker() -> None:
         os.close(reading)
         _watch(child)
     os.close(writing)
-    atexit.register(_leave)  # before all others, so that it comes after them
 
     def end_with_parent() -> None:
         os.read(reading, 1)  # nothing is ever written: this returns when the parent is gone
@@ -116,20 +109,15 @@ def enter_worker() -> None:
 
 
 def end_with(status: object) -> None:
-    """Register the exit ``status`` of a worker, which then skips taking down interpreter and libraries (0.2 s)."""
-    global _status
-    _status = status if isinstance(status, int) else None
-
-
-def _leave() -> None:
-    if _status is None:
+    """End a worker with an exit ``status`` without taking down interpreter and libraries, which takes 0.2 s."""
+    if _advice is None or not isinstance(status, int):
         return
     try:
         sys.stdout.flush()
         sys.stderr.flush()
     except (OSError, ValueError):
         os._exit(2)  # what was printed is lost; the interpreter would say so with a traceback
-    os._exit(_status)
+    os._exit(status)
 
 
 def advise(text: str) -> None:
@@ -272,9 +260,7 @@ def _again(_: int, __: FrameType | None) -> None:
 
 
 def _unraisable(lost: sys.UnraisableHookArgs) -> None:
-    """Repeat an interrupt that Python dropped in a callback or destructor; alarms repeat anyway."""
-    if lost.exc_type is OutOfTime:
-        return
+    """Repeat an interrupt that Python dropped in a callback or destructor."""
     if not is_stopped():
         sys.__unraisablehook__(lost)
     elif lost.exc_type is KeyboardInterrupt:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, field_validator, model_validator
 
-from mitsim.core.configuration import Configuration, Positive, Table, locate, read_table, validate
+from mitsim.core.configuration import Configuration, Positive, locate, read_table, validate
 from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.core.files import check_plain, read_json
 from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
@@ -48,7 +48,7 @@ DARK = "dark"
 """Beginning of the names of dark frames where no list names them."""
 
 
-def read_list(folder: Path, fields: str) -> tuple[Path, Table]:
+def read_list(folder: Path, fields: str) -> tuple[Path, dict[str, Any]]:
     """Return path and contents of the list in a ``folder``; raise MitsimError for none or two."""
     lists = [folder / name for name in LISTS if (folder / name).is_file()]
     if len(lists) != 1:

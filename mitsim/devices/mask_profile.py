@@ -188,7 +188,7 @@ def load_mask(path: Path | str) -> MaskProfile | None:
         return None
     if not isinstance(table["mask"], dict):
         raise MitsimError(f"file {path}: mask: got {table['mask']!r}; give a table [mask]")
-    return validate(MaskProfile, table.part("mask"), f"file {path}")
+    return validate(MaskProfile, table["mask"], f"file {path}: mask")
 
 
 # -------- Pictures of point spread functions

@@ -7,11 +7,11 @@ import os
 from bisect import bisect_left
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from mitsim.core.configuration import CAMERA, Configuration, Table, locate, read_toml, shipped_files, validate
+from mitsim.core.configuration import CAMERA, Configuration, locate, read_toml, shipped_files, validate
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
 from mitsim.core.manifests import Digital
 
@@ -367,7 +367,7 @@ def load_sensor(path: Path | str) -> SensorModel:
     return validate(SensorModel, sensor_table(path), f"file {path}")
 
 
-def sensor_table(path: Path | str) -> Table:
+def sensor_table(path: Path | str) -> dict[str, Any]:
     """Return the fields of the sensor in a TOML file without its table ``[mask]``.
 
     A line ``base`` names a shipped camera, or a file beside it, whose fields are inherited. Raises MitsimError if there
@@ -396,7 +396,7 @@ def sensor_table(path: Path | str) -> Table:
         if any(kind & table.keys() for kind in _EFFICIENCIES):
             others = [kind for kind in _EFFICIENCIES if not kind & table.keys()]
             below = {name: below[name] for name in below.keys() - set().union(*others)}
-        table = Table({**below, **table}, table.text, table.place)
+        table = {**below, **table}
     table.pop("mask", None)
     return table
 

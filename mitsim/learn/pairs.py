@@ -526,7 +526,6 @@ def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairS
         maker.check(left)
         cost = maker.cost(left)
         cost.check(f"{asked.count} pairs", job.limits, folder)
-        job.clock.predict({"pairs": cost.seconds})
         begun = maker.begin(configuration, tuple(shards))
         write_json(folder / PAIRS, begun)
         for shard in left:

@@ -331,7 +331,6 @@ def train_network(
     with job.clock.stage("train"):
         predicted = time.perf_counter() - started + trainer.seconds_a_step() * (request.steps - trainer.taken)
         Cost(predicted).check(f"{store.folder}: training {request.method}", job.limits)
-        job.clock.predict({"train": predicted})
         while not trainer.is_over():
             trainer.go_on(job)
             trainer.save(unfinished, digest)

@@ -319,7 +319,6 @@ def reconstruct_request(
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     clock = (job or Job()).apart("").clock
-    clock.predict(cost.seconds if cost else {})
     focus: Depth | DepthMap | None = None
     if request.focus is not None:
         with clock.stage("focus"):

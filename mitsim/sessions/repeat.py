@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,6 @@ from mitsim.devices.session import load_recipe
 from mitsim.reconstruct.reconstruct import MADE_OF, read_result
 from mitsim.reconstruct.request import METHODS, RESULT_FILE
 from mitsim.sessions.session_file import SESSION_FILE, SUMMARY, fields_of, read_session, session_text, value_of
-from mitsim.studies.framework.campaign import read_scope
 
 
 class _Opened(BaseModel):
@@ -66,22 +64,18 @@ class Repeat:
         Text of the file, with whole paths.
     warnings
         Sentences.
-    tables, notes
-        Tables of the file, and lines of comment before them.
     """
 
     text: str
     warnings: tuple[str, ...] = ()
-    tables: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    notes: tuple[str, ...] = field(default=(), repr=False)
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the session file to ``path``, which is replaced, with paths as seen from there; return the path.
+        """Write the session file to ``path``, which is replaced, and return the path.
 
         MitsimError when it cannot be written.
         """
-        write_text(path, session_text(self.tables, Path(path).absolute().parent, *self.notes))
+        write_text(path, self.text)
         return Path(path)
 
 
@@ -92,7 +86,7 @@ def session_of(folder: Path | str) -> Repeat:
     Parameters
     ----------
     folder
-        Folder of a session, a capture, a calibration, an image, the demo, or a study of many points.
+        Folder of a session, a capture, a calibration, or an image.
 
     Returns
     -------
@@ -103,19 +97,14 @@ def session_of(folder: Path | str) -> Repeat:
     ------
     MitsimError
         for a folder that holds none of these, and for work that no session file describes: frames of a real camera,
-        a bench before a board, a calibration that is fitted to pictures.
+        a bench before a board, a capture by a stored plan, a calibration that is fitted to pictures.
     """
     folder = Path(folder)
     if (folder / SUMMARY).is_file() and (folder / SESSION_FILE).is_file():
-        tables = read_session(folder / SESSION_FILE).tables
-        return Repeat(session_text(tables), (), tables)
+        return Repeat(session_text(read_session(folder / SESSION_FILE).tables))
     place, found, coloured = folder.absolute(), _Found(), is_coloured(folder)
     data = read_json(folder / COLOUR) if coloured else {}
-    if (folder / "demo.json").is_file():
-        manifest = read_manifest(place / "run", RunManifest)
-        found.add_scene(manifest, place, False)
-        found.tables["demo"] = {name: manifest.configuration[name] for name in ("patterns", "accuracy", "seed")}
-    elif (folder / RESULT_FILE).is_file() or (isinstance(data, dict) and data.get("kind") == IMAGE):
+    if (folder / RESULT_FILE).is_file() or (isinstance(data, dict) and data.get("kind") == IMAGE):
         found.add_image(place)
     elif coloured or (folder / MANIFEST).is_file():
         manifest_data = read_json(_first(place) / MANIFEST)
@@ -127,10 +116,13 @@ def session_of(folder: Path | str) -> Repeat:
                 if path.is_dir() and _made_of(path).get("run") == str(place):
                     found.add_image(path)
     else:
-        found.add_study(place)
+        raise MitsimError(
+            f"{folder}: holds nothing that a session file repeats; give a folder of mitsim run, capture, calibrate or "
+            "reconstruct"
+        )
     tables = read_session(found.tables).tables  # which refuses values that a damaged folder states
     notes = f"Repeats {place}: mitsim run FILE -o FOLDER", *found.warnings
-    return Repeat(session_text(tables, None, *notes), tuple(found.warnings), tables, notes)
+    return Repeat(session_text(tables, *notes), tuple(found.warnings))
 
 
 @dataclass
@@ -205,12 +197,11 @@ class _Found:
             for name, value in request.items()
             if name in always or value != Request.model_fields[name].default
         }
-        above = {name: asked[name] for name in (*always, "effects") if name in asked}  # on which light depends
+        if "plan_seed" in conf:
+            raise MitsimError(f"{folder}: was captured by a stored plan, which no session file holds")
         if "light" in conf:
+            above = {name: asked[name] for name in (*always, "effects") if name in asked}  # on which light depends
             self.tables["transport"] = {**above, **conf["light"]}
-        elif "plan_seed" in conf:
-            self.tables["plan"] = {**above, "seed": conf["plan_seed"]}
-        if {"light", "plan_seed"} & conf.keys():
             asked = {name: value for name, value in asked.items() if name not in ("accuracy", "effects")}
         self.tables["capture"] = {**asked, **self.colour_of(folder)}
         self.taken["capture"] = str(folder)
@@ -271,28 +262,6 @@ class _Found:
         images = self.tables.setdefault("reconstruct", [])
         named = {} if folder.name in (each.get("output") for each in images) else {"output": folder.name}
         images.append({**inputs, **named})
-
-    def add_study(self, folder: Path) -> None:
-        """Add the options of the study in a ``folder``."""
-        name, scope = read_scope(folder)
-        setup = scope.setup
-        given = {
-            "name": name,
-            "scene": None if any(scope.pictures) else _short_name(setup.scene, "scenes"),
-            "patterns": scope.patterns if name in ("sweep", "drift") else None,
-            "seed": scope.seeds[0],
-            "quick": scope.quick or None,
-            "camera": setup.camera,
-            "projector": setup.projector,
-            "variant": None if setup.variant == DEFAULT_VARIANT else setup.variant,
-            "allow_outside_files": setup.outside or None,
-            "recipe": scope.recipe,
-            "data": scope.data,
-            "parameters": dict(setup.parameters) or None,
-            "measure": ",".join(scope.measures) or None,
-            "over": {knob: [*values] for knob, values in scope.sweep} or None,
-        }
-        self.tables["study"] = [{key: value for key, value in given.items() if value is not None}]
 
 
 def _first(folder: Path) -> Path:

@@ -9,10 +9,8 @@ import hashlib
 import json
 import math
 import os
-import shutil
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -21,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, Field
 
 from mitsim.bench.request import NO, Exposure, Opening, Request, SessionRequest, Task
-from mitsim.core.configuration import Configuration, refuse_unused, takes, validate
+from mitsim.core.configuration import Configuration, takes, validate
 from mitsim.core.environment import deciding_versions
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import (
@@ -32,14 +30,13 @@ from mitsim.core.files import (
     plain,
     read_json,
     remove_page,
-    write_bytes,
     write_json,
     write_text,
 )
 from mitsim.core.job import Job
 from mitsim.core.manifests import MOSAIC, RUN, CalibrationManifest, RunManifest, is_coloured, open_lines, read_manifest
 from mitsim.devices.session import SessionRecipe, load_recipe
-from mitsim.exchange.formats import PNG, check_export, check_format, export
+from mitsim.exchange.formats import PNG, check_export, export
 from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.sessions.session_file import (
     FOLDERS,
@@ -49,21 +46,18 @@ from mitsim.sessions.session_file import (
     Session,
     Step,
     calibration_for,
-    portable,
     read_session,
     session_text,
-    sweep_options,
-    swept_values,
+    stated,
 )
 from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, open_as, prepare_study
 
 if TYPE_CHECKING:
     from mitsim.acquire.capture import Light
     from mitsim.api.bench import Bench
-    from mitsim.light.plan import Plan
 
 KIND = "session"
-"""What session.json says that the folder is."""
+"""Kind of the folder in session.json."""
 
 
 @dataclass(frozen=True)
@@ -73,15 +67,15 @@ class StepResult:
     Attributes
     ----------
     step, output
-        Its verb, and its folder or file in the session's.
+        Verb of the step, and its folder or file in the session's.
     says, warnings
-        A line, and why the step is flagged.
+        A line on the result, and the reasons why the step is flagged.
     seconds
         Wall time.
     page
-        Its page, from the session's folder; empty without one.
+        Page of the step, from the session's folder; empty without one.
     left_alone
-        Whether it was finished already.
+        True if the step was finished already.
     """
 
     step: str
@@ -103,7 +97,7 @@ class SessionResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings of all steps, each with its folder."""
+        """Return the warnings of all steps, each with its folder."""
         return tuple(dict.fromkeys(f"{step.output}: {text}" for step in self.steps for text in step.warnings))
 
     def payload(self) -> dict[str, Any]:
@@ -122,9 +116,9 @@ class _Made(Configuration):
 
 
 class _Earlier(BaseModel):
-    """Statements of session.json on an earlier run."""
+    """Content of session.json on an earlier run."""
 
-    kind: Literal["session"] = "session"
+    kind: Literal["session"]
     steps: tuple[StepResult, ...] = ()
     made: dict[str, _Made] = Field(default_factory=dict)
 
@@ -137,7 +131,7 @@ def run(
     job: Job | None = None,
     **options: Any,
 ) -> SessionResult:
-    """Run the steps of a session: plan, capture, calibrate, reconstruct, study and export, each into its own folder.
+    """Run the steps of a session: capture, calibrate, reconstruct, study and export, each into its own folder.
 
     Parameters
     ----------
@@ -164,55 +158,47 @@ def run(
     """
     asked = RunOptions(**options)
     read, place = read_session(session, values), Path(output)
-    again, earlier = (place / SUMMARY).is_file(), _Earlier()
+    again, earlier = (place / SUMMARY).is_file(), _Earlier(kind=KIND)
     if again and not asked.resume:
         raise MitsimError(f"output {place}: holds a session already; go on with resume=True, or choose another folder")
     with output_folder(place, overwrite=again) as folder:
         if again:
-            known, where = read_json(folder / SUMMARY), f"resume=True: {folder / SUMMARY}"
-            if not isinstance(known, dict) or known.get("kind") != KIND:
-                raise MitsimError(f"{where} is not that of a session; use another folder")
-            earlier = validate(_Earlier, known, where)
+            earlier = validate(_Earlier, read_json(folder / SUMMARY), f"resume=True: {folder / SUMMARY}")
         steps = _Steps(read, folder, job or Job(), asked, {step.output: step for step in earlier.steps}, earlier.made)
-        work = [(step, steps.prepare(step)) for step in read.steps if steps.makes(step)]
-        steps.check_bench(work)
-        before = {
-            path: path.read_bytes() if path.is_file() else None for path in (folder / SUMMARY, folder / SESSION_FILE)
-        }
-        head = {"kind": KIND, "session": portable(read.tables, folder), "versions": deciding_versions()}
-        results, text = list[StepResult](), session_text(read.tables, folder)
+        work = []
+        for step in read.steps:
+            task = _WORK[step.verb](steps, step)
+            next(task)
+            work.append((step, task))
+        for step, task in work:
+            if step.verb in OF_A_BENCH:
+                next(task)
+        head = {"kind": KIND, "session": stated(read.tables), "versions": deciding_versions()}
+        results, text = list[StepResult](), session_text(read.tables)
 
-        def note() -> None:
+        def note(**more: Any) -> None:
             """Write the finished steps and the one at work, so that a killed session can be resumed."""
             kept = {**steps.earlier, **{each.output: each for each in results}}
-            stated = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
-            write_json(folder / SUMMARY, {**head, **stated})
+            known = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
+            write_json(folder / SUMMARY, {**head, **known, **more})
             write_text(folder / SESSION_FILE, text)
 
-        try:
-            for step, task in work:
-                started = time.perf_counter()
-                if steps.is_finished(step):
-                    note()
-                    found = replace(steps.earlier[step.output], left_alone=True)
-                else:
-                    with steps.making(step):
-                        note()
-                        says, warnings = _end(task)
-                    found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
-                results.append(replace(found, page=steps.page_of(step, found.left_alone)))
-        except MitsimError:
-            if all(each.left_alone for each in results):  # nothing was made: it is the session that it was
-                for path, data in before.items():
-                    path.unlink(missing_ok=True) if data is None else write_bytes(path, data)
+        for step, task in work:
+            started = time.perf_counter()
+            if steps.is_finished(step):
+                found = replace(steps.earlier[step.output], left_alone=True)
             else:
+                steps.made[step.output] = _Made(inputs="")  # its earlier files no longer count
                 note()
-            raise
+                says, warnings = _end(task)
+                steps.made[step.output] = _Made(inputs=steps.inputs(step), files=_checksums(folder / step.output))
+                found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
+            results.append(replace(found, page=steps.page_of(step, found.left_alone)))
+            note()
         remove_page(folder)
         page = _write_page(folder, text, results, job) if asked.pictures else None
         done = SessionResult(tuple(results), str(folder), page)
-        ended = {**done.payload(), "status": "complete", "command": job and job.command, "made": steps.made}
-        write_json(folder / SUMMARY, {**head, **ended})
+        note(**done.payload(), status="complete", command=job and job.command)
     return done
 
 
@@ -243,7 +229,7 @@ Said = tuple[str, Sequence[str]]
 """Result of a step in a line, and its warnings."""
 Work = Generator[None, None, Said]
 """A step's work. It has checked the request at its first yield, and has written nothing. A step of a bench has checked
-the opened scene at a second yield. Then it makes its files, and returns what it came to."""
+the opened scene at a second yield. Then it makes its files, and returns its result."""
 
 
 def _end(work: Work) -> Said:
@@ -260,8 +246,8 @@ def _end(work: Work) -> Said:
 class _Steps:
     """The steps of a ``session`` in a ``folder``, and the bench and light that they share.
 
-    ``earlier`` are results of an earlier run in the folder, and ``made`` the files, by the step's output. ``plan`` and
-    ``light`` are those of an earlier step, by which frames are captured.
+    ``earlier`` are results of an earlier run in the folder, and ``made`` the files, by the step's output. ``light`` is
+    that of an earlier step, in which frames are exposed.
     """
 
     session: Session
@@ -270,30 +256,7 @@ class _Steps:
     asked: RunOptions
     earlier: Mapping[str, StepResult]
     made: dict[str, _Made]
-    plan: Plan | None = field(default=None, init=False)
     light: Light | None = field(default=None, init=False)
-
-    def makes(self, step: Step) -> bool:
-        """Return True if a ``step`` makes files itself; next to a sweep, some steps only state values of its points."""
-        return self.session.step("sweep") is None or step.verb not in FOLDERS
-
-    def prepare(self, step: Step) -> Work:
-        """Return the work of a ``step``, whose request is checked."""
-        shared = step.verb in ("sweep", "study")
-        if not shared:
-            idle = self.asked.without("resume", "pictures")
-            given = [name for name in idle if idle[name] != RunOptions.model_fields[name].default]
-            refuse_unused(given, idle, f"on [{step.verb}], which has no points to share")
-        work = _WORK[step.verb](self, step)
-        next(work)
-        return work
-
-    def check_bench(self, prepared: Sequence[tuple[Step, Work]]) -> None:
-        """Open the scene if a step needs it, and check the steps against the opened scene."""
-        for step, work in prepared:
-            if step.verb in OF_A_BENCH:
-                self.bench  # noqa: B018 - opens it
-                next(work)
 
     # ---- Files that are there already ----
 
@@ -303,7 +266,7 @@ class _Steps:
         values = {name: _contents(value) for name, value in step.values.items() if name not in read}
         asked: dict[str, Any] = {"versions": deciding_versions(), step.verb: values}
         if step.verb in OF_A_BENCH:
-            above = [each.values for each in self.session.steps if each.verb in ("plan", "transport")]
+            above = [each.values for each in self.session.steps if each.verb == "transport"]
             asked |= {**self.bench.deciding, **self.bench.identity(), "above": above}
         if step.verb in ("reconstruct", "export"):
             places = [self._source(step, name) for name in read]
@@ -316,44 +279,10 @@ class _Steps:
             capture = self.session.step("capture")
             return step.output in self.earlier and capture is not None and self.is_finished(capture)
         made = self.made.get(step.output)
-        if step.verb in ("sweep", "study") or made is None or not made.files or step.output not in self.earlier:
-            return False  # a study looks itself into what an earlier run left
+        if step.verb == "study" or made is None or not made.files or step.output not in self.earlier:
+            return False  # a study finds its finished points itself
         there = _checksums(self.folder / step.output)
-        same = made.inputs == self.inputs(step) and all(there.get(name) == each for name, each in made.files.items())
-        if same and step.verb == "plan":
-            from mitsim.light.plan import Plan
-
-            self.plan = Plan.load(self.folder / step.output / "plan.json")
-        return same
-
-    @contextmanager
-    def making(self, step: Step) -> Iterator[None]:
-        """Note that a ``step`` is at work, so that its earlier files no longer count, and then the files that it made.
-
-        An earlier image or export is kept aside, and restored if the step is refused. MitsimError if its folder has
-        files that the session did not make.
-        """
-        place, aside = self.folder / step.output, self.folder / f".{step.output}.before"
-        _remove(aside)
-        before, self.made[step.output] = self.made.get(step.output), _Made(inputs="")
-        again = before is not None and step.verb in ("reconstruct", "export") and place.exists()
-        try:
-            if again and before is not None:
-                others = _checksums(place).keys() - before.files.keys() if before.files else ()
-                if others or place.is_symlink():
-                    other = min(others, default="it")
-                    raise MitsimError(f"output {place}: is made anew, and {other} is not the session's; move that away")
-                os.replace(place, aside)
-            yield
-        except BaseException:
-            if again and before is not None:
-                if aside.exists():
-                    _remove(place)
-                    os.replace(aside, place)
-                self.made[step.output] = before
-            raise
-        _remove(aside)
-        self.made[step.output] = _Made(inputs=self.inputs(step), files=_checksums(place))
+        return made.inputs == self.inputs(step) and made.files.items() <= there.items()
 
     def page_of(self, step: Step, left_alone: bool) -> str:
         """Write the page of a finished ``step`` unless it is there, and return its name; empty without one."""
@@ -386,30 +315,13 @@ class _Steps:
         yield
 
     def _source(self, step: Step, name: str) -> Path:
-        """Folder of the ``run`` or the ``calibration`` of a ``step``: the one that it names, or this session's."""
+        """Return the folder of the ``run`` or the ``calibration`` of a ``step``: as it states, or this session's."""
         if name in step.values:
             return Path(step.values[name])
         own = self.session.step("capture" if name == "run" else "calibrate")
         return self.folder / (own.output if own else name)
 
-    def _check_folders(self, step: Step, coloured: bool) -> None:
-        """Refuse folders that a ``step`` reads and that are damaged, or of another kind."""
-        folders: dict[str, Any] = {"run": RunManifest, "calibration": CalibrationManifest}
-        for name, model in folders.items():
-            if name in step.values and not coloured and not is_coloured(folder := Path(step.values[name])):
-                from mitsim.core.exr import verify_files
-
-                verify_files(folder, read_manifest(folder, model).checksums, "make it again, or copy it again")
-
     # ---- A verb each ----
-
-    def _plan(self, step: Step) -> Work:
-        asked, place = step.of(Request), self.folder / step.output / "plan.json"
-        yield from self._asked(Request(**asked), None)
-        self.plan = plan = self.bench.plan(**asked)
-        place.parent.mkdir(exist_ok=True)
-        plan.save(place)
-        return f"{plan.predicted_seconds:.3g} s, error up to {plan.systematic_bound:.1e}", plan.warnings
 
     def _transport(self, step: Step) -> Work:
         asked = step.of(Request)
@@ -419,13 +331,13 @@ class _Steps:
 
     def _capture(self, step: Step) -> Work:
         own, colour, place = step.of(Request), step.values.get("colour", NO), self.folder / step.output
-        above, request = self.session.step("transport") or self.session.step("plan"), Request(**own)
+        above, request = self.session.step("transport"), Request(**own)
         if above:
             request = Request(**above.of(Request)).with_values(**request.model_dump(exclude_unset=True))
         yield from self._asked(request, request.timing, colour)
         task = Task(place, self.asked.resume, self.job.apart("capture "))
-        more = own if self.plan else {name: value for name, value in own.items() if name != "patterns"}
-        found = capture_in(self.bench, colour, self.plan or request.patterns, more, task, self.light)
+        more = {name: value for name, value in own.items() if name != "patterns"}
+        found = capture_in(self.bench, colour, request.patterns, more, task, self.light)
 
         def said(result: Mapping[str, Any]) -> Said:
             size, bound = "x".join(map(str, result["shape"])), result["total_error_bound"]
@@ -478,8 +390,10 @@ class _Steps:
             options["method"] = load_network(options["method"])
         if mosaic and (others := options.keys() - {"lam"}):
             raise ArgumentError(min(others), "has no effect on frames behind colour filters; leave it out")
-        self._check_folders(step, coloured)
-        if not coloured and {"run", "calibration"} <= values.keys():
+        folders: dict[str, Any] = {"run": RunManifest, "calibration": CalibrationManifest}
+        for name in folders.keys() & values.keys() if not coloured else ():
+            read_manifest(Path(values[name]), folders[name])
+        if not coloured and folders.keys() <= values.keys():
             from mitsim.core.runs import load_run
             from mitsim.reconstruct.factors import load_calibration
             from mitsim.reconstruct.reconstruct import check_image
@@ -495,33 +409,20 @@ class _Steps:
         yield
         from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
 
-        job = self.job.apart(f"{step.output} ")
+        again: Any = {"overwrite": self.asked.resume, "job": self.job.apart(f"{step.output} ")}
         if coloured:
-            colours = reconstruct_colours(run, calibration, place, chart, job=job, page=False, **options)
+            colours = reconstruct_colours(run, calibration, place, chart, page=False, **again, **options)
             known = "" if colours.psnr_db is None else f", PSNR {colours.psnr_db:.2f} dB over all lines"
             return f"an image of every line{known}", colours.warnings
-        judged = reconstruct(run, calibration, place, job=job, **options)
+        judged = reconstruct(run, calibration, place, **again, **options)
         sentence = f"{judged.reconstruction.status.sentence}."
         return str(judged.quality or sentence), judged.summary()["warnings"]
 
-    def _demo(self, step: Step) -> Work:
-        request = Request(**step.of(Request))
-        yield from self._asked(request, request.timing)
-        from mitsim.studies.demo import demo
-
-        found = demo(self.bench, self.folder / step.output, request, self.job.apart("demo "))
-        return found.verdict, found.warnings
-
     def _study(self, step: Step) -> Work:
-        if step.verb == "sweep":
-            name, scene = "sweep", self.session.scene["scene"]
-            options = {**sweep_options(self.session, step), **self.opening.given}
-        else:
-            options = dict(step.values)
-            name, scene = options.pop("name"), options.pop("scene", None)
-            options |= {"over": swept_values(options["over"])} if "over" in options else {}
-        asked = StudyOptions(**options, **self.asked.without("resume", "pictures"))
-        study = prepare_study(name, scene, self.folder / step.output, asked, self.job.apart(f"{step.output} "))
+        options = dict(step.values)
+        name, scene = options.pop("name"), options.pop("scene", None)
+        job = self.job.apart(f"{step.output} ")
+        study = prepare_study(name, scene, self.folder / step.output, StudyOptions(**options), job)
         yield
         found = study()
         return found.lines()[0], found.warnings
@@ -532,25 +433,21 @@ class _Steps:
         run, calibration = self._source(step, "run"), None
         if "calibration" in values or calibration_for(self.session, step):
             calibration = self._source(step, "calibration")
-        check_format(values["format"], step.output, calibration, values.get("projector"))
         if "run" in values and ("calibration" in values or calibration is None):
             check_export(run, output=place, calibration=calibration, **how)
-        self._check_folders(step, is_coloured(run))
         if step.output not in self.made:
             check_output(place, kind="folder" if values["format"] == PNG else "file")
         yield
-        found = export(run, output=place, calibration=calibration, **how)
+        again = values["format"] != PNG and self.asked.resume
+        found = export(run, output=place, calibration=calibration, overwrite=again, **how)
         return f"{found['frames']} frames as {found['format']}", ()
 
 
 _WORK = {
-    "plan": _Steps._plan,
     "transport": _Steps._transport,
     "capture": _Steps._capture,
     "calibrate": _Steps._calibrate,
     "reconstruct": _Steps._reconstruct,
-    "demo": _Steps._demo,
-    "sweep": _Steps._study,
     "study": _Steps._study,
     "export": _Steps._export,
 }
@@ -586,11 +483,3 @@ def _contents(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: _contents(each) for name, each in value.items()}
     return _checksums(Path(value)) or value if isinstance(value, str) and os.path.isabs(value) else value
-
-
-def _remove(place: Path) -> None:
-    """Remove a file, or a folder with all that is in it, if it is there."""
-    if place.is_dir() and not place.is_symlink():
-        shutil.rmtree(place)
-    else:
-        place.unlink(missing_ok=True)

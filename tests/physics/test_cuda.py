@@ -97,7 +97,7 @@ def light_spread(frame: np.ndarray) -> float:
 
 def has_gpu() -> bool:
     """As a child sees it: Dr.Jit must not be imported here before an LLVM is chosen for the other tests."""
-    program = "from mitsim.core.environment import has_gpu; print(has_gpu())"
+    program = "import drjit; print(drjit.has_backend(drjit.JitBackend.CUDA))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=600, check=True)
     return done.stdout.split()[-1] == "True"
 

@@ -424,18 +424,6 @@ def _head(folder: Path) -> dict[str, Any]:
     raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
 
 
-def read_scope(folder: Path) -> tuple[str, Scope]:
-    """Return name and scope; MitsimError for a folder without a study."""
-    for file in sorted(folder.glob("*.json")) if folder.is_dir() else ():
-        head = read_json(file)
-        if isinstance(head, dict) and isinstance(head.get("study"), str) and "scope" in head:
-            return head["study"], _scope(head["scope"], folder)
-    raise MitsimError(
-        f"{folder}: holds nothing that a session file repeats; give a folder of mitsim run, capture, calibrate, "
-        "reconstruct or demo, or of a study of many points"
-    )
-
-
 def _scope(found: Any, part: Path | str) -> Scope:
     try:
         return TypeAdapter(Scope).validate_python(found)

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import shutil
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
@@ -47,16 +46,6 @@ def bench(shared_scene: Callable[..., Path], variant: str, printed: np.ndarray) 
 @pytest.fixture(scope="module")
 def captured(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return bench.capture("dots:3", tmp_path_factory.mktemp("capture") / "run", accuracy=ACCURACY, seed=5)
-
-
-def test_a_plan_that_takes_too_long_is_refused(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its own seconds count, and nothing is left of the run."""
-    monkeypatch.setattr(spectral, "make_plan", lambda *_: time.sleep(60))
-    job = Job(limits=Limits(seconds=1.0))
-    with pytest.raises(MitsimError, match=r"dots:3: was not planned within the 1 s that are allowed"):
-        bench.capture("dots:3", tmp_path / "run", job=job)
-    assert job.clock.seconds()["total"] < 30
-    assert not (tmp_path / "run").exists()
 
 
 def pixels(folder: Path) -> dict[str, str]:

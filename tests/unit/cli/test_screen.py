@@ -14,7 +14,7 @@ from mitsim.cli import commands as screen
 from mitsim.cli.bench_verbs import plan_lines
 from mitsim.core import job as progress
 from mitsim.core.errors import MitsimError
-from mitsim.core.job import Clock, Cost, Job
+from mitsim.core.job import Cost
 from mitsim.light.plan import Plan, PlanRow, State
 
 
@@ -47,133 +47,25 @@ def test_hidden_progress_leaves_no_line(capsys: pytest.CaptureFixture[str], ever
     assert capsys.readouterr().err == ""
 
 
-# ---- rows of a terminal ----------------------------------------------------------------------------------------------
-
-
-class Terminal:
-    """Rows of a program that began 2 s ago, on a clock that is moved by hand; ``now`` in seconds."""
-
-    def __init__(self, patch: pytest.MonkeyPatch, height: int = 24) -> None:
-        self.now, self.height = 100.0, height
-        for name in ("monotonic", "perf_counter"):
-            patch.setattr(progress.time, name, lambda: self.now)
-        self.rows = progress._Rows(2.0)
-        self.clock = Clock(0.0, self.rows)
-
-    @property
-    def shown(self) -> dict[str, str]:
-        """What stands behind each row's bar, by its words."""
-        console = Console(file=io.StringIO(), width=80, height=self.height, force_terminal=True, no_color=True)
-        with console.capture() as seen:
-            console.print(self.rows)
-        assert max(map(len, seen.get().splitlines()), default=0) <= 80
-        lines = [re.split(r"\s{2,}", re.sub(r"[━╸╺]+| (?=  )", " ", line).strip()) for line in seen.get().splitlines()]
-        return {words: ", ".join(rest) for words, *rest in lines}
-
-
-@pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
-    return Terminal(monkeypatch)
-
-
-def test_each_stage_has_a_row_that_moves_and_ends(terminal: Terminal) -> None:
-    """As the plan predicts, until light tells its own rate. (Planted: the plan's seconds whatever the rate says.)"""
-    rows = terminal.rows
-    rows.begin("plan")
-    terminal.now += 3
-    assert terminal.shown == {"plan": "3.0 s", "total": "5.0 s"}
-    rows.end("plan", 3.0)
-    rows.predict({"transport": 10.0, "optics": 2.0, "write": 0.01})
-    waiting = {"optics": "2.0 s left"}
-    assert terminal.shown == {"plan": "3.0 s", "transport": "10.0 s left", **waiting, "total": "5.0 s, 12.0 s left"}
-    rows.begin("transport")
-    terminal.now += 4
-    light = {"transport": "4.0 s, 6.0 s left", **waiting}
-    assert terminal.shown == {"plan": "3.0 s", **light, "total": "9.0 s, 8.0 s left"}
-    rows.report("transport", 0.2)
-    light = {"transport": "4.0 s, 16.0 s left", **waiting}
-    assert terminal.shown == {"plan": "3.0 s", **light, "total": "9.0 s, 18.0 s left"}
-    terminal.now += 16
-    rows.end("transport", 20.0)
-    assert terminal.shown == {"plan": "3.0 s", "transport": "20.0 s", **waiting, "total": "25.0 s, 2.0 s left"}
-
-
-def test_longer_than_was_predicted_is_said_by_no_number(terminal: Terminal) -> None:
-    """Neither a frozen nor a negative one, of the stage and of all. (Planted: 0.0 s left; the sum of the others.)"""
-    terminal.rows.predict({"transport": 10.0, "optics": 2.0})
-    terminal.rows.begin("transport")
-    before = 12.0
-    for _ in range(40):
-        terminal.now += 0.5
-        (*_, left) = terminal.shown["total"].split(", ")
-        seconds = float(left.removesuffix(" s left")) if "left" in left else 0.0
-        assert seconds == pytest.approx(before - 0.5) if terminal.now < 110 else seconds == 0.0
-        before = seconds
-    assert terminal.shown["transport"] == "20.0 s" and terminal.shown["total"] == "22.0 s"
-
-
-def test_a_loop_over_stages_says_how_long_they_go_on(terminal: Terminal) -> None:
-    """Frames are formed, exposed and written in turns; what a stage took before does not count. (Planted: it does.)"""
-    rows, clock = terminal.rows, terminal.clock
-    with clock.stage("optics"):
-        terminal.now += 5
-    rows.report("frames", 0.0)
-    for done in range(1, 5):
-        for stage in ("optics", "sensor"):
-            with clock.stage(stage):
-                terminal.now += 1
-            if done == 2:
-                rest = {"frames": "3.0 s, 5.0 s left" if stage == "optics" else "4.0 s, 4.0 s left"}
-                assert rest.items() <= terminal.shown.items()
-        rows.report("frames", done / 4)
-        if done == 2:
-            each = {"optics": "7.0 s", "sensor": "2.0 s", "frames": "4.0 s, 4.0 s left"}
-            assert terminal.shown == {**each, "total": "11.0 s, 4.0 s left"}
-    over = {"optics": "9.0 s", "sensor": "4.0 s", "frames": "8.0 s"}
-    terminal.now += 1
-    assert terminal.shown == {**over, "total": "16.0 s"}
-
-
-def test_a_loop_that_goes_on_has_the_rate_of_what_it_did(terminal: Terminal) -> None:
-    """Stripes of an interrupted session take no time. (Planted: they do.)"""
-    terminal.rows.report("stripes", 0.75)
-    terminal.now += 1
-    terminal.rows.report("stripes", 0.8)
-    assert terminal.shown["stripes"] == "1.0 s, 4.0 s left"
-
-
-def test_work_within_work_has_rows_of_its_own(terminal: Terminal) -> None:
-    """Of its own seconds, and of the same watch. (Planted: reports without the prefix.)"""
-    job = Job(terminal.clock, terminal.rows.report)
-    with job.clock.stage("optics"):
-        terminal.now += 1
-    part = job.apart("calibration ")
-    part.clock.predict({"optics": 4.0})
-    with part.clock.stage("optics"):
-        terminal.now += 1
-        part.progress("optics", 0.5)
-        assert terminal.shown["calibration optics"] == "1.0 s, 1.0 s left" and terminal.shown["optics"] == "1.0 s"
-    assert terminal.shown == {"optics": "1.0 s", "calibration optics": "1.0 s", "total": "4.0 s"}
-
-
-def test_a_report_with_numbers_in_it_keeps_its_row(terminal: Terminal) -> None:
-    """A study of many points says how many are measured, in one row. (Planted: a row for each number.)"""
-    terminal.rows.report("patterns: 0 of 4 points", 0.0)
-    for point in range(1, 4):
-        terminal.now += 60
-        terminal.rows.report(f"patterns: {point} of 4 points, 3 min left", point / 4)
-    assert terminal.shown == {"patterns: 3 of 4 points": "3:00, 1:00 left", "total": "3:02, 1:00 left"}
-
-
-def test_rows_fit_a_small_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those that are over go first, so that what works is seen. (Planted: all of them.)"""
-    terminal = Terminal(monkeypatch, height=6)
-    for number in range(12):
-        with terminal.clock.stage(f"stage {number}"):
-            terminal.now += 1
-    terminal.rows.begin("last")
-    terminal.rows.predict({f"next {number}": 1.0 for number in range(9)})
-    assert [*terminal.shown] == ["last", "next 0", "next 1", "next 2", "total"]
+def test_each_stage_has_a_row_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its bar, its seconds, and what is left at its rate; a report with numbers in it keeps its row."""
+    shown = io.StringIO()
+    console = Console(file=shown, width=80, force_terminal=True, no_color=True)
+    monkeypatch.setattr("rich.console.Console", lambda **_: console)
+    monkeypatch.setattr(progress, "has_rows", lambda: True)
+    with progress.progress() as job:
+        with job.clock.stage("plan"):
+            pass
+        part = job.apart("calibration ")
+        with part.clock.stage("optics"):
+            part.progress("optics", 0.5)
+        for point in range(1, 5):
+            job.progress(f"patterns: {point} of 4 points, 3 min left", point / 4)
+        job.progress(HOSTILE, 0.5)
+    rows = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", line) for line in shown.getvalue().splitlines()]
+    for words in ("plan ", "calibration optics ", "patterns: 4 of 4 points ", f"{HARMLESS} "):
+        assert any(line.strip().startswith(words) and "━" in line for line in rows), words
+    assert any("0.0 s" in line for line in rows) and not any("1 of 4" in line for line in rows[-8:])
 
 
 HOSTILE = "a\x1b]0;title\x07\u202eb\x9bc [bold]d[/] \\x1b"
@@ -302,43 +194,3 @@ def test_output_that_nobody_reads_ends_as_by_a_signal(monkeypatch: pytest.Monkey
     monkeypatch.setattr(screen.sys, "stdout", Full(28))
     with pytest.raises(MitsimError, match="standard output: cannot be written"), screen.write_at_end():
         print("result")
-
-
-# ---- rows of a notebook ----------------------------------------------------------------------------------------------
-
-
-def test_a_notebook_has_the_rows_below_its_cell(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One output, written anew, which stays. (Planted: another output at each stage; nothing written at the end.)"""
-    import IPython
-    import IPython.display
-
-    pages: list[list[str]] = []
-
-    class Handle:
-        """What ``display`` gives for an output."""
-
-        def update(self, page: Any) -> None:
-            """Take the place of it."""
-            pages[-1].append(page.data)
-
-    def display(page: Any, display_id: bool) -> Handle:
-        assert display_id
-        pages.append([page.data])
-        return Handle()
-
-    monkeypatch.setattr(IPython, "get_ipython", lambda: type("Shell", (), {"kernel": object()})())
-    monkeypatch.setattr(IPython.display, "display", display)
-    clock = [100.0]
-    for name in ("monotonic", "perf_counter"):
-        monkeypatch.setattr(progress.time, name, lambda: clock[0])
-    with progress.progress() as job:
-        with job.clock.stage("plan"):
-            clock[0] += 1.0
-        with job.clock.stage("transport"):
-            clock[0] += 1.0
-            job.progress("transport", 0.5)
-            clock[0] += 0.1  # too soon to be written again
-            job.progress("transport", 1.0)
-    (shown,) = pages
-    assert "plan" in shown[0] and "transport" not in shown[0] and "<pre" in shown[0]
-    assert "left" in shown[-2] and "transport" in shown[-1] and "left" not in shown[-1] and "1.1 s" in shown[-1]

@@ -26,10 +26,9 @@ def test_a_file_becomes_a_model(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ({"name": "a", "inner": {"gap_um": -2}}, r"^here: inner\.gap_um: got -2; give a number greater than 0$"),
+        ({"name": "a", "inner": {"gap_um": -2}}, r"^here: inner\.gap_um: got -2; give a number above 0$"),
         ({"name": "a", "inner": {}}, r"^here: inner\.gap_um: is missing$"),
         ({"name": "a", "inner": {"gap_um": 1}, "gap": 3}, r"gap: got 3, .* known fields: name, inner$"),
-        ({"name": 1, "inner": {"gap_um": "x"}}, r"name: got 1; .* \(and 1 more\)$"),
     ],
 )
 def test_a_broken_rule_is_one_line_with_place_value_and_rule(data: dict, message: str) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from mitsim.core import job
 from mitsim.core.errors import MitsimError
-from mitsim.core.job import Cost, Limits, free_disk, free_memory
+from mitsim.core.job import Cost, Job, Limits, free_disk, free_memory
 
 
 def refusal(cost: Cost, limits: Limits, output: Path | None = None) -> str:
@@ -31,6 +31,14 @@ def test_each_limit_is_named_with_what_is_allowed(tmp_path: Path) -> None:
     assert "about 2 GiB of memory; allowed are 1 GiB" in refusal(Cost(memory_bytes=2**31), Limits(memory_bytes=2**30))
     line = refusal(Cost(disk_bytes=1e18), Limits(), tmp_path / "run")
     assert "would write about" in line and f"{tmp_path / 'run'} has" in line
+
+
+def test_a_plan_that_takes_too_long_is_refused() -> None:
+    job = Job(limits=Limits(seconds=0.01))
+    refused = r"dots:3: was not planned within the 0.01 s that are allowed.*max_seconds"
+    with pytest.raises(MitsimError, match=refused), job.planning("dots:3"):
+        time.sleep(0.02)
+    assert job.clock.seconds()["plan"] > 0.01
 
 
 def test_an_estimate_that_is_no_number_is_too_much() -> None:

@@ -81,26 +81,23 @@ def test_an_exit_status_is_passed_on(status: int) -> None:
 
 
 LEAVING = """
-import atexit, threading
 from mitsim.core.worker import end_with
 class Library:
     def __del__(self): os.write(1, b"taken apart")
 kept = Library()
-threading.Timer(0.1, print, ["thread"]).start()
-atexit.register(print, "exit function")
 print("unflushed")
-end_with(3)
-sys.exit(3)
+end_with({status})
+sys.exit({status})
 """
 
 
-def test_a_worker_ends_once_all_is_done_and_takes_nothing_apart() -> None:
-    """(Planted: no flush; ended at once instead of at exit; a status of none that is noted.)"""
-    process = start(LEAVING)
-    reported = "unflushed\nthread\nexit function\n"
-    assert (*process.communicate(), process.returncode) == (reported, "", 3)
-    process = start(LEAVING.replace("(3)", "('words')"))
-    assert (*process.communicate(), process.returncode) == (reported + "taken apart", "words\n", 1)
+@pytest.mark.parametrize(
+    ("status", "ended"), [("3", ("unflushed\n", "", 3)), ("'no'", ("unflushed\ntaken apart", "no\n", 1))]
+)
+def test_a_worker_ends_and_takes_nothing_apart(status: str, ended: tuple[str, str, int]) -> None:
+    """(Planted: no flush; a status that is no number.)"""
+    process = start(LEAVING.format(status=status))
+    assert (*process.communicate(), process.returncode) == ended
 
 
 @pytest.mark.parametrize(

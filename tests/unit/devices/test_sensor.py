@@ -95,7 +95,7 @@ def test_a_model_does_not_change() -> None:
 def test_a_bad_file_is_one_line(tmp_path: Path, line: str, message: str) -> None:
     text = shipped_path("calibration", "imx249.toml").read_text(encoding="utf-8")
     (tmp_path / "a.toml").write_text(text.replace("read_noise_e = 6.7", line))
-    with pytest.raises(MitsimError, match=rf"^file [^\n]*a\.toml:\d+: {message}[^\n]*"):
+    with pytest.raises(MitsimError, match=rf"^file [^\n]*a\.toml: {message}[^\n]*"):
         load_sensor(tmp_path / "a.toml")
 
 

@@ -332,7 +332,7 @@ LISTS = {
     "a camera's file": ("imx249", "is a camera's file; give it to --camera"),
     "a session's list": ('signed_capture = "pair"\n', "is the list of a calibration's frames"),
     "a mistyped field": ('pattern = "dots:2"\n', "pattern: got 'dots:2', no such field; did you mean patterns"),
-    "a mistyped field of prepare": ("[prepare]\nturn = 1.0\n", "list.toml:2: prepare.turn: .* did you mean turn_deg"),
+    "a mistyped field of prepare": ("[prepare]\nturn = 1.0\n", "list.toml: prepare.turn: .* did you mean turn_deg"),
     "no TOML": ("patterns = dots\n", "not valid TOML"),
     "a plane of no mosaic": ('[prepare]\nchannel = "green"\n', "prepare.channel: got 'green'; give 'r'"),
     "a mosaic without a plane": ('[prepare]\nmosaic = "RGGB"\n', "prepare: mosaic is of planes; give channel too"),
