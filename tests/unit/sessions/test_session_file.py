@@ -154,7 +154,6 @@ SCENE = '[scene]\nscene = "photograph"\n'
         (SCENE + "[reconstruct]\n", "reconstruct.0.run: is missing, and there is no [capture]"),
         (SCENE + "[transport]\n[capture]\naccuracy = 0.1\n", "capture.accuracy: is the transport's; give it in [tr"),
         (SCENE + '[transport]\n[capture]\ncolour = "lines"\n', "capture.colour: stands beside [transport]"),
-        (SCENE + "[capture]\nseconds = 5\naccuracy = 0.1\n", "capture.seconds: 5: the accuracy is what they buy"),
         (SCENE + '[capture]\n[calibrate]\noutput = "run"\n', "calibrate.output: 'run' is another step's too"),
         (SCENE + "[calibrate]\nrecipe = {exposure_fracton = 0.5}\n", "exposure_fracton: got 0.5, no such field"),
         (SCENE + "sheet_z = [1]\n[capture]\n", "scene.sheet_z: [1]: give a number"),
