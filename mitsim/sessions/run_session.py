@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from mitsim.acquire.capture import Light
     from mitsim.api.bench import Bench
 
-KIND = "session"
+KIND: Literal["session"] = "session"
 """Kind of the folder in session.json."""
 
 
