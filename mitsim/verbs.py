@@ -19,6 +19,7 @@ from mitsim.bench.request import (
     Irradiance,
     Opening,
     Planned,
+    Procedure,
     Request,
     Sampled,
     Seeded,
@@ -53,7 +54,6 @@ from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
 from mitsim.studies import OF_CAPTURES, OF_NO_SCENE
-from mitsim.studies.emva_options import Procedure
 from mitsim.studies.twin_files import TwinFiles
 
 if TYPE_CHECKING:

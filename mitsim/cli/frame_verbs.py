@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mitsim
-from mitsim.bench.request import Irradiance
+from mitsim.bench.request import Irradiance, Procedure
 from mitsim.cli.commands import (
     Common,
     Limited,
@@ -29,7 +29,6 @@ from mitsim.exchange.capture_list import FrameFacts
 from mitsim.exchange.formats import Exported, Pictures
 from mitsim.learn.requests import METHODS, Schedule, Training
 from mitsim.reconstruct.request import MODEL, ImageRequest
-from mitsim.studies.emva_options import Procedure
 
 if TYPE_CHECKING:
     from mitsim.report.colour_image import ColourImage

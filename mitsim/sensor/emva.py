@@ -183,7 +183,7 @@ def alike(
     left = (np.asarray(part - variance / count / k) for part, k in zip(parts, (1, n, m), strict=True))
     rows = max(shared, 0.0)
     noise = math.sqrt(max(variance - rows, 0.0))
-    # Spread over the pixels' variances, which noise that rows share moves together (`mitsim.studies.camera_frames`).
+    # Spread over the pixels' variances, which noise that rows share moves together.
     spread = float(own.var()) + (4 * max(variance - rows, 0.0) * rows + 2 * rows**2 * n) / (count - 1)
     drift = float(np.var(means, ddof=1)) - (variance - rows) / (m * n) - rows / m
     difference = difference - difference.mean(axis=1, keepdims=True)

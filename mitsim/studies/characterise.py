@@ -1,48 +1,313 @@
-"""Characterise a camera after EMVA 1288 release 4.0: figures, the camera file, a page and plots.
+"""Characterise a camera after EMVA 1288 release 4.0: figures, the camera that explains the frames, a page and plots.
 
-Figures of simulated frames are compared with the camera file, and those of real frames with the camera that explains
-the frames. Standard errors are the scatter of a thousand drawn sessions (GUM, supplement 1).
+Frames are simulated, or those of a real camera. The fields of the camera found have standard errors; for simulated
+frames they are compared with the camera file.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import scipy
 from matplotlib.figure import Figure
 
+from mitsim.bench.request import Procedure
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
+from mitsim.core.errors import MitsimError
 from mitsim.core.files import write_json, write_text
-from mitsim.core.job import Job
-from mitsim.devices.framelist import FlatFrames, capacity_of
-from mitsim.devices.sensor import SensorModel
+from mitsim.core.images import image_size, read_image
+from mitsim.core.job import Cost, Job
+from mitsim.core.parallel import in_threads
+from mitsim.core.seeds import stream
+from mitsim.devices.framelist import DarkSet, FlatFrames, LitSet, capacity_of
+from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.report.pages import Mean, page_figure, round_to_error, typeset
-from mitsim.report.plots import curves, grouped_bars
-from mitsim.sensor.camera_fit import FoundCamera, Pixels
-from mitsim.sensor.chain import mean_dark_current
-from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, QUANTISATION, SPLIT, Alike, Session, figures
-from mitsim.studies.camera_frames import Frames, draw_sessions, mean_image, read_again, read_sets, remarks
-from mitsim.studies.emva_options import Procedure
+from mitsim.report.plots import curves
+from mitsim.sensor.camera_fit import FoundCamera, Pixels, Places, nonuniform, saturation_of
+from mitsim.sensor.chain import dark_current_variance, expose, mean_dark_current, response_variance
+from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, MOST_FITTED, SPLIT, Alike, Session, alike, figures, pairs_of
 from mitsim.studies.framework.campaign import study_folder, write_figures
-from mitsim.studies.framework.panels import Part, build_findings, text_table
+from mitsim.studies.framework.panels import Part, Section, page_of, text_table
 
 CAMERA_FILE = "camera.toml"
 MOST_OFF = 5.0
-_BIASED, _MISLEADS = 0.5, 1.0
-"""Standard errors of the procedure's own bias from which the expected value is compared, and a figure flagged."""
-_DUST = 1e-10
-_OF_FIELDS = "name", "unit", "set", "found", "standard_error", "deviations"
-_WHOLE = 1e4
+"""Standard errors from which a field of the camera found is reported as off."""
+
+# -------- Simulated frames
+
+_TO = 1.15
+_DARK_STEPS = 6
+_DARK_FILL, _DARK_ELECTRONS = 0.4, 2000.0
+"""Dark electrons at the longest exposure: a fraction of saturation, or enough for a permille."""
+_LONGEST_S = 10.0
+_FILLED_BY_DARK = 0.01
 
 
-# ---- tables of the measured numbers ----------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames of a simulated camera in S sets of frames that are taken alike; `dark` and `bright` are stacks.
 
+    ``light`` and ``electrons`` (S,) are photons and photoelectrons of a pixel; 0 in the dark.
+    """
+
+    sensor: SensorModel
+    shape: tuple[int, int]
+    light: FloatArray
+    electrons: FloatArray
+    exposure_s: FloatArray
+    counts: npt.NDArray[np.intp]
+    dark: int
+    bright: int
+    seed: int
+
+    @classmethod
+    def of(cls, sensor: SensorModel, procedure: Procedure) -> Frames:
+        """Return the frames of a simulated camera; MitsimError if no light saturates it."""
+        capacity, steps, pixels = capacity_of(sensor), procedure.steps, procedure.pixels
+        hottest = sensor.dark_current_e_per_s + sensor.hot_dark_current_e_per_s
+        hottest = sensor.binning**2 * sensor.dark_factor * hottest
+        longest, exposure_s = _LONGEST_S, math.inf
+        if hottest:
+            longest = min(_DARK_FILL * capacity / hottest, _DARK_ELECTRONS / mean_dark_current(sensor))
+            exposure_s = _FILLED_BY_DARK * capacity / hottest
+        longest = min(max(longest, EXPOSURE_S[0] * _DARK_STEPS), EXPOSURE_S[1])
+        times = longest * np.arange(_DARK_STEPS) / (_DARK_STEPS - 1)
+        ladder, beyond = capacity * _TO * np.arange(1, steps + 1) / steps, 2 * capacity + 20 * math.sqrt(capacity)
+        electrons = np.concatenate([ladder, [beyond, capacity / 2, 0.0], np.zeros(_DARK_STEPS)])
+        exposures = np.concatenate([np.full(steps + 3, min(0.01, exposure_s)), times])
+        counts, bright = np.full(len(electrons), 2), steps + 1
+        counts[[bright, bright + 1]] = procedure.frames
+        light = electrons / procedure.efficiency(sensor)
+        return cls(sensor, (pixels, pixels), light, electrons, exposures, counts, bright + 1, bright, procedure.seed)
+
+    def images(self, index: int, places: Places | None = None) -> Iterator[FloatArray]:
+        """Yield the frames of a set, with the pixel at `places` (M, N) in place of each pixel."""
+        for number in range(self.counts[index]):
+            shot, read = (stream(self.seed, "characterise", noise, index, number) for noise in ("shot", "read"))
+            light = np.full(self.shape, self.electrons[index])
+            image = np.asarray(expose(light, float(self.exposure_s[index]), self.sensor, shot, read), dtype=np.float64)
+            yield image if places is None else image.flat[places]
+
+    def take(self, job: Job, places: Places | None = None) -> list[Alike]:
+        largest = math.inf if self.sensor.largest_dn is None else float(self.sensor.largest_dn)
+
+        def taken(index: int) -> Alike:
+            return alike(self.images(index, places), largest, float(self.light[index]), float(self.exposure_s[index]))
+
+        job.progress("frames", 0.0)
+        with job.clock.stage("frames"):
+            return in_threads(taken, range(len(self.light)))
+
+    def figures_set(self) -> dict[str, float]:
+        """Return the figures of the camera file; variances where :func:`mitsim.sensor.emva.figures` has them."""
+        sensor, brightest, current = self.sensor, int(self.light.argmax()), mean_dark_current(self.sensor)
+        alive, exposure_s = 1 - sensor.dead_pixels, float(self.exposure_s[self.dark])
+        pixel, row, column = np.square(sensor.offset_parts)
+        offsets = row, column, pixel + dark_current_variance(sensor) * exposure_s**2
+        _, row, column = np.square(sensor.response_parts)
+        responses = np.array([row, column, response_variance(sensor) - row - column]) / alive**2
+        return {
+            "system_gain": sensor.gain_dn_per_e,
+            "quantum_efficiency": float(self.electrons[brightest]) / float(self.light[brightest]) * alive,
+            "dark_noise": math.sqrt(sensor.superpixel_reading_noise_e**2 + current * exposure_s),
+            "row_noise": sensor.superpixel_row_noise_e**2,
+            "saturation_capacity": capacity_of(sensor),
+            "full_well": (capacity_of(sensor) - current * float(self.exposure_s[brightest])) * alive,
+            **dict.fromkeys(("linearity_min", "linearity_max"), 0.0),
+            **dict.fromkeys(("dark_current", "dark_current_by_variance"), current),
+            **{f"dsnu_{part}": float(each) for part, each in zip(SPLIT, (sum(offsets), *offsets), strict=True)},
+            **{f"prnu_{part}": float(each) for part, each in zip(SPLIT, (responses.sum(), *responses), strict=True)},
+        }
+
+
+def session_of(taken: Sequence[Alike], dark: int, bright: int, saturates: bool, rounded: bool) -> Session:
+    light, exposure_s = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
+    stacks = taken[dark].stack, taken[bright].stack
+    return Session(taken[0].shape, light, exposure_s, pairs_of(taken), dark, bright, *stacks, saturates, rounded)
+
+
+# -------- A real camera's frames
+
+_LEAST_SIDE = 16
+_SURE = 6.0
+_UNEQUAL = 0.1
+_WHITE = 0.02
+"""Correlation of neighbours' noise that charge between pixels may cause."""
+_OUT, _SWAPPED = 0.02, 1.5
+"""Relative response from which a set is reported, and from which frames are refused."""
+_MIXED, _SCALED, _PEAK = 0.1, 0.99, 0.6
+"""Limits of refusals: neighbours' correlation, a pattern in the codes, and the brightest signal's least fraction."""
+_COMB, _EVEN, _STEADY, _STRAIGHT, _STILL, _DARK_CUT, _DEAD = 0.05, 0.03, 0.01, 0.05, 0.1, 0.01, 0.01
+"""Limits of remarks, among them unevenness (EMVA 1288 4.0), misfits of a variance and of a dark mean [DN]."""
+_FLOATS = 9
+
+
+def read_sets(flats: FlatFrames, job: Job) -> list[Alike]:
+    """Compute the statistics of every set; MitsimError if the frames show nothing of the camera."""
+    where = f"frames {flats.folder}"
+    shape = image_size(flats.folder / flats.sets[0].files[0], flats.wanted)
+    if min(shape) < _LEAST_SIDE:
+        raise MitsimError(f"{where}: {shape[0]} x {shape[1]} pixels; give {_LEAST_SIDE} or more a side")
+    Cost(memory_bytes=2 * 8 * _FLOATS * math.prod(shape)).check(where, job.limits)
+    job.progress("frames", 0.0)
+    with job.clock.stage("frames"):
+        taken = read_again(flats, shape)
+    for fault in _faults(flats, taken):
+        raise MitsimError(f"{where}: {fault}")
+    return taken
+
+
+def read_again(flats: FlatFrames, shape: tuple[int, int], places: Places | None = None) -> list[Alike]:
+    """Compute the statistics with the pixel at `places` (M, N) read in place of each pixel."""
+    bits = flats.listed.bits
+    largest = math.inf if bits is None else 2.0**bits - 1
+
+    def frames(listed: DarkSet) -> Iterator[npt.NDArray[np.generic]]:
+        for path in (flats.folder / name for name in listed.files):
+            values = read_image(path, flats.wanted)
+            if values.shape != shape:
+                sizes = " and ".join(f"{m} x {n}" for m, n in (shape, values.shape[:2]))
+                raise MitsimError(f"frame {path}: frames have {sizes} pixels; give frames of one size")
+            least, most = float(values.min()), float(values.max())
+            if bits is not None and (least < 0 or most > largest):
+                held = f"{least if least < 0 else most:g}, and numbers of {bits} bits are 0 to {largest:g}"
+                raise MitsimError(f"frame {path}: holds {held}; correct bits")
+            if bits is not None and values.dtype.kind == "f" and np.any(values != np.rint(values)):
+                raise MitsimError(f"frame {path}: holds numbers that are not whole; leave bits out")
+            yield values if places is None else values.flat[places]
+
+    def taken(listed: DarkSet) -> Alike:
+        power = listed.light if isinstance(listed, LitSet) else 0.0
+        light = power * listed.exposure_s * (flats.listed.photons_per_s or 1.0)
+        return alike(frames(listed), largest, light, listed.exposure_s)
+
+    return in_threads(taken, flats.sets)
+
+
+def _names(flats: FlatFrames) -> list[str]:
+    return [f"{listed.files[0]} to {listed.files[-1]}" for listed in flats.sets]
+
+
+def _faults(flats: FlatFrames, taken: Sequence[Alike]) -> Iterator[str]:
+    seen = dict[bytes, str]()
+    for listed, each in zip(flats.sets, taken, strict=True):
+        for name, digest in zip(listed.files, each.digests, strict=True):
+            if digest and digest in seen:
+                yield f"{seen[digest]} and {name} are equal in every number; take each frame anew, or at a higher gain"
+            seen[digest] = name
+    dark, lit = {each.exposure_s: each for each in taken if not each.light}, [each for each in taken if each.light]
+    brightest = max(each.mean for each in lit)
+    for name, said in zip(_names(flats), taken, strict=True):
+        still = dark[said.exposure_s]
+        signal = said.mean - still.mean
+        if said.light and signal <= _SURE * math.hypot(said.mean_error, still.mean_error):
+            yield f"{name} is no brighter than the dark frames of its exposure; light it, or list it as dark"
+        most = signal if said.light else max(brightest - said.mean, 0.0)
+        if said.flicker > _UNEQUAL * most:
+            yield (
+                f"{name} differ by {said.flicker:.3g} DN, {100 * said.flicker / max(most, 1e-9):.0f} % of their light; "
+                "take the frames of a set with one exposure under a steady lamp, and dark ones with the camera covered"
+            )
+    if full := 100 * min(each.cut[1] for each in lit):
+        yield f"all sets under light hold saturated numbers, {full:.3g} % of them at least; expose some for less"
+    yield from (text for _, refused, text in _altered(flats, taken, taken) if refused)
+
+
+def _altered(flats: FlatFrames, taken: Sequence[Alike], used: Sequence[Alike]) -> list[tuple[bool, bool, str]]:
+    """Return what was done to the numbers after the ADC: whether to report it, whether to refuse it, and in words."""
+    names, means = _names(flats), [each.mean for each in taken]
+    peak, dark = means[saturation_of(taken)[0]], min(each.mean for each in taken if not each.light)
+    combs = [
+        (*each.comb, name) for name, each in zip(names, taken, strict=True)
+        if each.comb[0] > _SURE / math.sqrt(each.count * math.prod(each.shape))
+        and each.light and not any(each.cut) and each.mean < dark + MOST_FITTED * (peak - dark)
+    ]  # fmt: skip
+    amplitude, period, combed = max(combs, default=(0.0, 1.0, ""))
+    # A correlation of neighbours' noise counts beyond chance and charge between pixels.
+    noises = [max(map(abs, each.neighbours)) for each in used]
+    least = [_WHITE + _SURE / math.sqrt(math.prod(each.shape)) for each in used]
+    noises = [noise if noise > chance else 0.0 for noise, chance in zip(noises, least, strict=True)]
+    smooth, smoothed = max(noises), names[[*taken].index(used[int(np.argmax(noises))])]
+    part = (peak - min(means)) / (max(means) - min(means))
+    found = [
+        (amplitude > _COMB, amplitude > _SCALED, f"codes are missing or too frequent in {combed} with a period of "
+         f"{period:.2g} DN, so numbers were scaled after the ADC or a bit is stuck; give raw frames"),
+        (smooth > 0, float(np.median(noises)) > _MIXED, f"noise of neighbouring pixels is correlated by {smooth:.2g} "
+         f"in {smoothed}, so frames were compressed, smoothed, scaled or demosaiced; give raw frames"),
+        (part < _PEAK, part < _PEAK, f"the variance is largest at {100 * part:.0f} % of the brightest signal, as after "
+         "a gamma curve, compression or too coarse codes; give raw frames of more bits, or of a higher gain"),
+    ]  # fmt: skip
+
+    # The logarithm of the response follows a robust line over light; sets beside it have other light than listed.
+    darks = {each.exposure_s: each.mean for each in taken if not each.light}
+    signals = np.array([each.mean - darks[each.exposure_s] for each in taken])
+    light = np.array([each.light for each in taken])
+    full = np.max(signals, where=np.array([not each.cut[1] for each in taken]), initial=0.0)
+    fitted = (light > 0) & (signals > LINEAR[0] * full) & (signals < LINEAR[1] * full)
+    fitted |= (signals >= LINEAR[1] * full) & (light < np.max(light, where=fitted, initial=0.0) * LINEAR[1])
+    if fitted.sum() < LINE:
+        return found
+    response = np.log(signals[fitted] / light[fitted])
+    slope = scipy.stats.theilslopes(response, light[fitted])[0] if np.ptp(light[fitted]) else 0.0
+    off, about = response - slope * light[fitted], response - np.median(response)
+    off -= float(np.median(off))
+    limit = max(_SURE * 1.4826 * float(np.median(np.abs(off))), _OUT)
+    off = np.where(np.abs(about) > math.log(_SWAPPED), about, np.where(np.abs(off) > limit, off, 0.0))
+    for name, ratio in zip(np.array(names)[fitted][off != 0], np.exp(off[off != 0]), strict=True):
+        text = f"{name} are {ratio:.3g} times as bright as the other sets are at their exposures; correct the list"
+        found.append((True, not 1 / _SWAPPED < ratio < _SWAPPED, text))
+    return found
+
+
+def remarks(flats: FlatFrames, found: FoundCamera) -> tuple[str, ...]:
+    """Return what the frames of a real camera show beside it, each with what is not to be trusted."""
+    transfer, pixels = found.transfer, found.pixels
+    used = [
+        (name, abs(off), taken)
+        for name, off, taken in zip(_names(flats), transfer.off, pixels.taken, strict=True) if np.isfinite(off[0])
+    ]  # fmt: skip
+    darks = [each for each in used if not each[2].light]
+    bent, curved = max(
+        (off[1] * said.variance_error / max(said.variance, LEAST_DARK), name)
+        for name, off, said in used if off[1] > _SURE or name is used[0][0]
+    )  # fmt: skip
+    moved, moving = max((off[0] * said.mean_error * (off[0] > _SURE), name) for name, off, said in darks)
+    noise = math.sqrt(transfer["read"] ** 2 + max(transfer["spatial"], 0.0) + 1 / 12)
+    cut, zero = max(said.cut[0] for *_, said in darks), scipy.special.ndtr((0.5 - transfer["black"]) / noise)
+    dead, lamp, hot = found.sensor.dead_pixels, 100 * transfer.lamp, round(pixels.filled * math.prod(pixels.shape))
+    light = {
+        "undecided": "means bend with exposure, and variances do not tell whether the camera bends or the lamp drifts",
+        "drifts": f"means bend with exposure and variances do not, so the lamp drifts by {lamp:.2g} %",
+    }.get(transfer.light, f"light scatters by {lamp:.2g} % about what exposures say")
+    table = [
+        *((seen, text) for seen, _, text in _altered(flats, pixels.taken, [said for *_, said in used])),
+        (bent > _STRAIGHT, f"variances do not rise with means as those of counted electrons: {curved} is off by "
+         f"{100 * bent:.0f} %; a gamma curve, compression or automatic gain does that"),
+        (moved > _STILL, f"dark means do not rise with exposure: {moving} is off by {moved:.2g} DN; do not trust "
+         "black_level_dn and dark_current_e_per_s"),
+        (cut - 1.1 * zero > _DARK_CUT, f"{100 * cut:.2g} % of dark readings are 0 DN, more than noise explains; raise "
+         "the black level, and do not trust black_level_dn, read_noise_e and dsnu_*"),
+        (pixels.filled > 0, f"{hot} hot pixels ({100 * pixels.filled:.2g} %) are full in the longest dark frames; "
+         "hot_dark_current_e_per_s is a lower limit"),
+        (dead > _DEAD, f"{100 * dead:.2g} % of the pixels show less than half of the light of most; the camera found "
+         "counts them as dead_pixels"),
+        (transfer.light in ("undecided", "drifts") or transfer.lamp > _STEADY, f"{light}; standard errors of "
+         "quantum_efficiency and linearity include it; take the frames again under a steady lamp"),
+        (pixels.uneven > _EVEN, f"light differs by {100 * pixels.uneven:.0f} % over the frame, and EMVA 1288 allows "
+         f"{100 * _EVEN:.0f} %; the figures prnu_* include it"),
+    ]  # fmt: skip
+    return tuple(text for said, text in table if said)
+
+
+# -------- Figures and fields
 
 FIGURES: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),
@@ -65,26 +330,31 @@ _UNITS = {
 """Unit of a field of a camera file by its first matching ending."""
 
 
-def figures_set(frames: Frames) -> dict[str, float]:
-    sensor, brightest, current = frames.sensor, int(frames.light.argmax()), mean_dark_current(frames.sensor)
-    alive, light = 1 - sensor.dead_pixels, float(frames.light[brightest])
-    # At no exposure if the light varies by exposure.
-    ladder = len(np.unique(frames.exposure_s[frames.light > 0])) >= LINE
-    dark = 0.0 if ladder else current * float(frames.exposure_s[frames.dark])
-    offsets = frames.parts(frames.dark)
-    responses = (frames.parts(frames.bright) - offsets) / (float(frames.electrons[frames.bright]) * alive) ** 2
-    return {
-        "system_gain": sensor.gain_dn_per_e,
-        "quantum_efficiency": float(frames.electrons[brightest]) / light * alive,
-        "dark_noise": math.sqrt(sensor.superpixel_reading_noise_e**2 + dark),
-        "row_noise": sensor.superpixel_row_noise_e**2,
-        "saturation_capacity": capacity_of(sensor),
-        "full_well": (capacity_of(sensor) - current * float(frames.exposure_s[brightest])) * alive,
-        **dict.fromkeys(("linearity_min", "linearity_max"), 0.0),
-        **dict.fromkeys(("dark_current", "dark_current_by_variance"), current),
-        **{f"dsnu_{part}": float(each) for part, each in zip(SPLIT, (offsets.sum(), *offsets), strict=True)},
-        **{f"prnu_{part}": float(each) for part, each in zip(SPLIT, (responses.sum(), *responses), strict=True)},
-    }
+@dataclass(frozen=True)
+class Row:
+    """A figure, or a field of the camera found with its standard error; `set` is None for frames of a real camera."""
+
+    name: str
+    symbol: str
+    unit: str
+    set: float | None
+    found: float
+    standard_error: float | None = None
+    deviations: float | None = None
+
+
+def figure_rows(found: Mapping[str, FloatArray], given: Mapping[str, float], efficient: bool) -> tuple[Row, ...]:
+    """Return the figures in their units; without a quantum efficiency light is counted in electrons."""
+    rows = []
+    for name, (symbol, unit) in FIGURES.items():
+        if name not in found or (name == "quantum_efficiency" and not efficient):
+            continue
+        values = [float(found[name]), given.get(name, math.nan)]
+        if name.startswith(_VARIANCES):
+            values = [math.copysign(math.sqrt(abs(value)), value) for value in values]
+        value, set_value = (each * (100.0 if unit == "%" else 1.0) for each in values)
+        rows.append(Row(name, symbol, unit, None if math.isnan(set_value) else set_value, value))
+    return tuple(rows)
 
 
 def fields_set(model: SensorModel) -> dict[str, float | None]:
@@ -106,52 +376,8 @@ def fields_set(model: SensorModel) -> dict[str, float | None]:
     }
 
 
-@dataclass(frozen=True)
-class Row:
-    """A figure, or a field of the camera that explains the frames, with `expected` if it differs from the set one;
-    `deviations` and `bias` are in standard errors.
-    """
-
-    name: str
-    symbol: str
-    unit: str
-    set: float | None
-    expected: float | None
-    found: float
-    standard_error: float
-    deviations: float | None
-    bias: float = 0.0
-
-
-def row_of(frames: Frames, name: str, given: float, found: FloatArray, sessions: FloatArray, bend: float = 0.0) -> Row:
-    """Compare a figure with its set or expected value.
-
-    `sessions` (count,) are figures of drawn sessions, and `bend` is the standard error of the expected linearity.
-    """
-    sensor, (symbol, unit) = frames.sensor, FIGURES[name]
-    value, spread, centre = float(found), max(float(sessions.std()), _DUST), float(sessions.mean())
-    # A linear method does not find the set value of a bent camera, or of nonuniformity under noise that rows share.
-    method = name.startswith(("saturation", "linearity")) or bool(sensor.linearity)
-    method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
-    bias = 0.0 if method or sensor.bits is None else (centre - given) / spread
-    method |= abs(bias) > _BIASED
-    if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + QUANTISATION < LEAST_DARK:
-        bias = 0.0  # the standard's limit is found, as it should be
-    spread = math.hypot(spread, bend if name.startswith("linearity") else 0.0)
-    if name == "saturation_capacity":
-        spread = math.hypot(spread, frames.step / math.sqrt(12))
-    against = centre if method else given
-    off = (value - against) / spread
-    if name.startswith(_VARIANCES):
-        root = math.sqrt(max(against, 0.0))
-        spread = spread / (2 * max(root, math.sqrt(spread)))
-        given, value, centre = (math.copysign(math.sqrt(abs(square)), square) for square in (given, value, centre))
-    scale = 100.0 if unit == "%" else 1.0
-    expected = scale * centre if method else None
-    return Row(name, symbol, unit, scale * given, expected, scale * value, scale * spread, off, bias)
-
-
-def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
+def field_rows(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
+    """Return the fields of the camera found, compared with those of the simulated ``model``."""
     rows, transfer, given = [], found.transfer, {} if model is None else fields_set(model)
     values = {**fields_set(found.sensor), "full_well_e": found.sensor.full_well_e}
     errors = dict(found.errors)
@@ -162,21 +388,19 @@ def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
             error, set_value = errors.get(name, 0.0), given.get(name)
             off = None if set_value is None or not error else (value - set_value) / error
             unit = next(unit for end, unit in _UNITS.items() if name.endswith(end))
-            rows.append(Row(name, "", unit, set_value, None, value, error, off))
+            rows.append(Row(name, "", unit, set_value, value, error, off))
     return tuple(rows)
 
 
-# ---- results ---------------------------------------------------------------------------------------------------------
+# -------- Results
 
 
 @dataclass(frozen=True, eq=False)
 class Characterisation:
-    """A camera's figures (`rows`), the camera that explains its frames (`fields`), and closed forms (`expected`)."""
+    """A camera's figures (`rows`) and the fields of the camera that explains its frames (`fields`)."""
 
     camera: str
-    frames: Frames
     session: Session = field(repr=False)
-    expected: Session = field(repr=False)
     rows: tuple[Row, ...]
     found: FoundCamera
     fields: tuple[Row, ...]
@@ -187,35 +411,23 @@ class Characterisation:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        lines, sensor = [*self.about], self.frames.sensor
-        if biased := [row for row in self.rows if abs(row.bias) > _MISLEADS]:
-            of = "the camera" if self.real else "what is set"
-            found = ", ".join(f"{row.name} {row.expected:.5g} {row.unit} for {row.set:.5g}" for row in biased)
-            noise = sensor.superpixel_reading_noise_e * sensor.gain_dn_per_e
-            lines.append(
-                f"the procedure does not find {of}, but {found}: a black level of "
-                f"{sensor.superpixel_black_level_dn:.3g} DN and rounding to whole DN hide part of a noise of "
-                f"{noise:.2g} DN; raise black_level_dn or gain_dn_per_e"
-            )
-        for row in (*self.rows, *self.fields):
-            if row.deviations is not None and abs(row.deviations) > MOST_OFF:
-                off = f"{row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors off"
-                against = row.set if row.expected is None else row.expected
-                lines.append(
-                    f"{row.name}: found {off} {against:.5g}; the procedure does not fit this camera"
-                    if row.symbol
-                    else f"{row.name} of the camera found: {off} {row.set:.5g}, which is set"
-                )
-        return tuple(lines)
+        off = [row for row in self.fields if row.deviations is not None and abs(row.deviations) > MOST_OFF]
+        return *self.about, *(
+            f"{row.name} of the camera found: {row.found:.5g} {row.unit}, {abs(row.deviations or 0):.1f} standard "
+            f"errors off {row.set:.5g}, which is set"
+            for row in off
+        )
 
     def payload(self) -> dict[str, Any]:
         transfer = self.found.transfer
+        fields = [asdict(row) for row in self.fields]
         return {
             "camera": self.camera,
             **self.asked,
-            "exposure_s": float(self.frames.exposure_s[self.frames.dark]),
-            "figures": [asdict(row) for row in self.rows],
-            "camera_found": [{name: getattr(row, name) for name in _OF_FIELDS} for row in self.fields],
+            "exposure_s": float(self.session.exposure_s[self.session.dark]),
+            # Figures have no standard errors; the keys are kept for readers of version 0.12.
+            "figures": [{**asdict(row), "expected": None, "bias": None} for row in self.rows],
+            "camera_found": [{name: row[name] for name in row if name != "symbol"} for row in fields],
             "light": {
                 "uneven": self.found.pixels.uneven, "scatter": transfer.lamp, "drifts": transfer.light == "drifts",
                 "seen": transfer.light, "chi_square": transfer.chi_square, "freedom": transfer.freedom,
@@ -230,44 +442,39 @@ class Characterisation:
         named = {"gain_dn_per_e": "Gain", "read_noise_e": "read noise", "full_well_e": "full well"}
         rows = {named[row.name]: row for row in self.fields if row.name in named}
         return ", ".join(
-            f"{name} {row.found:{'.4g' if row.found < _WHOLE else '.0f'}} {row.unit}" for name, row in rows.items()
+            f"{name} {row.found:{'.4g' if row.found < 1e4 else '.0f'}} {row.unit}" for name, row in rows.items()
         )
 
     @property
     def where(self) -> str:
-        (m, n), lit, unlit = self.frames.shape, len(self.session.lit), len(self.session.unlit)
+        (m, n), lit, unlit = self.session.shape, len(self.session.lit), len(self.session.unlit)
         return f"{m} x {n} pixels, {lit} sets of frames under light, {unlit} in the dark"
 
     @property
     def parts(self) -> tuple[Part, Part]:
-
         def cell(row: Row, name: str) -> str:
             value = getattr(row, name)
-            if name in ("found", "standard_error"):
-                return round_to_error(value, row.standard_error)
             if value is None or isinstance(value, str):
                 return value or ""
+            if name in ("found", "standard_error") and row.standard_error is not None:
+                return round_to_error(value, row.standard_error)
             return f"{value:{'.1f' if name == 'deviations' else '.5g'}}"
 
-        def table(rows: Sequence[Row], columns: Mapping[str, str]) -> tuple[Any, Any]:
-            return tuple(columns), tuple(tuple(cell(row, name) for name in columns.values()) for row in rows)
+        def table(rows: Sequence[Row], **columns: str) -> tuple[Any, Any]:
+            shown = {head: name for head, name in columns.items() if not self.real or name not in ("set", "deviations")}
+            heads = tuple(head.replace("_", " ") for head in shown)
+            return heads, tuple(tuple(cell(row, name) for name in shown.values()) for row in rows)
 
-        found, off = {"found": "found", "std. error": "standard_error"}, {"off by": "deviations"}
-        figure = {"figure": "name", "symbol": "symbol", "unit": "unit", "camera" if self.real else "set": "set"}
-        compared = {**found} if self.real else {"set": "set", **found, **off}
-        which = "the camera has" if self.real else "the one set"
-        note = f"expected: where the procedure finds another figure than {which}, at these steps and frames"
         return (
             Part(
-                "Figures of EMVA 1288",
-                "What the standard's procedure finds, with its standard error, and by how many of these it is off.",
-                *table(self.rows, {**figure, "expected": "expected", **found, **off}),
-                ("deviations.png", "photon_transfer.png", "linearity.png", "dark_current.png"),
-                (note,) if any(row.expected is not None for row in self.rows) else (),
+                "Figures of EMVA 1288", "What the standard's procedure finds.",
+                *table(self.rows, figure="name", symbol="symbol", unit="unit", set="set", found="found"),
+                ("photon_transfer.png", "linearity.png", "dark_current.png"),
             ),
             Part(
                 "The camera that explains the frames", "The fields of camera.toml, which --camera takes.",
-                *table(self.fields, {"camera found": "name", "unit": "unit", **compared}),
+                *table(self.fields, camera_found="name", unit="unit", set="set", found="found",
+                       std_error="standard_error", off_by="deviations"),
                 notes=tuple(self.found.notes),
             ),
         )  # fmt: skip
@@ -281,62 +488,46 @@ class Characterisation:
         return lines[:-1]
 
 
-# ---- plots -----------------------------------------------------------------------------------------------------------
-
-
 def figures_of(done: Characterisation) -> Mapping[str, Figure]:
-    rows, what = {row.name: row for row in done.rows}, "camera found" if done.real else "closed form"
-    gain, black = rows["system_gain"].found, done.frames.sensor.superpixel_black_level_dn
+    """Return the plots by file name: measured points, and the line of the camera found."""
+    session, rows = done.session, {row.name: row.found for row in done.rows}
+    gain, black = done.found.sensor.gain_dn_per_e, done.found.sensor.superpixel_black_level_dn
 
-    def found(name: str) -> str:
-        row = rows[name]
-        value, error = (round_to_error(each, row.standard_error) for each in (row.found, row.standard_error))
-        given = f"{'camera found' if done.real else 'set'} {row.set:.5g}"
-        return typeset(f"{value} +- {error} {row.unit}, {given}".replace("e-", "e\N{SUPERSCRIPT MINUS}"))
-
-    def chart(points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str) -> Figure:
+    def chart(x: FloatArray, named: Mapping[str, FloatArray], title: str, x_label: str, y_label: str) -> Figure:
         lines = {
-            name: {place: Mean(value, math.nan, 1) for place, value in zip(*points(session), strict=True)}
-            for name, session in ((what, done.expected), ("pairs of frames", done.session))
+            name: {place: Mean(value, math.nan, 1) for place, value in zip(x.tolist(), y.tolist(), strict=True)}
+            for name, y in named.items()
         }
-        return curves({"": lines}, x, y, ticks=False, title=title)
+        return curves({"": lines}, x_label, typeset(y_label), ticks=False, title=typeset(title))
 
-    def straightness(session: Session) -> tuple[FloatArray, FloatArray]:
-        photons, signal, noise = session.transfer()
+    photons, signal, noise = session.transfer()
+    charts = {
+        "photon_transfer.png": chart(
+            signal, {"camera found": gain * signal, "frames": noise},
+            f"EMVA 1288 finds a gain of {rows['system_gain']:.4g} DN/e-",
+            "signal less dark signal [DN]", "variance less dark variance [DN$^2$]",
+        )
+    }  # fmt: skip
+    if "linearity_min" in rows:
         top = float(signal[int(noise.argmax())]) if session.saturates else float(signal.max()) / LINEAR[1]
         used = (signal >= LINEAR[0] * top) & (signal <= LINEAR[1] * top * (1 + 1e-12))
         slope, start = np.polyfit(photons[used], signal[used], 1, w=1 / signal[used])
-        return photons[used], 100 * (signal[used] / (start + slope * photons[used]) - 1)
-
-    off = {row.name.replace("_", " "): {"": Mean(row.deviations or 0.0, math.nan, 1)} for row in done.rows}
-    far = sum(abs(row.deviations or 0.0) > MOST_OFF for row in done.rows)
-    title = (
-        f"{far or 'None'} of {len(off)} figures {'are' if far > 1 else 'is'} more than {MOST_OFF:g} standard errors off"
-    )
-    given = "the camera's" if done.real else "set"
-    charts = {
-        "deviations.png": grouped_bars(off, f"found less {given} or expected [standard errors]", title),
-        "photon_transfer.png": chart(
-            lambda session: session.transfer()[1:], f"EMVA 1288 finds a gain of {found('system_gain')}",
-            "signal less dark signal [DN]", "variance less dark variance [DN$^2$]",
-        ),
-    }  # fmt: skip
-    if "linearity_min" in rows:
-        light = "photons on a pixel [1]" if done.frames.sensor.states_efficiency else "light on a pixel [a.u.]"
-        title = f"Linearity: {rows['linearity_min'].found:.2g} to {rows['linearity_max'].found:+.2g} % off a line"
-        charts["linearity.png"] = chart(straightness, typeset(title), light, "deviation from a line [%]")
+        off = 100 * (signal[used] / (start + slope * photons[used]) - 1)
+        light = "photons on a pixel [1]" if done.found.sensor.states_efficiency else "light on a pixel [a.u.]"
+        title = f"Linearity: {rows['linearity_min']:.2g} to {rows['linearity_max']:+.2g} % off a line"
+        charts["linearity.png"] = chart(photons[used], {"frames": off}, title, light, "deviation from a line [%]")
     if "dark_current" in rows:
+        times = session.exposure_s[session.unlit]
+        current = done.found.sensor.superpixel_dark_current_e_per_s
         charts["dark_current.png"] = chart(
-            lambda session: (
-                session.exposure_s[session.unlit], (session.pairs.mean[session.unlit] - black) / gain
-            ),
-            f"EMVA 1288 finds a dark current of {found('dark_current')}", "exposure time [s]",
-            "dark signal less black level [e$^-$]",
+            times, {"camera found": current * times, "frames": (session.pairs.mean[session.unlit] - black) / gain},
+            f"EMVA 1288 finds a dark current of {rows['dark_current']:.4g} e-/s", "exposure time [s]",
+            "dark signal less black level [e-]",
         )  # fmt: skip
     return charts
 
 
-# ---- characterisation ------------------------------------------------------------------------------------------------
+# -------- Characterisation
 
 
 def characterise(
@@ -353,7 +544,10 @@ def characterise(
         taken = frames.take(job)
         pixels = Pixels(taken, lambda index: np.mean([*frames.images(index)], axis=0), partial(frames.take, job))
         found = pixels.camera(stated, sensor.states_efficiency)
-        return _compare(frames, taken, found, asked=procedure.stated, camera=sensor.name, output=folder)
+        session = session_of(taken, frames.dark, frames.bright, True, sensor.bits is not None)
+        rows = figure_rows(figures(session), frames.figures_set(), sensor.states_efficiency)
+        fields, asked = field_rows(found, sensor), procedure.stated
+        return Characterisation(sensor.name, session, rows, found, fields, asked, output=folder)
 
     return _write(measure, output)
 
@@ -361,38 +555,27 @@ def characterise(
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
+    """Characterise a real camera by its listed frames; MitsimError for frames that show nothing of a camera."""
     job, facts = job or Job(), listed.listed
     stated = {name: getattr(facts, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
 
+    def mean_image(index: int) -> FloatArray:
+        files = listed.sets[index].files
+        total = 0.0 + sum(read_image(listed.folder / name, listed.wanted).astype(np.float64) for name in files)
+        return np.asarray(total / len(files))
+
     def measure(folder: str | None) -> Characterisation:
         taken = read_sets(listed, job)
-        pixels = Pixels(taken, partial(mean_image, listed), partial(read_again, listed, taken[0].shape))
+        pixels = Pixels(taken, mean_image, partial(read_again, listed, taken[0].shape))
         found = pixels.camera(stated, facts.photons_per_s is not None)
+        saturates = saturation_of(taken)[1] is not None
+        session = session_of(taken, *nonuniform(taken), saturates, facts.bits is not None)
+        rows = figure_rows(figures(session), {}, facts.photons_per_s is not None)
         asked = {"folder": str(listed.folder), "shape": taken[0].shape, "sets": len(taken)}
-        frames, about = Frames.as_taken(taken, found), remarks(listed, found)
-        return _compare(frames, taken, found, asked=asked, camera=facts.name, output=folder, real=True, about=about)
+        about, fields = remarks(listed, found), field_rows(found, None)
+        return Characterisation(facts.name, session, rows, found, fields, asked, True, about, folder)
 
     return _write(measure, output)
-
-
-def _compare(
-    frames: Frames, taken: list[Alike], found: FoundCamera, real: bool = False, **facts: Any
-) -> Characterisation:
-    expected, sensor = frames.expect(), frames.sensor
-    session = frames.session(taken, taken[frames.dark].stack, taken[frames.bright].stack)
-    spread, of_frames = figures(draw_sessions(frames, expected)), figures(session)
-    bend = found.transfer.error("bend") if real else 0.0  # the error of a real camera's expected linearity
-    given = figures_set(frames)
-    rows = tuple(
-        row_of(frames, name, given[name], of_frames[name], spread[name], bend)
-        for name in FIGURES
-        # Without a quantum efficiency light is counted in electrons, so there is none to find.
-        if name in of_frames and name in spread and (sensor.states_efficiency or name != "quantum_efficiency")
-    )
-    fields = fields_of(found, None if real else sensor)
-    return Characterisation(
-        frames=frames, session=session, expected=expected, rows=rows, found=found, fields=fields, real=real, **facts
-    )
 
 
 def _write(measure: Callable[[str | None], Characterisation], output: Path | str | None) -> Characterisation:
@@ -402,11 +585,12 @@ def _write(measure: Callable[[str | None], Characterisation], output: Path | str
         done = measure(str(folder))
         results = folder / "characterise.json"  # written last, so that a folder with it is complete
         results.unlink(missing_ok=True)
-        drawn = write_figures(folder, figures_of(done))
-        pictures = {name: page_figure(figure) for name, figure in drawn.items()}
-        titles = f"{done.camera} after EMVA 1288", done.message
-        page = build_findings("characterise", titles, done.where, done.parts, pictures, done.warnings)
-        write_text(folder / "characterise.html", page)
+        pictures = {name: page_figure(figure) for name, figure in write_figures(folder, figures_of(done)).items()}
+        title = f"{done.camera} after EMVA 1288"
+        section = Section(
+            "characterise", title, done.message, done.where, pictures, done.parts, warnings=done.warnings
+        )  # fmt: skip
+        write_text(folder / "characterise.html", page_of([section], title))
         write_text(folder / CAMERA_FILE, done.found.toml())
         write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})
     return done

@@ -475,13 +475,6 @@ def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     return path
 
 
-def build_findings(
-    name: str, titles: tuple[str, str], where: str, parts: Sequence[Part], pictures: Mapping[str, tuple[str, int]],
-    warnings: Sequence[str] = (),
-) -> str:  # fmt: skip
-    return page_of([Section(name, *titles, where, pictures, tuple(parts), warnings=tuple(warnings))], titles[0])
-
-
 def _options(scope: Scope) -> list[str]:
     setup = scope.setup
     given: list[tuple[str, Any]] = [

@@ -19,7 +19,7 @@ from mitsim.report import demo_page as R
 from mitsim.report.demo_page import Trust
 from mitsim.report.pages import page_figure, stages_of
 from mitsim.studies.demo import doubts
-from mitsim.studies.framework.panels import Part, build_findings
+from mitsim.studies.framework.panels import Part, Section, page_of
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 N = 32
@@ -345,9 +345,8 @@ def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
     rows = (("shot noise", "+7.4 +- 0.1", "2.8e+12", "1"), ("read noise", "nothing", "", "one"))
     part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
     assert part.numeric == (False, True, True, False)
-    page = build_findings(
-        "toy", ("A study", "7 dB"), "Scene toy", [part], {"a.png": page_figure(Figure(figsize=(3.0, 2.0)))}
-    )
+    pictures = {"a.png": page_figure(Figure(figsize=(3.0, 2.0)))}
+    page = page_of([Section("toy", "A study", "7 dB", "Scene toy", pictures, (part,))], "A study")
     assert (
         '<p class="verdict">7 dB</p>' in page
         and page.count('<th class="n">') == 2
@@ -359,7 +358,8 @@ def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
 def test_warnings_of_findings_stand_at_the_head_and_notes_below_the_figures() -> None:
     """(Planted: warnings on the command line alone.)"""
     part = Part("Title", "the lead", notes=("how to read it",))
-    page = build_findings("toy", ("A study", ""), "Scene toy", [part], {}, ["losses: a cause is missing"])
+    section = Section("toy", "A study", "", "Scene toy", {}, (part,), warnings=("losses: a cause is missing",))
+    page = page_of([section], "A study")
     head, body = page.split("</header>")
     assert "Losses: a cause is missing." in head and body.index("the lead") < body.index("how to read it")
 
