@@ -54,7 +54,7 @@ from mitsim.reconstruct.factors import (
     load_calibration,
     stripe_sums,
 )
-from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
+from mitsim.reconstruct.session_check import CheckedSession, check_session
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses from which factors are estimated."""
@@ -398,17 +398,18 @@ def estimates(
 ) -> tuple[list[Estimate], int, CheckedSession]:
     session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
     drift = session.recipe.drift
-    taken = SessionConditions(
-        session.order,
-        saturated=bool(found.saturated),
-        # A stated drift of the lamp is not divided out, so that the user sees its effect.
-        unsteady=bool(drift.session_ramp or drift.session_flicker),
-    )
     with job.clock.stage("estimate"):
         judged = [CheckedSession(sums) for sums in found.sums.values()]
         if kinds[0] == NOISY:
             try:
-                judged[0] = check_session(found.sums[NOISY], session.signs, taken)
+                judged[0] = check_session(
+                    found.sums[NOISY],
+                    session.signs,
+                    session.order,
+                    saturated=bool(found.saturated),
+                    # A stated drift of the lamp is not divided out, so that the user sees its effect.
+                    unsteady=bool(drift.session_ramp or drift.session_flicker),
+                )
             except MitsimError as error:
                 # A real session would be refused. A simulated one is flagged, because the bench asks for it, and
                 # comparison with exact factors shows the loss.

@@ -10,13 +10,11 @@ HDR reconstruction with linear digital cameras", CVPR).
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,11 +36,10 @@ from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.sensor import digital_of, load_sensor
 from mitsim.devices.session import SIDES, UNIFORM, Half, Merge, Side
 from mitsim.reconstruct.factors import Factors, ResponseFit, StripeSums, stripe_sums
-from mitsim.reconstruct.session_check import SessionConditions, check_session
+from mitsim.reconstruct.session_check import check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
-_UNLIKE, _MATTERS = 4.0, 0.02
 _LIT = 0.01
 
 
@@ -140,13 +137,12 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...]) -> Fac
     listed, readings = session.listed, _Readings(session)
     signs = stripe_signs(listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
-    taken = SessionConditions(session.order, session.frame_name, bool(readings.saturated), wrong=readings.wrong())
-    found = check_session(sums, signs, taken)
+    found = check_session(sums, signs, session.order, session.frame_name, saturated=bool(readings.saturated))
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         estimate = found.estimate(signs, noise)
     warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
-    warnings += (*found.warnings, *readings.odd.values())
+    warnings += found.warnings
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
@@ -253,48 +249,10 @@ class _Reading:
         return max(self.ladder.variance(self.rate), 0.0) / self.shots
 
 
-class _Compared(NamedTuple):
-    names: tuple[str, str]
-    kind: int
-    squared: float
-    light: float
-    part: float
-
-
 @dataclass(frozen=True, eq=False)
 class _Readings:
     session: SessionFrames
     saturated: set[str] = field(default_factory=set)
-    compared: dict[Half, list[_Compared]] = field(default_factory=dict)
-    odd: dict[str, str] = field(default_factory=dict)
-
-    def wrong(self) -> dict[Half, str]:
-        kinds: dict[int, list[float]] = {}
-        for each in self.compared.values():
-            for one in each:
-                kinds.setdefault(one.kind, []).append(one.squared)
-        usual = {kind: float(np.median(values)) for kind, values in kinds.items()}
-        found = {}
-        for half, each in self.compared.items():
-            far = [
-                one
-                for one in each
-                if one.squared > max(_UNLIKE * usual[one.kind], _MATTERS**2 * max(one.light, 1e-300))
-            ]
-            if not far:
-                continue
-            first = far[0]
-            # A frame that differs from two that are alike is the wrong one.
-            counts = Counter(name for one in far for name in one.names)
-            near = {name for one in each if one not in far for name in one.names}
-            name = max(first.names, key=lambda name: (counts[name], name not in near))
-            other = first.names[1 - first.names.index(name)]
-            part = first.part if name == first.names[0] else 1 / (first.part or np.inf)
-            which = "should be alike" if len(each) == 1 else "is the one that differs"
-            found[half] = (
-                f"{name} has {part:.3g} of the light of {other}, and {'both' if len(each) == 1 else 'it'} {which}"
-            )
-        return found
 
     def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
         positive = self._merge((side, index, 1))
@@ -342,7 +300,17 @@ class _Readings:
         found = {}
         for exposure in {self.session.exposure_s(frame) for frame in self.session.dark}:
             frames = [frame for frame in self.session.dark if self.session.exposure_s(frame) == exposure]
-            found[exposure] = self._read(self._alike(frames), True)
+            levels = np.array([float(self._read([frame], True).rate.mean()) for frame in frames])
+            uniform = self._read(self.session.repeats_of((SIDES[0], 0, UNIFORM)), True).rate.mean()
+            parts = (levels - np.median(levels)) / uniform
+            worst = int(np.argmax(np.abs(parts)))
+            if abs(parts[worst]) > _LIT:
+                raise MitsimError(
+                    f"frames {self.session.folder}: {frames[worst].file}, with the projector off, has "
+                    f"{parts[worst]:+.1%} of a uniform frame's light more than the median of {len(frames)} such "
+                    "frames; leave the wrong one out"
+                )
+            found[exposure] = self._read(frames, True)
         if self._ladders is None:
             return dict.fromkeys(SIDES, found)
         each = [found[digital.exposure_s] for digital in self._ladders[SIDES[0]].digitals]
@@ -351,61 +319,25 @@ class _Readings:
             for side, ladder in self._ladders.items()
         }
 
-    def _alike(self, frames: list[DarkFile]) -> list[DarkFile]:
-        levels = np.array([float(self._read([frame], True).rate.mean()) for frame in frames])
-        uniform = self._read(self.session.repeats_of((SIDES[0], 0, UNIFORM)), True).rate.mean()
-        parts = (levels - np.median(levels)) / uniform
-        lit = np.abs(parts) > _LIT
-        if not lit.any():
-            return frames
-        few = len(frames) < 3
-        remedy = "one of them is wrong: take more" if few else "it is left out"
-        for frame, part in zip(np.asarray(frames)[lit], parts[lit], strict=True):
-            self.odd[frame.file] = (
-                f"frames: {frame.file}, with the projector off, has {part:+.1%} of a uniform frame's light more than "
-                f"the median of {len(frames)} such frames; {remedy}"
-            )
-        return frames if few else [frame for frame, one in zip(frames, lit, strict=True) if not one]
-
     def _merge(self, half: Half) -> _Reading:
         if self._ladders is None:
             return self._read(self.session.repeats_of(half), True)
         ladder = self._ladders[half[0]]
-        rates = []
-        for number in range(len(ladder.digitals)):
-            frames, used = self.session.repeats_of(half, number), ladder.used_pixels(number)
-            rates.append(self._read(frames, used).rate)
-            both = np.asarray(used & ladder.used_pixels(0))
-            if number and both.any():
-                names = frames[0].file, self.session.repeats_of(half)[0].file
-                self._compare(half, names, -number, rates[-1][both], rates[0][both])
+        rates = [
+            self._read(self.session.repeats_of(half, number), ladder.used_pixels(number)).rate
+            for number in range(len(ladder.digitals))
+        ]
         return _Reading(ladder.merge(rates), ladder, self.session.listed.repeats)
-
-    def _compare(self, half: Half, names: tuple[str, str], kind: int, one: FloatArray, other: FloatArray) -> None:
-        size = float(np.square(other).mean())
-        light, part = max(size, float(np.square(one).mean())), float(np.dot(one.ravel(), other.ravel())) / other.size
-        compared = _Compared(names, kind, float(np.square(one - other).mean()), light, part / size if size else 0.0)
-        known = self.compared.setdefault(half, [])
-        if compared not in known:
-            known.append(compared)
 
     def _read(self, frames: Sequence[StripeFile | DarkFile], used: Chosen) -> _Reading:
         digital = self.session.listed.digital.model_copy(update={"exposure_s": self.session.exposure_s(frames[0])})
         total: FloatArray | None = None
-        before: FloatArray | None = None
-        for place, frame in enumerate(frames):
+        for frame in frames:
             values = self.session.read(frame.file)
             end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
             if end is not None and ((values >= end) & used).any():
                 self.saturated.add(frame.file)
             total = values.astype(np.float64) if total is None else total + values
-            if len(frames) > 1 and isinstance(frame, StripeFile):
-                rate = digital.rate(values)
-                if before is not None:
-                    names = frame.file, frames[place - 1].file
-                    half = frame.side, frame.index, frame.sign
-                    self._compare(half, names, frame.exposure, rate, before)
-                before = rate
         assert total is not None
         return _Reading(digital.rate(total / len(frames)), Ladder((digital,)), len(frames))
 

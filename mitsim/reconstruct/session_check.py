@@ -19,7 +19,7 @@ pixels is aliased. The part of the columns outside these modes is zero but for n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -166,6 +166,7 @@ _BENT = "numbers are not in proportion to light; switch gamma and other processi
 _POWER = "frames are of different power; use a steadier lamp, or pairs"
 _OFFSET = "the uniform frame does not fit those of patterns; keep lamp and ambient light steady, or take pairs"
 _REPLACED = "a frame of a pair is wrong; take it again"
+_UNEQUAL = "the two do not add up to what others do"
 _STEP = 5.0
 
 
@@ -174,17 +175,6 @@ def frame_words(half: Half) -> str:
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class SessionConditions:
-    """Order, names and known defects of a session's frames."""
-
-    order: Sequence[Half]
-    name: Callable[[Half], str] = frame_words
-    saturated: bool = False
-    unsteady: bool = False
-    wrong: Mapping[Half, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -232,12 +222,31 @@ class CheckedSession:
         return (*map(str, self.faults), *self.doubts)
 
 
-def check_session(sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> CheckedSession:
+def check_session(
+    sums: tuple[StripeSums, StripeSums],
+    signs: FloatArray,
+    order: Sequence[Half],
+    name: Callable[[Half], str] = frame_words,
+    saturated: bool = False,
+    unsteady: bool = False,
+) -> CheckedSession:
     """Check a session, make repairs that a check afterwards confirms, and add remaining errors to the stated error.
 
-    Raises MitsimError for faults that cannot be mended, with the frames that do not fit.
+    ``order`` and ``name`` are those of the frames. The lamp's power is not divided out of a session whose lamp is
+    stated as ``unsteady``. Raises MitsimError for faults that cannot be mended, with the frames that do not fit.
     """
-    return _Check(sums, signs, taken).result()
+    check = _Check(sums, signs, order, name)
+    if not check.paired:
+        apart = abs(check.sides[0].power - check.sides[1].power)
+        for own in check.sides:
+            check.subtract_ambient(own, np.ones(check.count, dtype=bool))
+            own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
+    elif not check.correct_pairs(saturated, unsteady):
+        return check.found
+    for own in check.sides:
+        check.check_shadow(own)
+    check.judge()
+    return check.found
 
 
 # ---- Statistics ------------------------------------------------------------------------------------------------------
@@ -342,15 +351,21 @@ class _Side:
 
 
 class _Check:
-    def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
-        self.signs, self.taken, self.count = signs, taken, signs.shape[1]
+    def __init__(
+        self,
+        sums: tuple[StripeSums, StripeSums],
+        signs: FloatArray,
+        order: Sequence[Half],
+        name: Callable[[Half], str],
+    ) -> None:
+        self.signs, self.name, self.count = signs, name, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
         self.paired = all(own.sums.lights.size for own in self.sides)
         self.found = CheckedSession(sums)
         self.refused: list[tuple[Half, str]] = []
         self.times, self.last = np.zeros((2, 2, self.count))
-        for place, (side, index, sign) in enumerate(taken.order):
-            self.times[SIDES.index(side), index], self.last[SIDES.index(side), index] = place / len(taken.order), sign
+        for place, (side, index, sign) in enumerate(order):
+            self.times[SIDES.index(side), index], self.last[SIDES.index(side), index] = place / len(order), sign
         self.noise = float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
@@ -360,31 +375,15 @@ class _Check:
         self.refused += [(half, reason) for half in self._halves(own, index)]
 
     def _mend(self, own: _Side, index: int, sign: int | None, words: tuple[str, str, str], cost: float = 0.0) -> None:
-        names = [self.taken.name(half) for half in self._halves(own, index) if sign in (None, half[2])]
+        names = [self.name(half) for half in self._halves(own, index) if sign in (None, half[2])]
         self.found.faults.append(SessionFault(names, own.side, index, sign, *words, cost))
-
-    def result(self) -> CheckedSession:
-        if not self.paired:
-            self.refused += self.taken.wrong.items()
-            apart = abs(self.sides[0].power - self.sides[1].power)
-            for own in self.sides:
-                self._subtract_ambient(own, np.ones(self.count, dtype=bool))
-                own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
-        elif not self._correct_pairs():
-            return self.found
-        for own in self.sides:
-            self._check_shadow(own)
-        self._judge()
-        return self.found
 
     # ---- what the sums of pairs show of lamp, lag, bend, motion and ambient light ------------------------------------
 
-    def _correct_pairs(self) -> bool:
+    def correct_pairs(self, saturated: bool, unsteady: bool) -> bool:
         bad, excess, *measured = np.stack([own.fit_sums() for own in self.sides], axis=1)
-        if self.taken.saturated and bad.any():
+        if saturated and bad.any():
             return False
-        for side, index, _ in self.taken.wrong:
-            bad[SIDES.index(side), index] = True
         self.good = bad == 0
         self.powers, places, self.ratios, *self.variances = measured
         # A frame that holds light of the one before makes all pairs unequal alike; wide stripes show it best.
@@ -400,22 +399,39 @@ class _Check:
                 f"the one before ({lag:.1%}), and that numbers are in proportion to light"
             )
         for axis in np.flatnonzero(bad[:, 0]).tolist():  # all others hang on it
-            self._refuse(self.sides[axis], 0, "the two do not add up to what others do")
-        self._judge()
+            self._refuse(self.sides[axis], 0, _UNEQUAL)
+        self.judge()
         for axis, (own, good) in enumerate(zip(self.sides, self.good, strict=True)):
             own.add(_UNKNOWN_LIGHT, float(excess[axis][good].sum()))
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             words = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
             own.add(words, lag**2 * (0.75**2 + 0.5**2) * own.size)
-            self._subtract_ambient(own, good)
+            self.subtract_ambient(own, good)
             own.add_motion(places[axis][good], self.variances[1][axis][good], self.times[axis][good])
-        if not self.taken.unsteady:
+        if not unsteady:
             self._divide()
         for axis, index in zip(*np.nonzero(bad), strict=True):
-            self._use_one_frame(self.sides[axis], int(index))
+            own = self.sides[axis]
+            apart = np.abs(self.times[axis] - self.times[axis, index]) + ~self.good[axis]
+            usual = np.median(own.sums.lights[:, np.argsort(apart)[:_NEAR]], axis=1)
+            away, misfits = own.sums.lights[:, index] - usual, dict[int, float]()
+            for wrong in (1, -1):
+                own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
+                shadow = MovingShadow(own.vectors, self.signs)
+                misfits[wrong] = min(float(shadow.deviations[index]) / _WRONG, float(shadow.unlike[index]) / _UNLIKE)
+            sign = min(misfits, key=lambda wrong: misfits[wrong])
+            if shadow.predicts and 2 * misfits[sign] < misfits[-sign] and misfits[sign] <= 1:
+                own.misfits[index] = np.median(own.misfits)
+                own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
+                # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
+                own.add(_REPLACED, 1.5 * own.noise)
+                words = "replaced", _UNEQUAL, "the other frame of its pair replaces it"
+                self._mend(own, int(index), sign, words, float(np.sqrt(1.5 * own.noise / own.size)))
+            elif not own.odd()[index]:  # the moving shadow's check refuses those of odd light
+                self._refuse(own, int(index), _UNEQUAL)
         return True
 
-    def _subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
+    def subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
         for found, effect, scale in zip(own.sums.ambient.T, own.light.effects, own.light.variances, strict=True):
             variance = own.variance * scale
             # Without pairs, all responses share the uniform and dark frames, a third of their noise at most.
@@ -489,29 +505,7 @@ class _Check:
 
     # ---- the moving shadow -------------------------------------------------------------------------------------------
 
-    def _use_one_frame(self, own: _Side, index: int) -> None:
-        known = {half[2]: why for half, why in self.taken.wrong.items() if half[:2] == (own.side, index)}
-        reason = f"is wrong: {next(iter(known.values()))}" if known else "the two do not add up to what others do"
-        apart = np.abs(self.times[own.axis] - self.times[own.axis, index]) + ~self.good[own.axis]
-        usual = np.median(own.sums.lights[:, np.argsort(apart)[:_NEAR]], axis=1)
-        away, misfits = own.sums.lights[:, index] - usual, dict[int, float]()
-        for wrong in known or (1, -1):
-            own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
-            shadow = MovingShadow(own.vectors, self.signs)
-            misfits[wrong] = min(float(shadow.deviations[index]) / _WRONG, float(shadow.unlike[index]) / _UNLIKE)
-        sign = min(misfits, key=lambda wrong: misfits[wrong])
-        decided = len(known) == 1 or (not known and shadow.predicts and 2 * misfits[sign] < misfits[-sign])
-        if decided and misfits[sign] <= 1:
-            own.misfits[index] = np.median(own.misfits)
-            own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
-            # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
-            own.add(_REPLACED, 1.5 * own.noise)
-            words = "replaced", reason, "the other frame of its pair replaces it"
-            self._mend(own, index, sign, words, float(np.sqrt(1.5 * own.noise / own.size)))
-        elif known or not own.odd()[index]:  # the moving shadow's check refuses those of odd light
-            self._refuse(own, index, reason)
-
-    def _check_shadow(self, own: _Side) -> None:
+    def check_shadow(self, own: _Side) -> None:
         foreign = list[int]()
         turned = (np.arange(self.count) == 0) & (np.dot(own.vectors[:, 0], own.uniform) < 0)
         own.vectors[:, turned] *= -1
@@ -570,7 +564,7 @@ class _Check:
 
     # ---- the result --------------------------------------------------------------------------------------------------
 
-    def _judge(self) -> None:
+    def judge(self) -> None:
         found, sides = self.found, self.sides
         energies = {
             why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for own in sides for why in own.extras
@@ -583,7 +577,7 @@ class _Check:
             raise MitsimError(f"all frames: {order[0]}: it leaves a factor error of {total:.0%}; take them again")
         if self.refused:
             reason = self.refused[0][1]
-            names = [self.taken.name(half) for half, why in self.refused if why == reason]
+            names = [self.name(half) for half, why in self.refused if why == reason]
             listed = ", ".join(names[:_NAMED]) + f" and {len(names) - _NAMED} more" * (len(names) > _NAMED)
             every = "all " * (len(self.refused) > 2 * max(2, MOST_FAULTS * self.count))
             raise MitsimError(f"{every}frames: {listed}: {reason}; take them again")

@@ -304,40 +304,29 @@ def repeated(folder: Path, listed: dict[str, Any], shots: list[tuple[int, float]
     return calibrate_frames(folder)
 
 
-@pytest.mark.parametrize(
-    ("listed", "shots", "wrong", "words"),
-    [
-        (
-            {"repeats": 2},
-            [(0, 1.0), (1, 1.0)],
-            1,
-            "f_10.png and 1 more (horizontal stripes 2 of sign -1): is wrong: f_11.png",
-        ),
-        ({"repeats": 3}, [(0, 1.0), (1, 1.0), (2, 1.0)], 1, "is wrong: f_16.png has 0.5"),
-        ({"repeats": 3}, [(0, 1.0), (1, 1.0), (2, 1.0)], 0, "is wrong: f_15.png has 0.5"),
-        ({"exposure_ladder": [1, 2]}, [(0, 1.0), (1, 2.0)], 1, "is wrong: f_11.png has 0.5"),
-    ],
-)
-def test_a_wrong_repeat_or_exposure_is_named(
-    tmp_path: Path, listed: dict[str, Any], shots: list[tuple[int, float]], wrong: int, words: str
-) -> None:
-    """(Planted: repeats, and exposures, are compared with themselves; twice the part of a first one.)"""
-    good = repeated(tmp_path / "good", listed, shots, (-1, -1))
-    assert good.ok, good.warnings
-    bad = repeated(tmp_path / "bad", listed, shots, (5, wrong))
-    assert not bad.ok and len(bad.warnings) == 1 and words in bad.warnings[0], bad.warnings
-    assert max(error(bad, RealSession())) < 0.05
+def test_a_wrong_repeat_or_exposure_is_named(tmp_path: Path) -> None:
+    """The pair's sum shows both. (Planted: exposures are compared with themselves.)"""
+    for name, listed, second in (("repeat", {"repeats": 2}, 1.0), ("rung", {"exposure_ladder": [1, 2]}, 2.0)):
+        shots = [(0, 1.0), (1, second)]
+        good = repeated(tmp_path / f"good_{name}", listed, shots, (-1, -1))
+        assert good.ok, good.warnings
+        bad = tmp_path / f"bad_{name}"
+        if name == "rung":
+            with pytest.raises(MitsimError, match=r"f_10\.png and 1 more .* the two do not add up"):
+                repeated(bad, listed, shots, (5, 1))
+        else:
+            (words,) = (found := repeated(bad, listed, shots, (5, 1))).warnings
+            assert "f_10.png and 1 more" in words and "0.755 of its light" in words
+            assert max(error(found, RealSession())) < 0.05
 
 
-def test_a_dark_frame_with_light_is_named_and_left_out(tmp_path: Path) -> None:
-    """(Planted: it is left in.)"""
+def test_a_dark_frame_with_light_is_refused(tmp_path: Path) -> None:
     session = RealSession()
     folder = session.write(tmp_path / "frames", "uniform")
     for number in range(4):
         write_image(folder / f"dark_{number}.png", session.frame(np.full((4, 4), 0.1 * (number == 2))))
-    found = calibrate_frames(folder)
-    assert len(found.warnings) == 1 and "dark_2.png, with the projector off, has +10" in found.warnings[0]
-    assert max(error(found, session)) < 0.02
+    with pytest.raises(MitsimError, match=r"dark_2\.png, with the projector off, has \+10"):
+        calibrate_frames(folder)
 
 
 # ---- Exposures of one frame ----

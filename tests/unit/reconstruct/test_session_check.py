@@ -17,7 +17,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.session import SIDES, Half, halves_in_order
 from mitsim.reconstruct.factors import StripeSums, stripe_sums
-from mitsim.reconstruct.session_check import CheckedSession, MovingShadow, SessionConditions, check_session, frame_words
+from mitsim.reconstruct.session_check import CheckedSession, MovingShadow, check_session, frame_words
 from tests.shadow_factor import scene_factor
 
 N, PIXELS = 32, (90, 100)
@@ -74,10 +74,8 @@ def sums_of(shown: Frames, pairs: bool = True) -> tuple[StripeSums, StripeSums]:
     return sums
 
 
-def checked(shown: Frames, pairs: bool = True, **wrong: Half) -> CheckedSession:
-    """Check frames of which some are known to be ``wrong``, why: which."""
-    taken = SessionConditions(ORDER, wrong={half: why for why, half in wrong.items()})
-    return check_session(sums_of(shown, pairs), SIGNS, taken)
+def checked(shown: Frames, pairs: bool = True) -> CheckedSession:
+    return check_session(sums_of(shown, pairs), SIGNS, ORDER)
 
 
 def error(found: CheckedSession) -> tuple[float, float]:
@@ -114,7 +112,7 @@ def test_a_good_session_is_left_as_it_is_to_the_bit(pairs: bool) -> None:
     """(Planted: the uniform pattern's vector is set to zero in the given sums; ambient light taken off the misfit.)"""
     given = sums_of(frames(), pairs)
     vectors, misfits = [own.vectors.copy() for own in given], [own.misfit for own in given]
-    found = check_session(given, SIGNS, SessionConditions(ORDER))
+    found = check_session(given, SIGNS, ORDER)
     assert not found.warnings and found.lamp is None
     assert all(np.array_equal(own.vectors, exact) for own, exact in zip(found.sums, vectors, strict=True))
     assert [own.misfit for own in found.sums] == misfits
@@ -163,18 +161,6 @@ def test_a_response_is_divided_by_a_single_frames_power(part: float) -> None:
     assert (*half, "power") == (fault.side, fault.index, fault.sign, fault.kind)
     assert f"{part:g} of its light" in fault.detail
     assert error(found)[0] < 1.2 * CLEAN and holds(found, 0.01)
-
-
-def test_frames_that_are_known_to_be_wrong_are_left_out_whatever_they_show() -> None:
-    """(Planted: only what does not add up.)"""
-    half: Half = ("horizontal", 5, 1)
-    (fault,) = (found := checked(frames(), unlike=half)).faults
-    assert (fault.side, fault.index, fault.sign, fault.detail) == (*half, "is wrong: unlike")
-    assert holds(found, 0.01)
-    with pytest.raises(MitsimError, match=r"^frames: horizontal stripes 5 of sign \+1, .* 5 of sign -1: is wrong: "):
-        checked(frames(), unlike=half, missing=("horizontal", 5, -1))
-    with pytest.raises(MitsimError, match=r"^frames: vertical stripes 20 of sign \+1: unlike; take them again"):
-        checked(frames(), pairs=False, unlike=("vertical", 20, 1))
 
 
 def test_the_power_of_a_uniform_frame_is_divided_out_and_its_ambient_light_counts() -> None:
