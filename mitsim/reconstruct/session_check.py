@@ -425,8 +425,8 @@ class _Check:
                 own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
                 # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
                 own.add(_REPLACED, 1.5 * own.noise)
-                words = "replaced", _UNEQUAL, "the other frame of its pair replaces it"
-                self._mend(own, int(index), sign, words, float(np.sqrt(1.5 * own.noise / own.size)))
+                mended = "replaced", _UNEQUAL, "the other frame of its pair replaces it"
+                self._mend(own, int(index), sign, mended, float(np.sqrt(1.5 * own.noise / own.size)))
             elif not own.odd()[index]:  # the moving shadow's check refuses those of odd light
                 self._refuse(own, int(index), _UNEQUAL)
         return True
