@@ -29,7 +29,7 @@ CALLS = {
     "run": ["run", "session_of"],
     "view": ["Bench.view"],
     "plan": ["Bench.plan", "Plan.save"],
-    "capture": ["Bench.capture", "Bench.capture_lines", "Bench.capture_mosaic", "Light.load", "Light.expose"],
+    "capture": ["Bench.capture", "Bench.capture_lines", "Bench.capture_mosaic", "Light.expose"],
     "calibrate": ["Bench.calibrate", "Bench.calibrate_lines", "Bench.calibrate_mosaic", "Bench.calibrate_depths",
                   "Bench.write_session", "calibrate_frames", "calibrate_known", "calibrate_model", "plan_calibration"],
     "reconstruct": ["reconstruct", "reconstruct_colours", "reconstruct_psf", "Reconstruction.save"],

@@ -33,7 +33,7 @@ from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.cost_model import first_shadow, frame_seconds, frames_cost
 from mitsim.light.light import SampledLight, trace_light, trace_lines
-from mitsim.light.light_file import read_light, write_light
+from mitsim.light.light_file import write_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
@@ -73,24 +73,6 @@ class Light(SampledLight):
         light.
         """
         return expose(self, patterns, output, job, **Request(**request).given)
-
-    @check_arguments
-    def check_serves(self, patterns: str) -> None:
-        """Raise ArgumentError for ``patterns`` that light fewer pixels than planned, because their error is unknown."""
-        sparser = _sparser(self, self.bench.family(patterns, self.seed).lighting)
-        if sparser:
-            raise ArgumentError("patterns", f"{patterns!r}: {sparser}; trace light for {patterns}, which serves both")
-
-    @staticmethod
-    @check_arguments
-    def load(path: Path | str, bench: Apparatus) -> Light:
-        """Load light from a file of :meth:`save` or ``mitsim transport``, in single precision.
-
-        Raises MitsimError if the file cannot be read or has other data, and for light of another bench, with the
-        difference.
-        """
-        light = read_light(Path(path), bench)
-        return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
 
     @check_arguments
     def save(self, path: Path | str) -> Path:

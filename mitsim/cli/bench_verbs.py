@@ -305,9 +305,6 @@ class Capturing(OfScene, Request, KnownPlan, Resumed, Coloured, Opening, Limited
     CHANGES = shown(patterns={"default": None, "help": f"{pattern_names()}; needed without --plan"})
 
     output: Path = to_make(..., "run folder to make", "RUN")
-    light: Path | None = option(
-        None, "file of `mitsim transport`: nothing is traced again", metavar="FILE.h5", panel=WHAT
-    )
 
 
 @command
@@ -324,12 +321,6 @@ def capture(asked: Capturing) -> int:
 
     asked.refuse_idle()
     given, colour, output = asked.given_of(Request), asked.colour, asked.output
-    if asked.light is not None:
-        if asked.plan is not None:
-            raise MitsimError(
-                f"--plan {asked.plan}: light in a file has a plan of its own; leave out --plan or --light"
-            )
-        asked.refuse(["resume", "colour"], "on --light, which is of all lines and soon exposed")
     if asked.plan is None and "patterns" not in given:
         raise MitsimError("Missing option '--patterns': give it, or a plan with --plan")
     known = asked.read(given, colour != NO)
@@ -339,13 +330,9 @@ def capture(asked: Capturing) -> int:
     advise(RESUME)
     with asked.job() as job:
         bench = open_as(asked.scene, asked, job, colour)
-        held, light = memory_from_here(), None
-        if asked.light is not None:
-            with job.clock.stage("transport"):
-                light = mitsim.Light.load(asked.light, bench)
-                light.check_serves(request.patterns)
+        held = memory_from_here()
         own = given if known and colour == NO else {name: each for name, each in given.items() if name != "patterns"}
-        found = capture_in(bench, colour, known or request.patterns, own, Task(output, asked.resume, job), light)
+        found = capture_in(bench, colour, known or request.patterns, own, Task(output, asked.resume, job))
         if isinstance(found, Mapping):
             payload = payload_of_lines(RUN, {name: run.summary() for name, run in found.items()}, output)
         else:
@@ -516,10 +503,9 @@ class Tracing(OfScene, Planned, KnownPlan, Overwritten, Opening, Limited):
 def transport(asked: Tracing) -> int:
     """Trace a scene's light, for frames of any pattern.
 
-    Written by projector pixel, for capture --light and for programs without mitsim.
+    Written by projector pixel, for programs without mitsim.
 
     $ mitsim transport photograph -o light.h5
-    $ mitsim capture photograph -o run --light light.h5 --patterns dots:5
     """
     from mitsim.core.files import check_apart, output_file
 

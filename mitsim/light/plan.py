@@ -115,7 +115,12 @@ class Plan:
 
         Raises MitsimError for a plan without a request, or if the file cannot be written.
         """
-        text = self.as_text()
+        known = self.known_request
+        asked = {name: getattr(known, name) for name in ("patterns", "seed", "effects")}
+        asked |= known.model_dump(mode="json", exclude_unset=True)
+        settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
+        own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
+        text = json_text({"kind": "plan", "format": FORMAT, "sha256": _digest(own), "plan": own})
         if len(text) > MOST_BYTES:
             raise MitsimError(f"plan {path}: would take {len(text)} bytes, and at most {MOST_BYTES} are read; keep it")
         write_text(path, text)
@@ -128,18 +133,7 @@ class Plan:
 
         Raises MitsimError for a file that cannot be read, contains no plan, was changed or written by another version.
         """
-        return Plan.of_data(read_json(path), f"plan {path}")
-
-    def as_text(self) -> str:
-        known = self.known_request
-        asked = {name: getattr(known, name) for name in ("patterns", "seed", "effects")}
-        asked |= known.model_dump(mode="json", exclude_unset=True)
-        settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
-        own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
-        return json_text({"kind": "plan", "format": FORMAT, "sha256": _digest(own), "plan": own})
-
-    @staticmethod
-    def of_data(data: Any, where: str) -> Plan:
+        data, where = read_json(path), f"plan {path}"
         if not isinstance(data, dict) or data.get("kind") != "plan":
             raise MitsimError(f"{where}: is no file of a plan; give one that `mitsim plan -o` wrote")
         writer: Any = data
@@ -185,10 +179,10 @@ class Plan:
         return f"the plan was made for {_words(getattr(self.known_request, name))}; plan anew"
 
     @check_arguments
-    def check_made_of(self, deciding: Mapping[str, Any], argument: str = "plan") -> None:
+    def check_made_of(self, deciding: Mapping[str, Any]) -> None:
         """Raise ArgumentError, with the difference, for a plan of a bench with other ``deciding`` properties."""
         if self.made_of is None:
-            raise ArgumentError(argument, "was decided without a bench; make it by bench.plan")
+            raise ArgumentError("plan", "was decided without a bench; make it by bench.plan")
         for what, here in deciding.items():
             differs = _difference(self.made_of.get(what), here)
             if differs is not None:
@@ -197,7 +191,7 @@ class Plan:
                 alike = what == "scene" or one == other  # checksums, or what is cut before it differs
                 differs_by = f"the content of {place.strip()} differs" if alike else f"{place}{one} there, {other} here"
                 raise ArgumentError(
-                    argument,
+                    "plan",
                     f"was made of another {what}: {differs_by}; give what it was made of, or make it anew "
                     "(seed, exposure, sensor noise and output may differ)",
                 )

@@ -150,11 +150,6 @@ def test_reconstruct_refuses(refused: Refused, lab: Any, options: list[str], fra
         (["capture", "photograph"], ["--output"]),
         (["capture", "photograph", *NEW], ["--patterns", "a plan with --plan"]),
         (["capture", "photograph", *NEW, "--plan", "none.json"], ["none.json", "No such file"]),
-        (
-            ["capture", "photograph", *NEW, "--light", "a.h5", "--patterns", "dots:2", "--resume"],
-            ["--resume", "--light"],
-        ),
-        (["capture", "photograph", *NEW, "--light", "a.h5", "--patterns", "dots:2", "--colour", "lines"], ["--colour"]),
         (["reconstruct"], ["RUN"]),
         (["plan"], ["SCENE"]),
     ],

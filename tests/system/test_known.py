@@ -1,4 +1,4 @@
-"""What is planned or traced already: `--plan` and `--light` on the command line."""
+"""What is planned already: `--plan` on the command line."""
 
 from __future__ import annotations
 
@@ -64,7 +64,6 @@ def test_a_plan_is_written_and_captured(
         (("--patterns", "dots:2"), ("--patterns 'dots:2': the plan was made for 'dots:4'; plan anew",)),
         (("--accuracy", "1e-3"), ("--accuracy 0.001: the plan was made for 0.005",)),
         (("--effects=-diffraction",), ("--effects -diffraction: the plan was made for none",)),
-        (("--light", "light.h5"), ("--plan", "leave out --plan or --light")),
     ):
         mentions(refused("capture", *devices, "--plan", file, *options, "-o", tmp_path / "new"), *fragments)
     traced = [
@@ -85,25 +84,6 @@ def test_a_plan_is_written_and_captured(
     mentions(line, "--plan was made of another scene: the content of its XML differs")
 
 
-def test_light_is_written_and_captured(
-    call: Callable[..., Any], refused: Refused, lab: Any, devices: tuple[object, ...], tmp_path: Path
-) -> None:
-    """(Planted: a sparser family is exposed; the light's own family traced again.)"""
-    file = tmp_path / "light.h5"
-    assert call("transport", *lab.arguments, "--patterns", "dots:4", "-o", file).code == 0
-    done = call("capture", *devices, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "run", "--json").payload
-    assert done["frames"] == 4 and done["accuracy"] == 0.005 and done["seconds"]["plan"] < 0.1
-    lines = call("capture", *devices, "--light", file, "--patterns", "uniform", "-o", tmp_path / "one").out
-    assert lines.startswith("1 frames of 64x64")
-    for options, fragments in (
-        (("--patterns", "dots:8"), ("--patterns 'dots:8': its shots light", "trace light for dots:8")),
-        (("--patterns", "dots:2", "--accuracy", "1e-3"), ("--accuracy 0.001",)),
-    ):
-        mentions(refused("capture", *devices, "--light", file, *options, "-o", tmp_path / "new"), *fragments)
-    lit = refused("capture", lab.scene, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "new")
-    mentions(lit, "--light was made of another projector: ")
-
-
 def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
     call: Callable[..., Any], refused: Refused, lab: Any, devices: tuple[object, ...], tmp_path: Path
 ) -> None:
@@ -120,12 +100,9 @@ def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
     for path in (file, drawn):
         line = refused("transport", *own, "--plan", file, "-o", path, "--overwrite")
         mentions(line, f"output {path}: would replace", "which is read")
-    light = tmp_path / "light.h5"
-    assert call("transport", *own, "--plan", file, "-o", light).code in (0, 1)
     np.save(tmp_path / "bars.npy", np.outer([1.0, 0, 1, 1], [0, 1.0, 1, 1]))  # of the same name
-    for known in (("--plan", file), ("--light", light, "--patterns", "dots:2")):
-        line = refused("capture", *own, *known, "-o", tmp_path / "run")
-        mentions(line, f"{known[0]} was made of another camera: the content of mask_plate differs")
+    line = refused("capture", *own, "--plan", file, "-o", tmp_path / "run")
+    mentions(line, "--plan was made of another camera: the content of mask_plate differs")
 
 
 def test_what_python_warns_of_is_a_line_of_the_command_line(
@@ -133,10 +110,8 @@ def test_what_python_warns_of_is_a_line_of_the_command_line(
 ) -> None:
     """A note on stderr when all is done, without file and line of a program, and not among the JSON. (Planted: Python's
     own words, as until 0.6.0 `mitsim demo --patterns dots:2` had them.)"""
-    file = tmp_path / "light.h5"
-    assert call("transport", *lab.arguments, "--patterns", "dots:4", "-o", file).code == 0
     monkeypatch.setattr("mitsim.acquire.capture._foreign", lambda *_: "these frames are\nnoisier")
-    known = "capture", *devices, "--light", file, "--patterns", "dots:2", "--json", "-o"
+    known = "capture", *lab.arguments, "--patterns", "dots:2", "--json", "-o"
     done = call(*known, tmp_path / "run")
     assert done.code == 0 and done.payload["frames"] == 4 and done.err == "mitsim: note: these frames are noisier\n"
     assert len(call(*known, tmp_path / "run").refusal.splitlines()) == 1
@@ -198,23 +173,4 @@ def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
     for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
         line = shell("transport", *sheet, "--plan", file, "--variant", variant, "-o", tmp_path / "none").refusal
         mentions(line, "--plan was made of another colour: ")
-    assert not (tmp_path / "none").exists()
-
-
-@pytest.mark.slow
-def test_light_is_of_no_colour(
-    shell: Callable[..., Any], sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path
-) -> None:
-    """What told no line apart is exposed as no line, by no word of --colour and no camera behind filters. (Planted: the
-    variant not compared.)"""
-    file = tmp_path / "light.h5"
-    assert shell("transport", *sheet, *OF_COLOUR, "-o", file).code == 0
-    known = "capture", *sheet, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "none"
-    for options, sentence in (
-        (("--colour", "lines"), "--colour: has no effect on --light"),
-        (("--colour", "mosaic", *filters), "--colour: has no effect on --light"),
-        (filters, "has a mosaic GBRG"),
-        (("--variant", "llvm_ad_spectral"), "--light was made of another variant: llvm_ad_mono there"),
-    ):
-        mentions(shell(*known, *options).refusal, sentence)
     assert not (tmp_path / "none").exists()

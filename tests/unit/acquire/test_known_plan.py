@@ -18,7 +18,6 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.devices.projector import Lines
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS
 from tests.conftest import write_small_scene
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -182,34 +181,12 @@ def test_light_of_a_plan_is_that_of_its_request(bench: Bench, file: Path, monkey
     assert other.expose("dots:3").manifest.configuration["seed"] == 6
 
 
-# ---- light in a file
+# ---- light that is traced already
 
 
 @pytest.fixture(scope="module")
 def light(bench: Bench) -> Light:
     return bench.light("dots:3", accuracy=ACCURACY, seed=SEED)
-
-
-@pytest.mark.usefixtures("no_plans")
-def test_light_of_a_file_is_exposed_as_it_was_traced(bench: Bench, light: Light, tmp_path: Path) -> None:
-    """Frames of another family, its lamps' light and truth, and the errors that are stated. (Planted: lamps left out;
-    the second group for the first; the flux and its error exchanged; samples left out; always reached; the request's
-    seed for the light's.)"""
-    path = light.save(tmp_path / "light.h5")
-    found = Light.load(path, bench)
-    assert found.plan == light.plan and len(found.groups) == GROUPS and found.summary() == light.summary()
-    assert np.array_equal(found.flux, light.flux) and np.array_equal(found.flux_error, light.flux_error)
-    assert (found.samples, found.reached) == (light.samples, light.reached)
-    assert Light.load(replace(light, reached=False).save(tmp_path / "rough.h5"), bench).reached is False
-    for patterns in ("dots:3", "dots:2", "hadamard:4"):
-        first, second = light.expose(patterns), found.expose(patterns)
-        assert np.abs(second.electrons - first.electrons).max() < 1e-6 * first.electrons.max()
-        assert np.array_equal(first.truth, second.truth)
-        for name in ("mc_error", "total_error_bound", "heaviest_group"):
-            assert getattr(second.manifest, name) == pytest.approx(getattr(first.manifest, name), rel=1e-5)
-        assert second.manifest.configuration == first.manifest.configuration
-        assert second.manifest.configuration["light"] == {"patterns": "dots:3", "seed": SEED}
-    assert found.expose("dots:3", seed=9).manifest.configuration["light"]["seed"] == SEED
 
 
 @pytest.mark.usefixtures("no_plans")
@@ -219,49 +196,6 @@ def test_frames_that_are_noisier_than_the_lights_own_say_so(light: Light) -> Non
     for patterns, said in (("dots:2", True), ("dots:3", False)):
         (warning,) = [each for each in rough.expose(patterns).warnings if "accuracy 1e-06 was not reached" in each]
         assert ("trace it for dots:2" in warning and "as much noisier" in warning) is said
-
-
-@pytest.mark.usefixtures("no_plans")
-def test_light_that_does_not_fit_is_refused(bench: Bench, light: Light, tmp_path: Path) -> None:
-    """(Planted: another bench is not looked at; a matrix of other cells is read; what it takes of memory not held
-    against what is free.)"""
-    import h5py
-
-    path = light.save(tmp_path / "light.h5")
-    with pytest.raises(ArgumentError, match=r"^light was made of another parameter: albedo"):
-        Light.load(path, replace(bench, defines={}))
-    found = Light.load(path, bench)
-    with pytest.raises(ArgumentError, match=r"^patterns 'dots:5': its shots light 0\.0\d+ of the pixels"):
-        found.check_serves("dots:5")
-    for patterns in ("dots:3", "dots:2", "uniform", "hadamard:4"):
-        found.check_serves(patterns)
+    assert rough.expose("dots:3", seed=9).manifest.configuration["light"] == {"patterns": "dots:3", "seed": SEED}
     with pytest.raises(ArgumentError, match=r"^accuracy 0\.001"):
-        found.expose("dots:2", accuracy=1e-3)
-
-    def damaged(edit: Callable[[h5py.File], object], sentence: str) -> None:
-        light.save(path)
-        with h5py.File(path, "r+") as file:
-            edit(file)
-        with pytest.raises(MitsimError, match=sentence) as refusal:
-            Light.load(path, bench)
-        assert len(str(refusal.value).splitlines()) == 1
-
-    with pytest.MonkeyPatch.context() as full:
-        full.setattr("mitsim.core.job.free_memory", lambda: 1e4)
-        with pytest.raises(MitsimError, match=r"^file .*light\.h5: would take about .* of memory"):
-            Light.load(path, bench)
-    damaged(lambda file: file.pop("kept"), "is no file of this version's `mitsim transport`; trace it again")
-    damaged(lambda file: file["kept"].pop("flux"), "damaged")
-    damaged(lambda file: file["light/fine"].attrs.update(shape=(4, 5)), r"damaged.*/light/fine is \(4, 5\)")
-    damaged(lambda file: file["kept/flux"].write_direct(np.full(256, np.nan)), "finite numbers")
-    damaged(lambda file: file["light/fine/indices"].write_direct(
-        np.full(file["light/fine/indices"].shape, 2**30, np.int32)), "damaged")  # fmt: skip
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(MitsimError, match="damaged, or no HDF5 file"):
-        Light.load(path, bench)
-
-
-def test_light_without_a_request_is_written_and_not_read(bench: Bench, light: Light, tmp_path: Path) -> None:
-    bare = replace(light, plan=replace(light.plan, request=None))
-    with pytest.raises(MitsimError, match="trace it again"):
-        Light.load(bare.save(tmp_path / "light.h5"), bench)
+        light.expose("dots:2", accuracy=1e-3)

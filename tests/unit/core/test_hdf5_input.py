@@ -14,7 +14,6 @@ from mitsim.core.arrays import checked_hdf5
 from mitsim.core.errors import MitsimError
 from mitsim.exchange.packed import load_hdf5
 from mitsim.learn.pair_store import PairStore, is_shard
-from mitsim.light.light_file import read_light
 
 
 def packed_twice(file: h5py.File) -> None:
@@ -61,7 +60,6 @@ HOSTILE: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "pieces too large": (large_pieces, "pieces of over 256 MiB"),
 }  # fmt: skip
 READERS: dict[str, Callable[[Path], object]] = {
-    "light": lambda path: read_light(path, None),  # type: ignore[arg-type]
     "run": lambda path: load_hdf5(path).__enter__(),
     "pairs": lambda path: PairStore(path.parent, None)._file(Stub(path.name)).__enter__(),  # type: ignore[arg-type]
 }
