@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.acquire import exposure
-from mitsim.acquire.spectral import SpectralBench
+from mitsim.acquire.spectral import MosaicLight, SpectralBench, excess_behind_filters
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request, Task
@@ -28,15 +28,14 @@ from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
-from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.cost_model import first_shadow, frame_seconds, frames_cost
-from mitsim.light.light import SampledLight, trace_light, trace_lines
+from mitsim.light.light import SampledLight, Sampling, trace_light, trace_lines
 from mitsim.light.light_file import write_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
-from mitsim.light.truth import Truth
+from mitsim.light.truth import Truth, trace_truths
 from mitsim.planner.planner import known_losses
 
 _FIREFLIES = 0.72
@@ -159,7 +158,7 @@ def capture(
         check_plan(plan, bench, request)
     bench = bench.lit_by_lamps(request.effects, request.seed)
     lighting = bench.whole.family(request.patterns, request.seed).lighting
-    lines, readings = len(bench.benches), bench.readings
+    lines, readings = len(bench.benches), (bench.whole,) if bench.whole.filters else bench.benches
     colours = None if bench.whole.filters else bench.manifest  # of a folder of each line's
     exposed = frame_seconds(bench.whole, len(readings) * len(lighting.weights))
     exposing = sum(exposed.values())
@@ -194,13 +193,18 @@ def capture(
         check(plan.settings, exposing if lights else plan.predicted_seconds)
         if not lights:
             with job.clock.stage("transport"):
-                sampling = bench.sampling(request)
+                sampling = Sampling(by_pixel=False, excess=excess_behind_filters if bench.whole.filters else None)
                 lights = trace_lines(bench.whole, bench.benches, plan, lighting, request.seed, sampling, job.progress)
             with job.clock.stage("truth"):
-                lights = bench.with_truths(lights, request.seed)
+                errors = np.stack([light.flux_error for light in lights])
+                truths = trace_truths(bench.whole, plan.settings, request.seed, errors)
+                lights = [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
+        seen = lights
+        if bench.whole.filters is not None and bench.manifest is not None:
+            seen = [MosaicLight.of(bench.whole, lights, bench.manifest.wavelengths_nm)]
         runs = [
             _run(each, light, plan, request, job, head, recorder)
-            for each, light, head, recorder in zip(readings, bench.read(lights), heads, recorders, strict=True)
+            for each, light, head, recorder in zip(readings, seen, heads, recorders, strict=True)
         ]
     return Captured(tuple(runs), tuple(light.apparent for light in lights))
 
@@ -335,54 +339,13 @@ def _warnings(
     if shooting.ambient is not None and shooting.ambient.saturated:
         yield "saturation: the ambient frame has pixels at the full well or the ADC's end; expose for less"
     yield from exposure.camera_warnings(light.bench.sensor, shooting.always.shape)
-    if shooting.always.any():
-        yield from _of_ambient_light(shooting, accuracy, total.bound * shooting.dilution)
-        yield from _of_unknown_light(light, shooting)
     if shooting.saturated:
         yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"
+    if not shooting.always.any():
+        return
 
-
-def _foreign(light: SampledLight, totals: exposure.Totals, request: Request) -> str:
-    traced = light.plan.request.patterns if light.plan.request else request.patterns
-    if traced == request.patterns:
-        return ""
-    if totals.mc_error > _NOISIER * light.sampling_error:
-        return (
-            f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
-            f"{request.patterns} {totals.mc_error:.1e}, and their image as much noisier; trace it for "
-            f"{request.patterns}"
-        )
-    sparser = _sparser(light, light.bench.family(request.patterns, request.seed).lighting)
-    return f"{sparser}; trace it for {request.patterns}" if sparser else ""
-
-
-def _sparser(light: SampledLight, lighting: Lighting) -> str:
-    planned = light.plan.known_request.patterns
-    both = light.bench.family(planned, light.seed).lighting, lighting
-    made, other = (each.lit for each in both)
-    if other >= _AS_DENSE * made:
-        return ""
-    return (
-        f"its shots light {other:.2g} of the pixels, those of {planned}, which the light was planned for, {made:.2g}: "
-        "what the plan left out shows more in them, by how much it does not tell"
-    )
-
-
-def _of_unknown_light(light: SampledLight, shooting: exposure.Shooting) -> Iterator[str]:
-    counted_lamps, accuracy = light.bench.counted_lamps, light.plan.accuracy
-    if counted_lamps is not None and counted_lamps.unknown * shooting.ambient_part > accuracy:
-        first, last = counted_lamps.range_nm
-        one = len(counted_lamps.responses) == 1
-        part = f"{counted_lamps.unknown:.1%} of the lamps' light"
-        yield (
-            f"{part if one else f'up to {part} behind filters of one colour'} is in no frame: what would be counted "
-            f"beyond {first:g} to {last:g} nm if the quantum efficiency went on as its curve ends; let it end at 0, as "
-            "a filter's does"
-        )
-
-
-def _of_ambient_light(shooting: exposure.Shooting, accuracy: float, of_projector: float) -> Iterator[str]:
-    part = f"{shooting.ambient_part:.1%} of the frames' light is ambient"
+    # ---- Ambient light
+    part, of_projector = f"{shooting.ambient_part:.1%} of the frames' light is ambient", total.bound * shooting.dilution
     if of_projector > _DILUTED * accuracy:
         yield (
             f"{part}, and the accuracy {accuracy:g} is relative to all of it: relative to the projector's light alone "
@@ -395,3 +358,32 @@ def _of_ambient_light(shooting: exposure.Shooting, accuracy: float, of_projector
             f"{part}: noise is {shooting.noise_to_signal:.2g} times the projector's light in the frames, so little of "
             "an image will be left; darken the room, or expose longer on a sensor of a larger full well"
         )
+    counted_lamps = light.bench.counted_lamps
+    if counted_lamps is not None and counted_lamps.unknown * shooting.ambient_part > accuracy:
+        first, last = counted_lamps.range_nm
+        yield (
+            f"up to {counted_lamps.unknown:.1%} of the lamps' light is in no frame: what would be counted beyond "
+            f"{first:g} to {last:g} nm if the quantum efficiency went on as its curve ends; let it end at 0, as a "
+            "filter's does"
+        )
+
+
+def _foreign(light: SampledLight, totals: exposure.Totals, request: Request) -> str:
+    """Return why frames of other patterns than the light was traced for may be worse than stated; empty if not."""
+    traced = light.plan.request.patterns if light.plan.request else request.patterns
+    if traced == request.patterns:
+        return ""
+    if totals.mc_error > _NOISIER * light.sampling_error:
+        return (
+            f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
+            f"{request.patterns} {totals.mc_error:.1e}, and their image as much noisier; trace it for "
+            f"{request.patterns}"
+        )
+    own = light.bench.family(request.patterns, request.seed).lighting.lit
+    planned = light.bench.family(traced, light.seed).lighting.lit
+    if own >= _AS_DENSE * planned:
+        return ""
+    return (
+        f"its shots light {own:.2g} of the pixels, those of {traced}, which the light was planned for, {planned:.2g}: "
+        f"what the plan left out shows more in them, by how much it does not tell; trace it for {request.patterns}"
+    )

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -217,17 +217,6 @@ class Totals:
         return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
 
 
-class _Exposed(NamedTuple):
-    number: int
-    shot: Shot
-    electrons: FloatArray
-    digital: Digital
-    rendering_noise: float
-    ratio: float
-    saturated: bool
-    sums: FloatArray
-
-
 class Shooting:
     """Exposes expected frames and records them; frames that a resumed run already has are kept.
 
@@ -269,50 +258,51 @@ class Shooting:
         return math.sqrt((noise + own) / signal) if signal else math.inf
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
+        exposer = self.exposer
+
+        def expose_shot(item: tuple[int, Shot, Frame]) -> tuple[int, Shot, FloatArray, Digital, float]:
+            index, shot, frame = item
+            electrons = exposer.shot_electrons(frame, *shot.names)
+            digital = exposer.digital(electrons, *shot.names)
+            return index, shot, electrons, digital, exposer.rendering_noise(frame)
+
+        def measure(exposed: tuple[int, Shot, FloatArray, Digital, float]) -> tuple[float, bool, FloatArray]:
+            _, _, electrons, digital, rendered = exposed
+            energy, noise = sum_of_squares(electrons), exposer.sensor_noise(electrons)
+            signal = sum_of_squares(electrons - self.always) if self.always.any() else energy
+            ratio = 0.0 if not rendered else rendered / noise if noise else math.inf
+            sums = np.array([noise**2 * electrons.size, energy, signal, float(electrons.sum())])
+            return ratio, exposer.saturates(digital, electrons), sums
+
+        def record(exposed: tuple[int, Shot, FloatArray, Digital, float]) -> None:
+            index, shot, electrons, digital, rendered = exposed
+            if not self.recorder.keeps(index):
+                metadata: dict[str, str | int | float] = {
+                    "row": shot.row, "column": shot.column, "sign": shot.sign, "exposure_s": exposer.exposure_s,
+                    "rendering_noise_e": rendered, "seed": exposer.seed,
+                }  # fmt: skip
+                self.recorder.write_frame(index, frame_channels(digital, electrons), metadata)
+
         chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
         job.progress("frames", 0.0)
-        with Behind(self._record) as writing:
+        with Behind(record) as writing:
             while True:
                 with job.clock.stage("optics"):
                     chunk = next(chunks, None)
                 if chunk is None:
                     break
                 with job.clock.stage("sensor"):
-                    exposed = in_threads(self._expose, chunk)
+                    exposed = in_threads(expose_shot, chunk)
+                    measured = in_threads(measure, exposed)
                 with job.clock.stage("write"):
                     writing.give(exposed)
-                for shot in exposed:
-                    self.noise_ratio = max(self.noise_ratio, shot.ratio)
-                    self.saturated += shot.saturated
-                    self._sums += shot.sums
+                for ratio, saturated, sums in measured:
+                    self.noise_ratio = max(self.noise_ratio, ratio)
+                    self.saturated += saturated
+                    self._sums += sums
                 job.progress("frames", (chunk[-1][0] + 1) / len(expected))
             with job.clock.stage("write"):
                 writing.wait()
-
-    def _expose(self, item: tuple[int, Shot, Frame]) -> _Exposed:
-        (index, shot, frame), exposer = item, self.exposer
-        electrons = exposer.shot_electrons(frame, *shot.names)
-        digital = exposer.digital(electrons, *shot.names)
-        energy, noise, rendered = (
-            sum_of_squares(electrons),
-            exposer.sensor_noise(electrons),
-            exposer.rendering_noise(frame),
-        )
-        signal = sum_of_squares(electrons - self.always) if self.always.any() else energy
-        ratio = 0.0 if not rendered else rendered / noise if noise else math.inf
-        sums = np.array([noise**2 * electrons.size, energy, signal, float(electrons.sum())])
-        saturated = exposer.saturates(digital, electrons)
-        return _Exposed(index, shot, electrons, digital, rendered, ratio, saturated, sums)
-
-    def _record(self, exposed: _Exposed) -> None:
-        if self.recorder.keeps(exposed.number):
-            return
-        shot, exposer = exposed.shot, self.exposer
-        metadata: dict[str, str | int | float] = {
-            "row": shot.row, "column": shot.column, "sign": shot.sign, "exposure_s": exposer.exposure_s,
-            "rendering_noise_e": exposed.rendering_noise, "seed": exposer.seed,
-        }  # fmt: skip
-        self.recorder.write_frame(exposed.number, frame_channels(exposed.digital, exposed.electrons), metadata)
 
 
 def frame_channels(digital: Digital, electrons: FloatArray) -> dict[str, Channel]:

@@ -93,14 +93,6 @@ class Rendered:
         rows, columns = self.mean.shape[:2]
         return f"Rendered({rows} x {columns}: {self.facts['estimator']}, relative noise {self.mc_error:.1e})"
 
-    def _repr_html_(self) -> str:
-        from mitsim.core.images import card, normalise, span
-
-        grey = self.mean.mean(axis=2)
-        facts = f"mean {grey.mean():.3g} W/m^2, relative noise {self.mc_error:.1e}"
-        pictures = {f"irradiance\n{span(grey, 'W/m^2')}": normalise(grey)}
-        return card(f"Rendered: {self.facts['estimator']}", pictures, (facts, *self.warnings))
-
 
 def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) -> tuple[FloatArray, FloatArray]:
     """Return (m, m', channels) irradiance [W m^-2] and its standard error, by the scene's own integrator.
@@ -151,18 +143,6 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     return mean.reshape(*mean.shape[:2], -1), np.sqrt(variance).reshape(*mean.shape[:2], -1)
 
 
-def _samples(bench: Apparatus, estimator: str, spp: int | None) -> int:
-    check_samples(estimator, spp)
-    stated = bench.loaded.samples
-    if spp is not None or stated is None:
-        return spp or _SAMPLES
-    try:
-        check_samples(estimator, stated)
-    except MitsimError as error:
-        raise MitsimError(f"{bench.loaded.path}: sample_count of its sampler, taken for {error}") from None
-    return stated
-
-
 @contextmanager
 def show_pattern(bench: Apparatus, pattern: FloatArray) -> Iterator[None]:
     """Show a ``pattern`` (n, n) of 0..1 on the projector within the context."""
@@ -194,7 +174,13 @@ def render(
     job: Job | None = None,
 ) -> Rendered:
     job = job or Job()
-    spp = _samples(bench, estimator, spp)
+    check_samples(estimator, spp)
+    if spp is None:
+        spp = bench.loaded.samples or _SAMPLES
+        try:
+            check_samples(estimator, spp)
+        except MitsimError as error:
+            raise MitsimError(f"{bench.loaded.path}: sample_count of its sampler, taken for {error}") from None
     check_accuracy(accuracy)
     warnings, notes, bound = tuple[str, ...](), tuple[str, ...](), None
     started = time.perf_counter()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame, whole_file
-from mitsim.core.images import card, from_above, normalise, span
+from mitsim.core.images import from_above
 from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
@@ -78,10 +77,6 @@ class Sensed:
     def __repr__(self) -> str:
         rows, columns = self.digital.shape
         return f"Sensed({rows} x {columns}: {self.sensor.name}, exposure {self.exposure_s:.3g} s)"
-
-    def _repr_html_(self) -> str:
-        picture = {f"frame\n{span(self.digital, 'DN')}": normalise(self.digital)}
-        return card(f"Sensed: {self.sensor.name}", picture, (f"exposure {self.exposure_s:.3g} s", *self.warnings))
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
@@ -191,10 +186,6 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
         except (OSError, ValueError) as error:
             raise MitsimError(f"image {path}: not an array of numbers ({error}); save one by numpy.save") from error
     channels = {name: values for name, values in read_frame(path)[0].items() if not name.startswith("error.")}
-    return _light_of(channels, channel, path)
-
-
-def _light_of(channels: Mapping[str, Channel], channel: str | None, path: Path) -> tuple[FloatArray, tuple[str, ...]]:
     if channel is None and {*_LUMINANCE} <= {*channels}:
         light = sum(weight * finite_channel(channels, name, path) for name, weight in _LUMINANCE.items())
         return np.asarray(light), ("channels R, G and B: taken as one, their luminance (ITU-R BT.709)",)

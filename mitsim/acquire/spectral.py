@@ -30,11 +30,11 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import SPECTRA_NM, Band, CountedLamps, Lines, Response, Spectrum, line_units
 from mitsim.light.cost_model import frame_seconds, frames_cost
-from mitsim.light.light import SampledLight, Sampling
+from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
-from mitsim.light.truth import Truth, trace_truths
+from mitsim.light.truth import Truth
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.colour import PLANES, behind
@@ -82,18 +82,6 @@ class SpectralBench:
     @property
     def names(self) -> tuple[str, ...]:
         return self.manifest.names if self.manifest else ()
-
-    @property
-    def readings(self) -> tuple[Apparatus, ...]:
-        return (self.whole,) if self.whole.filters else self.benches
-
-    def read(self, lights: Sequence[SampledLight]) -> Sequence[SampledLight]:
-        if self.whole.filters is None or self.manifest is None:
-            return lights
-        return [MosaicLight.of(self.whole, lights, self.manifest.wavelengths_nm)]
-
-    def sampling(self, request: Request) -> Sampling:
-        return Sampling(by_pixel=False, excess=excess_behind_filters if self.whole.filters else None)
 
     def check(self, request: Request) -> None:
         request.timing.check(self.whole.sensor, self.whole.devices.camera_file)
@@ -148,11 +136,6 @@ class SpectralBench:
             steps.append(differences / energy * part**2 if energy else 0.0)
         alike = [each for each, step in zip(self.benches, steps, strict=True) if step >= _ALIKE * max(steps)]
         return max(alike, key=lambda each: each.projector.effective_wavelength_nm)
-
-    def with_truths(self, lights: Sequence[SampledLight], seed: int) -> list[SampledLight]:
-        errors = np.stack([light.flux_error for light in lights])
-        truths = trace_truths(self.whole, lights[0].plan.settings, seed, errors)
-        return [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
 
 
 def line_alone(bench: Apparatus, line: Lines) -> Apparatus:
@@ -356,51 +339,36 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
     settings = Settings(bench.geometry.scene_distance, effects=found)
     tracer = Simulation(bench, settings, pixels=min(bench.n, _CELLS)).from_camera
     assert isinstance(tracer, FromCameraTracer), "lamps are followed, not yet apart"
-    runs = [_LampRuns.of(response, tracer, integer(seed, "lamplight")) for response in responses]
-    light = np.concatenate([response.part * run.light for response, run in zip(responses, runs, strict=True)])
-    lines = bench.projector.lines
+    stream, (begin, end) = integer(seed, "lamplight"), SPECTRA_NM
+    light, spectra, unknown = list[FloatArray](), list[Spectrum](), 0.0
+    for response in responses:
+
+        def counted(*bands: Band, response: Response = response) -> FloatArray:
+            seen = LampTracer(tracer, LampResponse(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
+            lit = np.bincount(seen.pixel - tracer.projector.n**2, seen.value, manifests.MOST_LINES)
+            return np.asarray(lit / _SAMPLES)
+
+        first, last = response.range_nm
+        parts = math.ceil((last - first) / manifests.MOST_LINES / _STEP_NM)
+        cut = [response.bands(manifests.MOST_LINES, part, parts) for part in range(parts)]
+        of_parts = np.stack([counted(*bands) for bands in cut], axis=1)  # (bands, parts)
+        beyond = counted((begin, first), (last, end), (end - _END_NM, end), (end, end))
+        missing = float(beyond[0] + beyond[1] + beyond[2] / _END_NM * response.beyond_nm)
+        if missing:
+            unknown = max(unknown, missing / (missing + float(of_parts.sum())))
+        for band, weights in enumerate(of_parts):
+            middles = np.array([(bands[band][0] + bands[band][1]) / 2 for bands in cut])
+            shining = weights > 0 if weights.any() else np.ones(parts, dtype=bool)
+            some = weights[shining] if weights.any() else np.ones(parts)
+            spectra.append(Spectrum(middles[shining], some / some.sum()))
+        light.append(response.part * of_parts.sum(axis=1))
+    shares, lines = np.concatenate(light), bench.projector.lines
     counted_lamps = CountedLamps(
         responses,
         tuple(band for response in responses for band in response.bands(manifests.MOST_LINES)),
-        tuple(spectrum for run in runs for spectrum in run.spectra),
-        light / light.sum() if light.any() else np.full(len(light), 1 / len(light)),
-        max(run.unknown for run in runs),
+        tuple(spectra),
+        shares / shares.sum() if shares.any() else np.full(len(shares), 1 / len(shares)),
+        unknown,
         tuple(zip(lines.wavelengths_nm, line_units(bench.counting, lines), strict=True)),
     )
     return replace(bench, counted_lamps=counted_lamps)
-
-
-@dataclass(frozen=True)
-class _LampRuns:
-    light: FloatArray
-    spectra: tuple[Spectrum, ...]
-    unknown: float
-
-    @classmethod
-    def of(cls, response: Response, tracer: FromCameraTracer, stream: int) -> _LampRuns:
-        (first, last), (begin, end) = response.range_nm, SPECTRA_NM
-        parts = math.ceil((last - first) / manifests.MOST_LINES / _STEP_NM)
-
-        def fit_response(*bands: Band) -> FloatArray:
-            light = LampTracer(tracer, LampResponse(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
-            return np.asarray(
-                np.bincount(light.pixel - tracer.projector.n**2, light.value, manifests.MOST_LINES) / _SAMPLES
-            )
-
-        # (bands, parts)
-        light = np.stack(
-            [fit_response(*response.bands(manifests.MOST_LINES, part, parts)) for part in range(parts)], axis=1
-        )
-        middles = [
-            [(low + high) / 2 for low, high in response.bands(manifests.MOST_LINES, part, parts)]
-            for part in range(parts)
-        ]
-        beyond = fit_response((begin, first), (last, end), (end - _END_NM, end), (end, end))
-        missing = float(beyond[0] + beyond[1] + beyond[2] / _END_NM * response.beyond_nm)
-        unknown = missing / (missing + float(light.sum())) if missing else 0.0
-        spectra = []
-        for wavelengths, weights in zip(np.array(middles).T, light, strict=True):
-            lit = weights > 0 if weights.any() else np.ones(len(weights), dtype=bool)
-            some = weights[lit] if weights.any() else np.ones(len(weights))
-            spectra.append(Spectrum(wavelengths[lit], some / some.sum()))
-        return cls(light.sum(axis=1), tuple(spectra), unknown)

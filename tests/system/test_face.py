@@ -314,7 +314,6 @@ def test_objects_show_themselves(bench: ms.Bench, shots: ms.Capture, factors: ms
         (shots, 4, "dots:3"),
         (factors, 2, "left: 64 sensor x 16 projector pixels"),
         (ms.reconstruct(shots, factors), 2, "standard uncertainty"),
-        (bench.render(spp=4), 1, "relative noise"),
     ):
         page = shown._repr_html_()
         assert page.count('src="data:image/png;base64,') == pictures, type(shown)

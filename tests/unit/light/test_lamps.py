@@ -15,12 +15,11 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
-from mitsim.acquire.capture import _of_unknown_light
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
@@ -296,19 +295,6 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
         assert np.allclose(found, alone.frame(row.indices, row.data), rtol=1e-12, atol=1e-15 * found.max())
         frames.append(found)
     assert np.linalg.norm(frames[0] - frames[3]) > 0.05 * np.linalg.norm(frames[0])
-
-
-@pytest.mark.parametrize(("part", "flagged"), [(0.5, True), (0.02, False)])
-def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool) -> None:
-    """Where it is more of all light than the accuracy."""
-    counted_lamps = CountedLamps((Response(np.ones(2), (400.0, 700.0)),), (), unknown=0.04)
-    light: Any = SimpleNamespace(
-        bench=SimpleNamespace(counted_lamps=counted_lamps), plan=SimpleNamespace(accuracy=1e-3)
-    )
-    reported = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
-    assert bool(reported) is flagged and all(
-        "4.0% of the lamps' light is in no frame" in sentence for sentence in reported
-    )
 
 
 def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch) -> None:
