@@ -179,8 +179,8 @@ def render(
         spp = bench.loaded.samples or _SAMPLES
         try:
             check_samples(estimator, spp)
-        except MitsimError as error:
-            raise MitsimError(f"{bench.loaded.path}: sample_count of its sampler, taken for {error}") from None
+        except MitsimError as wrong:
+            raise MitsimError(f"{bench.loaded.path}: sample_count of its sampler, taken for {wrong}") from None
     check_accuracy(accuracy)
     warnings, notes, bound = tuple[str, ...](), tuple[str, ...](), None
     started = time.perf_counter()
