@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,10 @@ from mitsim.studies.characterise import CAMERA_FILE, Characterisation, character
 from tests.real_flats import CAMERAS, Light, camera, write_flats
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
-SLOW = (
-    *("few bits", "dark current", "high gain", "saturating ADC", "no black level"),
-    *("high read noise, cut darks", "six bits, next to no noise", "darks of one code", "many hot pixels"),
-)
-"""Cameras of the slow tests: the quick ones are one of each kind of fault. What cut darks and few bits do to the gain
-is looked at by a test of its own."""
-SLOW_LAMPS = "random walk", "step", "linear"
-"""Light that scatters, as that of the quick "scattering", and drifts, as that of "weakly linear"."""
+QUICK = "nonuniform", "defects", "bent"
+"""Cameras of the quick tests, one of each kind of fault; the fits of few codes take up to a minute."""
+QUICK_LAMPS = "scattering", "weakly linear"
+"""Light that scatters, and light that drifts."""
 
 
 def off_by(done: Characterisation, name: str) -> dict[str, float]:
@@ -41,7 +36,7 @@ def off_by(done: Characterisation, name: str) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CAMERAS]
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in CAMERAS]
 )
 def test_frames_of_a_camera_characterise_to_that_camera(name: str, tmp_path: Path) -> None:
     """Every field within five standard errors, of some fifteen a camera; and its file is a camera's.
@@ -57,6 +52,7 @@ def test_frames_of_a_camera_characterise_to_that_camera(name: str, tmp_path: Pat
     assert bool(found.row_noise_e) == bool(camera(name).row_noise_e) and bool(found.linearity) == (name == "bent")
 
 
+@pytest.mark.slow
 def test_cut_dark_readings_and_few_codes_move_the_standard_s_gain_and_not_the_camera_s(tmp_path: Path) -> None:
     """A fifth of the dark readings is 0: the standard's gain is 0.7 % too high; six bits and next to no noise: 50 %."""
     for name, least in (("high read noise, cut darks", 1.003), ("six bits, next to no noise", 1.3)):
@@ -67,6 +63,7 @@ def test_cut_dark_readings_and_few_codes_move_the_standard_s_gain_and_not_the_ca
         assert abs(off_by(done, name)["gain_dn_per_e"]) < 4
 
 
+@pytest.mark.slow
 def test_of_two_cameras_that_explain_few_codes_the_better_is_found(tmp_path: Path) -> None:
     """A fit that begins at straight lines ends at a gain 2 % too high, ten standard errors off, and fits well enough.
 
@@ -112,7 +109,7 @@ LAMPS: dict[str, tuple[Light, int, str]] = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_LAMPS else []) for name in LAMPS]
+    "name", [pytest.param(name, marks=[] if name in QUICK_LAMPS else [pytest.mark.slow]) for name in LAMPS]
 )
 def test_a_lamp_that_drifts_is_said_and_in_the_errors_of_what_depends_on_it(name: str, tmp_path: Path) -> None:
     """All fields and figures within five standard errors, and a line that names those which are known the less.
@@ -161,7 +158,6 @@ def behind_filters(photons: float, number: int, frame: int) -> np.ndarray:
 NO_CAMERA: dict[str, tuple[dict[str, Any], str]] = {
     "8 bits as of a JPEG": ({"read": compressed, "bits": 8}, "so frames were compressed"),
     "a gamma curve": ({"read": gamma}, "a gamma curve, compression"),
-    "a gamma curve of 8 bits": ({"read": lambda frame: np.rint(gamma(frame) / 16), "bits": 8}, "a gamma curve"),
     "a vignetted lamp": ({"light": vignetted}, "light differs by 33 % over the frame"),
     "colour filters": ({"light": behind_filters}, "give the frames of one colour behind filters"),
     "shifted numbers": ({"read": lambda frame: 16 * frame, "bits": 16}, "with a period of 16 DN"),
@@ -169,14 +165,12 @@ NO_CAMERA: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", NO_CAMERA)
-def test_frames_that_tell_nothing_of_a_camera_are_refused_soon(name: str, tmp_path: Path) -> None:
-    """In 10 s of the processor, most of it for the frames."""
+def test_frames_that_tell_nothing_of_a_camera_are_refused(name: str, tmp_path: Path) -> None:
+    """(Planted: each limit of a refusal at 1.)"""
     changes, words = NO_CAMERA[name]
     flats = load_flats(write_flats(tmp_path / "frames", camera("plain"), **changes))
-    start = time.process_time()
     with pytest.raises(MitsimError, match=re.escape(words)):
         characterise_frames(flats)
-    assert time.process_time() - start < 10
 
 
 def stuck(frame: np.ndarray) -> np.ndarray:
@@ -193,8 +187,6 @@ def without_columns(frame: np.ndarray) -> np.ndarray:
 
 ALTERED: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "every third code is missing": (lambda frame: np.floor(1.5 * frame), "with a period of 3 DN"),
-    "every fifth code is missing": (lambda frame: np.floor(1.25 * frame), "with a period of 5 DN"),
-    "every third code is twice as frequent": (lambda frame: np.floor(0.75 * frame), "with a period of 3 DN"),
     "bit 2 is stuck": (stuck, "with a period of 8 DN"),
     "a quarter of the pixels is black below 0": (partly_below, "25 % of dark readings are 0 DN"),
     "two columns are dead": (without_columns, "of the pixels show less than half of the light"),
@@ -238,6 +230,7 @@ def test_sets_and_hot_pixels_are_named_and_good_frames_are_not(tmp_path: Path) -
     assert all(abs(off[name]) < 5 for name in names), off
 
 
+@pytest.mark.slow
 def test_a_black_level_below_zero_is_refused_with_its_size(tmp_path: Path) -> None:
     """Firmware takes 80 off a black level of 60. (Planted: the black level cut at 0, as a camera file has it.)"""
     flats = write_flats(tmp_path / "f", camera("plain"), side=64, steps=8, read=lambda frame: np.maximum(frame - 80, 0))
@@ -245,7 +238,10 @@ def test_a_black_level_below_zero_is_refused_with_its_size(tmp_path: Path) -> No
         characterise_frames(load_flats(flats))
 
 
-@pytest.mark.parametrize(("read_noise_e", "black_level_dn"), [(12.0, 5.0), (8.0, 5.4), (25.0, 0.5)])
+@pytest.mark.parametrize(
+    ("read_noise_e", "black_level_dn"),
+    [(12.0, 5.0), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((8.0, 5.4), (25.0, 0.5)))],
+)
 def test_offsets_that_rounding_hides_are_found_or_said_to_be_hidden(
     read_noise_e: float, black_level_dn: float, tmp_path: Path
 ) -> None:
@@ -262,6 +258,7 @@ def test_offsets_that_rounding_hides_are_found_or_said_to_be_hidden(
     assert abs(row.found - 4.0) < 5 * row.standard_error and row.standard_error < 0.5, row
 
 
+@pytest.mark.slow
 def test_offsets_that_leave_no_trace_are_hidden(tmp_path: Path) -> None:
     """All dark readings are one code. (Planted: an error of 0 for offsets of which nothing is seen.)"""
     update = {"dsnu_pixel_e": 3.0, "bits": 8, "gain_dn_per_e": 0.0115, "black_level_dn": 4.0}
