@@ -14,7 +14,6 @@ reflectance of the glossy scene, its mean over the sensor:
     pixels           = t - L                         brightness that differs from the matt one
     sensor           = R(Y_direct) - R(Y_even)       light of a projector pixel that changes over the sensor
     interreflection  = R(Y_all) - R(Y_direct)
-    saturation       = R(mean reading of Y_all) - R(Y_all)
     rest             = R(Y_even) - t and noise       error that a matt scene of the same brightness has as well
 
 where Y_even is the twin's light, with that of each projector pixel times t / L. A user's scene needs a parameter
@@ -23,13 +22,10 @@ where Y_even is the twin's light, with that of each projector pixel times t / L.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from math import inf
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray
@@ -39,13 +35,12 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import PatternFamily
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
-from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solution import Solution
-from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
-from mitsim.report.lit_scene import DIM, LitScene, Unexposed, peak_time
-from mitsim.sensor.moments import frame_moments
+from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
+from mitsim.report.lit_scene import DIM, LitScene, Unexposed
 from mitsim.studies.framework.claims import Gain, Level, measured, stated
-from mitsim.studies.framework.experiment import Axes, Found, Point, Results, Scope, Study
+from mitsim.studies.framework.experiment import Axes, Found, Point, Scope, Study
 from mitsim.studies.framework.panels import Bars, Images, Lines
 from mitsim.studies.framework.studio import Image, Studio, finding, flags_of, measure_image, single_precision
 
@@ -59,24 +54,12 @@ _FEW = "uniform", "random:7", "dots:2", "dots:4", "dots:7", "dots:8", "hadamard:
 _SHOWN = "uniform", "random:7", "dots:4", "dots:7", "hadamard:8"
 _STATED = "uniform", "dots:7"
 """Families whose PSNR the paper's figures 4 to 6 state, mask at 2000 um."""
-_SPECTRUM = "spectrum"
 
 
 def _patterns_measure(studio: Studio, point: Point) -> Found:
-    frames = studio.frames(point.setup, point["model"], point["patterns"], int(point["seed"]))
-    found, kind = measure_image(studio, point, _SHOWN), str(point["patterns"]).partition(":")[0]
-    count = frames.family.left.shape[1] * frames.family.right.shape[1]
-    shown = point["patterns"] in _SHOWN and point["model"] == RENDERED
-    spectrum = {_SPECTRUM: frames.prepare().left.singular ** 2} if shown else {}
-    rows = tuple({**row, "patterns_count": count, "kind": kind} for row in found.rows)
-    return Found(rows, {**found.arrays, **spectrum})
-
-
-def _spectra(results: Results) -> Mapping[str, Figure]:
-    from mitsim.report.plots import singular_values
-
-    found = ((str(row["patterns"]), results.array(row, _SPECTRUM)) for row in results.rows)
-    return {"singular_values.png": singular_values({label(name): each for name, each in found if each is not None})}
+    family, kind = studio.bench(point.setup).family(point["patterns"]), str(point["patterns"]).partition(":")[0]
+    count, found = family.left.shape[1] * family.right.shape[1], measure_image(studio, point, _SHOWN)
+    return replace(found, rows=tuple({**row, "patterns_count": count, "kind": kind} for row in found.rows))
 
 
 _ANY = {"exposure": CONVENTIONS}
@@ -99,7 +82,6 @@ PATTERNS = Study(
     ),
     panels=(
         Lines("patterns_count", "number of patterns [1]", where=_ANY, each="exposure", colour="kind", shared="uniform"),
-        _spectra,
         Images("patterns", columns=_SHOWN, title=f"exposure {EQUAL_FRAME}", where={"exposure": EQUAL_FRAME}),
     ),
 )
@@ -158,10 +140,9 @@ EXPOSURE = Study(
 
 RADIANCES = WEAK, _, AS_BRIGHT, BRIGHTER, STRONG = ("1.17", "11.7", "117", "1170", "11700")
 """Radiance of the scene's lamp [W m^-2 sr^-1]."""
-_PERCENTILES = (1.0, 99.0)
-"""Bounds of a dynamic range, because the noise of single pixels is no signal."""
+_BRIGHT = 99.0
+"""Percentile at the end of a dynamic range, because the noise of single pixels is no signal."""
 _BETTER, _OTHER = "hadamard:8", "dots:8"
-_by_lamp = partial(Lines, "lamp", "radiance of the lamp [W m$^{-2}$ sr$^{-1}$]", facet="", log=True)
 
 
 def _ambient_measure(studio: Studio, point: Point) -> Found:
@@ -169,13 +150,9 @@ def _ambient_measure(studio: Studio, point: Point) -> Found:
     image, frames = studio.image(setup, RENDERED, patterns, seed), studio.frames(setup, RENDERED, patterns, seed)
     exposer = frames.exposer(frames.seconds(EQUAL_PEAK))
     dark = exposer.electrons(frames.expected.projector_off)
-    ends = [np.percentile(exposer.electrons(frame) - dark, _PERCENTILES) for frame in frames.expected]
-    low, high = np.mean(ends, axis=0) / frames.lit.bench.sensor.superpixel_full_well_e
-    uniform = studio.frames(setup, RENDERED, "uniform", seed).expected
-    (white,), lamp = uniform, uniform.projector_off.irradiance.sum()
-    ratio = float(lamp / (white.irradiance.sum() - lamp))
-    measures = {"ratio": ratio, "range_low": float(low), "range_high": float(high), **image.row()}
-    return finding(studio, point, image.image, **measures)
+    bright = [np.percentile(exposer.electrons(frame) - dark, _BRIGHT) for frame in frames.expected]
+    part = float(np.mean(bright)) / frames.lit.bench.sensor.superpixel_full_well_e
+    return finding(studio, point, image.image, range_high=part, **image.row())
 
 
 AMBIENT = Study(
@@ -217,21 +194,23 @@ AMBIENT = Study(
         ),
     ),
     panels=(
-        _by_lamp(title="PSNR by the lamp, exposure equal peak"),
-        _by_lamp(file="range", y="range_high", y_label="projector's light in bright pixels / full well [1]"),
+        Lines(
+            "lamp",
+            "radiance of the lamp [W m$^{-2}$ sr$^{-1}$]",
+            title="PSNR by the lamp, exposure equal peak",
+            facet="",
+            log=True,
+        ),
         Images("lamp", title="Images by the lamp's radiance, exposure equal peak", down=("patterns",)),
     ),
     heads=("Paper", "", "Rendered"),
-    note="The column ratio has the lamp's light over the projector's in a frame of uniform light. From every frame a "
-    "frame with the projector off is subtracted; its noise stays. An even grey has a PSNR of 12 to 20 dB.",
+    note="From every frame a frame with the projector off is subtracted; its noise stays. An even grey has a PSNR of "
+    "12 to 20 dB.",
 )
 
 # -------- Gloss: the error against the matt twin by cause
 
-PIXELS, SENSOR, INTERREFLECTION, SATURATION, REST = ERROR_SOURCES = (
-    "pixels", "sensor", "interreflection", "saturation", "rest",
-)  # fmt: skip
-_ADDED = SENSOR, INTERREFLECTION, SATURATION
+PIXELS, SENSOR, INTERREFLECTION, REST = ERROR_SOURCES = ("pixels", "sensor", "interreflection", "rest")
 _DARK = 1e-3
 """Reflectance of shadows, whose scale is only sampling noise."""
 
@@ -245,25 +224,18 @@ def split(frames: Unexposed, twin: LitScene, seconds: float) -> tuple[Solution, 
     model, sums = frames.data(seconds)
     solution, exposer, lit = model.solve(sums), frames.exposer(seconds), frames.lit
 
-    def rate(frame: Frame) -> FloatArray:
-        return exposer.electrons(frame) / seconds
-
-    def reading(frame: Frame) -> FloatArray:
-        return exposer.rate(frame_moments(exposer.electrons(frame), seconds, lit.bench.sensor)[0])
-
-    def image(expected: ExpectedFrames, seen: Callable[[Frame], FloatArray]) -> FloatArray:
+    def image(expected: ExpectedFrames) -> FloatArray:
         sums = model.accumulator()
         for shot, frame in zip(frames.family.shots, expected, strict=True):
-            sums.add(seen(frame), shot.row, shot.column)
+            sums.add(exposer.electrons(frame) / seconds, shot.row, shot.column)
         return model.solve(sums, solution.lam).image
 
     even, direct = (
-        LitScene(light).expected_frames(RENDERED, frames.family)
+        image(LitScene(light).expected_frames(RENDERED, frames.family))
         for light in (as_bright(twin.light, lit.light), direct_of(lit.light))
     )
-    images = [image(even, rate), image(direct, rate), image(frames.expected, rate), image(frames.expected, reading)]
-    parts = {PIXELS: lit.truth - twin.truth}
-    parts |= dict(zip(_ADDED, np.diff(images, axis=0), strict=True))
+    whole = image(frames.expected)
+    parts = {PIXELS: lit.truth - twin.truth, SENSOR: direct - even, INTERREFLECTION: whole - direct}
     return solution, {**parts, REST: solution.image - twin.truth - sum(parts.values())}
 
 
@@ -288,19 +260,22 @@ def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
 
 
 CARD, BLADE, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
-SHAPES = {"plate": {"shape": "rectangle", "z": "400"}, "ball": {"shape": "sphere", "z": "440"}}
-ROUGHNESSES = {"plate": (1.0, 0.3, 0.1, 0.03, 0.003, 0.001), "ball": (1.0, 0.3, 0.1, 0.03)}
-"""Roughness of GGX lobes; at 0.01 lobes are too narrow for anchors and too wide to be aimed at, so that light takes
-minutes."""
-GLOSS_FAMILIES = ("uniform", "dots:7")
-AS_MATT = "as the matt scene"
-EXPOSURES = (EQUAL_PEAK, AS_MATT)
 _TRUTHS = ("matt paint", "apparent")
-_KEPT_AS = "{patterns}, {exposure}"
+_IMAGE = "49 dots"
 _GREY = 0.5
 _ROUNDING = 1e-12
 _PLAIN_DB = 20.0
 _ACCURACY = 3e-3
+
+
+def _reflectivity_points(scope: Scope) -> list[Point]:
+    base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
+    subjects = scope.choose(SHIPPED, (CARD, DISC))
+    if scope.pictures == (None,):
+        if 'name="finish"' not in locate(base.scene, "scenes", "scene.xml").read_text(errors="replace"):
+            raise MitsimError(f"study reflectivity: {base.scene} has no parameter finish, whose matt is the truth")
+        subjects = (base.scene,)
+    return [Point.of(replace(base, scene=name), subject=name, seed=seed) for name in subjects for seed in scope.repeats]
 
 
 def _measure_gloss(studio: Studio, point: Point) -> Found:
@@ -311,57 +286,21 @@ def _measure_gloss(studio: Studio, point: Point) -> Found:
     seed = int(point["seed"])
     factors = studio.factors(point.setup, seed)
     twin, lit = studio.lit_scene(point.setup.with_parameters(finish="matt")), studio.lit_scene(point.setup)
-    rows, images = [], dict(zip(_TRUTHS, (twin.truth, lit.truth), strict=True))
-    for name in GLOSS_FAMILIES:
-        family = lit.bench.family(name, seed)
-        frames = lit.rendered_frames(factors, family, seed)
-        times = frames.seconds(EQUAL_PEAK), peak_time(twin.bench, twin.expected_frames(RENDERED, family))
-        for exposure, seconds in zip(EXPOSURES, times, strict=True):
-            solution, parts = split(frames, twin, seconds)
-            row = point.row(
-                patterns=name,
-                exposure=exposure,
-                exposure_s=seconds,
-                artefacts_db=decibels(np.sum([parts[cause] for cause in _ADDED], axis=0)),
-                psnr_db=psnr(solution.image, lit.truth),
-                psnr_matt_db=psnr(solution.image, twin.truth),
-                **flags_of(solution.status),
-                **{f"{cause}_db": decibels(part) for cause, part in parts.items()},
-            )
-            rows.append(row)
-            images[_KEPT_AS.format(**row)] = solution.image
-            if name == "dots:7" and exposure == EQUAL_PEAK:
-                images |= {cause: part + _GREY for cause, part in parts.items()}
-    return Found(tuple(rows), single_precision(images))
+    frames = lit.rendered_frames(factors, lit.bench.family("dots:7", seed), seed)
+    seconds = frames.seconds(EQUAL_PEAK)
+    solution, parts = split(frames, twin, seconds)
+    row = point.row(
+        exposure_s=seconds,
+        artefacts_db=decibels(parts[SENSOR] + parts[INTERREFLECTION]),
+        psnr_db=psnr(solution.image, lit.truth),
+        psnr_matt_db=psnr(solution.image, twin.truth),
+        **flags_of(solution.status),
+        **{f"{cause}_db": decibels(part) for cause, part in parts.items()},
+    )
+    images = {**dict(zip(_TRUTHS, (twin.truth, lit.truth), strict=True)), _IMAGE: solution.image}
+    images |= {cause: part + _GREY for cause, part in parts.items()}
+    return Found((row,), single_precision(images))
 
-
-# -------- The study
-
-
-def _reflectivity_points(scope: Scope) -> list[Point]:
-    base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
-    if scope.pictures == (None,):
-        if 'name="finish"' not in locate(base.scene, "scenes", "scene.xml").read_text(errors="replace"):
-            raise MitsimError(f"study reflectivity: {base.scene} has no parameter finish, whose matt is the truth")
-        gloss = [(base.scene, base)]
-    else:
-        gloss = [(name, replace(base, scene=name)) for name in scope.choose(SHIPPED, (CARD, DISC))]
-        highlight = replace(base, scene="highlight")
-        gloss += [
-            (name, highlight.with_parameters(roughness=each, **shape))
-            for name, shape in scope.choose(tuple(SHAPES.items()), ())
-            for each in ROUGHNESSES[name]
-        ]
-    return [Point.of(setup, subject=name, seed=seed) for name, setup in gloss for seed in scope.repeats]
-
-
-_CAUSES = {cause: (cause, f"{{{cause}_db:.1f}} dB") for cause in ERROR_SOURCES}
-_DOTS_ALONE = {"patterns": "dots:7"}
-_DRAWN = _DOTS_ALONE | {"exposure": EQUAL_PEAK}
-_SWEPT, _NOT_SWEPT = {"subject": tuple(SHAPES)}, {"subject": lambda name: name not in SHAPES}
-_LEVELS = {"psnr_matt_db": "image", **{f"{cause}_db": f"{cause} alone" for cause in ERROR_SOURCES}}
-_artefacts = partial(Level, column="artefacts_db", optional=True)
-_by_subject = partial(Images, down=("subject",))
 
 REFLECTIVITY = Study(
     "reflectivity",
@@ -369,49 +308,30 @@ REFLECTIVITY = Study(
     "What do shiny surfaces do to the image?",
     points=_reflectivity_points,
     measure=_measure_gloss,
-    claims=(
-        *(
-            _artefacts(
-                f"{words} (artefacts of gloss, 49 dots)",
-                paper=paper,
-                where=_DOTS_ALONE | {"subject": name},
-                at_least=low,
-                at_most=high,
-            )
-            for name, words, paper, low, high in (
-                (CARD, "The gift card comes out well", "quite good", _PLAIN_DB, inf),
-                (BLADE, "The metal blade comes out well", "quite good", _PLAIN_DB, inf),
-                (DISC, "The compact disc is worst", "severe artefacts", -inf, _PLAIN_DB),
-            )
-        ),
+    claims=tuple(
+        Level(
+            f"{words} (artefacts of gloss, 49 dots)", paper=paper, where={"subject": name}, column="artefacts_db",
+            at_least=low, at_most=high, optional=True,
+        )
+        for name, words, paper, low, high in (
+            (CARD, "The gift card comes out well", "quite good", _PLAIN_DB, inf),
+            (BLADE, "The metal blade comes out well", "quite good", _PLAIN_DB, inf),
+            (DISC, "The compact disc is worst", "severe artefacts", -inf, _PLAIN_DB),
+        )
     ),
     panels=(
-        Lines(
-            "roughness",
-            "roughness, alpha of GGX [1]",
-            file="causes",
-            y_label="PSNR against matt paint [dB]",
-            where=_DOTS_ALONE | _SWEPT,
-            each="exposure",
-            colour=_LEVELS,
-            facet="subject",
-            log=True,
+        Images(
+            {_IMAGE: (_IMAGE, "{psnr_db:.1f} dB"),
+             **{cause: (cause.replace("interr", "inter-r"), f"{{{cause}_db:.1f}} dB") for cause in ERROR_SOURCES}},
+            title="Images and their errors by cause, grey is none", before={name: name for name in _TRUTHS},
+            down=("subject",),
         ),
-        _by_subject("roughness", where=_DRAWN | _SWEPT, each="subject", array=_KEPT_AS, names="alpha {}"),
-        _by_subject(
-            ("patterns", "exposure"),
-            file="images_shipped",
-            where=_NOT_SWEPT,
-            array=_KEPT_AS,
-            before=dict(zip(_TRUTHS, _TRUTHS, strict=True)),
-        ),
-        _by_subject(_CAUSES, file="causes_shipped", title="Errors by cause, grey is none", where=_DRAWN | _NOT_SWEPT),
     ),
     heads=("Paper", "", "Rendered"),
     note="Each scene with gloss has a twin of matt paint, the truth of errors; apparent is the mean of the glossy "
-    "scene over the sensor, the truth of the images' decibels. As the matt scene: exposed as long as the twin, so that "
-    "highlights saturate. Decibels of a cause are the PSNR that its errors alone would leave. Pixels: brightness that "
-    "is not the matt one; sensor: light of a projector pixel that changes over the sensor.",
-)
+    "scene over the sensor, the truth of the image's decibels. Decibels of a cause are the PSNR that its errors alone "
+    "would leave. Pixels: brightness that is not the matt one; sensor: light of a projector pixel that changes over "
+    "the sensor.",
+)  # fmt: skip
 
 STUDIES = {each.name: each for each in (PATTERNS, EXPOSURE, AMBIENT, REFLECTIVITY)}

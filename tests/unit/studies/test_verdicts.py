@@ -168,17 +168,7 @@ def glossy(card: float = 40.0, disc: float = 10.0) -> list[Row]:
     return [
         row
         for name, decibels in (("gift_card", card), ("compact_disc", disc))
-        for exposure in (EQUAL_PEAK, "as the matt scene")
-        for row in rows(
-            decibels,
-            "artefacts_db",
-            jitter=True,
-            part="gloss",
-            model=RENDERED,
-            subject=name,
-            exposure=exposure,
-            patterns="dots:7",
-        )
+        for row in rows(decibels, "artefacts_db", jitter=True, model=RENDERED, subject=name)
     ]
 
 
