@@ -564,7 +564,7 @@ SIZES = {
     "scene": (8, 1434),
     "sensor": (5, 1193),
     "sessions": (4, 805),
-    "studies": (23, 6130),
+    "studies": (23, 6062),
     "transport": (21, 4485),
     "verbs": (1, 304),
     "version": (1, 1),
