@@ -163,13 +163,13 @@ class Capture:
                 )
             light = digital.rate(dn)
             own = light * shot.sign if shot.sign else self._projector_part(light)
-            factor, top, end = _common_factor(dn), float(dn.max()), digital.saturation_dn
+            top, end = float(dn.max()), digital.saturation_dn
             full = int(np.count_nonzero(dn >= end)) if end is not None and top >= end else 0
-            clipped = 0 if full else _clipped_readings(dn, top, digital, factor)
+            clipped = 0 if full else _clipped_readings(dn, top, digital)
             # Identical frames share a digest; constant frames have none.
             some = np.ascontiguousarray(dn[::_EVERY, ::_EVERY])
             digest = 0 if (some == some.flat[0]).all() else 1 + zlib.crc32(some.tobytes())
-            half = Measurement(own, *index, light, 1, full, factor, (digest,), (clipped,))
+            half = Measurement(own, *index, light, 1, full, (digest,), (clipped,))
             if shot.sign and index not in waiting:
                 waiting[index] = half
                 continue
@@ -351,7 +351,7 @@ def _common_factor(dn: FloatArray) -> int:
     return factor
 
 
-def _clipped_readings(dn: FloatArray, top: float, digital: Digital, factor: int) -> int:
+def _clipped_readings(dn: FloatArray, top: float, digital: Digital) -> int:
     """Return the number of readings at the largest number, ``top``, if noise makes so many unlikely; else 0.
 
     Without clipping, a frame's largest number is not more frequent than the numbers just below it.
@@ -361,7 +361,7 @@ def _clipped_readings(dn: FloatArray, top: float, digital: Digital, factor: int)
         return 0
     variance = float(digital.variance(digital.rate(np.array(top))))
     deviation = math.sqrt(max(variance, 0.0)) * digital.exposure_s * digital.gain_dn_per_e
-    step = max(digital.step_dn, float(factor)) if digital.step_dn else 0.0
+    step = max(digital.step_dn, float(_common_factor(dn))) if digital.step_dn else 0.0
     levels = _LEVELS if not step else min(int(deviation / step), _LEVELS)
     below = int(np.count_nonzero(dn > top - (levels + 0.5) * (step or deviation / _LEVELS))) - count
     share, least = count / (count + below), 1 / (1 + levels)
@@ -430,8 +430,6 @@ class Measurement:
         (rows, columns) [electrons/s] sum of the shots as read, which determines shot noise.
     saturated
         Readings at the full well or the ADC's end.
-    factor
-        Largest whole number that divides all digital numbers; 1 if they are not whole.
     digests
         Hash of each shot, different for independent readings; 0 for a constant frame.
     clipped
@@ -445,7 +443,6 @@ class Measurement:
     light: FloatArray
     shots: int
     saturated: int
-    factor: int = 1
     digests: tuple[int, ...] = ()
     clipped: tuple[int, ...] = ()
 
@@ -453,7 +450,7 @@ class Measurement:
         """Combine both halves of a signed pattern."""
         summed = ("frame", "light", "shots", "saturated", "digests", "clipped")
         sums = {name: getattr(self, name) + getattr(other, name) for name in summed}
-        return replace(self, **sums, factor=math.gcd(self.factor, other.factor))
+        return replace(self, **sums)
 
     @property
     def power(self) -> float:

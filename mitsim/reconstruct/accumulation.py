@@ -17,21 +17,19 @@ calibrated distance moves light likewise and is included."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import Digital, FactorNoise, RunManifest
 from mitsim.core.runs import Capture, Measurement
-from mitsim.reconstruct.factorisation import IndexArray, Side, group_pixels
+from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import BYTES_A_NUMBER, TIKHONOV, keeps_frames, slab_numbers
 from mitsim.reconstruct.solution import Solution
@@ -46,10 +44,6 @@ _ALIKE = 0.5
 _LEAST_EIGENVALUE = 0.01
 _SIGNIFICANT = 3.0
 _NEAR = 2.0
-_BLOCKS = 4
-_EDGE = 0.5
-_PLACES = (0.1, 0.3), (0.4, 0.8), (0.7, 0.1), (0.9, 0.6)
-_RANK = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,118 +83,6 @@ def print_energy(model: Model, image: FloatArray) -> float:
     return EDGES * max(total, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class LitFrame:
-    frame: FloatArray
-    variance: float
-    factors: tuple[FloatArray, FloatArray]
-    slopes: tuple[FloatArray, FloatArray]
-    blocks: tuple[IndexArray, IndexArray]
-
-    def beyond(self, left: FloatArray, right: FloatArray) -> float:
-        seen = left.T @ self.frame @ right
-        beyond = np.square(self.frame).sum() - np.square(seen).sum() - (self.frame.size - seen.size) * self.variance
-        return float(beyond)
-
-    def of_depths(self, ranges: Sequence[FloatArray], wider: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        wide, wide_ = wider
-        image = np.linalg.pinv(self.factors[0]) @ self.frame @ np.linalg.pinv(self.factors[1]).T
-        own, own_ = wide.T @ ranges[0], wide_.T @ ranges[1]
-        seen, slid = ([wide.T @ of[0], wide_.T @ of[1]] for of in (self.factors, self.slopes))
-
-        def outside(frame: FloatArray) -> FloatArray:
-            return np.asarray(frame - own @ (own.T @ frame @ own_) @ own_.T).ravel()
-
-        moved = []
-        for row, column in np.ndindex(_BLOCKS, _BLOCKS):
-            part = image * np.outer(self.blocks[0] == row, self.blocks[1] == column)
-            moved += [outside(slid[0] @ part @ seen[1].T), outside(seen[0] @ part @ slid[1].T)]
-        vectors = np.stack(moved)
-        return vectors @ vectors.T, vectors @ outside(wide.T @ self.frame @ wide_)
-
-
-class LitFrames:
-    def __init__(self, factors: tuple[FloatArray, FloatArray], patterns: tuple[FloatArray, FloatArray]) -> None:
-        self._factors, sides = factors, list[list[tuple[IndexArray, FloatArray]]]()
-        for side in patterns:
-            groups = group_pixels(side)
-            lit = [(group.pixels, group.shared[1]) for group in groups if group.shared and group.shared[1].any()]
-            alone = all(group.shared for group in groups)
-            sides.append([(pixels, psi / np.dot(psi, psi)) for pixels, psi in lit] if alone else [])
-        self._apart = all(sides)
-        places = {(int(row * len(sides[0])), int(column * len(sides[1]))) for row, column in _PLACES}
-        self._groups = [(sides[0][row], sides[1][column]) for row, column in sorted(places)] if self._apart else []
-        shape = len(factors[0]), len(factors[1])
-        self._frames: list[FloatArray] = [np.zeros(shape) for _ in self._groups]
-        self._variances = [0.0] * len(self._groups)
-
-    def collect(self, measurement: Measurement, frame: FloatArray, variance: float) -> None:
-        for k, ((_, rows), (_, columns)) in enumerate(self._groups):
-            weight = rows[measurement.row] * columns[measurement.column]
-            if weight:
-                self._frames[k] += weight * frame
-                self._variances[k] += weight**2 * variance
-
-    def print_part(self) -> float:
-        if not self._apart:
-            return float("nan")
-        slopes, (left, right) = [factor_slope(side, spline=True) for side in self._factors], self._factors
-        frames = []
-        for ((rows, _), (columns, _)), frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
-            lit = left[:, rows], right[:, columns]
-            blocks = rows * _BLOCKS // left.shape[1], columns * _BLOCKS // right.shape[1]
-            frames.append(LitFrame(frame, variance, lit, (slopes[0][:, rows], slopes[1][:, columns]), blocks))
-        return print_part(frames)
-
-
-def print_part(frames: Sequence[LitFrame]) -> float:
-    """Return the part of the misfit of ``frames`` that is light beside pixels' centres, but not because of depth.
-
-    Print has its light on either side of the centres, a surface beside the calibrated distance on one side. Therefore
-    the energy that depths explain is no print. They are estimated from the other frames, because dipoles may imitate a
-    depth.
-    """
-    moments, own, left_over, depths = np.zeros(3), 0.0, 0.0, list[tuple[FloatArray, FloatArray]]()
-    for each in frames:
-        both = [np.hstack(pair) for pair in zip(each.factors, each.slopes, strict=True)]
-        ranges, wider = [orthonormal(side) for side in each.factors], [orthonormal(side) for side in both]
-        # Sums of squares of the lit pixels' light, and of its dipoles along rows and along columns.
-        found = np.linalg.pinv(both[0]) @ each.frame @ np.linalg.pinv(both[1]).T
-        rows, columns = (side.shape[1] for side in each.factors)
-        parts = found[:rows, :columns], found[rows:, :columns], found[:rows, columns:]
-        moments += [np.square(part).sum() for part in parts]
-        own += each.beyond(ranges[0], ranges[1])
-        size, (left, right), (wide, wide_) = each.frame.size, ranges, wider
-        if size <= wide.shape[1] * wide_.shape[1]:
-            return 0.0
-        spare = (size - left.shape[1] * right.shape[1]) / (size - wide.shape[1] * wide_.shape[1])
-        left_over += each.beyond(wide, wide_) * spare
-        depths.append(each.of_depths(ranges, wider))
-    if max(moments[1:]) > _EDGE**2 * moments[0] or own <= 0:
-        return 0.0
-    whole = np.tile(np.eye(2), _BLOCKS**2)
-    of_depth = max(
-        _predicted_energy(depths),
-        _predicted_energy([(whole @ matrix @ whole.T, whole @ side) for matrix, side in depths]),
-    )
-    return float(np.clip(1 - (max(left_over, 0.0) + max(of_depth, 0.0)) / own, 0.0, 1.0))
-
-
-def _predicted_energy(problems: Sequence[tuple[FloatArray, FloatArray]]) -> float:
-    total = 0.0
-    for index, (matrix, side) in enumerate(problems):
-        others = [each for place, each in enumerate(problems) if place != index] or [(matrix, side)]
-        normal, data = (np.sum(parts, axis=0) for parts in zip(*others, strict=True))
-        found = np.linalg.lstsq(normal, data, rcond=_RANK)[0]
-        total += float(2 * found @ side - found @ matrix @ found)
-    return total
-
-
-def orthonormal(matrix: FloatArray) -> FloatArray:
-    left, singular, _ = np.linalg.svd(matrix, full_matrices=False)
-    return np.asarray(left[:, singular > singular[0] * max(matrix.shape) * np.finfo(np.float64).eps])
-
-
 def offset_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> FloatArray:
     total = np.zeros((2, slope.shape[1], len(side.singular)))
     for half, strips in zip(total, side.halves, strict=True):
@@ -211,20 +93,29 @@ def offset_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> Flo
     return total
 
 
-def factor_slope(factor: FloatArray, spline: bool = False) -> FloatArray:
+def factor_slope(factor: FloatArray) -> FloatArray:
     """Return the change Phi' (m, n) of a ``factor`` (m, n) by scene pixel.
 
     A fast shadow's slope is computed along the sensor, because neighbours in the scene may be a feature of the mask
-    apart. A ``spline`` halves the error at edges and doubles the noise.
+    apart.
     """
     rows, columns = factor.shape
     if columns == 1:
         return np.zeros_like(factor)
-    shift = _shift(factor) if rows > 2 else 0.0
-    if abs(shift) >= 1:
-        return np.asarray(-shift * np.gradient(factor, axis=0))
-    places = np.arange(columns)
-    return np.asarray(CubicSpline(places, factor, axis=1)(places, 1) if spline else np.gradient(factor, axis=1))
+    if rows <= 2:
+        return np.asarray(np.gradient(factor, axis=1))
+    # The shift [sensor pixels] from each scene pixel to the next is where their correlation peaks, by a parabola.
+    shadows = np.ascontiguousarray((factor - factor.mean(axis=0)).T)  # transforms are faster along lines of memory
+    spectra = np.fft.rfft(shadows, 2 * rows)
+    correlation = np.fft.irfft((spectra[1:] * spectra[:-1].conj()).sum(axis=0), 2 * rows)
+    place = int(np.argmax(correlation))
+    before, peak, after = correlation[np.arange(place - 1, place + 2) % (2 * rows)]
+    if peak > _ALIKE * float(np.square(shadows).sum()) and before + after < 2 * peak:
+        whole = place if place < rows else place - 2 * rows
+        shift = whole + 0.5 * float((before - after) / (before - 2 * peak + after))
+        if abs(shift) >= 1:
+            return np.asarray(-shift * np.gradient(factor, axis=0))
+    return np.asarray(np.gradient(factor, axis=1))
 
 
 def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[FloatArray, FloatArray]) -> FloatArray:
@@ -251,20 +142,6 @@ def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[Fl
     return np.maximum(total, 0.0)
 
 
-def _shift(factor: FloatArray) -> float:
-    rows = len(factor)
-    shadows = np.ascontiguousarray((factor - factor.mean(axis=0)).T)  # transforms are faster along lines of memory
-    spectra = np.fft.rfft(shadows, 2 * rows)
-    size = float(np.square(shadows).sum())
-    correlation = np.fft.irfft((spectra[1:] * spectra[:-1].conj()).sum(axis=0), 2 * rows)
-    place = int(np.argmax(correlation))
-    before, peak, after = correlation[np.arange(place - 1, place + 2) % (2 * rows)]
-    if not (peak > _ALIKE * size and before + after < 2 * peak):
-        return 0.0
-    whole = place if place < rows else place - 2 * rows
-    return whole + 0.5 * float((before - after) / (before - 2 * peak + after))  # a parabola's peak
-
-
 # ---- Noise of frames ----
 
 
@@ -273,8 +150,7 @@ class FrameNoise:
 
     Variances [(electrons/s)^2] of the ``ambient`` frame are by sensor row (m,) and column (m',); those of patterns (K,
     K'), ``rows`` (K, K', m) and ``columns`` (K, K', m') do not include it. ``light_error`` is the relative error of
-    single projector pixels' light in simulated frames; ``factor`` the largest whole number that divides all digital
-    numbers.
+    single projector pixels' light in simulated frames.
     """
 
     def __init__(self, manifest: RunManifest, ambient: tuple[FloatArray, FloatArray] | None = None) -> None:
@@ -291,7 +167,6 @@ class FrameNoise:
         self.columns: FloatArray
         self.rows, self.columns = (np.zeros((*counts, 0)) for _ in range(2))
         self.power, self.shots, self.saturated, self.readings = 0.0, 1, 0, 0
-        self.factor = 0
         self.light: FloatArray = np.zeros((0, 0))
 
     @property
@@ -323,7 +198,6 @@ class FrameNoise:
         self.rows[pattern], self.columns[pattern] = self._own(by_row, shots), self._own(by_column, shots)
         self.power += measurement.power
         self.shots = shots
-        self.factor = math.gcd(self.factor, measurement.factor)
         self.saturated += measurement.saturated
         self.readings += shots * measurement.frame.size
 
@@ -369,20 +243,16 @@ class Lack:
 
     @cached_property
     def struck(self) -> FloatArray:
-        sides, patterns = self.model.sides, self.model.patterns
-        return np.asarray(
-            sum(
-                _term_response(sides[0], a, patterns[0]) @ self.image @ _term_response(sides[1], b, patterns[1]).T
-                for a, b in self.terms
-            )
-        )
-
-
-def _term_response(side: Side, term: FloatArray, patterns: FloatArray) -> FloatArray:
-    seen = np.zeros((len(side.singular), term.shape[1]))
-    for slab, lit in zip(side.slabs, patterns.T, strict=True):
-        seen[slab.columns] += (slab.matrix.T @ term) * lit
-    return seen
+        total = np.zeros_like(self.model.prepared.sigma)
+        for term in self.terms:
+            responses = []
+            for side, factor, patterns in zip(self.model.sides, term, self.model.patterns, strict=True):
+                seen = np.zeros((len(side.singular), factor.shape[1]))
+                for slab, lit in zip(side.slabs, patterns.T, strict=True):
+                    seen[slab.columns] += (slab.matrix.T @ factor) * lit
+                responses.append(seen)
+            total += responses[0] @ self.image @ responses[1].T
+        return total
 
 
 # ---- Frames added up ----

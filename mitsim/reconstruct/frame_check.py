@@ -10,22 +10,21 @@ stencil of neighbours, fitted to the run itself, predicts each pixel from other 
 the differences r between pixels and predictions:
 
 1. the mean of log(1 + u^2) over a frame, u being r over its robust scale, detects a foreign frame;
-2. least squares of the power and then of the shift of all frames, because a frame of power 1 + a adds a X at its own
-   pixels and changes the predictions of its neighbours;
+2. least squares of the power of all frames, because a frame of power 1 + a adds a X at its own pixels and changes the
+   predictions of its neighbours;
 3. the mean of 1 over windows of a few dots and one to four consecutive shots detects a hand in a few frames.
 
-The undecided rest is stated as a standard error of the power and of the place of single frames.
+The undecided rest is stated as a standard error of the power of single frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import correlate1d, uniform_filter
+from scipy.ndimage import uniform_filter
 from scipy.optimize import nnls
 from scipy.sparse import csr_matrix
 
@@ -38,7 +37,7 @@ from mitsim.reconstruct.uncertainty import Propagation
 
 # ---- The picture of shifting dots -----------------------------------------------------------------------------------
 
-_PRIOR_POWER, _PRIOR_SHIFT = 0.1, 0.5
+_PRIOR = 0.1
 _SCALES = 8.0, 3.0, 1.0, 1.0
 _PIXELS, _FEWEST = 2500, 4
 _WINDOWS, _LONGEST = (3, 5), 4
@@ -75,9 +74,8 @@ class PictureCheck:
         # Differences along a line of pixels that the same frame lights share their error.
         along = [axis for axis in (0, 1) if (np.diff(frame_of, axis=axis) == 0).all()]
         self._line_of: IndexArray = np.indices(image.shape)[1 - along[0]].ravel() if along else np.arange(image.size)
-        self.power, self.power_error = self._fit(image, [image], _PRIOR_POWER, _SCALES)
-        self._even = image * (1 - self.power[frame_of])
-        left_over = self._differences(self._even)
+        self.power, self.power_error = self._fit(image)
+        left_over = self._differences(image * (1 - self.power[frame_of]))
         differences = left_over / self._scale(left_over, self._pixels)
         self.predicted = float(np.sqrt(np.mean(np.square(left_over))))
         moved, roughness = np.clip(differences, -_MOST, _MOST), np.log1p(np.square(differences))
@@ -103,28 +101,14 @@ class PictureCheck:
         common = float(shared.sum() / (np.square(moved).sum() + 1e-300)) if along else 0.0
         self.disturbed = self._disturbance(moved, periods, common)
 
-    @cached_property
-    def place(self) -> tuple[FloatArray, FloatArray]:
-        # Looked for in the picture without the powers, because in even parts these look like a slope.
-        place, error = self._fit(self._even, [*np.gradient(self._even)], _PRIOR_SHIFT)
-        return place.reshape(2, -1), error.reshape(2, -1)
+    @property
+    def scatter(self) -> float:
+        """Scatter of the power of single frames beyond its own error.
 
-    def uncertainty(self, image: FloatArray) -> FloatArray:
-        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames.
-
-        The scatter over the frames beyond its own error is stated, and at least its standard error, because a flicker
-        as small as the errors is not seen.
+        It is at least its standard error, because a flicker as small as the errors is not seen.
         """
-        found, errors = (
-            np.stack([own, *others]) for own, others in zip((self.power, self.power_error), self.place, strict=True)
-        )
-        scatter, known = np.var(found, axis=1), np.mean(np.square(_UNDERSTATED * errors), axis=1)
-        power, *moves = np.sqrt(np.maximum(scatter - known, scatter * np.sqrt(2 / self._count)))
-        variance = np.square(image * power)
-        for axis, move in enumerate(moves):  # to either side, because a slope over both misses the finest print
-            for step in ([0.0, -1.0, 1.0], [-1.0, 1.0, 0.0]):
-                variance += np.square(move * correlate1d(image, step, axis, mode="nearest")) / 2
-        return np.asarray(np.sqrt(variance))
+        scatter, known = float(np.var(self.power)), float(np.mean(np.square(_UNDERSTATED * self.power_error)))
+        return float(np.sqrt(max(scatter - known, scatter * np.sqrt(2 / self._count))))
 
     def _disturbance(self, moved: FloatArray, periods: Sequence[int], common: float) -> FloatArray:
         cells = [
@@ -151,38 +135,46 @@ class PictureCheck:
                     found[k : k + length] = np.maximum(found[k : k + length], worst)
         return found
 
-    def _fit(
-        self, image: FloatArray, changes: Sequence[FloatArray], prior: float, learned: Sequence[float] = ()
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return how far each frame is off by each of the ``changes`` (n, n') of an ``image``, with errors.
+    def _fit(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Learn the stencil's weights, and return the relative power (K,) of each frame, with errors.
 
         The errors are those of the sandwich estimator (Huber 1967), because differences are not normal. Least squares
         are reweighted by Cauchy's weights, because edges of the print are outliers. The stencil has no negative
         weights, because these imitate a lamp that flickers in the period of the dots.
         """
-        own, target = self._pairs(image, self._some), image.ravel()[self._some]
-        # The same change of all frames is a change of the picture, and is held at zero.
-        known = np.kron(np.eye(len(changes)), np.eye(self._count) / prior**2 + _FIXED)
-        found, left_over = np.zeros(len(known)), target - own @ self._weights
-        design = self._sensitivity(changes)
-        for wider in learned or (1.0, 1.0):
+        values, count, place = image.ravel(), len(self._some), np.arange(len(self._some))
+        own, target = self._pairs(image, self._some), values[self._some]
+        # The same power of all frames is a change of the picture, and is held at zero.
+        known = np.eye(self._count) / _PRIOR**2 + _FIXED
+        found, left_over = np.zeros(self._count), target - own @ self._weights
+        design = self._sensitivity(values)
+        for wider in _SCALES:
             weights = 1 / (np.square(wider * self._scale(left_over, self._some)) + np.square(left_over))
-            if learned:
-                normal = own.T @ (weights[:, None] * own)
-                normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
-                root = np.linalg.cholesky(normal)
-                side = own.T @ (weights * (target - design @ found))
-                self._weights = nnls(root.T, np.linalg.solve(root, side))[0]
-                design = self._sensitivity(changes)
+            normal = own.T @ (weights[:, None] * own)
+            normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
+            root = np.linalg.cholesky(normal)
+            self._weights = nnls(root.T, np.linalg.solve(root, own.T @ (weights * (target - design @ found))))[0]
+            design = self._sensitivity(values)
             rest, weighted = target - own @ self._weights, design.multiply(weights[:, None]).tocsr()
             inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
             found = inverse @ (weighted.T @ rest)
             left_over = rest - design @ found
-        lines, place = self._line_of[self._some], np.arange(len(self._some))
-        scores = csr_matrix((np.ones(len(lines)), (lines, place))) @ weighted.multiply(left_over[:, None]).tocsr()
-        covariance = inverse @ ((scores.T @ scores).toarray() + np.eye(len(known)) / prior**2) @ inverse
-        spare = max(len(left_over) - len(inverse), 1) / len(left_over)
+        scores = (
+            csr_matrix((np.ones(count), (self._line_of[self._some], place)))
+            @ weighted.multiply(left_over[:, None]).tocsr()
+        )
+        covariance = inverse @ ((scores.T @ scores).toarray() + np.eye(self._count) / _PRIOR**2) @ inverse
+        spare = max(count - len(inverse), 1) / count
         return found, np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare)
+
+    def _sensitivity(self, values: FloatArray) -> csr_matrix:
+        """Return the change (pixels, K) of the differences by the power of each frame."""
+        near = zip(self._offsets, self._weights, strict=False)
+        terms = [(0, 1.0), *((sign * offset, -weight / 2) for offset, weight in near for sign in (1, -1) if weight)]
+        lit = [self._some + offset for offset, _ in terms]
+        changes = np.concatenate([weight * values[places] for places, (_, weight) in zip(lit, terms, strict=True)])
+        rows, frames = np.tile(np.arange(len(self._some)), len(terms)), self._frames[np.concatenate(lit)]
+        return csr_matrix((changes, (rows, frames)), shape=(len(self._some), self._count))
 
     def _differences(self, image: FloatArray) -> FloatArray:
         return np.asarray(image.ravel()[self._pixels] - self._pairs(image, self._pixels) @ self._weights)
@@ -194,18 +186,6 @@ class PictureCheck:
         values, ones = image.ravel(), np.ones(len(pixels))
         pairs = [(values[pixels + each] + values[pixels - each]) / 2 for each in self._offsets]
         return np.stack([*pairs, ones, -ones], axis=1)
-
-    def _sensitivity(self, changes: Sequence[FloatArray]) -> csr_matrix:
-        place, near = np.arange(len(self._some)), zip(self._offsets, self._weights, strict=False)
-        terms = [(0, 1.0), *((sign * offset, -weight / 2) for offset, weight in near for sign in (1, -1) if weight)]
-        parts = [
-            (weight * change.ravel()[places], place, self._frames[places] + number * self._count)
-            for number, change in enumerate(changes)
-            for offset, weight in terms
-            for places in (self._some + offset,)
-        ]
-        values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return csr_matrix((values, (rows, columns)), shape=(len(place), len(changes) * self._count))
 
 
 OFF = 7e-3
@@ -240,6 +220,8 @@ class FrameFault:
 
 
 class FrameCheck:
+    """Tests of single frames of a run; under shifting dots with the ``picture`` that they show together."""
+
     def __init__(self, data: Accumulation, sums: Residuals, lam: float, ratio: float, beside: float) -> None:
         self._data, self._sums, self._beside = data, sums, beside
         self._variance, self._signed = ratio * data.noise.variance, data.noise.shots == 2
@@ -251,32 +233,47 @@ class FrameCheck:
         self._doubt = float(np.sqrt(1 + beside / max(spare, TINY)))
         single = all(((side != 0).sum(axis=1) == 1).all() for side in data.shots.patterns)
         self._exclusive = single and not self._signed and self._variance.size > 1
-        self.picture = self._check_picture(lam) if self._exclusive else None
+        self.picture: PictureCheck | None = None
+        if self._exclusive:
+            seen, shape = Propagation(data.model, lam), self._variance.shape
+            rows, columns = ((side != 0).argmax(axis=1) for side in data.shots.patterns)
+            numbers = np.reshape([self._number.get((*pattern, 0), 0) for pattern in np.ndindex(*shape)], shape)
+            image, noise = data.prepared.image(seen.gain * sums.weights), seen.of_white(float(self._variance.mean()))
+            picture = PictureCheck(image, numbers[np.ix_(rows, columns)], shape, noise)
+            self.picture = picture if picture.decides else None
 
     def faults(self) -> tuple[FrameFault, ...]:
-        found, by_others = [*self._alone()], [*self._unlike_model()]
-        powers = [*self._unlike_picture(), *self._flicker()]
+        noise, count, sums, picture = self._data.noise, len(self._shots), self._sums, self.picture
+        found, powers, by_model = list[FrameFault](), list[FrameFault](), [*self._unlike_model()]
+        if abs(float(noise.means.sum())) < CHANCE * float(np.sqrt(noise.variance.sum() / sums.squares.size)):
+            found.append(self._fault("dark", range(count), "holds no light" if count == 1 else "hold no light"))
+        for digest, shots in sums.same.items():
+            if digest and len(shots) > 1 and noise.variance.any():
+                numbers = [self._number[shot] for shot in shots]
+                found.append(self._fault("repeated", numbers, "are equal, noise and all"))
+        for shot, readings in sums.clipped.items() if len(sums.clipped) <= self._most else ():
+            words = f"has {readings} readings at its largest number"
+            found.append(self._fault("clipped", [self._number[shot]], words))
+        if picture is not None:
+            foreign = np.flatnonzero(picture.foreign > _FOREIGN * self._doubt)
+            if len(foreign):
+                words = "show another picture than the frames around, dot by dot"
+                powers.append(self._fault("picture", foreign, words))
+            disturbed = np.flatnonzero(picture.disturbed > _DISTURBED * self._doubt)
+            # Gloss is seen in some frames, too, but its light has no image: no frame is at fault.
+            if len(disturbed) and not len(foreign) and self._excess < OFF**2 * float(sums.shots.sum()):
+                strongest = disturbed[np.argsort(-picture.disturbed[disturbed])][:8]
+                words = "show a part of the scene otherwise than the frames around"
+                powers.append(self._fault("picture", strongest, words))
+            powers += self._powers(picture.power, picture.power_error, range(count), _FLICKERS)
+        powers += self._flicker()
         # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
-        flicker = max((fault.part for fault in powers), default=0.0)
-        if by_others and by_others[0].part >= _SCATTERS * flicker:
-            found += by_others
+        if by_model and by_model[0].part >= _SCATTERS * max((fault.part for fault in powers), default=0.0):
+            found += by_model
         patterns = [(shot.row, shot.column) for shot in self._shots]
         named = {patterns[number] for fault in found for number in fault.numbers}
         powers = [each for each in powers if each.kind != "power" or not named & {patterns[n] for n in each.numbers}]
         return (*found, *powers, *self._closing())
-
-    # ---- Tests of single frames
-
-    def _alone(self) -> Iterator[FrameFault]:
-        noise, count = self._data.noise, len(self._shots)
-        if abs(float(noise.means.sum())) < CHANCE * float(np.sqrt(noise.variance.sum() / self._sums.squares.size)):
-            yield self._fault("dark", range(count), "holds no light" if count == 1 else "hold no light")
-        for digest, shots in self._sums.same.items():
-            if digest and len(shots) > 1 and noise.variance.any():
-                yield self._fault("repeated", [self._number[shot] for shot in shots], "are equal, noise and all")
-        if len(self._sums.clipped) <= self._most:
-            for shot, readings in self._sums.clipped.items():
-                yield self._fault("clipped", [self._number[shot]], f"has {readings} readings at its largest number")
 
     def _unlike_model(self) -> Iterator[FrameFault]:
         sums, count, noise = self._sums, self._variance.size, self._variance
@@ -307,31 +304,6 @@ class FrameCheck:
             numbers = [self._number[row, column, sign] for sign in (signs if self._signed else [0])]
             size = float(np.sqrt(off[row, column]))
             yield self._fault("model", numbers, f"differ by {size:.1%} from what the other frames predict", size)
-
-    # ---- The picture of shifting dots
-
-    def _check_picture(self, lam: float) -> PictureCheck | None:
-        seen = Propagation(self._data.model, lam)
-        rows, columns = ((side != 0).argmax(axis=1) for side in self._data.shots.patterns)
-        shape = self._variance.shape
-        numbers = np.reshape([self._number.get((*pattern, 0), 0) for pattern in np.ndindex(*shape)], shape)
-        image, noise = self._data.prepared.image(seen.gain * self._sums.weights), float(self._variance.mean())
-        found = PictureCheck(image, numbers[np.ix_(rows, columns)], shape, seen.of_white(noise))
-        return found if found.decides else None
-
-    def _unlike_picture(self) -> Iterator[FrameFault]:
-        found = self.picture
-        if found is None:
-            return
-        foreign = np.flatnonzero(found.foreign > _FOREIGN * self._doubt)
-        if len(foreign):
-            yield self._fault("picture", foreign, "show another picture than the frames around, dot by dot")
-        disturbed = np.flatnonzero(found.disturbed > _DISTURBED * self._doubt)
-        # Gloss is seen in some frames, too, but its light has no image: no frame is at fault.
-        if len(disturbed) and not len(foreign) and self._excess < OFF**2 * float(self._sums.shots.sum()):
-            strongest = disturbed[np.argsort(-found.disturbed[disturbed])][:8]
-            yield self._fault("picture", strongest, "show a part of the scene otherwise than the frames around")
-        yield from self._powers(found.power, found.power_error, range(len(self._shots)), _FLICKERS)
 
     def _flicker(self) -> Iterator[FrameFault]:
         """Report shots of another power.
@@ -371,8 +343,6 @@ class FrameCheck:
             words = f"differ by {float(np.std(power)):.2%} in their power"
             yield self._fault("power", range(len(self._shots)), words, scatter)
 
-    # ---- A closing frame
-
     def _closing(self) -> Iterator[FrameFault]:
         closing, noise, sides = self._data.shots.closing, self._data.noise, self._data.shots.patterns
         if closing is None:
@@ -403,8 +373,6 @@ class FrameCheck:
             words += f"{np.vdot(closing.light, predicted) / energy:.3f} of theirs: lamp, camera or scene changed"
             yield FrameFault("closing", tuple(range(len(self._shots))), (), words, part)
 
-    # ---- What no test decides
-
     def limits(self) -> tuple[dict[str, Any], ...]:
         shots = self._data.shots
         if shots.manifest.plan is not None or (shots.closing and shots.closing.kind == "uniform"):
@@ -414,17 +382,14 @@ class FrameCheck:
             sizes: dict[str, float | None] = dict.fromkeys(("pixel", "power", "place"))
             told = "is too small, or too much the same along the dots' lines, to decide about single frames"
             if found:
-                values = found.predicted, np.median(found.power_error), np.median(found.place[1])
-                sizes = dict(zip(sizes, map(float, values), strict=True))
-                told = "decides pixels to {:.2g}, power to {:.1%}, places to {:.2g} scene pixels".format(*values)
+                sizes |= {"pixel": found.predicted, "power": float(np.median(found.power_error))}
+                told = "decides pixels to {pixel:.2g} and power to {power:.1%}".format(**sizes)
             words = f"{_DOTS} The picture {told}; an object over few dots of some frames is not seen. {_REMEDY}"
             return ({"words": words, **sizes},)
         contrast = float(self._sums.contrast[whole]) if whole and self._sums.powers else 1.0
         leak = (1 - contrast) / (1 + contrast)
         words = f"the dark half of the even pattern has {leak:.1%} of the light of the bright one. {_LEAKING} {_REMEDY}"
         return ({"words": words, "leak": leak},) if leak > _LEAK else ()
-
-    # ---- Words
 
     def _fault(self, kind: str, numbers: Iterable[int], words: str, part: float = 0.0) -> FrameFault:
         numbers = tuple(sorted(int(number) for number in numbers))

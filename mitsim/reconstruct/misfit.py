@@ -7,8 +7,8 @@ data that restore the fit. Four measurements decide, in this order:
 2. Energy: the residuals' energy beyond that of noise, calibration error, rendering and print finer than a scene pixel,
    for the whole sensor, its tiles, rows, columns and pixels, and in time.
 3. Frames: each frame against the prediction of the others (:mod:`mitsim.reconstruct.frame_check`).
-4. Readings, if one of these is off: turned frames, shots in another order, tone curves, scale, lag, and a light that is
-   the same in all frames.
+4. Readings, if one of these is off: turned frames and shots in another order. Besides, light that is the same in all
+   frames.
 
 *Defective pixels.* A defective pixel is off in every frame, and its neighbours are not. A separable solver cannot
 weigh single pixels, so their readings are replaced by the prediction from all others: setting y - r / (1 - h) at a
@@ -27,7 +27,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.accumulation import Accumulation, FrameNoise, LitFrames, print_energy
+from mitsim.reconstruct.accumulation import Accumulation, FrameNoise, print_energy
 from mitsim.reconstruct.factorisation import IndexArray
 from mitsim.reconstruct.factors import decibels
 from mitsim.reconstruct.focus import DerivedCapture
@@ -40,10 +40,8 @@ from mitsim.reconstruct.residuals import (
     Reading,
     Residuals,
     find_readings,
-    multiple,
-    negative,
+    is_negative,
     noise_chance,
-    pixel_groups,
 )
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.uncertainty import Propagation
@@ -166,7 +164,8 @@ class Cause(Enum):
     SATURATION = "readings at the full well or the ADC's end", "expose for less"
     MODEL = (
         "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, "
-        "gloss, indirect light, or another camera",
+        "gloss, indirect light, print finer than a scene pixel, numbers that are not linear in the light, or another "
+        "camera",
         "try `--focus auto`, check that the camera is the calibrated one, and compare the misfit's map with the scene",
     )
 
@@ -176,10 +175,9 @@ class Misfit:
     """Part of the measurements that the model does not explain, and its cause.
 
     ``chi_square`` is the residual's energy over the expected one, by tile in ``tiles``; ``unexplained`` is the rms of
-    the excess beyond print, relative to the measurements, of which the calibration predicts ``predicted``. Print finer
-    than a scene pixel (``detail``) is no part of it. Without ``stated`` noise only gross misfit is flagged. ``noise``
-    is measured over stated noise, ``gain`` the camera's stated gain [DN per electron], and ``common`` the relative
-    change of the image by light that all frames share.
+    the excess beyond print, relative to the measurements, of which the calibration predicts ``predicted``. Without
+    ``stated`` noise only gross misfit is flagged. ``noise`` is measured over stated noise, ``gain`` the camera's stated
+    gain [DN per electron], and ``common`` the relative change of the image by light that all frames share.
     """
 
     chi_square: float
@@ -196,7 +194,6 @@ class Misfit:
     places: tuple[Place, ...] = ()
     readings: tuple[Reading, ...] = ()
     defects: Defects | None = None
-    detail: float = 0.0
     picture: PictureCheck | None = None
     common: float = 0.0
     limits: tuple[dict[str, Any], ...] = ()
@@ -207,9 +204,8 @@ class Misfit:
 
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
-        detail = f" beside {self.detail:.1e} of print finer than a scene pixel" if self.detail else ""
         others = "".join(f"; {other}" for other in (self.reason, self.defects) if other)
-        return f"misfit: {self.gist}{noise}, {self.unexplained:.1e} unexplained{detail}{others}"
+        return f"misfit: {self.gist}{noise}, {self.unexplained:.1e} unexplained{others}"
 
     @property
     def reason(self) -> str:
@@ -234,7 +230,8 @@ class Misfit:
     def summary(self) -> dict[str, Any]:
         measured = self.gain * self.noise.gain if self.gain and self.noise and self.noise.gain > 0 else None
         return {
-            **{name: getattr(self, name) for name in ("chi_square", "unexplained", "worst_tile", "flagged", "detail")},
+            **{name: getattr(self, name) for name in ("chi_square", "unexplained", "worst_tile", "flagged")},
+            "detail": 0.0,  # of earlier versions, which measured print finer than a scene pixel
             "noise_stated": self.stated,
             "cause": self.cause.name.lower() if self.cause else None,
             "reason": self.reason or None,
@@ -303,19 +300,12 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
         return replace(found, defects=defects)  # the caller leaves them out, and tries again
     check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)
     faults, places = check.faults(), tuple(sums.places(ratio)) if noise.stated and not off else ()
-    scaled = multiple(noise.factor, test.ratio) if test and noise.stated else None
-    turned = noise.shots == 2 and negative(prepared, pixel_groups(data.shots.patterns), sums.weights)
+    turned = noise.shots == 2 and is_negative(prepared, data.shots.patterns, sums.weights)
     # A reading is looked for in dim light, too, where chance hides half of what is off.
     hint = 1 + noise_chance(noise, float(sums.pixels.sum())) / 2
     hinted = found.stated and found.unexplained > UNEXPLAINED and found.chi_square > hint
-    readings = tuple(filter(None, [scaled]))
-    if not scaled and (found.flagged or faults or places or off or turned or hinted):
-        readings = find_readings(data, ratio, beside + of_ramps)
-    if found.flagged and not (readings or faults) and (detail := _detail(data, sums, excess, beside)):
-        fine, _ = weigh(energies, known, noise, max(of_ramps, detail))
-        if not fine.flagged:
-            found = replace(found, flagged=False, unexplained=fine.unexplained, worst_tile=fine.worst_tile)
-            found, places = replace(found, detail=float(np.sqrt(detail / energy))), ()
+    suspect = found.flagged or faults or places or off or turned or hinted
+    readings = find_readings(data, ratio, beside + of_ramps) if suspect else ()
     full, local = noise.saturated > 1e-5 * noise.readings, bool(places) and places[0].energy > _MOSTLY * excess
     unlike = Cause.SATURATION if full else Cause.PIXELS if local else Cause.MODEL
     findings = {Cause.READING: readings, Cause.FRAMES: faults, unlike: found.flagged}
@@ -353,14 +343,6 @@ def _common_light(data: Accumulation, sums: Residuals, stated: float, beside: fl
     if found @ side < max(least, beside, _MOSTLY * (float(sums.squares.sum()) - stated - beside)):
         return None
     return np.asarray((lights[0] * (found / scale)[:, None]).T @ lights[1])
-
-
-def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -> float:
-    lit = LitFrames(data.factors.sides, data.shots.patterns)
-    for each in data.measurements_again():
-        variance = float(data.noise.of(float(data.noise.means[each.row, each.column]), each.shots))
-        lit.collect(each, data.prepared.as_solved(each.frame), variance)
-    return float(np.nan_to_num(lit.print_part())) * max(excess + beside, 0.0)
 
 
 # ---- Energies found and expected ----

@@ -12,22 +12,20 @@ the noise over the light is rho times the stated one.
 *Map.* Energies by tile, row, column and pixel are each divided by their own robust scatter, so that a general fault
 does not hide a local one.
 
-*Other readings* of a run's frames are turned frames, shots in another order, numbers with a tone curve, and lag, each
-fitted by the same model on a part of the sensor. For light g(y) of numbers y, the model H g(y) is mapped back by the
-inverse of g, so that all misfits are compared with the same noise. All readings that fit as well as the best one
-within noise are offered, because a symmetric camera cannot decide between them.
+*Other readings* of a run's frames are turned frames, and shots in another order, each fitted by the same model on a
+part of the sensor. All readings that fit as well as the best one within noise are offered, because a symmetric camera
+cannot decide between them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
@@ -40,9 +38,7 @@ from mitsim.reconstruct.solver import Prepared, prepare, robust_scatter
 
 _FITS, _AT_MOST = 0.05, 2e-2
 _FIT_ALIKE, _ROWS = 0.02, 4.0
-_EXPONENTS, _LAGS, _LINEAR, _NO_LAG = (0.3, 3.0), (0.0, 0.5), 0.05, 2e-3
 _LAMBDA, _NEGATIVE = 1e-3, 0.5
-_MULTIPLIED, _LEAST_MULTIPLIED = 0.15, 1.5
 
 _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "as they are": lambda frame: frame,
@@ -64,26 +60,16 @@ _STEPS = {
 @dataclass(frozen=True)
 class Reading:
     words: str
-    left: float = 0.0
-    order: str | None = None
+    left: float
+    order: str | None
 
     def summary(self) -> dict[str, object]:
         return {"words": self.words, "order": self.order, "unexplained": self.left}
 
 
-def multiple(factor: int, chi_square: float) -> Reading | None:
-    if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
-        return None
-    bits = "" if factor & (factor - 1) else f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
-    return Reading(f"the numbers are divided by {factor}, because all of them are multiples of {factor}{bits}")
-
-
-def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[IndexArray]]:
-    return [[group.pixels for group in group_pixels(side)] for side in patterns]
-
-
-def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatArray) -> bool:
-    sigma = prepared.sigma
+def is_negative(prepared: Prepared, patterns: tuple[FloatArray, FloatArray], weights: FloatArray) -> bool:
+    """Return True if scene pixels that are lit together are negative in the mean, as with exchanged halves of pairs."""
+    sigma, groups = prepared.sigma, [[group.pixels for group in group_pixels(side)] for side in patterns]
     image = prepared.image(weights * sigma / (np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2 + TINY))
     means = np.array([[image[np.ix_(rows, columns)].mean() for columns in groups[1]] for rows in groups[0]])
     return bool(means.min() < -_NEGATIVE * np.abs(means).max())
@@ -91,114 +77,62 @@ def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatA
 
 def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Reading, ...]:
     """Return the readings that restore the fit of a run, the best first; empty if none does."""
-    run = _Part(data)
-    if run.prepared.spare <= 0:
+    manifest, patterns, signed = data.shots.manifest, data.shots.patterns, data.noise.shots == 2
+    sides, captures = (data.factors.left, data.factors.right), manifest.patterns.captures
+    part = tuple(slice(None, None, max(int(len(side) / (_ROWS * side.shape[1])), 1)) for side in sides)
+    left, right = (np.asarray(side)[rows] for side, rows in zip(sides, part, strict=True))
+    prepared = prepare(left, right, *patterns, centre=data.prepared.centre)
+    if prepared.spare <= 0:
         return ()
-    noise = ratio * float(data.noise.variance.sum()) * run.size * run.prepared.spare
-    whole = max(run.energy, TINY)
-    allowed = noise + beside * run.energy / max(float(data.frames.energy), TINY)
-    chance = CHANCE * noise * float(np.sqrt(2 / max(run.size * data.noise.variance.size * run.prepared.spare, 1)))
-    now = run.misfit(run.shots())  # infinite if the image is negative
+    number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(captures)}
+    frames: list[FloatArray] = [np.zeros(())] * len(captures)
+    for each in data.measurements_again():
+        for sign in (1, -1) if signed else (0,):
+            light = (each.light + sign * each.frame) / 2 if sign else each.frame
+            frames[number[each.row, each.column, sign]] = light.astype(np.float32)
+
+    def fit(turn: str, order: IndexArray) -> tuple[float, float]:
+        """Return the frames' energy, and its part outside the model's range, infinite if the image is negative."""
+        weights, energy = np.zeros_like(prepared.sigma), 0.0
+        measured: dict[tuple[int, int], FloatArray] = {}
+        for shot, index in zip(captures, order, strict=True):
+            own = np.ascontiguousarray(_TURNS[turn](frames[index])[part], dtype=np.float64)
+            measured[shot.row, shot.column] = measured.get((shot.row, shot.column), 0.0) + (shot.sign or 1) * own
+        for pattern, frame in measured.items():
+            seen = prepared.as_solved(frame)
+            weights[prepared.places(pattern)] += prepared.weights(seen, pattern)
+            energy += sum_of_squares(seen)
+        weights = np.where(prepared.sigma > 0, weights, 0.0)
+        outside = energy - sum_of_squares(weights)
+        return energy, float("inf") if is_negative(prepared, patterns, weights) else outside
+
+    taken = np.arange(len(captures))
+    orders = {_TAKEN: taken, **shot_orders(manifest.patterns, manifest.order)}
+    orders |= {"late": np.roll(taken, -1), "early": np.roll(taken, 1)}
+    names = [name for name in {tuple(each): name for name, each in reversed(orders.items())}.values() if name != _TAKEN]
+    turns = [name for name, turn in _TURNS.items() if turn(np.zeros(frames[0].shape, bool)).shape == frames[0].shape]
+    size, (energy, now) = len(left) * len(right), fit(_KEPT, taken)
+    noise, whole = ratio * float(data.noise.variance.sum()) * size * prepared.spare, max(energy, TINY)
+    allowed = noise + beside * energy / max(float(data.frames.energy), TINY)
+    chance = CHANCE * noise * float(np.sqrt(2 / max(size * data.noise.variance.size * prepared.spare, 1)))
     unexplained = min(max(now - allowed, 0.0), whole)
     if unexplained <= chance / 2:
         return ()
     limit = allowed + max(min(_FITS * unexplained, _AT_MOST**2 * whole), min(chance, unexplained / 2))
-    turns, orders = ([(turn, _TAKEN) for turn in run.turns], [(_KEPT, order) for order in run.orders])
-    stages = map(run.moved, turns + orders), map(run.moved, product(run.turns, run.orders)), run.curves()
     good: list[Reading] = []
-    for stage in stages:
-        good = good or sorted((each for each in stage if each.left < limit), key=lambda each: each.left)
+    # One change is tried before two.
+    for stage in (
+        [(turn, _TAKEN) for turn in turns[1:]] + [(_KEPT, name) for name in names],
+        product(turns[1:], names),
+    ):
+        for turn, name in stage if not good else ():
+            words = [] if turn == _KEPT else [f"the frames are {turn}"]
+            words += [] if name == _TAKEN else [_STEPS.get(name, f"the shots were taken in the order {name}")]
+            known = None if name == _TAKEN or name in _STEPS else name
+            good.append(Reading(" and ".join(words), fit(turn, orders[name])[1], known))
+        good = sorted((each for each in good if each.left < limit), key=lambda each: each.left)
     alike = [each for each in good if each.left <= good[0].left * (1 + _FIT_ALIKE) + chance]
     return tuple(replace(each, left=float(np.sqrt(max(each.left - allowed, 0.0) / whole))) for each in alike)
-
-
-class _Part:
-    def __init__(self, data: Accumulation) -> None:
-        manifest = data.shots.manifest
-        sides, patterns = (data.factors.left, data.factors.right), data.shots.patterns
-        steps = [max(int(len(side) / (_ROWS * side.shape[1])), 1) for side in sides]
-        self._part = tuple(slice(None, None, step) for step in steps)
-        left, right = (np.asarray(side)[part] for side, part in zip(sides, self._part, strict=True))
-        self.prepared: Prepared = prepare(left, right, *patterns, centre=data.prepared.centre)
-        self._groups, self._captures = pixel_groups(patterns), manifest.patterns.captures
-        self._signed, self._dark = data.noise.shots == 2, data.digital.dark_current_e_per_s
-        number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._captures)}
-        self._frames: list[FloatArray] = [np.zeros(())] * len(number)
-        for each in data.measurements_again():
-            for sign in (1, -1) if self._signed else (0,):
-                light = (each.light + sign * each.frame) / 2 if sign else each.frame
-                self._frames[number[each.row, each.column, sign]] = light.astype(np.float32)
-        shape, taken = self._frames[0].shape, np.arange(len(number))
-        self.turns = [name for name, turn in _TURNS.items() if turn(np.zeros(shape, bool)).shape == shape][1:]
-        self._orders = {_TAKEN: taken, **shot_orders(manifest.patterns, manifest.order)}
-        self._orders |= {"late": np.roll(taken, -1), "early": np.roll(taken, 1)}
-        distinct = {tuple(order): name for name, order in reversed(self._orders.items())}
-        self.orders = [name for name in distinct.values() if name != _TAKEN]
-        self.size = len(left) * len(right)
-        self.energy = self._weights(self.shots())[1]
-
-    def moved(self, change: tuple[str, str]) -> Reading:
-        turn, order = change
-        parts = [] if turn == _KEPT else [f"the frames are {turn}"]
-        parts += [] if order == _TAKEN else [_STEPS.get(order, f"the shots were taken in the order {order}")]
-        known = None if order == _TAKEN or order in _STEPS else order
-        return Reading(" and ".join(parts), self.misfit(self.shots(turn, order)), known)
-
-    def curves(self) -> Iterator[Reading]:
-        shots = self.shots()
-
-        def misfit_of_lag(part: float) -> float:
-            earlier = [np.zeros_like(shots[0]), *shots[:-1]]
-            now = [(own - part * before) / (1 - part) for own, before in zip(shots, earlier, strict=True)]
-            return min(self.misfit(now), self.energy) * (1 - part) ** 2  # the search needs finite numbers
-
-        if not self.prepared.centre:  # without means of rows and columns, no number is known
-            best = minimize_scalar(self._bent_misfit, bounds=np.log(_EXPONENTS), args=(shots,), method="bounded")
-            words = f"the numbers went through a tone curve: they are the light to the power of {np.exp(-best.x):.2g}"
-            if abs(best.x) > _LINEAR:
-                yield Reading(words, float(best.fun))
-        if not self._signed:
-            best = minimize_scalar(misfit_of_lag, bounds=_LAGS, method="bounded")
-            if best.x > _NO_LAG:
-                yield Reading(f"the sensor lags: each frame holds {best.x:.1%} of the frame before", float(best.fun))
-
-    def shots(self, turn: str = _KEPT, order: str = _TAKEN) -> list[FloatArray]:
-        frames = (_TURNS[turn](self._frames[index])[self._part] for index in self._orders[order])
-        return [np.ascontiguousarray(frame, dtype=np.float64) for frame in frames]
-
-    def misfit(self, shots: Sequence[FloatArray]) -> float:
-        weights, energy = self._weights(shots)
-        return float("inf") if negative(self.prepared, self._groups, weights) else energy - sum_of_squares(weights)
-
-    def _weights(self, shots: Sequence[FloatArray]) -> tuple[FloatArray, float]:
-        weights, energy = np.zeros_like(self.prepared.sigma), 0.0
-        frames: dict[tuple[int, int], FloatArray] = {}
-        for capture, light in zip(self._captures, shots, strict=True):
-            pattern = capture.row, capture.column
-            frames[pattern] = frames.get(pattern, 0.0) + (capture.sign or 1) * light
-        for pattern, frame in frames.items():
-            seen = self.prepared.as_solved(frame)
-            weights[self.prepared.places(pattern)] += self.prepared.weights(seen, pattern)
-            energy += sum_of_squares(seen)
-        return np.where(self.prepared.sigma > 0, weights, 0.0), energy
-
-    def _bent_misfit(self, logarithm: float, shots: Sequence[FloatArray]) -> float:
-        exponent, spare = float(np.exp(logarithm)), self.prepared.spare
-        top = max(float(shot.max()) for shot in shots) + self._dark or 1.0
-
-        def bend(values: FloatArray, power: float) -> FloatArray:
-            return np.asarray(np.sign(values) * np.abs(values) ** power)
-
-        even = bend(np.array(self._dark / top), exponent)
-        linear = [bend((shot + self._dark) / top, exponent) - even for shot in shots]
-        weights, _ = self._weights(linear)
-        # The halves of a pair are known by their sum, which is the same for all pairs.
-        mean, total = 2 * np.mean(linear, axis=0), 0.0
-        for capture, shot in zip(self._captures, shots, strict=True):
-            model = self.prepared.frame(weights, (capture.row, capture.column))
-            model = (mean + capture.sign * model) / 2 if self._signed else model
-            total += sum_of_squares(shot + self._dark - top * bend(model + even, 1 / exponent))
-        return total * 2 * spare / (1 + spare) if self._signed else total
 
 
 CHANCE = 6.0

@@ -8,15 +8,12 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.accumulation import (
-    LitFrame,
     Model,
     accumulate,
     disagreement,
     factor_slope,
     offset_responses,
-    print_part,
 )
-from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
@@ -208,67 +205,9 @@ def test_light_of_one_side_weighs_the_dipoles_of_the_other() -> None:
     assert reported == pytest.approx(struck, rel=0.1)
 
 
-SMALL, PARTS = 64, 4
-"""Scene pixels a side, 1.9 mm, and parts of each where points are printed."""
 
 
-def points(count: int = 200) -> np.ndarray:
-    """(PARTS SMALL, PARTS SMALL) dark print of points of 3 x 3 parts, anywhere within pixels."""
-    rng, dark = np.random.default_rng([0, 3]), np.full((PARTS * SMALL, PARTS * SMALL), 0.06)
-    for _ in range(count):
-        y, x = rng.integers(0, PARTS * SMALL, 2)
-        dark[y : y + 3, x : x + 3] = rng.uniform(0.4, 0.95)
-    return dark
 
 
-@pytest.mark.parametrize(
-    ("patterns", "count", "left", "right", "flagged"),
-    [
-        ("dots:4", 200, 0.0, 0.0, False),
-        ("dots:4", 200, 0.1, 0.1, True),
-        ("dots:4", 200, -0.1, 0.1, True),
-        ("dots:7", 60, 0.1, 0.1, True),
-    ],
-)
-def test_print_within_pixels_is_no_misfit_and_depth_is(
-    patterns: str, count: int, left: float, right: float, flagged: bool
-) -> None:
-    """Points of 0.6 % of the measurements are told from light that parallax moves by a tenth of a pixel, as of a
-    sheet beside the calibrated distance and of two cards; of few points under few dots both are about the same, and no
-    more is print. (Planted: depth not taken off, or that of the whole scene or of blocks alone; depth told from the
-    frames that it explains.)"""
-    camera, parts = fine_shadow(SMALL * PARTS) / PARTS, SMALL * PARTS
-    coarse = camera.reshape(PIXELS, SMALL, PARTS).sum(axis=2)
-    columns = [fine_shadow(parts, part * 120 / SMALL) / PARTS for part in (left, right)]
-    seen = np.hstack([columns[0][:, : parts // 2], columns[1][:, parts // 2 :]])
-    dark = points(count)
-    image = reconstruct(Bench(camera, seen, parts=PARTS).run(patterns, dark, 0), Bench(coarse, coarse).calibrated(0))
-    found = image.misfit
-    print(found)
-    assert found and found.flagged == flagged and image.ok != flagged
-    if not flagged:
-        assert found.detail > UNEXPLAINED > found.unexplained and f"beside {found.detail:.1e} of print" in str(found)
-        truth = dark.reshape(SMALL, PARTS, SMALL, PARTS).mean(axis=(1, 3))
-        assert image.uncertainty is not None
-        assert np.mean(np.abs(image.image - truth) < 1.96 * image.uncertainty) > 0.9
 
 
-def test_what_is_neither_print_nor_depth_is_no_print() -> None:
-    """Drawn light of any kind, although factors and slopes of 12 x 12 pixels span a quarter of a frame of 48 x 48, and
-    a shift in proportion to the light; but dipoles of any sign are. (Planted: wider ranges not weighed by their size.)
-    """
-    rng = np.random.default_rng(2)
-    sides, slopes = ((rng.random((48, 12)), rng.random((48, 12))) for _ in range(2))
-    pixels = np.arange(12) * 4 // 12, np.arange(12) * 4 // 12
-
-    def part(*lights: np.ndarray) -> float:
-        return print_part([LitFrame(light, 0.0, sides, slopes, pixels) for light in lights])
-
-    images, dipoles = rng.random((4, 12, 12)), rng.standard_normal((4, 12, 12))
-    own = [sides[0] @ image @ sides[1].T for image in images]
-    moved = [slopes[0] @ (0.1 * image) @ sides[1].T for image in images]
-    fine = [sides[0] @ (0.1 * dipole) @ slopes[1].T for dipole in dipoles]
-    noise = 0.1 * rng.standard_normal((4, 48, 48))
-    assert part(*(a + b for a, b in zip(own, noise, strict=True))) < 0.05
-    assert part(*(a + b for a, b in zip(own, moved, strict=True))) < 0.05
-    assert part(*(a + b for a, b in zip(own, fine, strict=True))) > 0.95

@@ -14,47 +14,18 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.manifests import Digital, FactorNoise, Patterns
-from mitsim.core.runs import Capture, Measurement
+from mitsim.core.runs import Measurement
 from mitsim.devices.patterns import parse_patterns, shot_orders
 from mitsim.reconstruct import misfit, residuals
-from mitsim.reconstruct.accumulation import FrameNoise, LitFrame, LitFrames, Model, factor_energy, orthonormal
+from mitsim.reconstruct.accumulation import FrameNoise, Model, factor_energy
 from mitsim.reconstruct.misfit import Cause, weigh
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.residuals import NoiseTest, Residuals
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
-from tests.ideal_sessions import BLACK, CODES, Bench, bench, picture, shadow
-from tests.unit.reconstruct.test_factors import N, factors
+from tests.ideal_sessions import Bench, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import Frames, with_frames
 from tests.unit.reconstruct.test_misfit import SHIFT, recovered
-
-
-def test_noise_outside_two_ranges_is_taken_off_and_light_inside_is_no_misfit() -> None:
-    """6 x 5 data less 2 x 3 that the ranges take up, each of variance 0.5."""
-    rng = np.random.default_rng(1)
-    left, right = (np.linalg.qr(rng.normal(size=shape))[0] for shape in ((6, 2), (5, 3)))
-    inside = left @ rng.normal(size=(2, 3)) @ right.T
-
-    def beyond(frame: np.ndarray, variance: float) -> float:
-        return LitFrame(frame, variance, (left, right), (left, right), (np.arange(2), np.arange(3))).beyond(left, right)
-
-    assert beyond(np.zeros((6, 5)), 0.5) == pytest.approx(-12.0)
-    assert beyond(inside, 0.0) == pytest.approx(0, abs=1e-12)
-    assert beyond(inside + 1, 0.0) == pytest.approx(
-        30 - np.square(left.sum(axis=0)).sum() * np.square(right.sum(axis=0)).sum()
-    )
-
-
-def test_directions_that_are_rounding_of_the_largest_are_none() -> None:
-    matrix = np.eye(5, 3) * [1.0, 1e-8, 1e-18]
-    assert orthonormal(matrix).shape == (5, 2)
-
-
-def test_the_groups_that_are_looked_at_are_spread_over_both_sides() -> None:
-    family = parse_patterns("dots:5", N)
-    lit = LitFrames(factors().sides, (family.left.astype(float), family.right.astype(float)))
-    first = {(int(rows[0][0]), int(columns[0][0])) for rows, columns in lit._groups}
-    assert first == {(0, 1), (2, 4), (3, 0), (4, 3)}
 
 
 def test_centring_takes_up_noise_as_well() -> None:
@@ -322,27 +293,8 @@ def test_exchanged_halves_of_all_pairs() -> None:
     assert cause is Cause.READING and "halves-exchanged" in words[0]
 
 
-@pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
-@pytest.mark.parametrize("exponent", [1.8, 2.2])
-def test_a_tone_curve(patterns: str, exponent: float) -> None:
-    """Its exponent is found to a tenth. (Planted: the misfit in curved numbers, by which any crushing curve wins.)"""
-    span = CODES - 1 - BLACK
-    cause, words = reported(
-        patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / exponent) for f in frames]
-    )
-    assert cause is Cause.READING and float(words[0].split()[-1]) == pytest.approx(1 / exponent, rel=0.1)
 
 
-def test_lag() -> None:
-    """Each frame holds a tenth of the frame before."""
-
-    def lagging(frames: Frames) -> Frames:
-        earlier = [np.full_like(frames[0], BLACK), *frames[:-1]]
-        return [0.9 * own + 0.1 * before for own, before in zip(frames, earlier, strict=True)]
-
-    cause, words = reported("dots:4", lagging)
-    found = float(words[0].split("holds ")[1].split("%")[0])
-    assert cause is Cause.READING and found == pytest.approx(10, rel=0.03)
 
 
 def test_light_of_walls_is_no_other_reading() -> None:
@@ -359,29 +311,8 @@ def test_another_order_of_dim_light() -> None:
     assert misfit is not None and misfit.flagged and "one step late" in misfit.reason
 
 
-def left_aligned(gain: float) -> Capture:
-    """Numbers of 13 bits moved up by 4, in a file whose camera has ``gain`` times the numbers an electron."""
-    shots = bench(peak=2e3).run("dots:4", picture(1), 1)
-    digital = shots.manifest.digital
-    known = digital.model_copy(
-        update={
-            "saturation_dn": 16.0 * CODES,
-            "gain_dn_per_e": digital.gain_dn_per_e * gain,
-            "black_level_dn": digital.black_level_dn * gain,
-        }
-    )
-    memory = {
-        shot.file: ({"DN": 16 * shots._memory[shot.file][0]["DN"]}, {}) for shot in shots.manifest.patterns.captures
-    }
-    return Capture(shots.manifest.model_copy(update={"digital": known}), memory=memory)
 
 
-def test_numbers_that_were_multiplied() -> None:
-    """An image 16 times too bright fits, but its noise does not. A camera file of these numbers fits."""
-    found = reconstruct(left_aligned(1.0), bench().calibrated(1))
-    assert not found.ok and found.misfit is not None and found.misfit.cause is Cause.READING
-    assert "multiples of 16" in str(found.status) and "divided by 16" in str(found.status)
-    assert reconstruct(left_aligned(16.0), bench().calibrated(1)).ok
 
 
 def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
