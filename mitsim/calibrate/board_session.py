@@ -127,7 +127,7 @@ class Session:
     def _first_cost(self) -> Cost:
         count, first = self.signs.shape[1], Settings(self.distance)
         seconds = session_seconds(self.board, count, self.shots, first)
-        return session_cost(self.board, count, first, sum(seconds.values()), len(self.recipe.exposure_ladder))
+        return session_cost(self.board, count, first, sum(seconds.values()))
 
     @cached_property
     def mask_warnings(self) -> tuple[str, ...]:
@@ -185,18 +185,17 @@ class Session:
 
     @property
     def shots(self) -> int:
-        lit = len(self.order) * self.recipe.repeats
-        return (lit + self.recipe.dark_frames) * len(self.recipe.exposure_ladder)
+        return len(self.order) * self.recipe.repeats
 
     @property
     def order(self) -> list[Half]:
-        """Return the order of lit frames: all exposures of a pattern, all repeats of each; dark frames come last."""
+        """Return the order of the frames; the repeats of each follow one another."""
         return halves_in_order(self.signs.shape[1], self.pairs, self.recipe.order, self.recipe.order_seed)
 
     @cached_property
     def powers(self) -> Mapping[tuple[str, int], FloatArray]:
         drift, order = self.recipe.drift, self.order
-        each = len(order), len(self.recipe.exposure_ladder), self.recipe.repeats
+        each = len(order), self.recipe.repeats
         found = levels(self.seed, "session", math.prod(each), drift.session_ramp, drift.session_flicker).reshape(each)
         return {self.shot(half): power for half, power in zip(order, found, strict=True)}
 
@@ -220,8 +219,7 @@ class Session:
             seconds["mask"] = told
         # There is no truth to be traced, and other frames are formed than those that the plan looks at.
         plan = plan.taking(start=spent["total"] - told, plan=planning, truth=0.0, **seconds)
-        exposures = len(self.recipe.exposure_ladder)
-        cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds, exposures)
+        cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds)
         cost.check("calibration", job.limits)
         return replace(plan, cost=cost)
 
@@ -261,8 +259,6 @@ _UNWRITTEN = 0.55
 """Cost of exposing a frame without writing it, relative to a capture's frame."""
 _HELD, _AT_WORK = 5.0, 5.0
 """Frames in double precision: of a session, and of each response in progress."""
-_OF_AN_EXPOSURE = 2.0
-"""Further frames of a response for each exposure beyond the first."""
 _SUMS = 8.0
 """Numbers of a side's sums for each pattern and pixel of a side of the sensor."""
 
@@ -303,12 +299,10 @@ def session_seconds(
     }
 
 
-def session_cost(board: Apparatus, count: int, settings: Settings, seconds: float, exposures: int = 1) -> Cost:
+def session_cost(board: Apparatus, count: int, settings: Settings, seconds: float) -> Cost:
     n, pixels = board.n, board.geometry.frame_side
     lines = n if lines_held(n, count, pixels) else 0
-    at_work = _AT_WORK + _OF_AN_EXPOSURE * (exposures - 1)
-    held = _HELD + (exposures if exposures > 1 else 0)  # and a pixel's weights
-    frames = lines + 3 * at_once(pixels) + held + at_work * frames_at_once(round(pixels**2))
+    frames = lines + 3 * at_once(pixels) + _HELD + _AT_WORK * frames_at_once(round(pixels**2))
     memory_bytes = 8.0 * (frames * pixels**2 + _SUMS * count * pixels)
     return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + memory_bytes)
 
@@ -355,16 +349,12 @@ def stripe_frames(
         if lines is None:
             frames: Iterator[Frame] = iter(light.frames(stripes.shots(numbers), seed, leaking=False))
         else:
-            frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in _mix(stripes.weights[numbers], lines, shape))
+            weights, mixed = stripes.weights[numbers], np.empty((len(numbers), lines.shape[1]))
+
+            def mix(begin: int, weights: FloatArray = weights, mixed: FloatArray = mixed) -> None:
+                inside = slice(begin, begin + _COLUMNS)
+                mixed[:, inside] = weights @ lines[:, inside]
+
+            in_threads(mix, range(0, lines.shape[1], _COLUMNS))
+            frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in mixed.reshape(-1, *shape))
         yield from (item for item in zip(numbers.tolist(), frames, strict=True) if item[0] >= first)
-
-
-def _mix(weights: FloatArray, lines: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    mixed = np.empty((len(weights), lines.shape[1]))
-
-    def part(start: int) -> None:
-        inside = slice(start, start + _COLUMNS)
-        mixed[:, inside] = weights @ lines[:, inside]
-
-    in_threads(part, range(0, lines.shape[1], _COLUMNS))
-    return mixed.reshape(-1, *shape)

@@ -11,10 +11,11 @@ import io
 import json
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -110,25 +111,6 @@ class Checkpoint:
         return hashlib.sha256(hashlib.sha256(self._session).digest() + data).digest()
 
 
-@contextmanager
-def claimed_session(
-    output: Path | None, configuration: Mapping[str, Any], resume: bool = False
-) -> Iterator[Checkpoint]:
-    """Claim the folder of a session's parts before any work; remove a new folder if the session fails before writing.
-
-    ``output`` None keeps nothing; ``resume`` allows a folder of the same configuration. MitsimError if the place cannot
-    be written, or holds other files or another configuration.
-    """
-    if output is None:
-        yield Checkpoint(None, configuration)
-        return
-    again = resume and (output / MANIFEST).is_file()
-    if again:
-        _check_same(output, plain(configuration))
-    with output_folder(output, overwrite=again) as folder:
-        yield Checkpoint(folder, configuration)
-
-
 def is_finished(output: Path, configuration: Mapping[str, Any]) -> bool:
     if not (output / MANIFEST).is_file():
         return False
@@ -184,38 +166,6 @@ def keep_light(checkpoint: Checkpoint, light: SampledLight) -> None:
         matrix = group[name]
         facts |= {f"{row.key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
     checkpoint.save("light", facts)
-
-
-@dataclass
-class SessionSums:
-    sums: dict[str, tuple[StripeSums, StripeSums]]
-    saturated: int
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
-        for kind, both in self.sums.items():
-            for sums in both:
-                arrays |= {f"{kind}_{sums.side}_{name}": value for name, value in vars(sums).items() if name != "side"}
-        checkpoint.save("stripes", arrays)
-
-    @classmethod
-    def from_checkpoint(cls, checkpoint: Checkpoint, kinds: Sequence[str]) -> SessionSums | None:
-        """Return the sums of an interrupted session, or None."""
-        arrays = checkpoint.load("stripes")
-        if arrays is None:
-            return None
-        by_kind = {}
-        for kind in kinds:
-            both = []
-            for side in SIDES:
-                own = {name.removeprefix(f"{kind}_{side}_"): values for name, values in arrays.items()}
-                single = float(own["misfit"]), float(own["energy"]), int(own["done"])
-                sums = StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single)
-                sums.misfits, sums.energies, sums.ambient = own["misfits"], own["energies"], own["ambient"]
-                sums.lights = own["lights"]
-                both.append(sums)
-            by_kind[kind] = both[0], both[1]
-        return cls(by_kind, int(arrays["saturated"]))
 
 
 # ---- Sessions ----
@@ -314,7 +264,12 @@ def _run_sessions(
         }
         if session.depth is not None and task.resume and place is not None and is_finished(place, configuration):
             return [load_calibration(place)]
-        with claimed_session(place, configuration, task.resume) as checkpoint:
+        again = task.resume and place is not None and (place / MANIFEST).is_file()
+        if again:
+            _check_same(place, plain(configuration))
+        # The folder is claimed before any work; a new one is removed if the session fails before writing.
+        with nullcontext() if place is None else output_folder(place, overwrite=again) as folder:
+            checkpoint = Checkpoint(folder, configuration)
             plan = plan or whole.plan(request.accuracy, job)
             checkpoint.begin()
             light = kept_light(checkpoint, session, plan)
@@ -344,6 +299,12 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
             f"saturation: {saturated} of {session.shots} frames have pixels at the full well or the ADC's end, "
             "so responses are not linear; lower the recipe's exposure_fraction",
         )
+    # (left, right) and (-left, -right) are the same camera, and centred factors have no sum that decides the sign.
+    sign, pairs = (
+        np.sign(np.vdot(noisy.left, clean.left)) or 1.0,
+        ((noisy.left, clean.left), (noisy.right, clean.right)),
+    )
+    errors = [np.linalg.norm(sign * own - exact) / np.linalg.norm(exact) for own, exact in pairs]
     result = {
         "n": bench.n,
         "depth_mm": session.distance,
@@ -351,7 +312,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         "separability_residual": noisy.separability_residual,
         "unexplained_residual": noisy.unexplained,
         "noise_free_residual": clean.separability_residual,
-        "phi_error": _factor_error(noisy, clean),
+        "phi_error": float(np.hypot(*errors)),
         "faults": [asdict(fault) for fault in faults.faults],
         "lamp": faults.lamp,
         "shadow_residual": lacks and lacks.residual,
@@ -396,77 +357,74 @@ def estimate(
 def estimates(
     lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
 ) -> tuple[list[Estimate], int, CheckedSession]:
-    session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
+    session, (found, saturated) = lit.session, session_sums(lit, job, kinds, checkpoint)
     drift = session.recipe.drift
+    # A stated drift of the lamp is not divided out, so that the user sees its effect.
+    unsteady = bool(drift.session_ramp or drift.session_flicker)
     with job.clock.stage("estimate"):
-        judged = [CheckedSession(sums) for sums in found.sums.values()]
+        judged = [CheckedSession(sums) for sums in found.values()]
         if kinds[0] == NOISY:
             try:
                 judged[0] = check_session(
-                    found.sums[NOISY],
-                    session.signs,
-                    session.order,
-                    saturated=bool(found.saturated),
-                    # A stated drift of the lamp is not divided out, so that the user sees its effect.
-                    unsteady=bool(drift.session_ramp or drift.session_flicker),
+                    found[NOISY], session.signs, session.order, saturated=bool(saturated), unsteady=unsteady
                 )
             except MitsimError as error:
                 # A real session would be refused. A simulated one is flagged, because the bench asks for it, and
                 # comparison with exact factors shows the loss.
                 judged[0].doubts += [*session.mask_warnings[:1], str(error)]
-        factors = [
-            each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
-            for kind, each in zip(kinds, judged, strict=True)
-        ]
-    return factors, found.saturated, judged[0]
+        noises = [lit.response_noise if kind == NOISY else None for kind in kinds]
+        factors = [each.estimate(session.signs, noise) for each, noise in zip(judged, noises, strict=True)]
+    return factors, saturated, judged[0]
 
 
-def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None) -> SessionSums:
-    """Return sums over all responses of a session, whose frames are formed once.
+def session_sums(
+    lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
+) -> tuple[dict[str, tuple[StripeSums, StripeSums]], int]:
+    """Return sums over all responses of a session by kind, whose frames are formed once, and its saturated frames.
 
     ``kinds`` are ``NOISY``, ``NOISE_FREE`` or both; ``checkpoint`` has finished stripes of an interrupted session.
     """
-    session, checkpoint = lit.session, checkpoint or Checkpoint()
+    session, checkpoint, found = lit.session, checkpoint or Checkpoint(), dict[str, tuple[StripeSums, StripeSums]]()
     count = session.signs.shape[1]
 
-    def response(kind: str, side: str, number: int, frame: Frame) -> Response:
+    def respond(kind: str, side: str, number: int, frame: Frame) -> Response:
         return lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
 
-    def fit_response(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[ResponseFit, int]]:
-        each = [response(kind, sums[0].side, *shown) for kind in kinds]
-        return [
-            (own.fit_response(one.rate, shown[0], one.light), one.saturated)
-            for own, one in zip(sums, each, strict=True)
-        ]
+    def fit_responses(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[ResponseFit, int]]:
+        each = [respond(kind, sums[0].side, *shown) for kind in kinds]
+        return [(own.fit_response(r.rate, shown[0], r.light), r.saturated) for own, r in zip(sums, each, strict=True)]
 
-    stripes = SessionSums.from_checkpoint(checkpoint, kinds)
-    if stripes is None:
-        stripes = SessionSums({}, 0)
+    if (arrays := checkpoint.load("stripes")) is not None:
+        saturated = int(arrays["saturated"])
+        for kind in kinds:
+            both = []
+            for side in SIDES:
+                own = {name.removeprefix(f"{kind}_{side}_"): values for name, values in arrays.items()}
+                single = float(own["misfit"]), float(own["energy"]), int(own["done"])
+                both.append(StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single))
+                for name in ("misfits", "energies", "ambient", "lights"):
+                    setattr(both[-1], name, own[name])
+            found[kind] = both[0], both[1]
+    else:
+        saturated = 0
         with job.clock.stage("sensor"):
             for kind in kinds:
-                one, other = (response(kind, side, 0, lit.white) for side in SIDES)
+                one, other = (respond(kind, side, 0, lit.white) for side in SIDES)
                 lights = one.light, other.light
-                stripes.sums[kind] = stripe_sums(one.rate, other.rate, count, session.centre, lights=lights)
-                stripes.saturated += one.saturated + other.saturated
+                found[kind] = stripe_sums(one.rate, other.rate, count, session.centre, lights=lights)
+                saturated += one.saturated + other.saturated
     saved = time.monotonic()
-    for side, sums in zip(SIDES, zip(*stripes.sums.values(), strict=True), strict=True):
-        for looked in lit.each(side, partial(fit_response, sums), job, sums[0].done):
-            for own, (vectors, saturated) in zip(sums, looked, strict=True):
-                own.put(vectors)
-                stripes.saturated += saturated
+    for side, sums in zip(SIDES, zip(*found.values(), strict=True), strict=True):
+        for fitted in lit.each(side, partial(fit_responses, sums), job, sums[0].done):
+            for own_sums, (fit, full) in zip(sums, fitted, strict=True):
+                own_sums.put(fit)
+                saturated += full
             due = sums[0].done % _SAVED_EVERY == 0 and time.monotonic() >= saved + _SAVED_AFTER_S
             if due or sums[0].done == count:
-                stripes.save(checkpoint)
+                parts: dict[str, npt.ArrayLike] = {"saturated": saturated}
+                for kind, each in product(kinds, (0, 1)):
+                    named = vars(found[kind][each]).items()
+                    parts |= {f"{kind}_{SIDES[each]}_{name}": values for name, values in named if name != "side"}
+                checkpoint.save("stripes", parts)
                 saved = time.monotonic()
-    return stripes
-
-
-def _factor_error(noisy: Estimate, clean: Estimate) -> float:
-    """Return the relative error of both factors in quadrature.
-
-    (left, right) and (-left, -right) are the same camera, and centred factors have no sum that decides the sign.
-    """
-    sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
-    left = np.linalg.norm(sign * noisy.left - clean.left) / np.linalg.norm(clean.left)
-    right = np.linalg.norm(sign * noisy.right - clean.right) / np.linalg.norm(clean.right)
-    return float(np.hypot(left, right))
+    return found, saturated

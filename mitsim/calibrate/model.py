@@ -24,13 +24,12 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import output_folder
 from mitsim.core.job import Job
-from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, FittedNumber, ModelledFactors
+from mitsim.core.manifests import CalibrationManifest, FactorNoise, FittedNumber, ModelledFactors
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.framelist import SessionFrames, load_frames
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, UNITS, Model, Modelling, SessionRecipe, Side, frames_of, load_recipe
-from mitsim.optics.frames import Frame
 from mitsim.optics.shadow import SeparableTerms
 from mitsim.optics.terms import ModelledCamera, Placement, best_term
 from mitsim.reconstruct.captured_session import chosen_responses
@@ -89,17 +88,29 @@ def calibrate_model(
     with nullcontext() if output is None else output_folder(output) as place:
         camera = model_of(bench, modelling.model)
         if frames is not None:
-            listed = frames if isinstance(frames, SessionFrames) else load_frames(frames)
-            shown, digital, used = _of_frames(bench, listed, modelling)
-            reflectance = listed.listed.board_reflectance
-            configuration: dict[str, Any] = {"frames": str(listed.folder)}
+            session = frames if isinstance(frames, SessionFrames) else load_frames(frames)
+            listed, shape = session.listed, tuple(bench.geometry.frame_shape)
+            if listed.n != bench.n:
+                raise MitsimError(
+                    f"frames {session.folder}: n is {listed.n}, but the scene's projector has {bench.n} pixels a side; "
+                    "give the scene of these devices"
+                )
+            signs = stripe_signs(listed.n).astype(np.float64)
+            chosen = modelling.used_patterns(_changes(signs), session.pairs, listed.repeats)
+            rates = [*chosen_responses(session, chosen)]
+            if wrong := [rate.shape for rate, _ in rates if rate.shape != shape]:
+                raise MitsimError(
+                    f"frames {session.folder}: are {wrong[0][0]} x {wrong[0][1]} pixels, but the scene's camera has "
+                    f"{shape[0]} x {shape[1]}; give the scene of these devices"
+                )
+            used = frames_of(chosen, session.pairs, listed.repeats) * len(listed.exposure_ladder)
+            shown, digital = _shown(signs, chosen, rates, listed.centre), listed.digital
+            reflectance, configuration = listed.board_reflectance, dict[str, Any](frames=str(session.folder))
         else:
-            recipe = request.recipe or load_recipe()
-            if recipe.depths:
-                raise MitsimError("recipe: has depths; a model is fitted on the aligned plane, so leave them out")
-            session = Session(bench, recipe, request.seed)
-            plan = session.plan(request.accuracy, job)
-            lit = LitSession.of(session, session.trace(plan, job), job)
+            recipe = (request.recipe or load_recipe()).of_one_depth()
+            board = Session(bench, recipe, request.seed)
+            plan = board.plan(request.accuracy, job)
+            lit = LitSession.of(board, board.trace(plan, job), job)
             with job.clock.stage("sensor"):
                 shown, used = simulate_responses(lit, modelling)
             digital, reflectance = digital_of(bench.sensor, lit.exposure_s), recipe.board_reflectance
@@ -135,41 +146,17 @@ def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
 
 
 def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
+    """Return the responses of a session with traced light that a model is fitted to, and their number of frames."""
     session, n = lit.session, lit.session.bench.n
     pairs, repeats, signs = session.pairs, session.recipe.repeats, session.signs
     chosen = modelling.used_patterns(_changes(signs), pairs, repeats)
-    row, column = np.divmod(np.arange(n * n), n)
-    formed: dict[tuple[str, int], Frame] = {}
-    for side, labels in zip(SIDES, (row, column), strict=True):
-        own = [index for each, index in chosen if each == side and index]
-        lighting = Lighting(labels, (1 + signs.T[own]) / 2)
-        frames = lit.light.frames(lighting, session.seed) if own else ()
-        formed |= {(side, index): frame for index, frame in zip(own, frames, strict=True)}
-    noise = lit.response_noise
-    rates = ((lit.noisy(side, index, formed.get((side, index), lit.white)).rate, noise) for side, index in chosen)
-    return _shown(signs, chosen, rates, session.centre), frames_of(chosen, pairs, repeats) * len(
-        session.recipe.exposure_ladder
-    )
-
-
-def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -> tuple[list[Shown], Digital, int]:
-    listed, pairs = session.listed, session.pairs
-    if listed.n != bench.n:
-        raise MitsimError(
-            f"frames {session.folder}: n is {listed.n}, but the scene's projector has {bench.n} pixels a side; give "
-            "the scene of these devices"
-        )
-    signs = stripe_signs(listed.n).astype(np.float64)
-    chosen = modelling.used_patterns(_changes(signs), pairs, listed.repeats)
-    shape, rates = bench.geometry.frame_shape, [*chosen_responses(session, chosen)]
-    for rate, _ in rates:
-        if rate.shape != tuple(shape):
-            raise MitsimError(
-                f"frames {session.folder}: are {rate.shape[0]} x {rate.shape[1]} pixels, but the scene's camera has "
-                f"{shape[0]} x {shape[1]}; give the scene of these devices"
-            )
-    frames = frames_of(chosen, pairs, listed.repeats) * len(listed.exposure_ladder)
-    return _shown(signs, chosen, rates, listed.centre), listed.digital, frames
+    formed, rates = dict.fromkeys(chosen, lit.white), []
+    for side, labels in zip(SIDES, np.divmod(np.arange(n * n), n), strict=True):
+        if own := [index for each, index in chosen if each == side and index]:
+            frames = lit.light.frames(Lighting(labels, (1 + signs.T[own]) / 2), session.seed)
+            formed |= {(side, index): frame for index, frame in zip(own, frames, strict=True)}
+    rates = [(lit.noisy(side, index, formed[side, index]).rate, lit.response_noise) for side, index in chosen]
+    return _shown(signs, chosen, rates, session.centre), frames_of(chosen, pairs, repeats)
 
 
 def _changes(signs: FloatArray) -> list[int]:
@@ -192,7 +179,17 @@ def modelled_factors(
     camera: ModelledCamera, fitted: Fitted, frames: int, manifest: CalibrationManifest, job: Job
 ) -> Factors:
     left, right = (side.astype(np.float32).astype(np.float64) for side in camera.factors(fitted.placement))
-    noise = _noise(camera, fitted)
+    # The slopes of the factors and the covariance of the fitted numbers give the error of the factors.
+    here, slopes = camera.factors(fitted.placement), list[list[FloatArray]]()
+    for name in fitted.free:
+        step = STEPS.get(name, GAIN_STEP * fitted.placement.gain)
+        there = camera.factors(fitted.placement.move({name: step}))
+        slopes.append([((on - at) / step).ravel() for on, at in zip(there, here, strict=True)])
+    deviations = [
+        float(np.sqrt(max(np.sum(fitted.covariance * (each @ each.T)), 0.0) / each.shape[1]))
+        for each in (np.stack(side) for side in zip(*slopes, strict=True))
+    ]
+    noise = FactorNoise(left=deviations[0], right=deviations[1], unexplained=fitted.unexplained)
     model: Model = "wave" if camera.spectrum else "geometric"
     warnings, unexplained = list[str](), fitted.unexplained
     status = Status(Verdict.CALIBRATED, f"Modelled: the {model} model explains {frames} frames")
@@ -218,7 +215,7 @@ def modelled_factors(
         name: FittedNumber(value=getattr(fitted.placement, name), standard_error=fitted.errors.get(name), unit=unit)
         for name, unit in UNITS.items()
     }
-    both = zip((noise.left, noise.right), (left, right), strict=True)
+    both = zip(deviations, (left, right), strict=True)
     relative = [error * np.sqrt(side.size) / np.linalg.norm(side) for error, side in both]
     result: dict[str, Any] = {
         "n": camera.n,
@@ -248,19 +245,6 @@ def modelled_factors(
     return Factors(left, right, manifest.model_copy(update=update), status)
 
 
-def _noise(camera: ModelledCamera, fitted: Fitted) -> FactorNoise:
-    here, places = camera.factors(fitted.placement), []
-    for name in fitted.free:
-        step = STEPS.get(name, GAIN_STEP * fitted.placement.gain)
-        there = camera.factors(fitted.placement.move({name: step}))
-        places.append([((on - at) / step).ravel() for on, at in zip(there, here, strict=True)])
-    left, right = (
-        float(np.sqrt(max(np.sum(fitted.covariance * (slopes @ slopes.T)), 0.0) / slopes.shape[1]))
-        for slopes in (np.stack(side) for side in zip(*places, strict=True))
-    )
-    return FactorNoise(left=left, right=right, unexplained=fitted.unexplained)
-
-
 # -------- Where mask and projector are
 # Model frames and their derivatives are sums of few products u v^T. Therefore each response is replaced by its
 # coefficients in the directions of sensor rows and columns that these span, which loses nothing for the fit and keeps
@@ -288,6 +272,8 @@ _FEATURES = 5
 """Features by which the mask may be displaced along either axis: 0.3 mm of a mask of 60 um."""
 _REACH = 10.0
 """Steps within which the directions represent a changed response: half a pixel on the mask, or less."""
+_SHIFTS = ("mask_shift_row", "mask_shift_column")
+"""Shifts of the mask that are tried before the fit."""
 _PASSES, _STILL = 20, 0.05
 """Largest number of passes, and standard errors by which the last may still move."""
 
@@ -346,65 +332,66 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
     The first of ``shown`` is the response to uniform light, and ``gain`` is in ``free``. MitsimError for numbers that
     these responses cannot distinguish, and a mask that is too far off.
     """
-    at = _first_guess(camera, shown[0], free)
-    for _ in range(_PASSES):
-        pass_ = _Pass(camera, shown, free, at)
-        bounds = -_REACH, _REACH
-        done = least_squares(pass_.residual, np.zeros(len(free)), pass_.jacobian, bounds, xtol=1e-6, ftol=1e-10)
-        jacobian = pass_.jacobian(done.x)
-        inverse = _inverse(jacobian, free)
-        at = pass_.placement(done.x)
-        if np.all(np.abs(done.x) <= _STILL * np.sqrt(np.diag(inverse))):
-            break
-    chi_square = 2 * float(done.cost) / (len(done.fun) - len(free))
-    scale = np.array([*pass_.steps.values()])
-    covariance = max(chi_square, 1.0) * inverse * scale[:, None] * scale
-    left = energy = 0.0
-    for each in shown:
-        frame = sum(np.multiply.outer(*pair) for pair in _vectors_of(pass_.terms(at), each))
-        left += float(np.square(each.rate - frame).sum()) - each.rate.size * each.noise**2
-        energy += float(np.square(each.rate).sum())
-    return Fitted(at, tuple(free), covariance, chi_square, float(np.sqrt(max(left, 0.0) / energy)))
 
+    def fit_near(start: Placement) -> tuple[Placement, bool, float, FloatArray, float]:
+        """Return placement, end of the search, chi-square per datum, covariance and unexplained part of one fit."""
+        steps = {name: STEPS.get(name, GAIN_STEP * start.gain) for name in free}
+        turned = camera.rotation_terms(start) if "mask_rotation" in free else []
 
-class _Pass:
-    def __init__(self, camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str], start: Placement) -> None:
-        self._camera, self._start, self._shown = camera, start, shown
-        self.steps = {name: STEPS.get(name, GAIN_STEP * start.gain) for name in free}
-        self._turned = camera.rotation_terms(start) if "mask_rotation" in free else []
-        far = [(name, sign * _REACH * step) for name, step in self.steps.items() if name != "gain" for sign in (-1, 1)]
-        near = [start, *(start.move({name: step}) for name, step in far)]
+        def place(x: FloatArray) -> Placement:
+            return start.move({name: step * float(value) for (name, step), value in zip(steps.items(), x, strict=True)})
+
+        def vectors(placement: Placement, each: Shown) -> SeparableTerms:
+            terms = [camera.factors(placement), *((placement.mask_rotation * left, right) for left, right in turned)]
+            return _vectors_of(terms, each)
+
+        far = [{name: sign * _REACH * step} for name, step in steps.items() if name != "gain" for sign in (-1, 1)]
         # A rotation of 0 would leave out its directions.
-        spanning = [*self._turned, *(camera.factors(place) for place in near)]
-        self._directions, data = list[tuple[FloatArray, FloatArray]](), []
+        spanning = [*turned, *(camera.factors(start.move(moves)) for moves in ({}, *far))]
+        directions, parts = list[tuple[FloatArray, FloatArray]](), list[FloatArray]()
         for each in shown:
-            lefts, rights = (np.stack(vectors, axis=1) for vectors in zip(*_vectors_of(spanning, each), strict=True))
-            across, along = np.linalg.qr(lefts)[0], np.linalg.qr(rights)[0]
-            self._directions.append((across, along))
-            data.append((across.T @ each.rate @ along / each.noise).ravel())
-        self._data = np.concatenate(data)
+            across, along = (
+                np.linalg.qr(np.stack(pair, axis=1))[0] for pair in zip(*_vectors_of(spanning, each), strict=True)
+            )
+            directions.append((across, along))
+            parts.append((across.T @ each.rate @ along / each.noise).ravel())
+        data = np.concatenate(parts)
 
-    def placement(self, x: FloatArray) -> Placement:
-        moves = {name: step * float(value) for (name, step), value in zip(self.steps.items(), x, strict=True)}
-        return self._start.move(moves)
+        def residual(x: FloatArray) -> FloatArray:
+            model, placement = list[FloatArray](), place(x)
+            for each, (across, along) in zip(shown, directions, strict=True):
+                pairs = vectors(placement, each)
+                model.append(
+                    sum(np.outer(across.T @ left, along.T @ right) for left, right in pairs).ravel() / each.noise
+                )
+            return np.asarray(np.concatenate(model) - data)
 
-    def terms(self, placement: Placement) -> SeparableTerms:
-        turned = ((placement.mask_rotation * left, right) for left, right in self._turned)
-        return [self._camera.factors(placement), *turned]
+        def jacobian(x: FloatArray) -> FloatArray:
+            here = residual(x)
+            return np.stack([residual(x + one) - here for one in np.eye(len(x))], axis=1)
 
-    def residual(self, x: FloatArray) -> FloatArray:
-        terms, model = self.terms(self.placement(x)), []
-        for each, (across, along) in zip(self._shown, self._directions, strict=True):
-            frame = sum(np.multiply.outer(across.T @ left, along.T @ right) for left, right in _vectors_of(terms, each))
-            model.append(np.ravel(frame) / each.noise)
-        return np.asarray(np.concatenate(model) - self._data)
+        bounds = -_REACH, _REACH
+        done = least_squares(residual, np.zeros(len(free)), jacobian, bounds, xtol=1e-6, ftol=1e-10)
+        inverse, at, scale = _inverse(jacobian(done.x), free), place(done.x), np.array([*steps.values()])
+        chi_square = 2 * float(done.cost) / (len(data) - len(free))
+        left_over = energy = 0.0
+        for each in shown:
+            frame = sum(np.outer(*pair) for pair in vectors(at, each))
+            left_over += float(np.square(each.rate - frame).sum()) - each.rate.size * each.noise**2
+            energy += float(np.square(each.rate).sum())
+        still = bool(np.all(np.abs(done.x) <= _STILL * np.sqrt(np.diag(inverse))))
+        covariance = max(chi_square, 1.0) * inverse * scale[:, None] * scale
+        return at, still, chi_square, covariance, float(np.sqrt(max(left_over, 0.0) / energy))
 
-    def jacobian(self, x: FloatArray) -> FloatArray:
-        here = self.residual(x)
-        return np.stack([self.residual(x + one) - here for one in np.eye(len(x))], axis=1)
+    at, still = _first_guess(camera, shown[0], free), False
+    for _ in range(_PASSES):
+        at, still, chi_square, covariance, unexplained = fit_near(at)
+        if still:
+            break
+    return Fitted(at, tuple(free), covariance, chi_square, unexplained)
 
 
-def _vectors_of(terms: SeparableTerms, shown: Shown) -> Iterable[tuple[FloatArray, FloatArray]]:
+def _vectors_of(terms: SeparableTerms, shown: Shown) -> SeparableTerms:
     return [(left @ shown.rows, right @ shown.columns) for left, right in terms]
 
 
@@ -428,30 +415,27 @@ def _inverse(jacobian: FloatArray, free: Sequence[str]) -> FloatArray:
 
 
 def _first_guess(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) -> Placement:
+    """Return the placement with the shift of the mask, within some features, and the gain that fit uniform light."""
     shifts = np.zeros(1)
-    if {"mask_shift_row", "mask_shift_column"} & {*free}:
+    if {*_SHIFTS} & {*free}:
         shifts = camera.geometry.mask_feature * np.arange(-_FEATURES, _FEATURES + 0.125, 0.25)
     geometric = replace(camera, spectrum=None)  # a shadow's fringes move with it
-    lefts, rights = [], []
-    for shift in shifts:
-        (pair,) = _vectors_of([geometric.factors(camera.built.move(dict.fromkeys(_SHIFTS, float(shift))))], uniform)
-        lefts.append(pair[0])
-        rights.append(pair[1])
-    products = np.stack(lefts) @ uniform.rate @ np.stack(rights).T
-    norms = np.multiply.outer(np.linalg.norm(lefts, axis=1), np.linalg.norm(rights, axis=1))
-    row, column = np.unravel_index(int(np.argmax(products / norms)), products.shape)
-    for name, index in zip(_SHIFTS, (row, column), strict=True):
+    moved = [geometric.factors(camera.built.move(dict.fromkeys(_SHIFTS, float(shift)))) for shift in shifts]
+    lefts, rights = (np.stack(side) for side in zip(*(_vectors_of([pair], uniform)[0] for pair in moved), strict=True))
+    products = lefts @ uniform.rate @ rights.T
+    norms = np.outer(np.linalg.norm(lefts, axis=1), np.linalg.norm(rights, axis=1))
+    found = dict(
+        zip(_SHIFTS, map(int, np.unravel_index(int(np.argmax(products / norms)), products.shape)), strict=True)
+    )
+    for name, index in found.items():
         if name in free and len(shifts) > 1 and index in (0, len(shifts) - 1):
             raise MitsimError(
                 f"{name}: the mask is off by {abs(shifts[-1]):g} mm or more; state mask_offset_row and "
                 "mask_offset_column in the scene, within some features"
             )
-    gain = float(products[row, column] / norms[row, column] ** 2)
+    place = tuple(found.values())
+    gain = float(products[place] / norms[place] ** 2)
     if not gain > 0:
         raise MitsimError("the response to uniform light has nothing of the camera's shadow; check mask and geometry")
-    moves = {name: float(shifts[index]) for name, index in zip(_SHIFTS, (row, column), strict=True) if name in free}
+    moves = {name: float(shifts[index]) for name, index in found.items() if name in free}
     return camera.built.move({**moves, "gain": gain - camera.built.gain})
-
-
-_SHIFTS = ("mask_shift_row", "mask_shift_column")
-"""Shifts of the mask that are tried before the fit."""

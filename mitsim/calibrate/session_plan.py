@@ -27,12 +27,10 @@ from mitsim.bench.request import Exposure, Request, check_psnr
 from mitsim.calibrate.board_session import Session, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.errors import check_arguments
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.runs import Capture
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_FRACTION, digital_of
 from mitsim.devices.session import MOST_REPEATS, SIDES, SessionRecipe, load_recipe
@@ -204,42 +202,72 @@ def plan_calibration(
         For a PSNR outside 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.api.bench.Bench.capture`.
     """
     check_psnr(psnr)
-    recipe, job = (recipe or load_recipe()).of_one_depth(), job or Job()
-    if len(recipe.exposure_ladder) > 1 or recipe.dark_frames:
-        raise MitsimError(
-            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; for "
-            "--plan leave exposure_ladder and dark_frames out"
-        )
-    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
-    session = Session(bench, recipe, seed)
+    largest, job = (recipe or load_recipe()).of_one_depth(), job or Job()
+    Exposure(None, largest.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
+    session = Session(bench, largest, seed)
     session.check_mask(job)
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
         request = Request.of(patterns=patterns, seed=seed, accuracy=accuracy)
         shots = capture(SpectralBench(bench), request).runs[0]
     job.progress("session", 0.0)
-    with job.clock.stage("session"):
+    with job.clock.stage("session"), single_threaded_blas():
         own = job.apart("session ")
         plan = session.plan(accuracy, own)
-        predicted = PredictedSession.of(LitSession.of(session, session.trace(plan, own), own), own)
-    truth = truth_for(shots, recipe.board_reflectance)
+        whole = LitSession.of(session, session.trace(plan, own), own)
+        sums = session_sums(whole, own, (NOISE_FREE,))[0][NOISE_FREE]
+    truth = truth_for(shots, largest.board_reflectance)
     assert truth is not None
-    search = _Search(shots, predicted, recipe, truth, job)
+
+    def by(recipe: SessionRecipe) -> LitSession:
+        exposure = Exposure(None, recipe.exposure_fraction)
+        exposure_s = exposure.choose(bench.devices, float(whole.white.irradiance.max()))
+        return replace(whole, session=replace(session, recipe=recipe), exposure_s=exposure_s)
+
+    def trial(recipe: SessionRecipe | None) -> Trial:
+        lit, found, budget = whole if recipe is None else by(recipe), [], dict[str, float]()
+        manifest = CalibrationManifest(
+            camera=bench.identity(),
+            centre=session.centre,
+            board_reflectance=largest.board_reflectance,
+            digital=digital_of(bench.sensor, lit.exposure_s),
+            parallax=bench.parallax,
+        )
+        for draw in range(_DRAWS) if recipe else (None,):
+            image = reconstruct(shots, Factors.of(drawn_estimate(lit, sums, draw), manifest))
+            found.append(psnr_of(image.image, truth))
+            budget = budget or (image.uncertainties.budget if image.uncertainties else {})
+        most = max(budget, key=lambda name: budget[name], default="").replace("_", " ")
+        return Trial(recipe, float(np.mean(found)), float(np.std(found, ddof=1)) if len(found) > 1 else 0.0, most)
+
+    trials: dict[float, Trial] = {}
+
+    def quality(dose: float) -> float:
+        if dose not in trials:
+            fraction = float(f"{dose * largest.exposure_fraction:.{_DIGITS}g}")
+            update = {"repeats": round(dose)} if dose > 1 else {"repeats": 1, "exposure_fraction": fraction}
+            trials[dose] = trial(largest.model_copy(update=update))
+            job.progress(f"solve: {len(trials)} sessions", min(_TRIED * len(trials), 1.0))
+        return trials[dose].psnr_db
+
     with job.clock.stage("solve"):
-        ceiling = search.trial(None)
-        trial = search.least(psnr, ceiling)
-    lit = predicted.by(trial.recipe or recipe)
+        ceiling = trial(None)
+        out_of_reach = quality(1.0) < psnr and ceiling.psnr_db < psnr
+        smallest = EXPOSURE_FRACTION[0] / largest.exposure_fraction
+        chosen = trials[1.0 if out_of_reach else least_dose(quality, psnr, smallest)]
+    assert chosen.recipe is not None
+    lit = by(chosen.recipe)
     taken = session_seconds(session.board, session.signs.shape[1], lit.session.shots, plan.settings)
-    contrast, unknown = lit.speckle, list[str]()
-    if contrast:
-        unknown = [f"speckle of contrast {contrast:g}: it is in every frame, and not in the plan's calibration"]
+    flags = [*shots.warnings, *session.warnings]
+    if lit.speckle:
+        flags.append(f"speckle of contrast {lit.speckle:g}: it is in every frame, and not in the plan's calibration")
     # Half of the projector's pixels are lit in every frame but the uniform ones.
     electrons = float(Exposer(bench.devices, lit.exposure_s, seed).electrons(lit.white).mean()) / 2
     return CalibrationPlan(
         psnr_asked=psnr,
         patterns=patterns,
-        recipe=lit.session.recipe.model_copy(update={"source": f"planned for {psnr:g} dB; {recipe.source}"}),
-        trial=trial,
+        recipe=chosen.recipe.model_copy(update={"source": f"planned for {psnr:g} dB; {chosen.recipe.source}"}),
+        trial=chosen,
         ceiling=ceiling,
         frames=lit.session.shots,
         exposure_s=lit.exposure_s,
@@ -247,40 +275,8 @@ def plan_calibration(
         photons=electrons / bench.sensor.efficiency(bench.projector.effective_wavelength_nm),
         simulation_s=plan.taking(start=0.0, **taken).predicted_seconds,
         seconds=job.clock.seconds(),
-        flags=(*shots.warnings, *session.warnings, *unknown),
+        flags=tuple(flags),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Search:
-    shots: Capture
-    predicted: PredictedSession
-    recipe: SessionRecipe
-    truth: FloatArray
-    job: Job
-
-    def trial(self, recipe: SessionRecipe | None) -> Trial:
-        draws = range(_DRAWS if recipe else 1)
-        images = [reconstruct(self.shots, self.predicted.factors(recipe, draw)) for draw in draws]
-        found = [psnr_of(image.image, self.truth) for image in images]
-        budget = images[0].uncertainties.budget if images[0].uncertainties else {}
-        largest = max(budget, key=lambda name: budget[name], default="").replace("_", " ")
-        return Trial(recipe, float(np.mean(found)), float(np.std(found, ddof=1)) if len(found) > 1 else 0.0, largest)
-
-    def least(self, wanted: float, ceiling: Trial) -> Trial:
-        trials: dict[float, Trial] = {}
-
-        def quality(dose: float) -> float:
-            if dose not in trials:
-                fraction = float(f"{dose * self.recipe.exposure_fraction:.{_DIGITS}g}")
-                update = {"repeats": round(dose)} if dose > 1 else {"repeats": 1, "exposure_fraction": fraction}
-                trials[dose] = self.trial(self.recipe.model_copy(update=update))
-                self.job.progress(f"solve: {len(trials)} sessions", min(_TRIED * len(trials), 1.0))
-            return trials[dose].psnr_db
-
-        out_of_reach = quality(1.0) < wanted and ceiling.psnr_db < wanted
-        smallest = EXPOSURE_FRACTION[0] / self.recipe.exposure_fraction
-        return trials[1.0 if out_of_reach else least_dose(quality, wanted, smallest)]
 
 
 def least_dose(quality: Callable[[float], float], wanted: float, smallest: float) -> float:
@@ -305,61 +301,32 @@ def least_dose(quality: Callable[[float], float], wanted: float, smallest: float
     return high
 
 
-# ---- A session whose responses are known without noise; factors as any exposure and repeats would leave them ----
+def drawn_estimate(lit: LitSession, sums: tuple[StripeSums, StripeSums], draw: int | None) -> Estimate:
+    """Estimate factors from noise-free ``sums`` with noise as of the session ``lit``.
 
-
-@dataclass(frozen=True, eq=False)
-class PredictedSession:
-    lit: LitSession
-    sums: tuple[StripeSums, StripeSums]
-
-    @classmethod
-    @single_threaded_blas()
-    def of(cls, lit: LitSession, job: Job) -> PredictedSession:
-        return cls(lit, session_sums(lit, job, (NOISE_FREE,)).sums[NOISE_FREE])
-
-    def by(self, recipe: SessionRecipe) -> LitSession:
-        lit = self.lit
-        exposure = Exposure(None, recipe.exposure_fraction).choose(
-            lit.session.bench.devices, float(lit.white.irradiance.max())
-        )
-        return replace(lit, session=replace(lit.session, recipe=recipe), exposure_s=exposure)
-
-    def estimate(self, lit: LitSession | None, draw: int = 0) -> Estimate:
-        """Estimate factors with drawn noise; equal numbers ``draw`` give equal noise, and ``lit`` None gives none."""
-        signs = self.lit.session.signs
-        if lit is None:
-            return factors_of_sums(*self.sums, signs, 0.0)
-        left, right = (_noisy(lit, sums, draw) for sums in self.sums)
-        return factors_of_sums(left, right, signs, lit.response_noise)
-
-    def factors(self, recipe: SessionRecipe | None, draw: int = 0) -> Factors:
-        lit = None if recipe is None else self.by(recipe)
-        session, exposure_s = self.lit.session, (lit or self.lit).exposure_s
-        manifest = CalibrationManifest(
-            camera=session.bench.identity(),
-            centre=session.centre,
-            board_reflectance=session.recipe.board_reflectance,
-            digital=digital_of(session.bench.sensor, exposure_s),
-            parallax=session.bench.parallax,
-        )
-        return Factors.of(self.estimate(lit, draw), manifest)
-
-
-def _noisy(lit: LitSession, sums: StripeSums, draw: int) -> StripeSums:
-    """Add noise of each response, and noise that all responses of a side share."""
+    Equal numbers ``draw`` give equal noise, and None gives none. Each response has noise of its own, and all responses
+    of a side share the noise of their uniform frame.
+    """
+    if draw is None:
+        return factors_of_sums(*sums, lit.session.signs, 0.0)
     own, shared = (
         np.broadcast_to(np.sum([*np.broadcast_arrays(*parts.values())], axis=0), lit.uniform_rate.shape)
-        for parts in lit.response_variances(sums.side)
+        for parts in lit.response_variances()
     )
-    across, weights = sums.side == SIDES[0], np.square(sums.common / np.dot(sums.common, sums.common))
-    random = stream(lit.session.seed, "foreseen", sums.side, draw)
-    noise = np.sqrt((own if across else own.T) @ weights)[:, None] * random.standard_normal(sums.vectors.shape)
-    if shared.any():
-        by_row = (shared if across else shared.T) @ weights
-        noise += np.sqrt(by_row)[:, None] * random.standard_normal((len(sums.vectors), 1))
-    # One number a row (or column) of each response was fitted.
-    energy, fitted = sums.done * float((own + shared).sum()), 1 - 1 / len(sums.common)
-    return replace(
-        sums, vectors=sums.vectors + noise, misfit=sums.misfit + fitted * energy, energy=sums.energy + energy
-    )
+    sides = []
+    for each in sums:
+        across, weights = each.side == SIDES[0], np.square(each.common / np.dot(each.common, each.common))
+        random = stream(lit.session.seed, "foreseen", each.side, draw)
+        noise = np.sqrt((own if across else own.T) @ weights)[:, None] * random.standard_normal(each.vectors.shape)
+        if shared.any():
+            by_row = (shared if across else shared.T) @ weights
+            noise += np.sqrt(by_row)[:, None] * random.standard_normal((len(each.vectors), 1))
+        # One number a row (or column) of each response was fitted.
+        energy, fitted = each.done * float((own + shared).sum()), 1 - 1 / len(each.common)
+        more = {
+            "vectors": each.vectors + noise,
+            "misfit": each.misfit + fitted * energy,
+            "energy": each.energy + energy,
+        }
+        sides.append(replace(each, **more))
+    return factors_of_sums(sides[0], sides[1], lit.session.signs, lit.response_noise)

@@ -253,12 +253,6 @@ class SessionRecipe(Configuration):
     """Shots of every frame, whose mean is taken."""
     depths: Depths = ()
     """Of the board [mm], a CAL folder each; none: on the aligned plane."""
-    exposure_ladder: Exposures = (1.0,)
-    """Exposures of every frame, over the shortest."""
-    ladder_merge: Merge = "weighted"
-    """How they make one: by variance, or the longest alone."""
-    dark_frames: int = Field(default=0, ge=0, le=MOST_REPEATS)
-    """Frames without light, of each exposure."""
     order: Order = "listed"
     """Order in which patterns are taken."""
     order_seed: int = Field(default=0, ge=0, le=MOST_SEED)
@@ -267,13 +261,6 @@ class SessionRecipe(Configuration):
     """What moves between calibration and capture; none: nothing."""
     source: str
     """Where the numbers come from."""
-
-    @model_validator(mode="after")
-    def _dark_frames_are_of_use(self) -> SessionRecipe:
-        if self.dark_frames and self.signed_capture == "pair":
-            problem = f"dark_frames: got {self.dark_frames}, but a pair's difference has no dark signal"
-            raise ValueError(f"{problem}; set 0, or signed_capture 'uniform'")
-        return self
 
     def of_one_depth(self) -> SessionRecipe:
         if self.depths:

@@ -206,7 +206,7 @@ def entry_variances(lit: LitSession, factors: tuple[FloatArray, FloatArray], sid
         weights = np.square(common) / np.dot(common, common) ** 2
         return np.asarray((variance if side == SIDES[0] else variance.T) @ weights)
 
-    own, shared = lit.response_variances(side)
+    own, shared = lit.response_variances()
     even, first = np.full(len(signs), 1 / signs.shape[1]), np.square(signs.mean(axis=1))
     return {source: np.outer(spread(own[source]), even) + np.outer(spread(shared[source]), first) for source in own}
 

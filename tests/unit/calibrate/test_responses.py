@@ -19,7 +19,7 @@ import pytest
 from mitsim.acquire.exposure import Exposer
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, Checkpoint, estimate, estimates
-from mitsim.calibrate.lit_session import LitSession, _Shot
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.devices.camera import Devices
@@ -27,7 +27,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.optics.frames import Frame
-from mitsim.reconstruct.captured_session import Ladder, calibrate_frames
+from mitsim.reconstruct.captured_session import calibrate_frames
 from mitsim.reconstruct.factors import Estimate
 from mitsim.sensor.chain import Digital
 
@@ -50,8 +50,7 @@ DEVICES = Devices(
     camera_file="none",
 )
 CLIPPED = replace(DEVICES, sensor=SENSOR.model_copy(update={"full_well_e": 1.3e3, "bits": 12}))
-"""A camera whose full well the toy's uniform light fills by 0.3, dark electrons too, and overfills here and there at
-three times the exposure."""
+"""A camera whose full well the toy's uniform light fills by 0.3, dark electrons too."""
 
 
 class ToyLight:
@@ -257,7 +256,7 @@ def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.Monke
     monkeypatch.setattr("mitsim.calibrate.board_session.lines_held", lambda *_: False)
     monkeypatch.setattr("mitsim.calibrate.board_session.at_once", lambda _: 4)
     lit, formed = lit_session(13), []
-    whole = {number: frame.irradiance for number, frame in lit._stripes("vertical", 0)}
+    whole = {number: frame.irradiance for number, frame in lit.stripes("vertical", 0)}
     frames = ToyLight.frames
 
     def counted(self: ToyLight, lighting: Lighting, seed: int, leaking: bool = True) -> list[Frame]:
@@ -265,7 +264,7 @@ def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.Monke
         return frames(self, lighting, seed, leaking)
 
     monkeypatch.setattr(ToyLight, "frames", counted)
-    found = dict(lit._stripes("vertical", first))
+    found = dict(lit.stripes("vertical", first))
     assert list(found) == list(range(first, 16)) and all(
         np.array_equal(frame.irradiance, whole[number]) for number, frame in found.items()
     )
@@ -294,18 +293,6 @@ def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: py
     assert estimate(lit, Job(), checkpoint=kept)[1] == 34
 
 
-def test_the_error_of_factors_is_that_of_both_whatever_their_common_sign() -> None:
-    from mitsim.calibrate.calibrate import _factor_error
-
-    def factors(left: list[float], right: list[float]) -> Estimate:
-        return SimpleNamespace(left=np.array([left]), right=np.array([right]))  # type: ignore[return-value]
-
-    clean = factors([3.0, 4.0], [0.0, 10.0])
-    assert _factor_error(factors([3.0, 4.5], [0.0, 10.0]), clean) == pytest.approx(0.1)
-    assert _factor_error(factors([3.0, 4.0], [1.0, 10.0]), clean) == pytest.approx(0.1)
-    assert _factor_error(factors([-3.3, -4.4], [0.0, -11.0]), clean) == pytest.approx(np.hypot(0.1, 0.1))
-
-
 # ---- differences -----------------------------------------------------------------------------------------------------
 
 
@@ -316,11 +303,7 @@ def played(pairs: bool, monkeypatch: pytest.MonkeyPatch) -> LitSession:
     """A session whose noisy frames are given, the uniform one first where it has one; digital numbers are rates."""
     lit = LitSession(SimpleNamespace(pairs=pairs, filters=None), None, Frame(np.ones((1, 2)), 0, 0, 0), 1.0, 0.0)  # type: ignore[arg-type]
     monkeypatch.setattr(LitSession, "_both", np.ones((1, 2)))
-    monkeypatch.setattr(LitSession, "_exposers", (SimpleNamespace(rate=lambda digital: digital),))
-    monkeypatch.setattr(LitSession, "_dark", None)
-    monkeypatch.setattr(
-        LitSession, "_expose", lambda self, light, side, index: _Shot(Ladder(()), (RATES[index],), index + 1)
-    )
+    monkeypatch.setattr(LitSession, "_expose", lambda self, light, side, index: (RATES[index], index + 1))
     return lit
 
 
@@ -371,40 +354,25 @@ def test_light_that_black_pixels_leak_is_in_both_shots_of_a_pair(shots: dict[tup
 # ---- frames on disk --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("mode", "more"),
-    [
-        *(("pair", {}), ("uniform", {}), ("pair", {"repeats": 3}), ("uniform", {"repeats": 3})),
-        ("uniform", {"dark_frames": 3}),
-        *((mode, {"exposure_ladder": (1.0, 3.0, 5.0), "ladder_merge": "longest"}) for mode in ("pair", "uniform")),
-        ("uniform", {"exposure_ladder": (1.0, 4.0), "repeats": 2, "dark_frames": 2}),
-    ],
-)
+@pytest.mark.parametrize("repeats", [1, 3])
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
 def test_frames_of_a_session_in_a_folder_give_its_factors_bit_for_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, more: dict[str, Any]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, repeats: int
 ) -> None:
-    """Shots are numbered in the order that a folder's names have. (Planted: the exposure divided before the gain, dark
-    frames not merged, repeats and exposures in the other order.)"""
-    lit, shoot = lit_session(mode=mode, devices=CLIPPED, **more), Exposer.digital
-    dark = []
+    """Shots are numbered in the order that a folder's names have. (Planted: the exposure divided before the gain.)"""
+    lit, shoot = lit_session(mode=mode, devices=CLIPPED, repeats=repeats), Exposer.digital
 
     def kept(self: Exposer, electrons: FloatArray, *names: str | int) -> Digital:
         numbers = shoot(self, electrons, *names)
-        if names[1] == "dark":
-            dark.append({"file": f"dark {names[2]} {names[3]}.npy", "exposure": names[2]})
-            np.save(tmp_path / dark[-1]["file"], numbers)
-            return numbers
-        options = dict(zip(names[3::2], names[4::2], strict=True))
-        where = *names[1:3], options.get("exposure", 0), options.get("repeat", 0)
-        np.save(tmp_path / f"{' '.join(map(str, where))}.npy", numbers)
+        repeat = names[4] if len(names) > 3 else 0
+        np.save(tmp_path / f"{names[1]} {names[2]} {repeat}.npy", numbers)
         return numbers
 
     monkeypatch.setattr(Exposer, "digital", kept)
     simulated, _ = estimate(lit, Job())
     digital = digital_of(lit.session.bench.sensor, EXPOSURE_S).model_dump(mode="json")
-    listed = {"camera": "toy", "n": 7, "signed_capture": mode, "digital": digital, "dark": dark}
-    shared = {name: value for name, value in more.items() if name != "dark_frames"}
-    (tmp_path / "session.json").write_text(json.dumps({**listed, **shared}))
+    listed = {"camera": "toy", "n": 7, "signed_capture": mode, "digital": digital, "repeats": repeats}
+    (tmp_path / "session.json").write_text(json.dumps(listed))
     assert len(list(tmp_path.glob("*.npy"))) == lit.session.shots
     found = calibrate_frames(tmp_path)
     measured = found.estimate
@@ -433,32 +401,19 @@ def test_repeats_leave_their_numbers_part_of_the_noise(mode: str) -> None:
     assert noise[4] == pytest.approx(noise[1] / 4, rel=0.08)
 
 
-@pytest.mark.parametrize(
-    ("mode", "more"),
-    [
-        ("pair", {}),
-        ("uniform", {}),
-        pytest.param("pair", {"exposure_ladder": (1.0, 3.0, 5.0), "ladder_merge": "longest"}, marks=pytest.mark.slow),
-        pytest.param("pair", {"exposure_ladder": (1.0, 2.0, 3.5), "repeats": 2}, marks=pytest.mark.slow),
-        ("uniform", {"exposure_ladder": (1.0, 3.0)}),
-        ("uniform", {"exposure_ladder": (1.0, 3.0), "dark_frames": 2}),
-    ],
-    ids=str,
-)
-def test_responses_have_the_mean_and_the_noise_of_the_closed_form(mode: str, more: dict[str, Any]) -> None:
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_responses_have_the_mean_and_the_noise_of_the_closed_form(mode: str) -> None:
     """Over 12 seeds, 16 responses of 648 pixels each. Their mean is the noise-free response, but for 5 deviations of
     10 368 means; their variance is the stated one to 3 %.
 
-    The uniform shot and the dark frame are shared by a side's responses: 12 x 1296 of these numbers tell a variance to
-    1.1 %, and they make a quarter of the whole. (Planted: dark frames added, their noise left out, exposures merged
-    without weights, saturated ones too, the weights themselves in the variance, weights by
-    a frame that they merge.)
+    The uniform shot is shared by a side's responses: 12 x 1296 of these numbers tell a variance to 1.1 %, and they make
+    a quarter of the whole. (Planted: its noise left out.)
     """
-    lit, seeds = lit_session(7, mode, devices=CLIPPED, **more), 12
+    lit, seeds = lit_session(7, mode, devices=CLIPPED), 12
     total, squares, saturated = 0.0, 0.0, 0
     for seed in range(seeds):
         own = replace(lit, session=replace(lit.session, seed=seed))
-        responses = [(own.noisy(side, *it), own.noise_free(it[1])) for side in SIDES for it in own._stripes(side, 0)]
+        responses = [(own.noisy(side, *it), own.noise_free(it[1])) for side in SIDES for it in own.stripes(side, 0)]
         off = np.array([response.rate - clean for response, clean in responses])
         total, squares = total + off, squares + np.square(off)
         saturated += sum(response.saturated for response, _ in responses)
@@ -466,5 +421,3 @@ def test_responses_have_the_mean_and_the_noise_of_the_closed_form(mode: str, mor
     variance = squares / seeds
     assert float(np.mean(variance)) == pytest.approx(lit.response_noise**2, rel=0.03)
     assert np.abs(total / np.sqrt(seeds * variance.mean())).max() < 7  # of pixels up to twice as noisy as the mean
-    if "exposure_ladder" in more:
-        assert lit.response_noise < 0.8 * lit_session(7, mode, devices=CLIPPED).response_noise

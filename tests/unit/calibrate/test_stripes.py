@@ -149,10 +149,3 @@ def test_memory_is_that_of_light_frames_and_sums(size: tuple[int, int], lines: i
     frames, pixels = lines + 3 * formed + 5 + 5 * exposed, size[1]
     assert cost.seconds == 3.0
     assert cost.memory_bytes == pytest.approx(LIGHT + 8 * (frames * pixels**2 + 8 * 128 * pixels))
-
-
-@pytest.mark.usefixtures("asked")
-def test_each_exposure_takes_memory() -> None:
-    """Weights of three, and two more frames of both others for each response that is worked on."""
-    one, three = (session.session_cost(board(*HELD), 128, Settings(400.0), 3.0, count) for count in (1, 3))
-    assert three.memory_bytes - one.memory_bytes == pytest.approx(8 * (3 + 2 * 2 * 16) * 512**2)

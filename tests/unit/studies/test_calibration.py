@@ -208,23 +208,21 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_noise_by_source_is_all_noise() -> None:
-    """Of a session whose exposures, dark frames and repeats are several, in both ways to take signed patterns: the
-    shares of shot, dark and read noise and of rounding, and that only a uniform shot is shared. (Planted: dark frames
-    in the shot noise; repeats left out of what is shared.)"""
-    fields = {"repeats": 2, "exposure_ladder": (1.0, 2.0)}
-    for mode, extra in (("pair", {}), ("uniform", {"dark_frames": 3})):
-        lit = lit_session(7, mode, devices=CLIPPED, **fields, **extra)
-        own, shared = lit.response_variances("horizontal")
+    """Of a session with repeats, in both ways to take signed patterns: the shares of shot, dark and read noise and of
+    rounding, and that only a uniform shot is shared. (Planted: repeats left out of what is shared.)"""
+    for mode in ("pair", "uniform"):
+        lit = lit_session(7, mode, devices=CLIPPED, repeats=2)
+        own, shared = lit.response_variances()
         assert set(own) == set(shared) == {"shot noise", "dark current", "read noise", "quantisation"}
         whole = sum(part.mean() for parts in (own, shared) for part in parts.values())
-        assert whole == pytest.approx(lit.response_variance("horizontal").mean())
+        assert whole == pytest.approx(lit.response_noise**2)
         assert all(part.any() == (mode == "uniform") for part in shared.values())
     sensor, time = CLIPPED.sensor, EXPOSURE_S
-    own, shared = lit_session(7, "uniform", devices=CLIPPED, repeats=2, dark_frames=3).response_variances("vertical")
+    own, shared = lit_session(7, "uniform", devices=CLIPPED, repeats=2).response_variances()
     dark, read = sensor.dark_current_e_per_s / time, sensor.read_noise_e**2 / time**2
     assert own["dark current"] == pytest.approx(4 * dark / 2)
-    assert shared["dark current"] == pytest.approx(dark / 2 + dark / 3)
-    assert own["read noise"] == pytest.approx(4 * read / 2) and shared["read noise"] == pytest.approx(read * 5 / 6)
+    assert shared["dark current"] == pytest.approx(dark / 2)
+    assert own["read noise"] == pytest.approx(4 * read / 2) and shared["read noise"] == pytest.approx(read / 2)
     assert own["quantisation"] == pytest.approx(own["read noise"] / 12 / sensor.read_noise_e**2)
 
 
