@@ -232,10 +232,10 @@ def measure_session(
         camera=bench.identity(), centre=session.centre, board_reflectance=recipe.board_reflectance,
         digital=digital_of(bench.sensor, lit.exposure_s), parallax=bench.parallax,
     )  # fmt: skip
-    lit_s = sum(lit.exposures_s) * recipe.repeats
+    lit_s = lit.exposure_s * recipe.repeats
     rows: list[Row] = [{
         "kind": "session", "frames": session.shots,
-        "exposure_seconds": len(session.order) * lit_s + recipe.dark_frames * sum(lit.exposures_s),
+        "exposure_seconds": len(session.order) * lit_s,
         "separability_residual": noisy.separability_residual, "noise_free_residual": clean.separability_residual,
     }]  # fmt: skip
     entries, maps = judge_factors(lit, noisy, clean)

@@ -21,7 +21,7 @@ from mitsim.calibrate.calibrate import NOISE_FREE, estimate, session_sums
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session_plan import drawn_estimate, least_dose
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.sensor import digital_of

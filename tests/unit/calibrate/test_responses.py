@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +27,6 @@ from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.captured_session import calibrate_frames
-from mitsim.reconstruct.factors import Estimate
 from mitsim.sensor.chain import Digital
 
 SENSOR = SensorModel(

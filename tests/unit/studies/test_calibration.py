@@ -132,7 +132,7 @@ def test_noise_is_told_by_source_and_by_factor() -> None:
     session: Any = SimpleNamespace(
         session=SimpleNamespace(signs=stripe_signs(N)),
         uniform_rate=np.ones((3, 5)),
-        response_variances=lambda side: ({"shot noise": variance}, {"shot noise": variance / 2}),
+        response_variances=lambda: ({"shot noise": variance}, {"shot noise": variance / 2}),
         light=SimpleNamespace(flux=np.ones(N * N), flux_error=np.full(N * N, 0.1)),
     )
     sampled = SimpleNamespace(flux_error=3.0, apparent=SimpleNamespace(error_of=lambda error: 2 * error, error=0.5))
