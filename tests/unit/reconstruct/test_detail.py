@@ -203,11 +203,3 @@ def test_light_of_one_side_weighs_the_dipoles_of_the_other() -> None:
         struck += np.square(prepared.image(gain * problem.projected)).mean()
         reported += disagreement(model, gain, problem.halves, (zero, zero)).mean()
     assert reported == pytest.approx(struck, rel=0.1)
-
-
-
-
-
-
-
-

@@ -293,10 +293,6 @@ def test_exchanged_halves_of_all_pairs() -> None:
     assert cause is Cause.READING and "halves-exchanged" in words[0]
 
 
-
-
-
-
 def test_light_of_walls_is_no_other_reading() -> None:
     """Nearly half of all light spread over the sensor."""
     walls = bench(optics=lambda light: light + 0.42228 * gaussian_filter(light, 25), peak=4e3)
@@ -309,10 +305,6 @@ def test_another_order_of_dim_light() -> None:
     late = with_frames(shots, lambda frames: [frames[-1], *frames[:-1]])
     misfit = reconstruct(late, CAMERA.calibrated(1)).misfit
     assert misfit is not None and misfit.flagged and "one step late" in misfit.reason
-
-
-
-
 
 
 def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
