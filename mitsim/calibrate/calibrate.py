@@ -265,7 +265,7 @@ def _run_sessions(
         if session.depth is not None and task.resume and place is not None and is_finished(place, configuration):
             return [load_calibration(place)]
         again = task.resume and place is not None and (place / MANIFEST).is_file()
-        if again:
+        if again and place is not None:
             _check_same(place, plain(configuration))
         # The folder is claimed before any work; a new one is removed if the session fails before writing.
         with nullcontext() if place is None else output_folder(place, overwrite=again) as folder:
@@ -300,11 +300,9 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
             "so responses are not linear; lower the recipe's exposure_fraction",
         )
     # (left, right) and (-left, -right) are the same camera, and centred factors have no sum that decides the sign.
-    sign, pairs = (
-        np.sign(np.vdot(noisy.left, clean.left)) or 1.0,
-        ((noisy.left, clean.left), (noisy.right, clean.right)),
-    )
-    errors = [np.linalg.norm(sign * own - exact) / np.linalg.norm(exact) for own, exact in pairs]
+    sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
+    left = np.linalg.norm(sign * noisy.left - clean.left) / np.linalg.norm(clean.left)
+    right = np.linalg.norm(sign * noisy.right - clean.right) / np.linalg.norm(clean.right)
     result = {
         "n": bench.n,
         "depth_mm": session.distance,
@@ -312,7 +310,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         "separability_residual": noisy.separability_residual,
         "unexplained_residual": noisy.unexplained,
         "noise_free_residual": clean.separability_residual,
-        "phi_error": float(np.hypot(*errors)),
+        "phi_error": float(np.hypot(left, right)),
         "faults": [asdict(fault) for fault in faults.faults],
         "lamp": faults.lamp,
         "shadow_residual": lacks and lacks.residual,

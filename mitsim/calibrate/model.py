@@ -360,10 +360,8 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
         def residual(x: FloatArray) -> FloatArray:
             model, placement = list[FloatArray](), place(x)
             for each, (across, along) in zip(shown, directions, strict=True):
-                pairs = vectors(placement, each)
-                model.append(
-                    sum(np.outer(across.T @ left, along.T @ right) for left, right in pairs).ravel() / each.noise
-                )
+                frame = sum(np.outer(across.T @ left, along.T @ right) for left, right in vectors(placement, each))
+                model.append(np.ravel(frame) / each.noise)
             return np.asarray(np.concatenate(model) - data)
 
         def jacobian(x: FloatArray) -> FloatArray:

@@ -382,8 +382,9 @@ class FrameCheck:
             sizes: dict[str, float | None] = dict.fromkeys(("pixel", "power", "place"))
             told = "is too small, or too much the same along the dots' lines, to decide about single frames"
             if found:
-                sizes |= {"pixel": found.predicted, "power": float(np.median(found.power_error))}
-                told = "decides pixels to {pixel:.2g} and power to {power:.1%}".format(**sizes)
+                power = float(np.median(found.power_error))
+                sizes |= {"pixel": found.predicted, "power": power}
+                told = f"decides pixels to {found.predicted:.2g} and power to {power:.1%}"
             words = f"{_DOTS} The picture {told}; an object over few dots of some frames is not seen. {_REMEDY}"
             return ({"words": words, **sizes},)
         contrast = float(self._sums.contrast[whole]) if whole and self._sums.powers else 1.0
