@@ -230,7 +230,10 @@ class Misfit:
     def summary(self) -> dict[str, Any]:
         measured = self.gain * self.noise.gain if self.gain and self.noise and self.noise.gain > 0 else None
         return {
-            **{name: getattr(self, name) for name in ("chi_square", "unexplained", "worst_tile", "flagged")},
+            "chi_square": self.chi_square,
+            "unexplained": self.unexplained,
+            "worst_tile": self.worst_tile,
+            "flagged": self.flagged,
             "detail": 0.0,  # of earlier versions, which measured print finer than a scene pixel
             "noise_stated": self.stated,
             "cause": self.cause.name.lower() if self.cause else None,
