@@ -53,8 +53,7 @@ from mitsim.core.manifests import MOSAIC as MOSAIC_RUN
 from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
-from mitsim.studies import OF_CAPTURES, OF_NO_SCENE
-from mitsim.studies.twin_files import TwinFiles
+from mitsim.studies import OF_CAPTURES, OF_NO_SCENE, find_files
 
 if TYPE_CHECKING:
     from mitsim.acquire.sense import Sensed
@@ -350,7 +349,7 @@ def prepare_study(
             raise MitsimError(f"study {name} {place}: it is of no scene; leave the scene out")
         of_scenes = "patterns", "camera", "projector", "parameters", "allow_outside_files"
         asked.refuse(of_scenes, f"on the study {name}, which is of no scene")
-        TwinFiles.find(None if data is None else Path(data), name)
+        find_files(None if data is None else Path(data), name)
     scope = Scope(setup, pictures, seeds=(asked.seed,), quick=asked.quick, recipe=recipe, data=data)
     scope = scope_of(name, scope, patterns, asked.varied, asked.measure)
     if name not in ("accuracy", "calibration", "sweep", "drift"):

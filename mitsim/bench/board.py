@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.bench.apparatus import Opened, check_depth
 from mitsim.core.arrays import FloatArray
@@ -137,91 +136,36 @@ def _bowed_mesh(shape: BoardShape, half: float, place: FloatArray, bsdf: dict[st
 
 
 # -------- Pictures on prints
-#
-# Pictures on the prints of a bench, and whether one tracing serves every picture.
-#
-# Light of a flat diffuse sheet that stands alone is linear in the reflectance of each point, and comes directly from
-# there to the sensor. Light of a white sheet times the picture is then that of the picture. Light over several surfaces
-# contains products of reflectances, and is traced for each picture.
 
 _PARALLEL = 1e-6
 """Sine of a sheet's tilt that counts as rounding."""
-_BITMAP, _PLAIN = ("reflectance.data", "diffuse_reflectance.data"), "reflectance.value"
-"""Endings of Mitsuba's parameter names for the reflectance of a print, and of an even surface."""
-_LARGEST_CODE = 255
-"""8-bit code of reflectance 1."""
-
-
-def traced_anew(bench: Apparatus) -> str:
-    """Return why light must be traced anew for each picture; empty if light of white prints can be multiplied."""
-    loaded, shapes = bench.loaded, bench.loaded.scene.shapes()
-    if len(shapes) != 1:
-        return f"the scene has {len(shapes)} surfaces, which light each other"
-    (sheet,) = shapes
-    diffuse = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
-    if sheet.class_name() != "Rectangle" or sheet.bsdf().flags() & ~diffuse:
-        return "the scene's surface is no flat diffuse sheet"
-    normal = np.array(sheet.sample_position(0.0, mi.Point2f(0.5)).n, dtype=np.float64).ravel()
-    if np.linalg.norm(np.cross(normal, camera_place(bench)[0][:, 2])) > _PARALLEL:
-        return "the sheet is not parallel to the sensor, so cells of light lie across the picture's pixels"
-    if len(loaded.lamps) > len(loaded.small_lamps):
-        return "the camera may see a lamp of the scene itself"
-    return ""
 
 
 @keep_scenes()
 def show_white(bench: Apparatus) -> None:
-    """Make all printed surfaces, or the only surface, reflect all light; raise MitsimError without either."""
-    for _, held, names in _prints(bench):
-        for name in names:
-            values = np.ones(np.shape(held[name]))
-            held[name] = _as_stored(held[name], values) if name.endswith(_BITMAP) else 1.0
-        held.update()
+    """Make the print of a bench reflect all light.
 
-
-@keep_scenes()
-def show_picture(bench: Apparatus, reflectance: npt.NDArray[np.float64]) -> None:
-    """Put a picture on all prints: each point takes the reflectance of the projector's pixel that lights it.
-
-    Points beyond the window take the nearest pixel. ``reflectance`` is (n, n). Raises MitsimError for a scene without a
-    print, or one whose bitmap has colours or is turned.
+    MitsimError if the light of a picture is not that of the white print times the picture. Light of a flat diffuse
+    sheet that stands alone is linear in the reflectance of each point, and comes directly from there to the sensor.
+    Light over several surfaces contains products of reflectances.
     """
-    rays, n = PinholeRays(bench.projector_optics, [None]), bench.n
-    for sheet, held, names in _prints(bench):
-        for name in names:
-            if not name.endswith(_BITMAP):
-                problem = f"{bench.loaded.path}: has no printed surface (a reflectance by bitmap) to put pictures on"
-                raise MitsimError(f"{problem}; give one its texture")
-            shape, turned = np.shape(held[name]), held[name.replace(".data", ".to_uv")]
-            if shape[2] != 1 or not np.array_equal(np.array(turned.matrix), np.eye(3)):
-                problem = f"{bench.loaded.path}: a print has {shape[2]} channels, or a turned bitmap"
-                raise MitsimError(f"{problem}; give a raw grey one")
-            row, column = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
-            texel = mi.Point2f(*((np.stack([column, row]) + 0.5) / [[shape[1]], [shape[0]]]).astype(np.float32))
-            places = sheet.eval_parameterization(texel).p
-            world = np.stack([host_values(axis, len(row)) for axis in (places.x, places.y, places.z)], axis=1)
-            at = np.nan_to_num(rays.points(world.astype(np.float64))[0])
-            pixel = np.clip(np.floor(at), 0, n - 1).astype(np.int64)
-            held[name] = _as_stored(held[name], reflectance[pixel[:, 0], pixel[:, 1]].reshape(shape))
-        held.update()
-
-
-def _prints(bench: Apparatus) -> list[tuple[mi.Shape, Any, list[str]]]:
-    """Return each shape that has a print, or the only shape, with its parameters and the names of its reflectances."""
-    every = [(shape, mi.traverse(shape)) for shape in bench.loaded.scene.shapes() if shape.bsdf()]
-
-    def named(ending: str | tuple[str, ...]) -> list[tuple[mi.Shape, Any, list[str]]]:
-        found = [(shape, held, [name for name in held.keys() if name.endswith(ending)]) for shape, held in every]  # noqa: SIM118 - no dict
-        return [(shape, held, names) for shape, held, names in found if names]
-
-    found = named(_BITMAP) or (named(_PLAIN) if len(every) == 1 else [])
-    if not found:
-        problem = f"{bench.loaded.path}: none of its {len(every)} surfaces has a print to put pictures on"
-        raise MitsimError(f"{problem}; give one a reflectance by bitmap")
-    return found
-
-
-def _as_stored(before: Any, values: npt.NDArray[np.float64]) -> Any:
-    whole = np.asarray(before).dtype == np.uint8
-    stored = np.rint(_LARGEST_CODE * values).astype(np.uint8) if whole else values.astype(np.float32)
-    return type(before)(stored)
+    loaded, shapes, why = bench.loaded, bench.loaded.scene.shapes(), ""
+    sheet, held = shapes[0], mi.traverse(shapes[0])
+    diffuse = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
+    normal = np.array(sheet.sample_position(0.0, mi.Point2f(0.5)).n, dtype=np.float64).ravel()
+    names = [name for name in held.keys() if name.endswith(("reflectance.data", "reflectance.value"))]  # noqa: SIM118
+    if len(shapes) != 1:
+        why = f"the scene has {len(shapes)} surfaces, which light each other"
+    elif sheet.class_name() != "Rectangle" or sheet.bsdf().flags() & ~diffuse or not names:
+        why = "the scene's surface is no flat diffuse sheet with a reflectance"
+    elif np.linalg.norm(np.cross(normal, camera_place(bench)[0][:, 2])) > _PARALLEL:
+        why = "the sheet is not parallel to the sensor, so cells of light lie across the picture's pixels"
+    elif len(loaded.lamps) > len(loaded.small_lamps):
+        why = "the camera may see a lamp of the scene itself"
+    if why:
+        raise MitsimError(f"{loaded.path}: {why}; pairs are made of one flat diffuse sheet that faces the sensor")
+    for name in names:
+        before = np.asarray(held[name])
+        white = np.full(before.shape, 255 if before.dtype == np.uint8 else 1, before.dtype)
+        held[name] = type(held[name])(white) if name.endswith(".data") else 1.0
+    held.update()

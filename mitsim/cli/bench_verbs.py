@@ -32,7 +32,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import RUN, read_colours
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
-from mitsim.learn.requests import PairOptions
+from mitsim.learn.verbs import PairOptions, PairsRequest
 from mitsim.studies import ALL, EXPERIMENTS
 from mitsim.verbs import DemoRequest, RunOptions, StudyOptions, capture_in, open_as, plan_in
 
@@ -551,23 +551,17 @@ def pairs(asked: Pairing) -> int:
     $ mitsim pairs photograph --count 500 --pictures photos -o mine
     """
     from mitsim.core.files import PAIRS, check_output
-    from mitsim.learn.requests import PairsRequest
 
     asked.refuse_idle()
     output = asked.output
     wanted = PairsRequest(capture=asked.part(Request), **asked.given_of(PairOptions))
-    wanted.check()
     check_output(output, overwrite=asked.resume and (output / PAIRS).is_file())
     asked.check(asked.scene, asked.patterns, asked.timing)
     advise(RESUME)
     with asked.job() as job:
         from mitsim.learn.pairs import make_pairs
 
-        def open_drawn(drawn: Mapping[str, str]) -> mitsim.Bench:
-            parameters = {**asked.parameters, **drawn}
-            return open_as(asked.scene, asked.model_copy(update={"parameters": parameters}), job)
-
-        made, cost = make_pairs(open_drawn, wanted, Task(output, asked.resume, job))
+        made, cost = make_pairs(open_as(asked.scene, asked, job), wanted, Task(output, asked.resume, job))
         payload = {**made.summary(), "predicted_seconds": cost.seconds, "predicted_bytes": cost.disk_bytes}
         payload |= {"seconds": job.clock.seconds(), "kernels": job.clock.kernels()}
     rows, columns = payload["shape"]
@@ -575,6 +569,5 @@ def pairs(asked: Pairing) -> int:
         f"{payload['count']} pairs of {payload['frames']} frames of {rows}x{columns} in "
         f"{payload['seconds']['total']:.1f} s ({cost.seconds:.3g} s predicted), "
         f"{payload['bytes'] / 2**20:.3g} MiB: {output}",
-        *([f"Light is traced for each picture: {payload['traced_anew']}"] if payload["traced_anew"] else []),
     ]
     return asked.finish(payload, lines, payload["warnings"])

@@ -27,7 +27,8 @@ from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.exchange.capture_list import FrameFacts
 from mitsim.exchange.formats import Exported, Pictures
-from mitsim.learn.requests import METHODS, Schedule, Training
+from mitsim.learn.verbs import METHODS, Schedule, Training, load_network
+from mitsim.learn.verbs import train as train_model
 from mitsim.reconstruct.request import MODEL, ImageRequest
 
 if TYPE_CHECKING:
@@ -41,8 +42,6 @@ def _method(name: str) -> Any:
     """Return a method's name, or the network in a file."""
     if not name.endswith(MODEL):
         return name
-    from mitsim.learn.verbs import load_network
-
     return load_network(name)
 
 
@@ -422,8 +421,6 @@ def train(asked: Learning) -> int:
     $ mitsim train unrolled pairs -o model.pt
     $ mitsim reconstruct run --calibration cal --method model.pt
     """
-    from mitsim.learn.verbs import train as train_model
-
     output, schedule = asked.output, asked.given_of(Schedule)
     if output.suffix != MODEL:
         raise MitsimError(f"--output {output}: a trained network is a file that ends in {MODEL}; give such a name")

@@ -1,4 +1,4 @@
-"""Learned methods: the network that all share, the camera's model as tensors, the methods, and FlatNet's losses.
+"""Trained networks as methods of solving: the network, the camera's model as tensors, the methods, and their files.
 
 *Network.* A U-Net (Ronneberger et al., arXiv 1505.04597) returns a change of its input. Its last layer begins at zero.
 Training turns and mirrors images; a reconstructed image is the mean over all eight ways.
@@ -10,26 +10,40 @@ both the data and an image Z, argmin ||w - s o C||^2 + rho ||X - Z||^2, is ::
     X = Z + V_L [s (w - s o V_L^T Z V_R) / (s^2 + rho)] V_R^T
 
 Unmeasured directions remain those of Z. All methods begin at the image nearest to the frames and to an even grey.
+
+*Files.* `torch.load` reads a network's file with `weights_only`, so that nothing in it is executed.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
+from zipfile import is_zipfile
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.seeds import integer
-from mitsim.learn.requests import FLATNET, PLUG_AND_PLAY, PREPROCESSED, REFINED, UNROLLED, Training
-from mitsim.reconstruct.factorisation import Side
-from mitsim.reconstruct.solver import Accumulator, Prepared
+from mitsim.core.configuration import validate
+from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
+from mitsim.core.files import check_plain, json_text, whole_file
+from mitsim.core.manifests import SIDES
+from mitsim.learn.pair_store import ModelManifest
+from mitsim.learn.verbs import FLATNET, REFINED, UNROLLED
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.misfit import UNEXPLAINED
+from mitsim.reconstruct.request import TIKHONOV
+from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import Accumulator, DiagonalProblem, Prepared, noise_variance
+from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 
 # -------- Network
 
@@ -39,63 +53,51 @@ WAYS = 8
 
 
 class UNet(nn.Module):
-    """U-Net that returns a change of images; frames are ``stacked`` as channels before the first level."""
+    """U-Net that returns a change of images."""
 
-    def __init__(self, channels_in: int, channels_out: int, width: int, stacked: int = 1) -> None:
+    def __init__(self, channels: int, width: int) -> None:
         super().__init__()
-        self.stacked, square = stacked, stacked * stacked
         sizes = [width * level for level in LEVELS]
-        self.first = nn.Conv2d(channels_in * square, sizes[0], 3, padding=1)
+
+        def block(size: int) -> nn.Sequential:
+            first, second = (nn.Conv2d(size, size, 3, padding=1) for _ in range(2))
+            return nn.Sequential(nn.ReLU(), first, nn.ReLU(), second)
+
+        self.first = nn.Conv2d(channels, sizes[0], 3, padding=1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in pairwise(sizes))
         self.up = nn.ModuleList(nn.Conv2d(b, 4 * a, 1) for a, b in pairwise(sizes))
-        self.before = nn.ModuleList(_block(size) for size in sizes)
-        self.after = nn.ModuleList(_block(size) for size in sizes[:-1])
-        self.last = nn.Conv2d(sizes[0], channels_out * square, 3, padding=1)
+        self.before = nn.ModuleList(block(size) for size in sizes)
+        self.after = nn.ModuleList(block(size) for size in sizes[:-1])
+        self.last = nn.Conv2d(sizes[0], 1, 3, padding=1)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
         self.to(memory_format=torch.channels_last)
 
     def forward(self, images: Tensor, way: int = 0) -> Tensor:
-        """Return the change of images (B, channels_in, n, n'), mirrored and transposed by the bits of ``way``.
+        """Return the change of images (B, channels, n, n'), mirrored and transposed by the bits of ``way``.
 
         Training uses bfloat16 where the processor computes with it, because it is twice as fast.
         """
         axes = [axis for axis in (-2, -1) if way >> (axis + 2) & 1]
-        half = self.training and has_half(images.device)
-        with torch.autocast(images.device.type, torch.bfloat16, enabled=half):
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.training and has_half(images.device)):
             turned = images.flip(axes)
             turned = turned.transpose(-2, -1) if way & 4 else turned
             rows, columns = turned.shape[-2:]
-            levels = self.levels(turned)
+            whole = 2 ** (len(LEVELS) - 1)
+            padded = functional.pad(turned, (0, -columns % whole, 0, -rows % whole), mode="replicate")
+            values = self.first(padded.contiguous(memory_format=torch.channels_last))
+            levels: list[Tensor] = []
+            for level, block in enumerate(self.before):
+                values = self.down[level - 1](values) if level else values
+                values = values + block(values)
+                levels.append(values)
             values = levels.pop()
             for up, after in zip(reversed(self.up), reversed(self.after), strict=True):
                 values = functional.pixel_shuffle(up(values), 2) + levels.pop()
                 values = values + after(values)
-            change = functional.pixel_shuffle(self.last(functional.relu(values)), self.stacked)[..., :rows, :columns]
+            change = self.last(functional.relu(values))[..., :rows, :columns]
             change = change.transpose(-2, -1) if way & 4 else change
             return change.flip(axes).to(images.dtype)
-
-    def levels(self, images: Tensor) -> list[Tensor]:
-        rows, columns = images.shape[-2:]
-        whole = self.stacked * 2 ** (len(LEVELS) - 1)
-        padded = functional.pad(images, (0, -columns % whole, 0, -rows % whole), mode="replicate")
-        squares = functional.pixel_unshuffle(padded, self.stacked)
-        values = self.first(squares.contiguous(memory_format=torch.channels_last))
-        found: list[Tensor] = []
-        for level, block in enumerate(self.before):
-            values = self.down[level - 1](values) if level else values
-            values = values + block(values)
-            found.append(values)
-        return found
-
-
-def _block(size: int) -> nn.Sequential:
-    first, second = (nn.Conv2d(size, size, 3, padding=1) for _ in range(2))
-    return nn.Sequential(nn.ReLU(), first, nn.ReLU(), second)
-
-
-def drawn_way(noise: torch.Generator) -> int:
-    return int(torch.randint(WAYS, (), generator=noise))
 
 
 def has_half(device: torch.device) -> bool:
@@ -106,52 +108,29 @@ def has_half(device: torch.device) -> bool:
 
 # -------- Camera
 
-BIN = 4
-"""Sensor pixels along an axis of one bin, so that frames under 49 patterns need 3 MB a pair."""
-
 
 @dataclass(frozen=True, eq=False)
 class Diagonal:
     """Model of a camera under its patterns.
 
-    Attributes
-    ----------
-    left, right
-        V_L (n, r) and V_R (n', r').
-    sigma
-        (r, r') singular values of the whole model [electrons / s].
-    slabs
-        (K, b, r) and (K', b', r') sums of U_L and U_R over the pixels of a bin, for every pattern; 0 where unlit.
+    ``left`` and ``right`` are V_L (n, r) and V_R (n', r'); ``sigma`` has the (r, r') singular values of the whole model
+    [electrons / s].
     """
 
     left: Tensor
     right: Tensor
     sigma: Tensor
-    slabs: tuple[Tensor, Tensor]
 
     @classmethod
     def of(cls, prepared: Prepared, like: Tensor) -> Diagonal:
-        def slabs(side: Side) -> FloatArray:
-            stack = np.zeros((side.pattern_count, -(-side.sensor_size // BIN), len(side.singular)))
-            for whole, slab in zip(stack, side.slabs, strict=True):
-                whole[:, slab.columns] = _bin(slab.matrix)
-            return stack
-
-        left, right = prepared.left, prepared.right
-        arrays = left.basis, right.basis, prepared.sigma, slabs(left), slabs(right)
-        v_left, v_right, sigma, *sums = (torch.as_tensor(values.copy()).to(like) for values in arrays)
-        return cls(v_left, v_right, sigma, (sums[0], sums[1]))
+        arrays = prepared.left.basis, prepared.right.basis, prepared.sigma
+        return cls(*(torch.as_tensor(values.copy()).to(like) for values in arrays))
 
     def coefficients(self, images: Tensor) -> Tensor:
         return self.left.T @ images @ self.right
 
     def images(self, coefficients: Tensor) -> Tensor:
         return self.left @ coefficients @ self.right.T
-
-    def project(self, frames: Tensor) -> Tensor:
-        """Return W = sum_ij U_Li^T Y_ij U_Rj (B, r, r') of frames (B, K, K', b, b') that are even over each bin."""
-        left, right = self.slabs
-        return (left.transpose(1, 2) @ (frames @ right).sum(2)).sum(1)
 
     def nearest(self, data: Data, images: Tensor, rho: Tensor) -> Tensor:
         """Return the images nearest to both the data and `images` (B, 1, n, n').
@@ -166,44 +145,18 @@ class Diagonal:
 class Data:
     """Measurements of B scenes.
 
-    Attributes
-    ----------
-    weights
-        (B, 1, r, r') W over the noise of a datum.
-    deviation
-        (B, 1, 1, 1) standard deviation of that noise [electrons / s].
-    frames
-        (B, K, K', b, b') binned frames [electrons / s]; None for methods that read none.
+    ``weights`` (B, 1, r, r') are W over the noise of a datum, and ``deviation`` (B, 1, 1, 1) is the standard deviation
+    of that noise [electrons / s].
     """
 
     weights: Tensor
     deviation: Tensor
-    frames: Tensor | None = None
 
     @classmethod
     def of(cls, weights: FloatArray, variance: FloatArray | float, like: Tensor) -> Data:
         deviation = np.sqrt(np.broadcast_to(variance, len(weights)))[:, None, None]
         scaled = torch.as_tensor(weights / deviation)
         return cls(scaled[:, None].to(like), torch.as_tensor(deviation)[:, None].to(like))
-
-
-class Binning(Accumulator):
-    def __init__(self, prepared: Prepared) -> None:
-        super().__init__(prepared)
-        sides = prepared.left, prepared.right
-        bins = (-(-side.sensor_size // BIN) for side in sides)
-        self.frames = np.zeros((*(side.pattern_count for side in sides), *bins), np.float32)
-
-    def add(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
-        own = super().add(frame, row, column)
-        values = np.asarray(frame)
-        pixels = np.outer(*(_bin(np.ones(size)) for size in values.shape))
-        self.frames[row, column] = _bin(_bin(values).T).T / pixels
-        return own
-
-
-def _bin(values: FloatArray) -> FloatArray:
-    return np.asarray(np.add.reduceat(values, np.arange(0, len(values), BIN)))
 
 
 # -------- Methods
@@ -216,7 +169,7 @@ _LEAST_ERROR = 1e-5
 
 class Method(nn.Module):
     PASSES, WIDTH = 1, 24
-    reads_frames, holds_camera = False, False
+    holds_camera = False
 
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__()
@@ -234,7 +187,10 @@ class Method(nn.Module):
         return torch.stack([self(data, model, way) for way in range(WAYS)]).mean(0)
 
     def loss(self, truths: Tensor, data: Data, model: Diagonal, noise: torch.Generator) -> Tensor:
-        return decibels(self(data, model, drawn_way(noise)), truths)
+        """Return the mean logarithm of each image's squared error, seen in a drawn way."""
+        way = int(torch.randint(WAYS, (), generator=noise))
+        errors = (self(data, model, way) - truths).square().mean(dim=(1, 2, 3))
+        return torch.log(errors + _LEAST_ERROR).mean()
 
 
 class Refined(Method):
@@ -245,7 +201,7 @@ class Refined(Method):
 
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__(shape)
-        self.network = UNet(1, 1, self.WIDTH)
+        self.network = UNet(1, self.WIDTH)
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
         start = self.start(data, model)
@@ -281,7 +237,7 @@ class Unrolled(Method):
 
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__(shape)
-        self.networks = nn.ModuleList(UNet(2, 1, self.WIDTH) for _ in range(self.STEPS))
+        self.networks = nn.ModuleList(UNet(2, self.WIDTH) for _ in range(self.STEPS))
         self.log_rho = nn.Parameter(torch.linspace(math.log(self.FIRST), math.log(self.LAST), self.STEPS))
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
@@ -293,131 +249,185 @@ class Unrolled(Method):
         return images + _GREY
 
 
-class PlugAndPlay(Method):
-    """A denoiser that learned from pictures alone, in the same splitting.
+CLASSES: dict[str, type[Method]] = {UNROLLED: Unrolled, REFINED: Refined, FLATNET: FlatNet}
 
-    The method is that of Zhang et al. (arXiv 2008.13751).
+# -------- Trained networks, and their files
+
+_MOST_BYTES = 1 << 28
+_SAME_CAMERA = 0.02
+"""Relative difference of models that indicates another camera: four times that of two sessions of 512 frames."""
+_OTHER_NOISE = 1.5
+"""Allowed factor of the noise outside the training's range; half an exposure gives 1.4."""
+_NO_NOISE = 1e-14
+"""Part of the frames' energy that counts as noise: rounding of single precision."""
+_TENSORS = (*SIDES, "P_L", "P_R")
+
+
+@dataclass(frozen=True, eq=False)
+class _Doubted(Prepared):
+    doubts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedSolver(Solver):
+    """Trained network as a method of solving, with the factors and patterns of its training."""
+
+    manifest: ModelManifest
+    network: Method
+    sides: tuple[FloatArray, FloatArray]
+    patterns: Patterns
+
+    linear, whole = False, False
+
+    @property
+    def name(self) -> str:
+        digest = hashlib.sha256(self.manifest.model_dump_json().encode())
+        for name, values in self.network.state_dict().items():
+            digest.update(name.encode() + values.cpu().contiguous().numpy().tobytes())
+        return f"{self.manifest.method} {digest.hexdigest()[:12]}"
+
+    def init(self, camera: Factors, patterns: Patterns) -> Prepared:
+        """Factorise the camera's model, with doubts where it differs from that of the training.
+
+        Raise MitsimError for images of another size, other patterns, and another camera where the weights belong to
+        one.
+        """
+        shape = camera.left.shape[1], camera.right.shape[1]
+        if shape != self.network.shape:
+            (own_rows, own_columns), (rows, columns) = self.network.shape, shape
+            raise MitsimError(
+                f"model {self.name}: makes images of {own_rows} x {own_columns} pixels, but calibration {camera.name} "
+                f"has {rows} x {columns}; train one for it"
+            )
+        if not all(np.array_equal(own, other) for own, other in zip(self.patterns, patterns, strict=True)):
+            raise MitsimError(
+                f"model {self.name}: was trained under the patterns {cut(self.manifest.patterns)}, and these are "
+                "others; capture those, or train one for these"
+            )
+        doubts, (ours, theirs) = list[str](), (self.manifest.camera, camera.manifest.camera)
+        if names := [cut(name) for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]:
+            other = f"{', '.join(names)} differ"
+            if self.network.holds_camera:
+                raise MitsimError(
+                    f"model {self.name}: was trained for another camera ({other}), and its weights stand for that one; "
+                    f"train one for calibration {camera.name}, or {UNROLLED} or {REFINED}, which serve others, flagged"
+                )
+            doubts.append(f"The network was trained for another camera: {other}.")
+        else:
+            difference = 1.0  # of the products of both sides; of other shapes all of it
+            if all(a.shape == b.shape for a, b in zip(self.sides, camera.sides, strict=True)):
+                own, theirs_too, both = (
+                    float(np.prod([np.vdot(a, b) for a, b in zip(first, second, strict=True)]))
+                    for first, second in (
+                        (self.sides, self.sides), (camera.sides, camera.sides), (self.sides, camera.sides),
+                    )
+                )  # fmt: skip
+                difference = float(np.sqrt(max(own + theirs_too - 2 * both, 0.0) / own))
+            if difference > _SAME_CAMERA:
+                doubts.append(f"The network was trained with a calibration that differs by {difference:.1%}.")
+        return _Doubted(**vars(SOLVERS[TIKHONOV].init(camera, patterns)), doubts=tuple(doubts))
+
+    def compute(
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
+    ) -> Solution:
+        """Return the image of the frames; raise MitsimError if it is not finite."""
+        problem = prepared.problem(frames)
+        variance = datum_variance(problem)
+        like = next(self.network.parameters())
+        with torch.no_grad():
+            data = Data.of(problem.projected[None], variance, like)
+            found = self.network.images(data, Diagonal.of(prepared, like))[0, 0]
+        image = found.cpu().numpy().astype(np.float64)
+        if not np.isfinite(image).all():
+            raise MitsimError(f"model {self.name}: its image of these frames is not finite; train it anew")
+        missed, beyond = beyond_noise(prepared, problem, image)
+        outside = max(problem.energy - float(np.square(problem.projected).sum()), 0.0)
+        flags = [*(prepared.doubts if isinstance(prepared, _Doubted) else ())]
+        relative, (low, high) = relative_noise(problem), self.manifest.noise
+        if not low / _OTHER_NOISE <= relative <= high * _OTHER_NOISE:
+            flags.append(
+                f"The network was trained with noise of {low:.1e} to {high:.1e} of the light, and here it is "
+                f"{relative:.1e}."
+            )
+        if beyond > UNEXPLAINED:
+            flags.append(f"The image does not give the frames: {beyond:.1e} of them, beyond noise, are others.")
+        return Solution(
+            image=image,
+            lam=variance * float(torch.exp(self.network.log_start.detach())),
+            residual=float(np.sqrt((missed + outside) / problem.energy)),
+            status=Status(
+                Verdict.SOLVED,
+                f"Found by a trained network, {self.name}: what it adds to the frames is likely, not measured, and its "
+                "uncertainty is not known",
+                figures=f"{prepared.extent}.",
+                flags=tuple(flags),
+            ),
+        )
+
+    def save(self, path: Path | str) -> None:
+        tensors = dict(zip(_TENSORS, (*self.sides, *self.patterns), strict=True))
+        held = {
+            "manifest": json_text(self.manifest.model_dump()),
+            "tensors": {name: torch.as_tensor(np.asarray(values, np.float64)) for name, values in tensors.items()},
+            "weights": {name: values.cpu() for name, values in self.network.state_dict().items()},
+        }
+        write_tensors(path, held)
+
+
+def read_network(path: Path | str, device: str) -> LearnedSolver:
+    """Read a file of `mitsim train` for a device of torch; raise MitsimError for any other file."""
+    if check_plain(path, "model").st_size > _MOST_BYTES:
+        raise MitsimError(f"model {path}: is larger than {_MOST_BYTES >> 20} MiB; give a file of `mitsim train`")
+    try:
+        if not is_zipfile(path):  # torch reads older files with warnings
+            raise ValueError("no file of torch")
+        held = torch.load(path, map_location="cpu", weights_only=True)
+        manifest = validate(ModelManifest, json.loads(held["manifest"]), f"model {path}")
+        left, right, *patterns = (held["tensors"][name].numpy() for name in _TENSORS)
+        network = CLASSES[manifest.method]((left.shape[1], right.shape[1]))
+        network.load_state_dict(held["weights"])
+        finite = all(bool(values.isfinite().all()) for values in network.state_dict().values())
+    except MitsimError:
+        raise
+    except Exception as error:  # torch.load raises errors of many classes
+        raise MitsimError(
+            f"model {path}: is no file of `mitsim train` ({cut(reason_of(error), 200)}); train one"
+        ) from error
+    if not finite:
+        raise MitsimError(f"model {path}: has weights that are not finite; train it anew")
+    return LearnedSolver(manifest, on_device(network, device).eval(), (left, right), (patterns[0], patterns[1]))
+
+
+def write_tensors(path: Path | str, held: dict[str, Any]) -> None:
+    """Write a file for ``torch.load`` as a whole; raise MitsimError if it cannot be written.
+
+    The buffer exists because torch reports a full disk with pages of text.
     """
-
-    STEPS = 8
-    NOISIEST, CLEANEST = 0.3, 0.01
-    """Standard deviations of the noise that the first and last step remove: that of least squares under uniform light,
-    and a hundredth of white."""
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        super().__init__(shape)
-        self.network = UNet(2, 1, self.WIDTH)
-
-    def denoise(self, images: Tensor, deviation: Tensor, way: int = 0) -> Tensor:
-        """Remove white noise of a standard deviation (B, 1, 1, 1) from images (B, 1, n, n'), less grey."""
-        return images + self.network(torch.cat([images, deviation.expand_as(images)], 1), way)
-
-    def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
-        images = self.start(data, model)
-        deviations = torch.logspace(math.log10(self.NOISIEST), math.log10(self.CLEANEST), self.STEPS)
-        for deviation in deviations.to(images):
-            images = self.denoise(images, deviation.reshape(1, 1, 1, 1), way)
-            images = model.nearest(data, images + _GREY, 1 / deviation**2) - _GREY
-        return images + _GREY
-
-    def loss(self, truths: Tensor, data: Data, model: Diagonal, noise: torch.Generator) -> Tensor:
-        low, high = math.log(self.CLEANEST), math.log(self.NOISIEST)
-        part = torch.rand((len(truths), 1, 1, 1), generator=noise).to(truths)
-        deviation = torch.exp(low + (high - low) * part)
-        noisy = truths - _GREY + deviation * torch.randn(truths.shape, generator=noise).to(truths)
-        return decibels(self.denoise(noisy, deviation, drawn_way(noise)), truths - _GREY)
+    buffer = BytesIO()
+    torch.save(held, buffer)
+    with whole_file(path) as part:
+        part.write_bytes(buffer.getbuffer())
 
 
-class Denoiser(nn.Module):
-    def __init__(self, network: PlugAndPlay) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, x: Tensor, sigma: Tensor | float, **_: Any) -> Tensor:
-        deviation = torch.as_tensor(sigma).to(x).reshape(-1, 1, 1, 1)
-        return self.network.denoise(x - _GREY, deviation.expand(len(x), 1, 1, 1)) + _GREY
-
-
-class Preprocessed(Refined):
-    """A network on every frame, least squares of its output, and a U-Net after that.
-
-    This is modular reconstruction (Bezzam et al., arXiv 2502.01102); the network sees binned frames.
-    """
-
-    reads_frames, holds_camera = True, True
-    FRAME_WIDTH, FRAME_STACKED = 16, 4
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        super().__init__(shape)
-        self.of_frames = UNet(1, 1, self.FRAME_WIDTH, self.FRAME_STACKED)
-
-    def start(self, data: Data, model: Diagonal) -> Tensor:
-        frames = data.frames
-        assert frames is not None, "this method reads frames"
-        scale = frames.mean(dim=(1, 2, 3, 4), keepdim=True)
-        change = scale * self.of_frames((frames / scale).flatten(0, 2)[:, None]).reshape(frames.shape)
-        added = model.project(change)[:, None] / data.deviation
-        return super().start(Data(data.weights + added, data.deviation), model)
+def on_device(network: Method, device: str) -> Method:
+    try:
+        network.to(device)
+        float(network.log_start.detach())
+    except (RuntimeError, AssertionError) as error:  # torch: unknown device, none built in, and `meta`
+        raise ArgumentError("device", f"{device!r}: cannot be used ({cut(reason_of(error))}); use cpu") from error
+    return network
 
 
-def decibels(images: Tensor, truths: Tensor) -> Tensor:
-    return torch.log((images - truths).square().mean(dim=(1, 2, 3)) + _LEAST_ERROR).mean()
+def datum_variance(problem: DiagonalProblem) -> float:
+    return max(noise_variance(problem), _NO_NOISE * problem.energy / problem.data_count)
 
 
-CLASSES: dict[str, type[Method]] = {
-    UNROLLED: Unrolled,
-    REFINED: Refined,
-    FLATNET: FlatNet,
-    PLUG_AND_PLAY: PlugAndPlay,
-    PREPROCESSED: Preprocessed,
-}
-
-# -------- Losses beside the squared error
-
-_FEATURES = 16
-_LEAST_FEATURES = 1e-5
-_PATCH = (32, 64, 128)
-"""Channels of the adversary's layers, half of those of Isola et al. (arXiv 1611.07004), whose pictures have colours."""
-_RATE, _BETAS, _SLOPE = 2e-4, (0.5, 0.999), 0.2
+def beyond_noise(prepared: Prepared, problem: DiagonalProblem, image: FloatArray) -> tuple[float, float]:
+    """Return the frames' energy in the model's range that an image does not reproduce, and the rms unexplained part."""
+    missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
+    beyond = max(missed - datum_variance(problem) * prepared.rank, 0.0)
+    return missed, float(np.sqrt(beyond / problem.energy))
 
 
-class Critic:
-    """FlatNet's two other losses: differences of features, and an adversary.
-
-    Features come from drawn weights, which work as well as learned ones (Liu et al., arXiv 2103.10571).
-    """
-
-    def __init__(self, request: Training, like: Tensor) -> None:
-        self._weights = request.feature_weight, request.adversary_weight
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(integer(request.seed, "critic"))
-            self._features = UNet(1, 1, _FEATURES).to(like).requires_grad_(False)
-            layers: list[nn.Module] = []
-            for before, after in zip((1, *_PATCH), _PATCH, strict=False):
-                layers += [nn.Conv2d(before, after, 4, stride=2, padding=1), nn.LeakyReLU(_SLOPE)]
-            self.adversary = nn.Sequential(*layers, nn.Conv2d(_PATCH[-1], 1, 4, padding=2)).to(like)
-        self.optimiser = torch.optim.Adam(self.adversary.parameters(), lr=_RATE, betas=_BETAS)
-
-    def loss(self, images: Tensor, truths: Tensor) -> Tensor:
-        """Return the loss to add for images (B, 1, n, n'): differences of features, and the adversary's."""
-        features, adversary = self._weights
-        found = images.new_zeros(())
-        if features:
-            for own, true in zip(self._features.levels(images), self._features.levels(truths), strict=True):
-                part = (own - true).square().mean(dim=(1, 2, 3)) / true.square().mean(dim=(1, 2, 3))
-                found = found + features * torch.log(part + _LEAST_FEATURES).mean()
-        return found - adversary * self.adversary(images).mean() if adversary else found
-
-    def learn(self, images: Tensor, truths: Tensor) -> None:
-        self.optimiser.zero_grad()
-        if self._weights[1]:
-            found = self.adversary(torch.cat([truths, images.detach()]))
-            real, made = functional.relu(1 - found[: len(truths)]), functional.relu(1 + found[len(truths) :])
-            (real.mean() + made.mean()).backward()
-
-    def state(self) -> dict[str, Any]:
-        return {"adversary": self.adversary.state_dict(), "optimiser": self.optimiser.state_dict()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.adversary.load_state_dict(state["adversary"])
-        self.optimiser.load_state_dict(state["optimiser"])
+def relative_noise(problem: DiagonalProblem) -> float:
+    return float(np.sqrt(datum_variance(problem) * problem.data_count / problem.energy))

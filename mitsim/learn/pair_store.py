@@ -2,8 +2,7 @@
 
 The folder holds `pairs.json` and shards `pairs_00000.h5` and so on. A shard keeps pictures, truths, and the light of a
 white print: times a picture, that is the light of the picture. A thousand pairs of 49 frames therefore take 100 MB
-instead of 25 GB. Where light is no such product, or the mask's shadow no sum of few terms, a shard keeps the expected
-frames. Noise is drawn when a pair is read.
+instead of 25 GB. Frames are formed, and noise is drawn, when a pair is read.
 """
 
 from __future__ import annotations
@@ -11,10 +10,10 @@ from __future__ import annotations
 import json
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -95,10 +94,10 @@ class PairsManifest(BaseModel):
     """Conversion of numbers to electrons a second, and their noise, at that exposure."""
     scene: str
     """Where the scene lies."""
-    idealised: bool
-    """Whether frames are of the separable model, and not rendered."""
-    traced_anew: str
-    """Why light was traced for each picture; empty: light of a white print, times the picture."""
+    idealised: bool = False
+    """Whether frames are of the separable model, as those of some stores of version 1."""
+    traced_anew: str = ""
+    """Why light was traced for each picture, in stores of version 1, which are refused."""
     seed: int
     """Root of every random stream."""
     count: int = Field(ge=1)
@@ -155,8 +154,8 @@ class ModelManifest(Configuration):
     pairs: Plain
     """Facts of the store of the pairs."""
     training: Plain
-    """Steps, batch, rate, seed and weights of losses; `curve`, the PSNR of pairs that choose, by step; `psnr_db` of
-    pairs that neither teach nor choose."""
+    """Steps, batch, rate and seed; `curve`, the PSNR of pairs that choose, by step; `psnr_db` of pairs that neither
+    teach nor choose."""
     versions: dict[str, str]
     """Of mitsim, torch and others."""
 
@@ -194,10 +193,6 @@ class PrintLight:
     parts: tuple[PrintPart, ...]
     emission: FloatArray
 
-    @property
-    def few(self) -> bool:
-        return all(part.optics.terms is not None for part in self.parts)
-
     def frames_of(self, reflectance: FloatArray) -> ExpectedFrames:
         """Return the expected frames [electrons/s] of a picture (n, n)."""
         lights = [part.times(reflectance) for part in self.parts if not part.lamps]
@@ -209,7 +204,7 @@ class PrintLight:
         group.create_dataset("emission", data=self.emission, **PACKED)
         for number, part in enumerate(self.parts):
             place = group.create_group(f"part_{number}", track_order=True)
-            assert part.optics.terms is not None, "light that is kept has few"
+            assert part.optics.terms is not None, "no mask whose shadow is drawn on a raster"
             (terms,) = part.optics.terms
             for axis, side in enumerate(("left", "right")):
                 place.create_dataset(side, data=np.stack([term[axis] for term in terms]), **PACKED)
@@ -237,17 +232,14 @@ class PrintLight:
 # -------- Writing
 
 
-Pair = tuple[dict[str, Any], Sequence[str]]
-
-
-def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, light: PrintLight | None) -> None:
+def write_shard(
+    path: Path, digest: str, pairs: Iterable[dict[str, Any]], light: PrintLight, speckle: float, warnings: Iterable[str]
+) -> None:
     with whole_hdf5(path) as file:
-        file.attrs.update({"configuration_sha256": digest, "speckle": speckle})
-        if light is not None:
-            light.write(file.create_group("light", track_order=True))
-        warnings = dict[str, None]()
-        for number, (rows, own) in enumerate(pairs):
-            warnings |= dict.fromkeys(own)
+        attributes = {"configuration_sha256": digest, "speckle": speckle, "warnings": json.dumps([*warnings])}
+        file.attrs.update(attributes)
+        light.write(file.create_group("light", track_order=True))
+        for number, rows in enumerate(pairs):
             for name, values in rows.items():
                 row = np.asarray(values)
                 if name not in file:
@@ -257,7 +249,6 @@ def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, 
                     file.create_dataset(name, shape, row.dtype, maxshape=most, chunks=chunks, **packed)
                 file[name].resize(number + 1, axis=0)
                 file[name][number] = row
-        file.attrs["warnings"] = json.dumps([*warnings])
 
 
 def is_shard(path: Path, digest: str, count: int) -> bool:
@@ -272,7 +263,7 @@ def is_shard(path: Path, digest: str, count: int) -> bool:
 
 
 def _open_shard(path: Path, known: set[object] | None = None) -> AbstractContextManager[h5py.File]:
-    rows = {"/picture", "/truth", "/expected", "/lamps"}  # of which one row is read at a time
+    rows = {"/picture", "/truth"}  # of which one row is read at a time
     return checked_hdf5(path, lambda each: 1 / max(each.shape[0], 1) if each.name in rows else 1.0, known)
 
 
@@ -281,7 +272,7 @@ class PairStore:
 
     def __init__(self, folder: Path, manifest: PairsManifest) -> None:
         self.folder, self.manifest = folder, manifest
-        self._lights = dict[int, tuple[PrintLight | None, float]]()
+        self._light = lru_cache(_LIGHTS_KEPT)(self._read_light)
         self._known = set[object]()
 
     @classmethod
@@ -391,22 +382,17 @@ class PairStore:
 
     def _light_of(self, index: int) -> tuple[Iterable[FloatArray], FloatArray, float, float]:
         """Return the light of each shot and of lamps [electrons/s], the exposure [s] and the speckle's contrast."""
-        number = self._shard(index)
-        if number not in self._lights:
-            with self._file(self.manifest.shards[number]) as file:
-                light = PrintLight.read(file["light"]) if "light" in file else None
-                self._lights[number] = light, float(file.attrs["speckle"])
-            if len(self._lights) > _LIGHTS_KEPT:
-                del self._lights[next(iter(self._lights))]
-        light, speckle = self._lights[number]
-        if light is None:
-            rows = self._rows(index, "expected", "lamps", "exposure_s")
-            frames = (frame.astype(np.float64) for frame in rows["expected"])
-            return frames, rows["lamps"].astype(np.float64), float(rows["exposure_s"]), speckle
+        light, speckle = self._light(self._shard(index))
         rows = self._rows(index, "picture", "exposure_s")
         expected = light.frames_of(rows["picture"] / WHITE)
         rates = (frame.irradiance for frame in expected)
         return rates, expected.projector_off.irradiance, float(rows["exposure_s"]), speckle
+
+    def _read_light(self, number: int) -> tuple[PrintLight, float]:
+        with self._file(self.manifest.shards[number]) as file:
+            if "light" not in file:  # of version 1, for light that was traced for each picture
+                raise MitsimError(f"{self.folder}: keeps frames in place of light, which is not read; make pairs again")
+            return PrintLight.read(file["light"]), float(file.attrs["speckle"])
 
     def facts(self, shard: Shard) -> tuple[FloatArray, int, list[str]]:
         """Return the exposures (pairs,) [s], the number of saturated pairs, and warnings of a shard."""

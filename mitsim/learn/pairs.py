@@ -1,8 +1,7 @@
-"""Pairs to learn from: pictures on the prints of a bench, their frames and truths.
+"""Pairs to learn from: pictures on the print of a bench, their frames and truths.
 
 The light of a picture is that of a white print times the reflectance of each cell's pixel, for light from one flat
-sheet straight to the sensor. Elsewhere (:func:`mitsim.bench.board.traced_anew`) each picture's light is traced.
-Idealised frames follow the paper's separable model.
+sheet straight to the sensor (:func:`mitsim.bench.board.show_white`). Other scenes are refused.
 
 Pictures are square, of eight bits, drawn from a seed or cut from files. Drawn pictures have the statistics of natural
 ones: leaves that hide each other (the dead leaves of Matheron, 1968), whose sizes follow a power law, with soft edges,
@@ -14,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -30,14 +29,13 @@ from mitsim.acquire.exposure import ambient_shots, camera_warnings, drift_mask, 
 from mitsim.acquire.spectral import plan_request
 from mitsim.api.bench import Bench
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.board import show_picture, show_white, traced_anew
+from mitsim.bench.board import show_white
 from mitsim.bench.request import Task
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.environment import deciding_versions, versions
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import MitsimError
 from mitsim.core.files import PAIRS, check_plain, output_folder, plain, write_json
-from mitsim.core.job import Cost, Job
-from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.job import Cost
 from mitsim.core.prepare import read_reflectance
 from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import PatternFamily
@@ -45,7 +43,6 @@ from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import Drift
 from mitsim.learn.pair_store import (
     WHITE,
-    Pair,
     PairsManifest,
     PairStore,
     PrintLight,
@@ -55,98 +52,64 @@ from mitsim.learn.pair_store import (
     read_pairs_manifest,
     write_shard,
 )
-from mitsim.learn.requests import CALIBRATION, PairsRequest, picture_files
+from mitsim.learn.verbs import PairsRequest, picture_files
 from mitsim.light.cost_model import first_shadow, frames_cost
-from mitsim.light.light import SampledLight, Sampling, trace_light, traced_again
-from mitsim.light.plan import Plan
+from mitsim.light.light import SampledLight, traced_again
 from mitsim.light.simulation import Simulation, emission
-from mitsim.optics.image_formation import FrameOptics
-from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.report.lit_scene import IdealCamera
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.transport.records import Bundle
 
 SHARD = 100
 """Most pairs of a shard, because an interruption then loses a minute."""
 _PICTURE_S = 3e-6
-_PAIR_BYTES, _FRAME_BYTES = 4, 4
+_PAIR_BYTES = 4
 _SHADOW_BYTES = 40
 """Bytes of the stored shadow per pixel of the frame's and projector's sides; measured 27 to 30."""
 _FORMED = 0.5
 """Time to form a pair's frames over that of a capture; measured 0.4 to 0.6."""
 
-Opening = Callable[[Mapping[str, str]], Bench]
-
-# -------- Light of white prints
-
-_STRAIGHT = ("fine", "anchor_residual")
+# -------- Light of a white print
 
 
-@dataclass(frozen=True, eq=False)
-class WhitePrints:
-    """Bench whose prints are white, in its light.
+def white_shares(light: SampledLight) -> sparse.csr_array:
+    """Return the (n^2, n^2) part of each projector pixel's direct light that each pixel of the picture reflects."""
+    direct, settings = light, light.plan.settings
+    if "glare" in settings.effects:  # which is in no truth
+        without = replace(settings, effects=settings.effects - {"glare"})
+        direct = traced_again(light, Simulation(light.bench, without))
+    pixels, fine = light.bench.n**2, direct.merge()
+    rows, columns = picture_axes(fine, fine.simulation.grids["fine"].bundle)
+    of_place = (rows[:, None] * light.bench.n + columns).ravel()
+    entries = (np.ones(len(of_place)), (np.arange(len(of_place)), of_place))
+    seen = fine.groups[0]["fine"][:pixels] @ sparse.csr_array(entries, shape=(len(of_place), pixels))
+    total = np.asarray(seen.sum(axis=1))
+    inverse = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
+    return sparse.csr_array(sparse.diags_array(inverse) @ seen)
 
-    Attributes
-    ----------
-    white
-        (n, n) apparent reflectance of the white prints.
-    shares
-        (n^2, n^2) part of each projector pixel's direct light that each pixel of the picture reflects.
-    """
 
-    light: SampledLight
-    white: FloatArray
-    shares: sparse.csr_array
-    warnings: tuple[str, ...]
-
-    @classmethod
-    def of(cls, light: SampledLight) -> WhitePrints:
-        direct, settings = light, light.plan.settings
-        if "glare" in settings.effects:  # which is in no truth
-            without = replace(settings, effects=settings.effects - {"glare"})
-            direct = traced_again(light, Simulation(light.bench, without))
-        pixels, fine = light.bench.n**2, direct.merge()
-        rows, columns = picture_axes(fine, fine.simulation.grids["fine"].bundle)
-        of_place = (rows[:, None] * light.bench.n + columns).ravel()
-        entries = (np.ones(len(of_place)), (np.arange(len(of_place)), of_place))
-        seen = fine.groups[0]["fine"][:pixels] @ sparse.csr_array(entries, shape=(len(of_place), pixels))
-        total = np.asarray(seen.sum(axis=1))
-        inverse = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
-        shares = sparse.csr_array(sparse.diags_array(inverse) @ seen)
-        return cls(light.merge(), light.truth, shares, (*light.warnings, *light.unreached))
-
-    def truth(self, reflectance: FloatArray) -> FloatArray:
-        return np.asarray(self.white * (self.shares @ reflectance.ravel()).reshape(self.white.shape))
-
-    def rendered_light(self, bench: Apparatus, family: PatternFamily) -> PrintLight:
-        light = self.light.behind(bench)
-        simulation, estimate, pixels = light.simulation, light.groups[0], bench.n**2
-        lighting, unit, parts = family.lighting, electrons_per_joule(bench), list[PrintPart]()
-        classes = int(lighting.labels.max()) + 1
-        by_class = sparse.csr_array((np.ones(pixels), (lighting.labels, np.arange(pixels))), shape=(classes, pixels))
-        lamps = [
-            (name, grid, pixels + band) for band, grids in enumerate(simulation.by_band) for name, grid in grids.items()
-        ]
-        for name, grid, row in [*((name, grid, None) for name, grid in simulation.grids.items()), *lamps]:
-            of_grid = estimate[name]
-            own = by_class @ of_grid[:pixels] if row is None else of_grid[[row]]
-            if own.nnz:
-                assert name in _STRAIGHT and len(grid.bundle.depths) == 1, "light of one flat sheet alone"
-                own = sparse.csr_array(own * unit)
-                own.sort_indices()
-                parts.append(PrintPart(grid.optics, own, *picture_axes(light, grid.bundle), row is not None))
-        return PrintLight(tuple(parts), emission(simulation.physics, lighting))
-
-    def ideal_light(self, family: PatternFamily) -> PrintLight:
-        bench, lighting = self.light.bench, family.lighting
-        pixels, classes = bench.n**2, int(lighting.labels.max()) + 1
-        sides = IdealCamera(bench, bench.geometry.mask).directions
-        optics = FrameOptics(bench.geometry, *sides, (bench.geometry.scene_distance,), 1, None)
-        even = float(self.light.apparent.board_flux.mean()) * electrons_per_joule(bench) * self.white.ravel()
-        light = sparse.csr_array((even, (lighting.labels, np.arange(pixels))), shape=(classes, pixels))
-        line = np.arange(bench.n)
-        return PrintLight((PrintPart(optics, light, line, line, False),), lighting.weights)
+def print_light(light: SampledLight, bench: Apparatus, family: PatternFamily) -> PrintLight:
+    """Return the light of a white print before the camera of ``bench``; MitsimError for a shadow on a raster."""
+    light = light.behind(bench)
+    simulation, estimate, pixels = light.simulation, light.groups[0], bench.n**2
+    lighting, unit, parts = family.lighting, electrons_per_joule(bench), list[PrintPart]()
+    classes = int(lighting.labels.max()) + 1
+    by_class = sparse.csr_array((np.ones(pixels), (lighting.labels, np.arange(pixels))), shape=(classes, pixels))
+    lamps = [
+        (name, grid, pixels + band) for band, grids in enumerate(simulation.by_band) for name, grid in grids.items()
+    ]
+    for name, grid, row in [*((name, grid, None) for name, grid in simulation.grids.items()), *lamps]:
+        of_grid = estimate[name]
+        own = by_class @ of_grid[:pixels] if row is None else of_grid[[row]]
+        if not own.nnz:
+            continue
+        straight = name in ("fine", "anchor_residual") and len(grid.bundle.depths) == 1
+        assert straight, "light of one flat sheet alone"
+        if grid.optics.terms is None:
+            raise MitsimError("this mask's shadow is drawn on a raster, which pairs do not keep; use a separable mask")
+        own = sparse.csr_array(own * unit)
+        own.sort_indices()
+        parts.append(PrintPart(grid.optics, own, *picture_axes(light, grid.bundle), row is not None))
+    return PrintLight(tuple(parts), emission(simulation.physics, lighting))
 
 
 def picture_axes(light: SampledLight, bundle: Bundle) -> tuple[Labels, Labels]:
@@ -321,192 +284,27 @@ class FolderPictures:
 # -------- Making a store
 
 
-class _Maker:
-    def __init__(self, opening: Opening, asked: PairsRequest, job: Job) -> None:
-        self._opening, self._asked, self._job = opening, asked, job
-        self._groups, seed = asked.groups(), asked.capture.seed
-        self._pictures = DrawnPictures(seed) if asked.pictures is None else FolderPictures(Path(asked.pictures), seed)
-        self._open: tuple[dict[str, str], Bench, Plan] | None = None
-        self._white: tuple[Bench, WhitePrints] | None = None
-        self.bench, self._plan = self._bench_of(0)
-        self._family = self.bench.family(asked.capture.patterns, seed)
-        self.why_anew = self._why(self.bench)
-
-    @property
-    def configuration(self) -> dict[str, Any]:
-        asked, bench = self._asked, self.bench
-        found = {**asked.capture.deciding, "count": asked.count, "idealised": asked.idealised}
-        found |= {"pictures": self._pictures.source, "groups": self._groups}
-        found |= {"bench": {**bench.provenance(), **bench.identity()}, "versions": deciding_versions()}
-        return dict(plain(found))
-
-    def _why(self, bench: Bench) -> str:
-        return "" if self._asked.idealised else traced_anew(bench)
-
-    def check(self, shards: Sequence[Shard]) -> None:
-        if isinstance(self._pictures, FolderPictures):
-            files = len(self._pictures.files)
-            for number in {index % files for each in shards for index in range(each.first, each.first + each.count)}:
-                self._pictures.draw(number, self.bench.n)
-        of_groups = {tuple(self._parameters(each.group).items()): each.group for each in shards}
-        for parameters, group in of_groups.items():
-            if not self.why_anew and parameters and (why := self._why(self._opening(dict(parameters)))):
-                raise ArgumentError(
-                    "vary",
-                    f"bench {group} ({', '.join(f'{name} {value}' for name, value in parameters)}): {why}, other than "
-                    "before bench 0; vary it less, or leave out what turns or hides the sheet",
-                )
-
-    def _parameters(self, group: int) -> dict[str, str]:
-        drawn = self._groups[group].items()
-        return {name.partition(".")[2]: repr(value) for name, value in drawn if name.startswith("scene.")}
-
-    def _bench_of(self, group: int) -> tuple[Bench, Plan]:
-        parameters = self._parameters(group)
-        if self._open is None or self._open[0] != parameters:
-            bench = self._opening(parameters)
-            self._asked.capture.timing.check(bench.sensor, bench.devices.camera_file)
-            with self._job.planning("pairs", first_shadow(bench, self._asked.capture.effects)):
-                if self._why(bench):
-                    show_picture(bench, self._pictures.draw(0, bench.n) / WHITE)
-                else:
-                    show_white(bench)
-                self._open = parameters, bench, plan_request(bench, self._asked.capture)
-        return self._open[1:]
-
-    def _white_of(self, group: int) -> WhitePrints:
-        bench, plan = self._bench_of(group)
-        if self._white is None or self._white[0] is not bench:
-            own = group if self._asked.vary and self._asked.vary.scene else 0
-            light = trace_request(bench, plan, self._job, integer(self._asked.capture.seed, "white prints", own))
-            self._white = bench, WhitePrints.of(light)
-        return self._white[1]
-
-    def write(self, shard: Shard, path: Path, digest: str) -> None:
-        bench, plan = self._bench_of(shard.group)
-        drawn = self._groups[shard.group].items()
-        mask = {name.partition(".")[2]: value for name, value in drawn if name.startswith("mask.")}
-        moved, idealised = drift_mask(bench, Drift(**mask)) if mask else bench, self._asked.idealised
-        light: PrintLight | None = None
-        if not self.why_anew:
-            white = self._white_of(shard.group)
-            light = white.ideal_light(self._family) if idealised else white.rendered_light(moved, self._family)
-        speckled = "speckle" in plan.settings.effects and not idealised
-        speckle = bench.speckle(self._family) if speckled else 0.0
-        kept = light if light is not None and light.few else None
-        with self._job.clock.stage("pairs"):
-            write_shard(path, digest, self._pairs(shard, moved, light, kept is None), speckle, kept)
-
-    def _pairs(self, shard: Shard, moved: Apparatus, light: PrintLight | None, keep: bool) -> Iterator[Pair]:
-        (bench, plan), lighting, sensor = self._bench_of(shard.group), self._family.lighting, moved.sensor
-        timing, per_joule = self._asked.capture.timing, electrons_per_joule(moved)
-        timing = replace(timing, fraction=self._groups[shard.group].get("exposure_fraction", timing.fraction))
-        for index in range(shard.first, shard.first + shard.count):
-            picture = self._pictures.draw(index, bench.n)
-            reflectance = picture / WHITE
-            if light is None:
-                show_picture(bench, reflectance)
-                seed = integer(self._asked.capture.seed, "prints", index)
-                own = trace_light(bench, plan, lighting, seed, Sampling(by_pixel=False))
-                expected, unit = own.merge().behind(moved).frames(lighting, seed), per_joule
-                truth, warnings = own.truth, (*own.warnings, *own.unreached)
-            else:
-                white = self._white_of(shard.group)
-                truth = white.white * reflectance if self._asked.idealised else white.truth(reflectance)
-                expected, unit, warnings = light.frames_of(reflectance), 1.0, white.warnings
-            peak = peak_irradiance(expected) * unit
-            exposure_s = timing.choose(moved.devices, peak / per_joule)
-            saturated = (peak + sensor.superpixel_dark_current_e_per_s) * exposure_s >= sensor.superpixel_full_well_e
-            rows: dict[str, Any] = {"picture": picture, "truth": truth.astype(np.float32)}
-            rows |= {"exposure_s": exposure_s, "saturated": np.uint8(saturated)}
-            if keep:
-                rows["expected"] = np.stack([(frame.irradiance * unit).astype(np.float32) for frame in expected])
-                rows["lamps"] = (expected.projector_off.irradiance * unit).astype(np.float32)
-            self._job.progress("pairs", (index + 1) / self._asked.count)
-            yield rows, warnings
-
-    def cost(self, left: Sequence[Shard]) -> Cost:
-        pairs, pixels, shots = sum(shard.count for shard in left), self.bench.n**2, len(self._family.shots)
-        geometry, taken, anew = self.bench.geometry, self._plan.predicted, bool(self.why_anew)
-        varied = self._asked.vary is not None and bool(self._asked.vary.scene)
-        benches = len({tuple(sorted(self._groups[shard.group].items())) for shard in left}) if varied else 1
-        tracing = taken["transport"] + taken["truth"]
-        each = _FORMED * taken["optics"] + _PICTURE_S * pixels
-        seconds = pairs * (each + tracing * anew) + benches * (taken["plan"] + tracing * (not anew))
-        few = not anew and not geometry.is_correlated(geometry.diffracts)
-        frames = 0 if few else _FRAME_BYTES * shots * math.prod(geometry.frame_shape)
-        shadow = len(left) * _SHADOW_BYTES * sum(geometry.frame_shape) * self.bench.n
-        memory = frames_cost(self.bench, self._plan.settings, self._family.lighting).memory_bytes
-        return Cost(seconds, memory, pairs * (pixels * _PAIR_BYTES + frames) + shadow)
-
-    def begin(self, configuration: Mapping[str, Any], shards: tuple[Shard, ...]) -> PairsManifest:
-        bench, asked, capture = self.bench, self._asked, self._asked.capture
-        lamps = "ambient" in self._plan.settings.effects and not asked.idealised
-        auto = capture.ambient_frame == "auto" and lamps and not self._family.signed
-        taken = capture.ambient_frame == "yes" or auto
-        return PairsManifest(
-            status="incomplete",
-            configuration=dict(configuration),
-            n=bench.n,
-            m=bench.geometry.frame_shape,
-            frames=sum(shot.sign != -1 for shot in self._family.shots),
-            patterns=capture.patterns,
-            exposure_s=1.0,
-            camera=plain(bench.identity()),
-            sensor=json.dumps(bench.sensor.model_dump(exclude_none=True)),
-            digital=digital_of(bench.sensor, 1.0),
-            scene=str(bench.loaded.path),
-            idealised=asked.idealised,
-            traced_anew=self.why_anew,
-            seed=capture.seed,
-            count=asked.count,
-            pictures=self._pictures.source,
-            photographs=self._pictures.photographs,
-            ambient_shots=ambient_shots(self._family) if taken else 0,
-            groups=tuple(self._groups) if asked.vary else (),
-            shards=shards,
-            versions=versions(),
-        )
-
-    def factors(self) -> Factors:
-        camera = IdealCamera(self.bench, self.bench.geometry.mask)
-        sides = camera.calibrated(float(self._white_of(0).light.apparent.board_flux.mean()))
-        left, right = (side.astype(np.float32).astype(np.float64) for side in sides)
-        status = Status(Verdict.CALIBRATED, "Exact factors of the idealised model")
-        about: dict[str, Any] = {"camera": plain(self.bench.identity()), "centre": camera.centre}
-        about |= {"estimate": str(status), "verdict": status.verdict.value, "versions": versions()}
-        return Factors(left, right, CalibrationManifest(**about), status)
-
-    def finish(self, store: PairStore) -> PairsManifest:
-        begun, facts = store.manifest, [store.facts(shard) for shard in store.manifest.shards]
-        exposure_s = float(np.median(np.concatenate([exposures for exposures, _, _ in facts])))
-        found = [text for _, _, warnings in facts for text in warnings]
-        if saturated := sum(count for _, count, _ in facts):
-            found.append(f"saturation: {saturated} pairs are expected to fill the full well; expose for less")
-        if self.bench.loaded.lamps and self._asked.capture.ambient_frame == "no" and not self._family.signed:
-            found.append("light of lamps is not taken off (ambient_frame is no): frames have it, and truths have not")
-        found += camera_warnings(self.bench.sensor, begun.m)
-        digital = digital_of(begun.sensor_model, exposure_s)
-        new = {
-            "status": "complete",
-            "exposure_s": exposure_s,
-            "digital": digital,
-            "warnings": tuple(dict.fromkeys(found)),
-        }
-        return begun.model_copy(update=new)
-
-
-def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairStore, Cost]:
-    """Make pairs of pictures on the prints of a scene in a folder, and return their predicted cost too.
+def make_pairs(bench: Bench, asked: PairsRequest, task: Task) -> tuple[PairStore, Cost]:
+    """Make pairs of pictures on the print of a bench in a folder, and return their predicted cost too.
 
     A resumed store equals an uninterrupted one bit for bit. MitsimError if the request cannot be served, limits do not
-    suffice, the scene has no print, or the output is that of another request.
+    suffice, the scene is no flat sheet with a print, or the output is that of another request.
     """
-    asked.check()
     assert task.output is not None, "pairs are kept in a folder"
+    job, capture, seed = task.job, asked.capture, asked.capture.seed
     again = task.resume and (task.output / PAIRS).is_file()
-    maker, job = _Maker(opening, asked, task.job), task.job
-    configuration = maker.configuration
+    bench = bench.in_variant(bench.variant)  # loaded anew, as its print is changed
+    show_white(bench)
+    capture.timing.check(bench.sensor, bench.devices.camera_file)
+    pictures = DrawnPictures(seed) if asked.pictures is None else FolderPictures(Path(asked.pictures), seed)
+    family = bench.family(capture.patterns, seed)
+    with job.planning("pairs", first_shadow(bench, capture.effects)):
+        plan = plan_request(bench, capture)
+    groups = [{}] if asked.vary is None else [asked.vary.draw(seed, group) for group in range(asked.vary.groups)]
+
+    about = {**capture.deciding, "count": asked.count, "pictures": pictures.source, "groups": groups}
+    about |= {"bench": {**bench.provenance(), **bench.identity()}, "versions": deciding_versions()}
+    configuration: dict[str, Any] = dict(plain(about))
     if again:
         before = read_pairs_manifest(task.output).configuration
         if changed := [key for key, value in configuration.items() if before.get(key) != value]:
@@ -515,24 +313,93 @@ def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairS
                 "the same options, or another folder"
             )
     digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
-    shards, groups = list[Shard](), 1 if asked.vary is None else asked.vary.groups
-    ends = [asked.count * group // groups for group in range(groups + 1)]
+    shards = list[Shard]()
+    ends = [asked.count * group // len(groups) for group in range(len(groups) + 1)]
     for group, (start, end) in enumerate(pairwise(ends)):
         for first in range(start, end, SHARD):
             file = f"pairs_{len(shards):05}.h5"
             shards.append(Shard(file=file, first=first, count=min(SHARD, end - first), group=group))
+
     with output_folder(task.output, overwrite=again) as folder:
         left = [shard for shard in shards if not is_shard(folder / shard.file, digest, shard.count)]
-        maker.check(left)
-        cost = maker.cost(left)
+        numbers = [index for shard in left for index in range(shard.first, shard.first + shard.count)]
+        if isinstance(pictures, FolderPictures):  # a picture that cannot be shown is refused before light is traced
+            for number in {index % len(pictures.files) for index in numbers}:
+                pictures.draw(number, bench.n)
+        taken, pixels = plan.predicted, bench.n**2
+        seconds = taken["plan"] + taken["transport"] + taken["truth"]
+        seconds += len(numbers) * (_FORMED * taken["optics"] + _PICTURE_S * pixels)
+        disk = len(numbers) * pixels * _PAIR_BYTES
+        disk += len(left) * _SHADOW_BYTES * sum(bench.geometry.frame_shape) * bench.n
+        cost = Cost(seconds, frames_cost(bench, plan.settings, family.lighting).memory_bytes, disk)
         cost.check(f"{asked.count} pairs", job.limits, folder)
-        begun = maker.begin(configuration, tuple(shards))
+
+        lamps = "ambient" in plan.settings.effects
+        off = capture.ambient_frame == "yes" or (capture.ambient_frame == "auto" and lamps and not family.signed)
+        begun = PairsManifest(
+            status="incomplete",
+            configuration=configuration,
+            n=bench.n,
+            m=bench.geometry.frame_shape,
+            frames=sum(shot.sign != -1 for shot in family.shots),
+            patterns=capture.patterns,
+            exposure_s=1.0,
+            camera=plain(bench.identity()),
+            sensor=json.dumps(bench.sensor.model_dump(exclude_none=True)),
+            digital=digital_of(bench.sensor, 1.0),
+            scene=str(bench.loaded.path),
+            seed=seed,
+            count=asked.count,
+            pictures=pictures.source,
+            photographs=pictures.photographs,
+            ambient_shots=ambient_shots(family) if off else 0,
+            groups=tuple(groups) if asked.vary else (),
+            shards=tuple(shards),
+            versions=versions(),
+        )
         write_json(folder / PAIRS, begun)
+
+        if left:
+            light = trace_request(bench, plan, job, integer(seed, "white prints", 0))
+            shares, white, whole = white_shares(light), light.truth, light.merge()
+            speckle = bench.speckle(family) if "speckle" in plan.settings.effects else 0.0
+
+        def pairs_of(shard: Shard, moved: Apparatus, kept: PrintLight) -> Iterator[dict[str, Any]]:
+            per_joule, sensor = electrons_per_joule(moved), moved.sensor
+            fraction = groups[shard.group].get("exposure_fraction", capture.timing.fraction)
+            timing = replace(capture.timing, fraction=fraction)
+            for index in range(shard.first, shard.first + shard.count):
+                picture = pictures.draw(index, bench.n)
+                reflectance = picture / WHITE
+                truth = white * (shares @ reflectance.ravel()).reshape(white.shape)
+                peak = peak_irradiance(kept.frames_of(reflectance))
+                exposure_s = timing.choose(moved.devices, peak / per_joule)
+                filled = (peak + sensor.superpixel_dark_current_e_per_s) * exposure_s
+                saturated = np.uint8(filled >= sensor.superpixel_full_well_e)
+                job.progress("pairs", (index + 1) / asked.count)
+                yield {
+                    "picture": picture, "truth": truth.astype(np.float32), "exposure_s": exposure_s,
+                    "saturated": saturated,
+                }  # fmt: skip
+
         for shard in left:
-            maker.write(shard, folder / shard.file, digest)
-        if asked.idealised:
-            (folder / CALIBRATION).mkdir(exist_ok=True)
-            maker.factors().write(folder / CALIBRATION)
-        manifest = maker.finish(PairStore(folder, begun))
+            mask = {
+                name.partition(".")[2]: value for name, value in groups[shard.group].items() if name.startswith("mask.")
+            }
+            moved = drift_mask(bench, Drift(**mask)) if mask else bench
+            kept, warnings = print_light(whole, moved, family), (*light.warnings, *light.unreached)
+            with job.clock.stage("pairs"):
+                write_shard(folder / shard.file, digest, pairs_of(shard, moved, kept), kept, speckle, warnings)
+
+        facts = [PairStore(folder, begun).facts(shard) for shard in shards]
+        exposure_s = float(np.median(np.concatenate([exposures for exposures, _, _ in facts])))
+        found = [text for _, _, texts in facts for text in texts]
+        if saturated := sum(count for _, count, _ in facts):
+            found.append(f"saturation: {saturated} pairs are expected to fill the full well; expose for less")
+        if bench.loaded.lamps and capture.ambient_frame == "no" and not family.signed:
+            found.append("light of lamps is not taken off (ambient_frame is no): frames have it, and truths have not")
+        found += camera_warnings(bench.sensor, begun.m)
+        new = {"status": "complete", "exposure_s": exposure_s, "digital": digital_of(bench.sensor, exposure_s)}
+        manifest = begun.model_copy(update={**new, "warnings": tuple(dict.fromkeys(found))})
         write_json(folder / PAIRS, manifest)
     return PairStore(folder, manifest), cost

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,20 @@ from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
-from mitsim.learn.learned_solver import LearnedSolver, datum_variance, on_device, relative_noise, write_tensors
-from mitsim.learn.methods import BIN, CLASSES, Binning, Critic, Data, Diagonal, Method, decibels, drawn_way, has_half
+from mitsim.learn.methods import (
+    CLASSES,
+    Data,
+    Diagonal,
+    LearnedSolver,
+    Method,
+    datum_variance,
+    has_half,
+    on_device,
+    relative_noise,
+    write_tensors,
+)
 from mitsim.learn.pair_store import ModelManifest, PairStore
-from mitsim.learn.requests import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, Training
+from mitsim.learn.verbs import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solver import Prepared
@@ -46,7 +56,6 @@ _DECAY, _BETAS, _LONGEST_GRADIENT = 1e-4, (0.9, 0.99), 1.0
 _BASE_BYTES, _CHANNEL_BYTES, _HALF = 6e8, 100.0, 0.6
 """Bytes of torch; bytes per pixel and channel of the first level (76 to 96 measured); and the part in half precision.
 """
-_FRAME_PIXELS = 8
 _LOOK = 0.05
 _UNFINISHED = ".unfinished"
 
@@ -64,40 +73,36 @@ class Sums:
         (N, n, n'), (N, r, r') W, and (N,) noise variance of a datum.
     noise
         Smallest and largest noise of a datum over its rms.
-    frames
-        (N, K, K', b, b') binned frames; None for methods that read none.
+    photographs
+        (N,) number of the photograph that each pair shows.
     """
 
     truths: FloatArray
     weights: FloatArray
     variances: FloatArray
     noise: tuple[float, float]
-    frames: FloatArray | None = None
-    photographs: Labels | None = None
+    photographs: Labels
 
     @classmethod
-    def of(cls, store: PairStore, prepared: Prepared, job: Job, keep: bool = False) -> Sums:
+    def of(cls, store: PairStore, prepared: Prepared, job: Job) -> Sums:
         count, started = len(store), time.perf_counter()
         truths, weights, variances, noise = [], [], np.empty(count), np.empty(count)
-        kept: FloatArray | None = None
         for index in range(count):
-            frames = Binning(prepared) if keep else prepared.accumulator()
+            frames = prepared.accumulator()
             for frame, (row, column) in zip(store.frames(index), store.indices, strict=True):
                 frames.add(frame, row, column)
             problem = prepared.problem(frames)
             variances[index], noise[index] = datum_variance(problem), relative_noise(problem)
             weights.append(problem.projected.astype(np.float32))
             truths.append(store.truth(index))
-            if isinstance(frames, Binning):
-                kept = np.empty((count, *frames.frames.shape), np.float32) if kept is None else kept
-                kept[index] = frames.frames
             if not index:
-                each = time.perf_counter() - started
-                held = 4.0 * count * (problem.projected.size + truths[0].size) + (0 if kept is None else kept.nbytes)
-                Cost(each * count, held).check(f"{store.folder}: reading {count} pairs", job.limits)
+                held = 4.0 * count * (problem.projected.size + truths[0].size)
+                Cost((time.perf_counter() - started) * count, held).check(
+                    f"{store.folder}: reading {count} pairs", job.limits
+                )
             job.progress("read", (index + 1) / count)
         limits = float(noise.min()), float(noise.max())
-        return cls(np.stack(truths), np.stack(weights), variances, limits, kept, store.photographs)
+        return cls(np.stack(truths), np.stack(weights), variances, limits, store.photographs)
 
 
 def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, Labels]:
@@ -131,10 +136,7 @@ class Trainer:
         self.optimiser = torch.optim.AdamW(self.network.parameters(), betas=_BETAS, weight_decay=_DECAY)
         self._like = next(self.network.parameters())
         self.model = Diagonal.of(self.prepared, self._like)
-        weighted = self.request.feature_weight or self.request.adversary_weight
-        self.critic = Critic(self.request, self._like) if weighted else None
-        photographs = np.arange(len(self.sums.truths)) if self.sums.photographs is None else self.sums.photographs
-        self.teaching, self.choosing, self.judging = part_photographs(photographs, self.request.seed)
+        self.teaching, self.choosing, self.judging = part_photographs(self.sums.photographs, self.request.seed)
 
     def is_over(self) -> bool:
         psnr = [value for _, value in self.curve]
@@ -159,8 +161,7 @@ class Trainer:
 
     def save(self, path: Path, digest: str) -> None:
         state = {"step": self.taken, "curve": self.curve, "best": self.best, "network": weights_of(self.network)}
-        critic = self.critic.state() if self.critic else {}
-        write_tensors(path, {"digest": digest, **state, "optimiser": self.optimiser.state_dict(), "critic": critic})
+        write_tensors(path, {"digest": digest, **state, "optimiser": self.optimiser.state_dict()})
 
     def load(self, path: Path, digest: str) -> None:
         """Continue from a state; raise MitsimError if it cannot be read or belongs to another training."""
@@ -176,8 +177,6 @@ class Trainer:
             )
         self.network.load_state_dict(held["network"])
         self.optimiser.load_state_dict(held["optimiser"])
-        if self.critic:
-            self.critic.restore(held["critic"])
 
     def rate(self, number: int) -> float:
         part, rising = (number + 0.5) / self.request.steps, _RISING
@@ -188,38 +187,24 @@ class Trainer:
     def step(self, number: int) -> float:
         random = stream(self.request.seed, "step", number)
         chosen = self.teaching[random.integers(len(self.teaching), size=self.request.batch)]
-        truths, data = self.batch(chosen)
-        if not self.network.reads_frames:
-            truths, data = self._turn(truths, data, random)
+        truths, data = self._turn(*self.batch(chosen), random)
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate(number)
-        noise = torch.Generator().manual_seed(integer(self.request.seed, "noise", number))
         self.network.train()
-        loss = self._gradients(truths, data, noise)
+        loss = self._gradients(truths, data, integer(self.request.seed, "noise", number))
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), _LONGEST_GRADIENT)
         self.optimiser.step()
-        if self.critic:
-            self.critic.optimiser.step()
         return loss
 
-    def _gradients(self, truths: Tensor, data: Data, noise: torch.Generator) -> float:
+    def _gradients(self, truths: Tensor, data: Data, seed: int) -> float:
         self.optimiser.zero_grad()
-        if self.critic is None:
-            loss = self.network.loss(truths, data, self.model, noise)
-            loss.backward()
-        else:
-            images = self.network(data, self.model, drawn_way(noise))
-            loss = decibels(images, truths) + self.critic.loss(images, truths)
-            loss.backward()
-            self.critic.learn(images, truths)
+        loss = self.network.loss(truths, data, self.model, torch.Generator().manual_seed(seed))
+        loss.backward()
         return float(loss.detach())
 
     def batch(self, chosen: Any) -> tuple[Tensor, Data]:
         truths = torch.as_tensor(self.sums.truths[chosen])[:, None].to(self._like)
-        data = Data.of(self.sums.weights[chosen], self.sums.variances[chosen], self._like)
-        if self.sums.frames is None:
-            return truths, data
-        return truths, replace(data, frames=torch.as_tensor(self.sums.frames[chosen]).to(self._like))
+        return truths, Data.of(self.sums.weights[chosen], self.sums.variances[chosen], self._like)
 
     def _turn(self, truths: Tensor, data: Data, random: np.random.Generator) -> tuple[Tensor, Data]:
         half = len(truths) // 2
@@ -238,7 +223,7 @@ class Trainer:
         taken = []
         for _ in range(2):  # the first fills caches
             started = time.perf_counter()
-            self._gradients(truths, data, torch.Generator().manual_seed(0))
+            self._gradients(truths, data, 0)
             taken.append(time.perf_counter() - started)
         self.optimiser.zero_grad()
         return taken[-1] * (1 + _LOOK)
@@ -289,9 +274,13 @@ class Trained:
 
 @single_threaded_blas()
 def train_network(
-    store: PairStore, factors: Factors, request: Training, output: Path | str, job: Job | None = None,
-    resume: bool = False, sums: Sums | None = None,
-) -> Trained:  # fmt: skip
+    store: PairStore,
+    factors: Factors,
+    request: Training,
+    output: Path | str,
+    job: Job | None = None,
+    resume: bool = False,
+) -> Trained:
     """Train a network for the calibration ``factors`` and write its file, beside which the resumable state lies."""
     job, output = job or Job(), Path(output)
     started = time.perf_counter()
@@ -313,12 +302,11 @@ def train_network(
         prepared = SOLVERS[TIKHONOV].init(factors, store.patterns)
         network = first_network(request, shape)
         half = has_half(next(network.parameters()).device)
-        bins = math.prod(-(-size // BIN) for size in frame) * store.manifest.frames if network.reads_frames else 0
-        pixels = math.prod(shape) * network.PASSES + bins // _FRAME_PIXELS
-        memory = _CHANNEL_BYTES * network.WIDTH * (_HALF if half else 1.0) * request.batch * pixels
-        memory += _BASE_BYTES + 4.0 * len(store) * (2 * math.prod(shape) + bins)
+        pixels = math.prod(shape)
+        memory = _CHANNEL_BYTES * network.WIDTH * (_HALF if half else 1.0) * request.batch * pixels * network.PASSES
+        memory += _BASE_BYTES + 4.0 * len(store) * 2 * pixels
         Cost(memory_bytes=memory).check(f"{store.folder}: training {request.method}", job.limits)
-        sums = sums or Sums.of(store, prepared, job, network.reads_frames)
+        sums = Sums.of(store, prepared, job)
     trainer, first = Trainer(request, prepared, sums, network), weights_of(network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
     parts = request.model_dump(), factors.fingerprint, about, half

@@ -8,20 +8,22 @@ because the learned codes contain it.
 *DiffuserCam*. Caustics of a random relief differ in every draw, so that statistics are compared. The slopes of a normal
 relief move light by d (n - 1) grad h (:mod:`mitsim.transport.plugins.diffuser`). The relief's correlation length, rms
 move, blur and haze are fitted by landing rays of small slopes on a grid; the compared light is traced by Mitsuba.
+
+Files lie in folders named as the public repositories: ``flatcam/fc_6.png``, .. and ``rec_6.png``, .. are raw captures
+of a FlatCam behind a Bayer sensor and their authors' images; ``diffusercam/psf_sample.tif`` is a point spread function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from itertools import product
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from scipy import ndimage
 
 from mitsim.api.bench import open_bench
@@ -30,22 +32,20 @@ from mitsim.core.configuration import read_toml, shipped_path, validate
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import BGGR, PLANES, Preparation, Wanted, planes_of
-from mitsim.core.images import Numbers, grey_png, read_image
+from mitsim.core.images import grey_png, read_image
 from mitsim.core.manifests import Digital
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.prepare import CommonFactor, Preparer
+from mitsim.core.prepare import Preparer
 from mitsim.core.seeds import stream
 from mitsim.devices.mask_profile import load_psf
-from mitsim.devices.sensor import SensorModel
 from mitsim.reconstruct.shifted_codes import Codes, Exposure, Pose, Shape, find_pose, fit_codes, plane_offsets
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.report.pages import Value
-from mitsim.sensor.chain import expose
+from mitsim.studies import Captures, find_files
 from mitsim.studies.framework.claims import Judged
 from mitsim.studies.framework.experiment import Found, Point, Scope, Study
-from mitsim.studies.framework.panels import Bars, Images, Lines
+from mitsim.studies.framework.panels import Bars, Images
 from mitsim.studies.framework.studio import Studio, single_precision
-from mitsim.studies.twin_files import TwinFiles
 from mitsim.transport.plugins.diffuser import Diffuser, Relief, point_spread, random_relief
 
 if TYPE_CHECKING:
@@ -53,19 +53,17 @@ if TYPE_CHECKING:
 
 # -------- Captures of a FlatCam: frames, their noise, and the codes of the mask
 
-_RAW = 1024, 1280
+_RAW, _STEP = (1024, 1280), 64
+"""Shape of a raw frame, whose numbers of 10 bits lie in the high bits of 16."""
 PITCH_MM = 0.0106
 """Width of a plane's pixels: twice 5.3 um. Frames do not depend on it."""
-EXPOSURE_S = 0.01
 _BLOCK, _SMOOTH = 48, 31
 """Side of the blocks of noise, and of the square of a pixel's mean light [pixels]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """One plane of a capture: ``level`` and ``noise`` (m, m') [DN], the authors' image ``scene`` (n, n'), 0 to 1,
-    ``gain`` [DN per electron] and ``read_variance`` [DN^2] of the raw plane.
-    """
+    """One plane of a capture: ``level`` and ``noise`` (m, m') [DN], the authors' image ``scene`` (n, n'), 0 to 1."""
 
     capture: str
     plane: str
@@ -73,8 +71,6 @@ class Measured:
     level: FloatArray
     noise: FloatArray
     scene: FloatArray
-    gain: float
-    read_variance: float
 
     @property
     def name(self) -> str:
@@ -84,72 +80,54 @@ class Measured:
     def frame(self) -> FloatArray:
         return centre_frame(self.level)
 
-    def exposure(self, frame: FloatArray | None = None, group: int = 0) -> Exposure:
-        return Exposure(self.scene, self.frame if frame is None else frame, group, self.plane, self.offset)
+    def exposure(self, group: int = 0) -> Exposure:
+        return Exposure(self.scene, self.frame, group, self.plane, self.offset)
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """Contents of `calibration/flatcam.toml`, with ``n`` scene pixels a side."""
-
-    how: Preparation
-    digital: Digital
-    bits: int
-    n: int
-
-    @classmethod
-    def load(cls) -> Recipe:
-        path = shipped_path("calibration", "flatcam.toml")
-        listed = read_toml(path)
-        how = validate(Preparation, listed["prepare"], f"list {path}")
-        return cls(how, validate(Digital, listed["digital"], f"list {path}"), listed["bits"], listed["n"])
-
-    def planes(self, path: Path) -> dict[str, FloatArray]:
-        """Return the whole planes [DN]; MitsimError for a file that is no capture."""
-        numbers = read_image(path, Wanted("capture", mosaic=self.how.mosaic))
-        if numbers.shape != _RAW:
-            raise MitsimError(f"capture {path}: is {_size(numbers)}; give the raw frame, {_RAW[0]} x {_RAW[1]}")
-        common, largest = CommonFactor(), 2**self.bits - 1
-        common.add(numbers)
-        factor = common.shift(largest)
-        if not 0 <= numbers.min() < numbers.max() <= factor * largest:
-            raise MitsimError(
-                f"capture {path}: holds {numbers.min():g} to {numbers.max():g}, no light in numbers of {self.bits} "
-                "bits; give the raw frame"
-            )
-        places = planes_of(self.how.mosaic or BGGR)
-        return {name: np.asarray(numbers[places[name][0] :: 2, places[name][1] :: 2] / factor) for name in PLANES}
-
-    def place(self, plane: FloatArray) -> FloatArray:
-        how = self.how.model_copy(update={"channel": None, "mosaic": None, "divide_by": 1})
-        return Preparer.of(how, self.digital, Wanted()).frame(Path(), plane).astype(np.float64)
-
-    def scene(self, path: Path) -> FloatArray:
-        """Return the authors' image (n, n, 3), 0 to 1; MitsimError for another size."""
-        image = read_image(path, Wanted("image", bits=(8,), colour=True))
-        if image.shape != (self.n, self.n, 3):
-            raise MitsimError(
-                f"image {path}: is {_size(image)}; give the authors', {self.n} x {self.n} of red, green and blue"
-            )
-        return np.asarray(image / 255, dtype=np.float64)
+@cache
+def preparation() -> tuple[Preparer, int]:
+    """Return the steps that place a plane, and the pixels per side of the authors' images."""
+    path = shipped_path("calibration", "flatcam.toml")
+    listed = read_toml(path)
+    how = validate(Preparation, {**listed["prepare"], "mosaic": None, "channel": None}, f"list {path}")
+    return Preparer.of(how, validate(Digital, listed["digital"], f"list {path}"), Wanted()), listed["n"]
 
 
-def _size(values: Numbers) -> str:
-    return " x ".join(map(str, values.shape))
+def read_planes(frame: Path, image: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return the whole raw plane [DN] and the authors' image (n, n), 0 to 1, by the plane's name.
+
+    MitsimError for files that are no capture and its image.
+    """
+    numbers, n = read_image(frame, Wanted("capture", mosaic=BGGR)), preparation()[1]
+    if numbers.shape != _RAW or (numbers % _STEP).any() or numbers.min() == numbers.max():
+        raise MitsimError(
+            f"capture {frame}: is {numbers.shape} of {numbers.min():g} to {numbers.max():g}; give the raw frame, {_RAW}"
+            f" multiples of {_STEP}"
+        )
+    colours = read_image(image, Wanted("image", bits=(8,), colour=True))
+    if colours.shape != (n, n, 3):
+        raise MitsimError(f"image {image}: is {colours.shape}; give the authors', {n} x {n} of red, green and blue")
+    return {
+        name: (np.asarray(numbers[row::2, column::2] / _STEP), np.asarray(colours[..., "rgb".index(name[0])] / 255))
+        for name, (row, column) in planes_of(BGGR).items()
+    }
 
 
-def read_captures(files: Mapping[str, tuple[Path, Path]], seed: int) -> list[Measured]:
+def read_captures(files: Captures, seed: int) -> list[Measured]:
     """Return every plane; MitsimError for files that are no captures."""
-    recipe, found = Recipe.load(), []
-    raw = {name: recipe.planes(frame) for name, (frame, _) in files.items()}
-    offsets = plane_offsets(recipe.how)
-    scenes = {name: recipe.scene(image) for name, (_, image) in files.items()}
+    (preparer, _), found = preparation(), []
+    raw, offsets = {name: read_planes(*both) for name, both in files.items()}, plane_offsets(preparer.how)
     for plane in PLANES:
-        gain, dark = noise_of([planes[plane] for planes in raw.values()])
+        gain, dark = noise_of([planes[plane][0] for planes in raw.values()])
         for name, planes in raw.items():
-            noise = recipe.place(draw_noise(planes[plane], gain, dark, seed, f"{name} {plane}"))
-            scene, level = scenes[name][..., "rgb".index(plane[0])], recipe.place(planes[plane])
-            found.append(Measured(name, plane, offsets[plane], level, centre_frame(noise), scene, gain, dark))
+            whole, scene = planes[plane]
+            light = np.maximum(ndimage.uniform_filter(whole, _SMOOTH), 0)
+            draws = stream(seed, "twin", f"{name} {plane}").standard_normal(whole.shape)
+            noise, level = (
+                preparer.frame(files[name][0], each).astype(np.float64)
+                for each in (draws * np.sqrt(gain * light + dark), whole)
+            )
+            found.append(Measured(name, plane, offsets[plane], level, centre_frame(noise), scene))
     return found
 
 
@@ -174,16 +152,6 @@ def noise_of(planes: Sequence[FloatArray]) -> tuple[float, float]:
     return float(gain), float(dark)
 
 
-def draw_noise(plane: FloatArray, gain: float, read_variance: float, seed: int, name: str) -> FloatArray:
-    sensor = SensorModel(
-        name="twin", pixel_pitch_um=PITCH_MM * 1e3, full_well_e=float("inf"), gain_dn_per_e=gain,
-        read_noise_e=float(np.sqrt(read_variance)) / gain, source="mitsim study twin",
-    )  # fmt: skip
-    light = np.maximum(ndimage.uniform_filter(plane, _SMOOTH), 0)
-    shot, read = (stream(seed, "twin", kind, name) for kind in ("shot", "read"))
-    return np.asarray(expose(light / gain, EXPOSURE_S, sensor, shot, read) - light, dtype=np.float64)
-
-
 @dataclass(frozen=True, eq=False)
 class Learned:
     pose: Pose
@@ -192,7 +160,7 @@ class Learned:
     @classmethod
     def of(cls, planes: Sequence[Measured]) -> Learned:
         names = list(dict.fromkeys(each.capture for each in planes))
-        exposures = [each.exposure(group=names.index(each.capture)) for each in planes]
+        exposures = [each.exposure(names.index(each.capture)) for each in planes]
         pose = find_pose(exposures)
         turned = [each.turn_scene(pose.orientation) for each in exposures]
         return cls(pose, fit_codes(turned, Shape(pose.scales, 1, True)))
@@ -205,7 +173,6 @@ class Learned:
 
 _MASK_MM, _SHEET_MM = 10.0, 1000.0
 """Sensor to mask and to sheet. Frames determine only the product of the mask's distance and an angle."""
-_ACCURACY = 1e-3
 _WIDER = 1.05
 _SCENE = Template("""<scene version="3.0.0">
 <integrator type="path"><integer name="max_depth" value="2"/></integrator>
@@ -269,19 +236,16 @@ def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> Floa
     camera += f'[mask]\nkind = "drawing"\nfeature_mm = {feature!r}\nfile = "mask.npy"\n'
     (folder / "camera.toml").write_text(camera, encoding="utf-8")
     bench = open_bench(str(folder), variant, str(folder / "camera.toml"))
-    plan = bench.plan("uniform", accuracy=_ACCURACY, effects="-diffraction")
-    expected = bench.capture(plan, exposure=EXPOSURE_S).electrons
+    plan = bench.plan("uniform", accuracy=1e-3, effects="-diffraction")
+    expected = bench.capture(plan, exposure=0.01).electrons
     assert expected is not None, "a simulated capture has them"
     return np.asarray(expected[0], dtype=np.float64)
 
 
 # -------- Explained part of a measured frame
 
-CAUSES = ("row and column means", "explained", "scale", "smooth field", "mask's code", "scene's image", "noise", "rest")
+CAUSES = ("row and column means", "explained", "mask's code", "noise", "rest")
 """Parts of a measured frame's energy, in the order of their removal."""
-_DEGREE = 3
-_LAMBDAS = np.geomspace(1e-6, 1e2, 49)
-"""Weights of the scene's correction over its largest singular value squared."""
 
 
 def column_of(cause: str) -> str:
@@ -294,87 +258,38 @@ def compare(measured: Measured, codes: Codes, electrons: FloatArray, other: Floa
 
     ``other`` is the scene of another capture.
     """
-    frame, expected = measured.frame, fitted(measured, electrons)
-    simulated, left = centre_frame(electrons), frame - expected
-    sides = codes.factors(measured.offset, measured.plane)
+    frame, expected, noise = measured.frame, fitted(measured, electrons), energy(measured.noise)
+    sides, simulated = codes.factors(measured.offset, measured.plane), centre_frame(electrons)
     model = sides[0] @ measured.scene @ sides[1].T
-    scale, own = (float(np.vdot(each, simulated)) / _energy(simulated) for each in (frame, model))
-    parts = _parts(measured, codes, expected, scale / own)
+    own = float(np.vdot(model, simulated)) / energy(simulated)
+    # Codes that are fitted to this frame alone take noise with them, a datum's for each number that they determine.
+    # Two numbers are none: the scale of one side over the other, and of both, which `expected` has taken.
+    shape = Shape((codes.sides[0].scale, codes.sides[1].scale), 1, True)
+    better = fit_codes([measured.exposure()], shape, codes.codes[1][0])
+    left, right = better.factors(measured.offset, measured.plane)
+    taken = noise / frame.size * (sum(better.told) - 2)
+    whole, rest = energy(measured.level - measured.level.mean()), energy(frame - left @ measured.scene @ right.T)
+    missed = energy(frame - expected)
+    parts = whole - energy(frame), energy(frame) - missed, missed - rest - taken, noise, rest + taken - noise
     return {
         "frame": measured.name,
         "correlation": correlation(frame, expected),
         "correlation_other_scene": correlation(frame, sides[0] @ other @ sides[1].T),
-        "explained": 1 - _energy(left) / _energy(frame),
-        "chi_square": _energy(left) / max(_energy(measured.noise), np.finfo(float).tiny),
-        "noise": _energy(measured.noise) / _energy(frame),
-        "scale": scale / own,
-        "gain_dn_per_e": measured.gain,
-        "read_variance_dn2": measured.read_variance,
-        "rows": correlation(measured.level.mean(axis=1), electrons.mean(axis=1)),
-        "columns": correlation(measured.level.mean(axis=0), electrons.mean(axis=0)),
-        "level": float(measured.level.mean() / (abs(scale) * electrons.mean())),
+        "explained": 1 - missed / energy(frame),
+        "chi_square": missed / max(noise, np.finfo(float).tiny),
+        "noise": noise / energy(frame),
         "render_error": float(np.linalg.norm(own * simulated - model) / np.linalg.norm(model)),
-        **{column_of(name): float(part) for name, part in zip(CAUSES, parts, strict=True)},
+        **{column_of(name): part / whole for name, part in zip(CAUSES, parts, strict=True)},
     }
 
 
 def fitted(measured: Measured, electrons: FloatArray) -> FloatArray:
     """Return expected ``electrons`` (m, m') without row and column means, in the scale of a measured frame [DN]."""
     simulated = centre_frame(electrons)
-    return np.asarray(np.vdot(measured.frame, simulated) / _energy(simulated) * simulated)
+    return np.asarray(np.vdot(measured.frame, simulated) / energy(simulated) * simulated)
 
 
-def _parts(measured: Measured, codes: Codes, expected: FloatArray, gain: float) -> FloatArray:
-    """Return the parts of a measured frame's energy by :data:`CAUSES`; noise that a correction fits counts as noise."""
-    frame, noise = measured.frame, _energy(measured.noise)
-    whole, level = _energy(measured.level - measured.level.mean()), noise / measured.frame.size
-    field, smooth = _smooth_field(frame - expected, expected)
-    mended = measured.exposure(frame - field)
-    shape = Shape((codes.sides[0].scale, codes.sides[1].scale), 1, True)
-    better = fit_codes([mended], shape, codes.codes[1][0])
-    left, right = better.factors(mended.offset, measured.plane)
-    rest = mended.frame - left @ measured.scene @ right.T
-    more, corrected = _scene_correction(rest, (left, right), level)
-    energies = [whole, *map(_energy, (frame, frame - expected / gain, frame - expected, mended.frame - expected))]
-    energies += [_energy(rest), _energy(rest - more)]
-    # Two of the codes' numbers are none: the scale of one side over the other, and of both, which `scale` has taken.
-    free = np.array([0.0, 0.0, 1.0, smooth, sum(better.told) - 2, corrected])
-    return np.array([*(-np.diff(energies) - level * free), noise, energies[-1] + level * free.sum() - noise]) / whole
-
-
-def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, float]:
-    sides = [legvander(np.linspace(-1, 1, count), _DEGREE).astype(np.float64) for count in rest.shape]
-    degrees = [each for each in product(range(_DEGREE + 1), repeat=2) if 0 < sum(each) <= _DEGREE]
-    shapes: list[FloatArray] = [np.outer(sides[0][:, row], sides[1][:, column]) for row, column in degrees]
-    # Light along one axis alone is a mean of rows or columns, which frames do not have.
-    light = [shape for shape, each in zip(shapes, degrees, strict=True) if min(each)]
-    fields = [expected * shape for shape in shapes] + light
-    design = np.stack([centre_frame(each).ravel() for each in fields], axis=1)
-    found = np.linalg.solve(design.T @ design, design.T @ rest.ravel())
-    return (design @ found).reshape(rest.shape), float(len(fields))
-
-
-def _scene_correction(
-    rest: FloatArray, factors: tuple[FloatArray, FloatArray], level: float
-) -> tuple[FloatArray, float]:
-    """Return the frame of a correction of the scene, by Tikhonov with the weight of least risk, and its number of
-    parameters.
-    """
-    (left, first, _), (right, second, _) = (np.linalg.svd(each, full_matrices=False) for each in factors)
-    seen, strength = left.T @ rest @ right, np.square(np.outer(first, second))
-    largest = strength.max()
-
-    def part(lam: float) -> FloatArray:
-        return np.asarray(strength / (strength + lam * largest))
-
-    def risk(lam: float) -> float:
-        return float(np.square((1 - part(lam)) * seen).sum() + 2 * level * part(lam).sum())
-
-    kept = part(min(_LAMBDAS, key=risk))
-    return left @ (kept * seen) @ right.T, float((2 * kept - kept**2).sum())
-
-
-def _energy(values: FloatArray) -> float:
+def energy(values: FloatArray) -> float:
     return float(np.vdot(values, values))
 
 
@@ -404,16 +319,6 @@ _MARGIN_MM = 1.2
 _SLOPE = 0.1
 
 
-class Spread(NamedTuple):
-    """Statistics of a square of light over its mean: power of each radial band, standard deviation, and share of the
-    light in the brightest twentieth of the pixels.
-    """
-
-    spectrum: FloatArray
-    contrast: float
-    brightest: float
-
-
 def radial_power(values: FloatArray) -> FloatArray:
     """Return the mean power (bands,) per pixel of ``values`` (rows, columns), windowed and without their mean."""
     window = np.outer(*(np.hanning(side) for side in values.shape))
@@ -425,11 +330,11 @@ def radial_power(values: FloatArray) -> FloatArray:
     return np.asarray(sums[1:-1] / np.maximum(counts[1:-1], 1))
 
 
-def spread_of(light: FloatArray) -> Spread:
-    even = light / light.mean()
-    ordered = np.sort(even.ravel())
-    count = max(1, round(0.05 * even.size))
-    return Spread(radial_power(even), float(even.std()), float(ordered[-count:].sum() / ordered.sum()))
+def statistics(light: FloatArray) -> tuple[float, float]:
+    """Return the contrast of light, and the share of it in the brightest twentieth of the pixels."""
+    ordered = np.sort(light.ravel())
+    count = max(1, round(0.05 * light.size))
+    return float(light.std() / light.mean()), float(ordered[-count:].sum() / ordered.sum())
 
 
 def read_spread(path: Path) -> FloatArray:
@@ -486,8 +391,8 @@ def fit(measured: FloatArray, grid: FloatArray) -> tuple[int, int, float, float]
     return best[1:]
 
 
-def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[FloatArray], FloatArray]:
-    """Return squares of light of traced diffusers fitted to a measured ``square``, and the spectra of the grid."""
+def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[FloatArray], dict[str, Value]]:
+    """Return squares of light of traced diffusers fitted to a measured ``square``, and the fitted numbers."""
     count = len(square)
     side = count * SPREAD_MM + 2 * _MARGIN_MM
     grids = np.empty((_SEEDS, len(CORRELATIONS_MM), len(MOVES_MM), _BANDS))
@@ -497,8 +402,7 @@ def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[Fl
         for column, move in enumerate(MOVES_MM):
             spectrum = radial_power(land(relief, float(move), count, each))
             grids[each, row, column] = np.maximum(spectrum - floor, spectrum / 10)
-    grid = grids.mean(axis=0)
-    row, column, blur, haze = fit(spread_of(square).spectrum, grid)
+    row, column, blur, haze = fit(radial_power(square / square.mean()), grids.mean(axis=0))
     load_variant(variant)
     squares, glass = [], Diffuser()
     for each in range(TRACED):
@@ -507,7 +411,8 @@ def diffusers_like(square: FloatArray, seed: int, variant: str) -> tuple[list[Fl
         traced = point_spread(Diffuser(relief), (count, count), SPREAD_MM, rays=_RAYS[1], seed=each)
         even = ndimage.gaussian_filter(traced / traced.mean(), blur) if blur else traced / traced.mean()
         squares.append((1 - haze) * even + haze)
-    return squares, grid
+    moved = {"correlation_mm": float(CORRELATIONS_MM[row]), "move_mm": float(MOVES_MM[column])}
+    return squares, {**moved, "blur": blur, "haze": haze}
 
 
 # -------- The study
@@ -519,25 +424,24 @@ _RENDERED = 0.1
 
 
 def _points(scope: Scope) -> list[Point]:
-    files = TwinFiles.find(None if scope.data is None else Path(scope.data))
-    recipe = Recipe.load()
-    for frame, image in files.captures.values():  # refused before there is a folder
-        recipe.planes(frame), recipe.scene(image)
-    if files.psf is not None:
-        read_spread(files.psf)
-    both = [*product(files.captures, PLANES), *([(_DIFFUSER, "")] if files.psf else [])]
+    captures, psf = find_files(None if scope.data is None else Path(scope.data))
+    for both in captures.values():  # refused before there is a folder
+        read_planes(*both)
+    if psf is not None:
+        read_spread(psf)
+    named = [*product(captures, PLANES), *([(_DIFFUSER, "")] if psf else [])]
     return [
         Point.of(scope.setup, data=scope.data, capture=capture, plane=plane, seed=scope.seeds[0])
-        for capture, plane in both
+        for capture, plane in named
     ]
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    files, seed, name = TwinFiles.find(Path(point["data"])), int(point["seed"]), str(point["capture"])
+    (captures, psf), seed, name = find_files(Path(point["data"])), int(point["seed"]), str(point["capture"])
     if name == _DIFFUSER:
-        assert files.psf is not None, "there is a point of it"
-        return _measure_diffuser(point, read_spread(files.psf), seed)
-    planes = studio.once("captures", 1, (point["data"], seed), lambda: read_captures(files.captures, seed))
+        assert psf is not None, "there is a point of it"
+        return _measure_diffuser(point, read_spread(psf), seed)
+    planes = studio.once("captures", 1, (point["data"], seed), lambda: read_captures(captures, seed))
     others = [each for each in planes if each.capture != name]
     learned = studio.once("codes", 1, (point["data"], seed, name), lambda: Learned.of(others))
     measured = next(each for each in planes if each.name == f"{name} {point['plane']}")
@@ -553,41 +457,25 @@ def _measure(studio: Studio, point: Point) -> Found:
             float(str(row["render_error"])) > _RENDERED,
     }  # fmt: skip
     found = [text for text, holds in reasons.items() if holds]
-    row |= {
-        "orientation": learned.pose.orientation, "codes_explained": learned.codes.explained,
-        **dict(zip(("scale_rows", "scale_columns"), map(float, learned.pose.scales), strict=True)),
-        **dict(zip(("told_rows", "told_columns"), map(float, learned.codes.told), strict=True)),
-        "flagged": bool(found), "reason": "; ".join(found),
-    }  # fmt: skip
+    row |= {"orientation": learned.pose.orientation, "flagged": bool(found), "reason": "; ".join(found)}
+    for side, scale, told in zip(("rows", "columns"), learned.pose.scales, learned.codes.told, strict=True):
+        row |= {f"scale_{side}": float(scale), f"told_{side}": float(told)}
     expected = fitted(seen, electrons)
     frames = {"measured": seen.frame, "simulated": expected + seen.noise, "difference": seen.frame - expected}
-    corner = [(side - _SHOWN) // 2 for side in seen.frame.shape]
-    middle = tuple(slice(max(0, first), max(0, first) + _SHOWN) for first in corner)
+    middle = tuple(slice(max(0, (side - _SHOWN) // 2), (side + _SHOWN) // 2) for side in seen.frame.shape)
     shown = {name: 0.5 + frame[middle] / (2 * _BRIGHT * seen.frame.std()) for name, frame in frames.items()}
     return Found((point.row(kind="frame", **row),), single_precision(shown))
 
 
 def _measure_diffuser(point: Point, square: FloatArray, seed: int) -> Found:
-    simulated, grid = diffusers_like(square, seed, point.setup.variant)
+    simulated, fitted_numbers = diffusers_like(square, seed, point.setup.variant)
     lights = {"measured": square, **{f"simulated {number}": each for number, each in enumerate(simulated, 1)}}
-    spreads = {name: spread_of(light) for name, light in lights.items()}
-    rows: list[dict[str, Value]] = []
-    for name, each in spreads.items():
-        kind = name.split()[0]
-        others = [other.spectrum for title, other in spreads.items() if title not in ("measured", name)]
-        off = np.log(each.spectrum) - np.log(others).mean(axis=0)
-        row, column, blur, haze = fit(each.spectrum, grid)
-        numbers = {"correlation_mm": float(CORRELATIONS_MM[row]), "move_mm": float(MOVES_MM[column])}
-        rows.append(
-            point.row(
-                kind=_DIFFUSER, source=kind, draw=name, contrast=each.contrast, brightest=each.brightest,
-                **numbers, blur=blur, haze=haze, spectrum_error=float(np.sqrt(np.square(off).mean())),
-            )
-        )  # fmt: skip
-        rows += [
-            point.row(kind="spectrum", source=kind, draw=name, frequency=float(middle), power=float(power))
-            for middle, power in zip(FREQUENCIES, each.spectrum, strict=True)
-        ]
+    rows = []
+    for name, light in lights.items():
+        contrast, brightest = statistics(light)
+        numbers = fitted_numbers if name == "measured" else {}
+        named: dict[str, Value] = {"kind": _DIFFUSER, "source": name.split()[0], "draw": name, **numbers}
+        rows.append(point.row(**named, contrast=contrast, brightest=brightest))
     # The root of light, because a few pixels are many times as bright as their mean.
     shown = {name: np.sqrt(lights[name] / lights[name].mean()) / _BRIGHT for name in ("measured", "simulated 1")}
     return Found(tuple(rows), single_precision(shown))
@@ -596,9 +484,8 @@ def _measure_diffuser(point: Point, square: FloatArray, seed: int) -> Found:
 def _own_scene(rows: DataFrame) -> tuple[str, bool]:
     apart = (rows["correlation"] - rows["correlation_other_scene"]).astype(float)
     low, high = rows["correlation"].min(), rows["correlation"].max()
-    return f"correlation {low:.3f} to {high:.3f}, by {apart.min():.3f} to {apart.max():.3f} higher", bool(
-        (apart > 0).all()
-    )
+    text = f"correlation {low:.3f} to {high:.3f}, by {apart.min():.3f} to {apart.max():.3f} higher"
+    return text, bool((apart > 0).all())
 
 
 def _noise_left(rows: DataFrame) -> tuple[str, bool]:
@@ -613,6 +500,8 @@ def _alike(rows: DataFrame, column: str) -> tuple[str, bool]:
     return text, bool(abs(simulated.mean() / measured - 1) < 0.2)
 
 
+_FRAMES, _DIFFUSERS = {"kind": "frame"}, {"kind": _DIFFUSER}
+_claim = partial(Judged, optional=True)
 STUDY = Study(
     "twin",
     "Real captures beside their simulation",
@@ -620,49 +509,27 @@ STUDY = Study(
     points=_points,
     measure=_measure,
     claims=(
-        Judged(
-            "Every frame is predicted better by its own scene than by another capture's", _own_scene,
-            where={"kind": "frame"}, optional=True,
-        ),
-        Judged(
-            "A simulated frame leaves less than twice the energy of the noise", _noise_left, where={"kind": "frame"},
-            optional=True,
-        ),
-        *(
-            Judged(
-                f"Simulated diffusers have the {words} of the real one within a fifth", partial(_alike, column=column),
-                where={"kind": _DIFFUSER}, optional=True,
-            )
-            for column, words in (("contrast", "contrast of light"), ("brightest", "light in the brightest pixels"))
-        ),
+        _claim("Every frame is predicted better by its own scene than by another capture's", _own_scene, where=_FRAMES),
+        _claim("A simulated frame leaves less than twice the energy of the noise", _noise_left, where=_FRAMES),
+        _claim("Simulated diffusers have the contrast of light of the real one within a fifth",
+               partial(_alike, column="contrast"), where=_DIFFUSERS),
+        _claim("Simulated diffusers have the light in the brightest pixels of the real one within a fifth",
+               partial(_alike, column="brightest"), where=_DIFFUSERS),
     ),
     panels=(
-        Images(
-            {"measured": ("measured", ""), "simulated": ("simulated, with noise", "correlation {correlation:.3f}"),
-             "difference": ("measured less simulated", "")},
-            file="frames", title=f"Middle {_SHOWN} x {_SHOWN} pixels, row and column means off",
-            where={"kind": "frame", "plane": "gb"}, down=("frame",),
-        ),
-        Bars(
-            "frame", file="causes", where={"kind": "frame"}, title="Energy that the simulation leaves, by cause",
-            colour={column_of(name): name for name in CAUSES[2:]}, x_label="part of the frame's energy [1]",
-        ),
-        Images(
-            {"measured": ("measured", ""), "simulated 1": ("simulated", "")}, file=_DIFFUSER,
-            title="Root of light over its mean", where={"draw": "measured", "kind": _DIFFUSER}, down=("source",),
-        ),
-        Lines(
-            "frequency", "frequency [cycles / pixel]", file="diffuser_spectrum", y="power", log=True, ticks=False,
-            y_label="power of light over its mean [1]", where={"kind": "spectrum"}, colour="source", facet="",
-        ),
+        Images({"measured": ("measured", ""), "simulated": ("simulated, with noise", "correlation {correlation:.3f}"),
+                "difference": ("measured less simulated", "")}, file="frames", down=("frame",),
+               title=f"Middle {_SHOWN} x {_SHOWN} pixels, row and column means off", where=_FRAMES | {"plane": "gb"}),
+        Bars("frame", file="causes", where=_FRAMES, title="Energy that the simulation leaves, by cause",
+             colour={column_of(name): name for name in CAUSES[2:]}, x_label="part of the frame's energy [1]"),
+        Images({"measured": ("measured", ""), "simulated 1": ("simulated", "")}, file=_DIFFUSER, down=("source",),
+               title="Root of light over its mean", where=_DIFFUSERS | {"draw": "measured"}),
     ),
     about="Frames are planes of the Bayer sensor: red, green beside blue, green beside red, blue. The mask's codes are "
     "learned from the other captures and their images; one number is fitted, the light. The correlation with another "
     "capture's scene is what bright scenes have in common. Parts of the energy are removed in order; noise that a fit "
-    "takes with it counts as noise. Not known are the distances of mask and scene, of which frames determine a product "
-    "alone; the scene, which its image by the authors' own calibration replaces; the mask's mean transmission, black "
-    "level and stray light. A diffuser's spectrum was fitted, contrast and brightest pixels were not. Its lengths are "
-    "in pixels of 23.4 um, which the public file does not state.",
+    "takes with it counts as noise. A diffuser's spectrum was fitted, contrast and brightest pixels were not. Its "
+    "lengths are in pixels of 23.4 um, which the public file does not state.",
     heads=("", "", "Found"),
     traced=False,
 )  # fmt: skip

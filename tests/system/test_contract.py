@@ -289,8 +289,9 @@ def test_train(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     """And the network asked for an image of frames that it was not trained for: it comes with the doubt."""
     pytest.importorskip("torch", reason="torch is an extra: pip install 'mitsim[learn]'")
     common = "--json", "--quiet", "--variant", "llvm_ad_mono"
-    options = "--count", 8, "--patterns", "dots:4", "--idealised", *common
+    options = "--count", 8, "--patterns", "dots:4", "--exposure-fraction", 0.05, *common
     call("pairs", *lab.arguments, "-o", tmp_path / "pairs", *options)
+    call("calibrate", *lab.arguments, "-o", tmp_path / "pairs" / "calibration", *common)
     found = call("train", "refined", tmp_path / "pairs", "-o", tmp_path / "m.pt", "--steps", 2, *common).payload
     assert found.keys() == {
         *("model", "weights", "curve", "psnr_before_db", "psnr_db", "steps", "predicted_seconds", "seconds", "output"),

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import h5py
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -16,18 +17,14 @@ from scipy import sparse
 import mitsim as ms
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.board import show_picture
 from mitsim.bench.request import Request, Task
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
-from mitsim.devices.session import load_recipe
 from mitsim.learn import pairs as pairs_module
 from mitsim.learn.pair_store import PairStore, PrintPart
 from mitsim.learn.pairs import electrons_per_joule, make_pairs
-from mitsim.learn.requests import PairsRequest, Variation
+from mitsim.learn.verbs import PairsRequest, Variation
 from mitsim.optics.frames import Frame
-from mitsim.optics.shadow import Directions
-from mitsim.optics.terms import shadow_terms
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
@@ -67,14 +64,10 @@ class Lab:
         **asked: Any,
     ) -> PairStore:
         """So many pairs in a folder of that ``name``; ``asked``: fields of a request, or of what pairs are."""
-        own = {key: asked.pop(key) for key in ("idealised", "pictures", "vary") if key in asked}
+        own = {key: asked.pop(key) for key in ("pictures", "vary") if key in asked}
         request = Request.of(**{"patterns": "dots:2", "accuracy": 2e-3, "seed": 3, **asked})
-        bench_of = dict(scene or {})
-        store, _ = make_pairs(
-            lambda drawn: self.bench(**bench_of, **drawn), PairsRequest(capture=request, count=count, **own),
-            Task(self.folder / name, resume),
-        )  # fmt: skip
-        return store
+        wanted = PairsRequest(capture=request, count=count, **own)
+        return make_pairs(self.bench(**scene or {}), wanted, Task(self.folder / name, resume))[0]
 
 
 def test_programs_make_the_same_pairs(lab: Lab) -> None:
@@ -89,7 +82,7 @@ def test_programs_make_the_same_pairs(lab: Lab) -> None:
     with pytest.raises(MitsimError, match="own"):
         ms.make_pairs(bench, folder, 2, "dots:2")
     with pytest.raises(MitsimError, match="nowhere: is no folder"):
-        ms.make_pairs(bench, lab.folder / "timed", 2, pictures="nowhere", idealised=True)
+        ms.make_pairs(bench, lab.folder / "timed", 2, pictures="nowhere")
     with pytest.raises(MitsimError, match="count 0: give a number from 1 to"):
         ms.make_pairs(bench, lab.folder / "timed", 0)
     with pytest.raises(MitsimError, match=r"^2 pairs"):
@@ -146,44 +139,11 @@ def test_frames_and_truth_are_those_of_a_capture_of_the_picture(lab: Lab, extra:
         assert np.sqrt(np.square(store.truth(index) - shots.truth).mean()) < (4e-3 if projector else 2e-4)
 
 
-def test_the_projectors_own_light_does_not_tell_another_picture(lab: Lab) -> None:
-    """What the test above would see: two pictures of one store differ a hundred times as much."""
-    store = lab.pairs()
-    frames = store.expected_frames(0), store.expected_frames(1)
-    assert np.linalg.norm(frames[0] - frames[1]) > 0.1 * np.linalg.norm(frames[0])
-
-
-def test_light_over_two_surfaces_is_traced_for_each_picture(lab: Lab) -> None:
-    """It says why, keeps frames, and these are a capture's. (Planted: the picture of pair 0 on all prints.)"""
-    store = lab.pairs(scene={"extra": SECOND})
-    assert "2 surfaces" in store.manifest.traced_anew
-    shots = lab.bench(on_sheet(store.picture(1)), SECOND).capture("dots:2", accuracy=2e-3, seed=70, exposure=1.0)
-    known = np.asarray(shots.electrons, dtype=np.float64)
-    assert np.linalg.norm(store.expected_frames(1) - known) < 3e-3 * np.linalg.norm(known)
-    assert shots.truth is not None and abs(store.truth(1) - shots.truth).max() < 5e-3
-    assert store.frames(1).shape == (4, 64, 64)
-
-
-def test_idealised_frames_are_the_separable_model(lab: Lab) -> None:
-    """P o X between the geometric shadow's factors, by plain products: to single precision. (Planted: the picture's
-    transpose; diffraction left on.)"""
-    store, bench = lab.pairs(idealised=True, exposure=0.01), lab.bench()
-    geometry = bench.geometry
-    sides = [Directions.cells(np.linspace(*edges, N + 1)) for edges in bench.windows]
-    terms = shadow_terms(geometry, *sides, geometry.scene_distance, None)
-    left, right = store.patterns
-    truth = store.truth(1).astype(np.float64)
-    frames = np.stack([
-        sum(one @ (truth * np.outer(left[:, i], right[:, j])) @ other.T for one, other in terms)
-        for i, j in store.indices
-    ])  # fmt: skip
-    expected = store.expected_frames(1)
-    scale = float(np.vdot(expected, frames) / np.vdot(frames, frames))
-    assert abs(expected - scale * frames).max() < 1e-6 * expected.max()
-    # A pixel of a white board puts E A on the sensor; the projector's light is even to 1 %.
-    board = bench.with_board(load_recipe().board_reflectance).light("uniform", accuracy=1e-2).flux.mean()
-    assert scale == pytest.approx(board * electrons_per_joule(bench), rel=0.01)
-    assert np.array_equal(store.truth(1) == store.truth(1).max(), store.picture(1) == store.picture(1).max())
+def test_scenes_whose_light_is_no_product_are_refused(lab: Lab) -> None:
+    """(Planted: a wall beside the sheet not looked for.)"""
+    with pytest.raises(MitsimError, match=r"the scene has 2 surfaces, which light each other; pairs are made of one"):
+        lab.pairs(scene={"extra": SECOND})
+    assert not (lab.folder / "store").exists()
 
 
 # ---- Noise -----------------------------------------------------------------------------------------------------------
@@ -245,21 +205,18 @@ def test_signed_patterns_are_differences(lab: Lab) -> None:
 
 
 def test_benches_vary_by_group(lab: Lab) -> None:
-    """Scene, mask and exposure are drawn for each group of pairs. (Planted: the mask, or the exposure,
-    of the first.)"""
+    """Mask and exposure are drawn for each group of pairs. (Planted: the mask, or the exposure, of the first.)"""
     variation = Variation.model_validate(
         {
             "groups": 2,
             "exposure_fraction": [0.2, 0.8],
-            "scene": {"albedo": [1, 3]},
             "mask": {"mask_rows_um": [-50, 50]},
         }
     )
-    scene = {"extra": POINT.replace("300", "$albedo"), "albedo": "2"}
-    still = lab.pairs(4, "still", scene=scene, accuracy=1e-2)
-    store = lab.pairs(4, vary=variation, scene={"extra": scene["extra"]}, accuracy=1e-2)
+    still = lab.pairs(4, "still", accuracy=1e-2)
+    store = lab.pairs(4, vary=variation, accuracy=1e-2)
     first, second = store.manifest.groups
-    assert first != second and first.keys() == {"exposure_fraction", "mask.mask_rows_um", "scene.albedo"}
+    assert first != second and first.keys() == {"exposure_fraction", "mask.mask_rows_um"}
     assert [(shard.first, shard.count, shard.group) for shard in store.manifest.shards] == [(0, 2, 0), (2, 2, 1)]
     for index, group in ((1, first), (3, second)):
         assert np.array_equal(store.picture(index), still.picture(index))
@@ -270,21 +227,6 @@ def test_benches_vary_by_group(lab: Lab) -> None:
         # The shadow of a sheet at 400 mm behind a mask at 2 mm moves by 400 / 398 of what the mask moves.
         pixels = group["mask.mask_rows_um"] / 11.72 * 400 / 398
         assert shift_of(store.expected_frames(index), still.expected_frames(index)) == pytest.approx(pixels, abs=0.1)
-
-
-def test_a_bench_that_cannot_share_its_light_is_refused_before_any_work(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Asked are the first bench twice, and then all. (Planted: benches looked at when their turn comes.)"""
-    answers = iter(["", "", "", "", "the sheet is turned"])
-    monkeypatch.setattr(pairs_module, "traced_anew", lambda _: next(answers))
-    variation = Variation(groups=3, scene={"albedo": (1.0, 3.0)})
-    scene = {"extra": POINT.replace("300", "$albedo")}
-    with pytest.raises(
-        MitsimError, match=r"bench 2 \(albedo [12]\..*\): the sheet is turned, other than before bench 0"
-    ):
-        lab.pairs(3, vary=variation, scene=scene)
-    assert not (lab.folder / "store").exists()
 
 
 def shift_of(moved: np.ndarray, still: np.ndarray) -> float:
@@ -363,8 +305,10 @@ def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) 
     (copy / "pairs_00000.h5").write_bytes(data)
     with pytest.raises(MitsimError, match="damaged, or no HDF5 file"):
         PairStore.open(copy).frames(3)
-    (copy / "pairs_00000.h5").write_bytes(bytes((drawn.folder / "pairs_00000.h5").read_bytes())[:-3000])
-    with pytest.raises(MitsimError, match="damaged, or no HDF5 file"):
+    (copy / "pairs_00000.h5").write_bytes((drawn.folder / "pairs_00000.h5").read_bytes())
+    with h5py.File(copy / "pairs_00000.h5", "a") as file:
+        del file["light"]  # as stores of earlier versions that traced light for each picture
+    with pytest.raises(MitsimError, match="keeps frames in place of light, which is not read; make pairs again"):
         PairStore.open(copy).frames(3)
     more = {**json.loads((drawn.folder / "pairs.json").read_text()), "count": 5}
     (copy / "pairs.json").write_text(json.dumps(more))
@@ -379,27 +323,17 @@ def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) 
     ("own", "words"),
     [
         ({"count": 0}, "count 0: give a number from 1 to"),
-        ({"idealised": True, "vary": Variation(groups=1)}, "the idealised model has no bench"),
         ({"vary": Variation(groups=3)}, "3 groups of 2 pairs"),
         ({"vary": Variation(groups=1, exposure_fraction=(0.1, 2.0))}, "exposure_fraction 2.0: give a part of"),
-        ({"vary": Variation(groups=1, mask={"mask_rows_um": (0.0, 1e5)})}, "mask_rows_um: got 100000.0"),
+        ({"vary": {"groups": 1, "mask": {"mask_rows_um": [0.0, 1e5]}}}, "mask_rows_um: got 100000.0"),
+        ({"vary": {"groups": 1, "mask": {"power": [0.0, 0.1]}}}, "'power' is no motion of a mask"),
+        ({"vary": {"groups": 1, "exposure_fraction": [0.5, 0.1]}}, "give the least number first"),
+        ({"vary": {"groups": 1, "scene": {"sheet_z": [390.0, 410.0]}}}, "extra inputs are not permitted"),
         ({"exposure": 0.1, "vary": Variation(groups=1, exposure_fraction=(0.1, 0.2))}, "exposure_fraction varies"),
     ],
 )
 def test_a_request_that_cannot_be_served_is_refused(own: dict[str, Any], words: str) -> None:
-    kept = {key: own.pop(key) for key in ("count", "idealised", "vary") if key in own}
+    kept = {key: own.pop(key) for key in ("count", "vary") if key in own}
     request = Request.of(**{key: value for key, value in own.items() if value is not None})
     with pytest.raises(MitsimError, match=words):
-        PairsRequest(capture=request, **{"count": 2, **kept}).check()
-
-
-def test_prints_show_what_a_bitmap_of_the_picture_shows(lab: Lab) -> None:
-    """Texel by texel of a sheet whose texels divide the pixels. (Planted: rows and columns changed.)"""
-    import mitsuba as mi
-
-    picture = np.arange(N * N).reshape(N, N) % 251
-    bench = lab.bench()
-    show_picture(bench, picture / 255)
-    (shape,) = bench.loaded.scene.shapes()
-    texels = np.array(mi.traverse(shape)["bsdf.reflectance.data"])[..., 0]
-    assert np.array_equal(texels, on_sheet(picture))
+        PairsRequest(capture=request, **{"count": 2, **kept})
