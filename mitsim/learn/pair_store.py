@@ -390,8 +390,11 @@ class PairStore:
 
     def _read_light(self, number: int) -> tuple[PrintLight, float]:
         with self._file(self.manifest.shards[number]) as file:
-            if "light" not in file:  # of version 1, for light that was traced for each picture
-                raise MitsimError(f"{self.folder}: keeps frames in place of light, which is not read; make pairs again")
+            if "light" not in file:  # of version 1
+                why = self.manifest.traced_anew or "the mask's shadow is drawn on a raster"
+                raise MitsimError(
+                    f"{self.folder}: keeps frames in place of light ({why}), which is not read; make new pairs"
+                )
             return PrintLight.read(file["light"]), float(file.attrs["speckle"])
 
     def facts(self, shard: Shard) -> tuple[FloatArray, int, list[str]]:

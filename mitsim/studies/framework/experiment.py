@@ -239,9 +239,6 @@ class Results:
 
         return DataFrame([dict(row) for row in self.rows], dtype=object)
 
-    def with_columns(self, **columns: Any) -> Results:
-        return replace(self, rows=tuple(self.frame.assign(**columns).to_dict("records")))
-
     def array(self, row: Mapping[str, Value], name: str = IMAGE) -> FloatArray | None:
         return self.arrays.get((str(row.get("point")), name))
 
@@ -287,8 +284,6 @@ class Study:
         claims with thresholds (:mod:`mitsim.studies.framework.claims`), or functions from all results to judged claims.
     panels
         figures (:mod:`mitsim.studies.framework.panels`), or functions from all results to figures by file name.
-    derive
-        adds columns that need more than one point; None adds none.
     tables
         tables of the page (:class:`mitsim.studies.framework.panels.Pivot`), or functions from all results to its parts.
     message
@@ -316,7 +311,6 @@ class Study:
     measure: Callable[[Any, Point], Found]
     claims: Sequence[Any] = ()
     panels: Sequence[Any] = ()
-    derive: Callable[[Results], Results] | None = None
     tables: Sequence[Any] = ()
     message: Callable[[Results], str] = lambda results: ""
     about: str = ""
@@ -327,20 +321,14 @@ class Study:
     solved: bool = False
 
     def judge(self, results: Results) -> list[Claim]:
-        results = self._derived(results)
         return [claim for each in self.claims for claim in (each(results) if callable(each) else each.judge(results))]
 
     def draw(self, results: Results) -> dict[str, Figure]:
-        results = self._derived(results)
         drawn = [each(results) if callable(each) else each.draw(results) for each in self.panels]
         return {file: figure for figures in drawn for file, figure in figures.items()}
 
     def parts(self, results: Results) -> list[Any]:
-        results = self._derived(results)
         return [part for each in self.tables for part in (each(results) if callable(each) else each.parts_of(results))]
-
-    def _derived(self, results: Results) -> Results:
-        return self.derive(results) if self.derive else results
 
 
 def group_by_setup(points: Sequence[Point]) -> list[Point]:
