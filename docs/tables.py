@@ -37,7 +37,7 @@ from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe
 from mitsim.exchange.capture_list import CaptureList
 from mitsim.learn.pair_store import ModelManifest, PairsManifest, Shard
-from mitsim.learn.verbs import Variation
+from mitsim.learn.requests import Variation
 from mitsim.light.plan import PlanFile
 
 FORMATS, SHIPPED = (Path(__file__).with_name(name) for name in ("formats.md", "shipped.md"))

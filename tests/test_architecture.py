@@ -71,7 +71,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.framelist",
     "mitsim.exchange.formats",
     "mitsim.exchange.capture_list",
-    "mitsim.learn.verbs",
+    "mitsim.learn.requests",
 )
 """What looks at words, manifests and lists before work begins."""
 

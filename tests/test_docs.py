@@ -216,7 +216,7 @@ def stored_pairs() -> dict[str, object]:
     from mitsim.api.bench import open_bench
     from mitsim.bench.request import Request, Task
     from mitsim.learn.pairs import make_pairs
-    from mitsim.learn.verbs import PairsRequest
+    from mitsim.learn.requests import PairsRequest
 
     scene = write_small_scene(Path("scenes"))
     asked = PairsRequest(capture=Request.of(patterns="uniform", accuracy=0.1), count=2)

@@ -32,7 +32,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import RUN, read_colours
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
-from mitsim.learn.verbs import PairOptions, PairsRequest
+from mitsim.learn.requests import PairOptions, PairsRequest
 from mitsim.studies import ALL, EXPERIMENTS
 from mitsim.verbs import DemoRequest, RunOptions, StudyOptions, capture_in, open_as, plan_in
 

@@ -27,7 +27,8 @@ from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.exchange.capture_list import FrameFacts
 from mitsim.exchange.formats import Exported, Pictures
-from mitsim.learn.verbs import METHODS, Schedule, Training, load_network
+from mitsim.learn.requests import METHODS, Schedule, Training
+from mitsim.learn.verbs import load_network
 from mitsim.learn.verbs import train as train_model
 from mitsim.reconstruct.request import MODEL, ImageRequest
 

@@ -81,7 +81,7 @@ def _effects() -> Iterator[Entry]:
 
 def _methods() -> Iterator[Entry]:
     """Iterate over the solver's methods and the learned ones, read from the source because torch may be missing."""
-    from mitsim.learn.verbs import METHODS
+    from mitsim.learn.requests import METHODS
     from mitsim.reconstruct.solvers import SOLVERS
 
     for name, solver in SOLVERS.items():

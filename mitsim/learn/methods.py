@@ -37,7 +37,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
 from mitsim.core.files import check_plain, json_text, whole_file
 from mitsim.core.manifests import SIDES
 from mitsim.learn.pair_store import ModelManifest
-from mitsim.learn.verbs import FLATNET, REFINED, UNROLLED
+from mitsim.learn.requests import FLATNET, REFINED, UNROLLED
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import TIKHONOV

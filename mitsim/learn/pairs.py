@@ -52,7 +52,7 @@ from mitsim.learn.pair_store import (
     read_pairs_manifest,
     write_shard,
 )
-from mitsim.learn.verbs import PairsRequest, picture_files
+from mitsim.learn.requests import PairsRequest, picture_files
 from mitsim.light.cost_model import first_shadow, frames_cost
 from mitsim.light.light import SampledLight, traced_again
 from mitsim.light.simulation import Simulation, emission

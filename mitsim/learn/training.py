@@ -38,7 +38,7 @@ from mitsim.learn.methods import (
     write_tensors,
 )
 from mitsim.learn.pair_store import ModelManifest, PairStore
-from mitsim.learn.verbs import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, Training
+from mitsim.learn.requests import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solver import Prepared

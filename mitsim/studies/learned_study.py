@@ -37,7 +37,8 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.learn.pair_store import WHITE
 from mitsim.learn.pairs import DrawnPictures, make_pairs
-from mitsim.learn.verbs import FLATNET, REFINED, UNROLLED, PairsRequest, Training, Variation, check_torch
+from mitsim.learn.requests import FLATNET, REFINED, UNROLLED, PairsRequest, Training, Variation
+from mitsim.learn.verbs import check_torch
 from mitsim.metrics import psnr
 from mitsim.reconstruct.request import MARKOV, TIKHONOV, TV
 from mitsim.reconstruct.solution import Solution

@@ -23,8 +23,8 @@ from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
 from mitsim.learn import methods, training, verbs
 from mitsim.learn.methods import CLASSES, WAYS, Data, Diagonal, LearnedSolver, UNet, has_half, read_network
+from mitsim.learn.requests import METHODS, Training
 from mitsim.learn.training import train_network
-from mitsim.learn.verbs import METHODS, Training
 from mitsim.metrics import psnr
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solvers import SOLVERS

@@ -23,7 +23,7 @@ from mitsim.core.seeds import integer
 from mitsim.learn import pairs as pairs_module
 from mitsim.learn.pair_store import PairStore, PrintPart
 from mitsim.learn.pairs import electrons_per_joule, make_pairs
-from mitsim.learn.verbs import PairsRequest, Variation
+from mitsim.learn.requests import PairsRequest, Variation
 from mitsim.optics.frames import Frame
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
