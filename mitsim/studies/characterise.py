@@ -35,7 +35,7 @@ from mitsim.sensor.camera_fit import FoundCamera, Pixels, Places, nonuniform, sa
 from mitsim.sensor.chain import dark_current_variance, expose, mean_dark_current, response_variance
 from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, MOST_FITTED, SPLIT, Alike, Session, alike, figures, pairs_of
 from mitsim.studies.framework.campaign import study_folder, write_figures
-from mitsim.studies.framework.panels import Part, Section, page_of, text_table
+from mitsim.studies.framework.panels import Part, Section, text_table, write_page
 
 CAMERA_FILE = "camera.toml"
 MOST_OFF = 5.0
@@ -590,7 +590,7 @@ def _write(measure: Callable[[str | None], Characterisation], output: Path | str
         section = Section(
             "characterise", title, done.message, done.where, pictures, done.parts, warnings=done.warnings
         )  # fmt: skip
-        write_text(folder / "characterise.html", page_of([section], title))
+        write_page([section], folder / "characterise.html", title)
         write_text(folder / CAMERA_FILE, done.found.toml())
         write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})
     return done

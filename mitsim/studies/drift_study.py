@@ -457,5 +457,4 @@ STUDY = Study(
     "formed. Their uncertainty, the bars of the figure, is what they leave out of the image without a drift, such as "
     "detail inside projector pixels.",
     heads=("", "Predicted", "Measured"),
-    solved=True,
 )

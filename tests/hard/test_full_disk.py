@@ -15,7 +15,7 @@ from mitsim.core.files import write_json, write_text
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.exchange.formats import export, import_file
 from mitsim.exchange.png_files import draw_family
-from mitsim.studies.framework.campaign import Store, write_table
+from mitsim.studies.framework.campaign import Store
 from mitsim.studies.framework.experiment import Found, Point, Setup
 from tests.exchanged import Made, made
 from tests.unit.core.test_hdf5file import room
@@ -63,7 +63,6 @@ WRITERS: dict[str, Callable[[Made, Path], object]] = {
     "NPY of sense": lambda _, place: sensed(place / "a.npy"),
     "PNG of sense": lambda _, place: sensed(place / "a.png"),
     "NPZ of a study": lambda _, place: Store(place).save(Point.of(Setup("a"), b=1), Found((), {"a": NOISE})),
-    "CSV": lambda _, place: write_table(place / "a.csv", [{"number": number} for number in range(2000)]),
     "JSON": lambda _, place: write_json(place / "a.json", NOISE),
     "HTML": lambda _, place: write_text(place / "a.html", "a" * (ROOM + 1)),
 }

@@ -14,10 +14,10 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatch
-from functools import cache
+from functools import cache, partial
 from itertools import groupby
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import TypeAdapter, ValidationError
 
-from mitsim.bench.apparatus import check_scene, open_apparatus
+from mitsim.bench.apparatus import check_scene
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import (
@@ -48,7 +48,6 @@ from mitsim.studies.framework.experiment import (
     Point,
     Results,
     Scope,
-    Setup,
     Study,
     find_experiment,
 )  # fmt: skip
@@ -108,6 +107,7 @@ class StudyResult:
 
 
 def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figure]:
+    """Write the figures that show two points or more, and return them."""
     from mitsim.report.plots import tells  # not in processes that measure
 
     drawn = {file: figure for file, figure in figures.items() if tells(figure)}
@@ -115,13 +115,6 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figu
         with whole_file(folder / file) as part:
             figure.savefig(part, dpi=150, format="png")  # 1290 pixels wide, a page of text on a common screen
     return drawn
-
-
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV file, all or nothing; MitsimError on failure."""
-    from pandas import DataFrame
-
-    write_text(path, DataFrame([dict(row) for row in rows], dtype=object).to_csv(index=False))
 
 
 # -------- The folder of a study
@@ -134,11 +127,9 @@ def check_study_folder(output: Path | str, name: str) -> None:
     check_output(output, overwrite=_is_earlier(Path(output), name))
 
 
-@contextmanager
-def study_folder(output: Path | str, name: str) -> Iterator[Path]:
+def study_folder(output: Path | str, name: str) -> AbstractContextManager[Path]:
     """Hold the new, empty or earlier folder ``output`` of the study ``name``; MitsimError if it holds anything else."""
-    with output_folder(output, overwrite=_is_earlier(Path(output), name)) as folder:
-        yield folder
+    return output_folder(output, overwrite=_is_earlier(Path(output), name))
 
 
 def _is_earlier(place: Path, name: str) -> bool:
@@ -274,8 +265,6 @@ def run_experiment(
     # Before there is a folder.
     for setup in dict.fromkeys(point.setup for point in own):
         check_scene(setup.scene, dict(setup.parameters), setup.outside)
-    if experiment.solved:
-        _check_data(own)
     with _campaign(study, experiment, scope, output) as (folder, store):
         todo = [point for point in own if not store.has(point)]
         if experiment.kept:
@@ -294,20 +283,6 @@ def run_experiment(
         return _finish(study, experiment, scope, points, store, time.perf_counter() - started)
 
 
-def _check_data(points: Sequence[Point]) -> None:
-    from mitsim.bench.layout import shortage  # here: it needs the renderer
-
-    asked = {(replace(each.setup, picture=None, accuracy=Setup.accuracy), each["patterns"]) for each in points}
-    for setup, patterns in sorted(asked, key=str):
-        parameters: dict[str, Any] = dict(setup.parameters)
-        devices = setup.camera, setup.projector
-        with warnings.catch_warnings(action="ignore"):  # whoever measures the point repeats them
-            bench = open_apparatus(setup.scene, setup.variant, *devices, setup.outside, **parameters)
-        short = shortage(bench, bench.family(patterns))
-        if short and short.lost == 1:
-            raise MitsimError(f"study: {short.reason}; {short.remedy}")
-
-
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> StudyResult:
     """Join ``parts``, folders of the same study, in the folder ``output``.
 
@@ -317,11 +292,6 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
     started, heads = time.perf_counter(), [_head(Path(part)) for part in parts]
     if not heads:
         raise MitsimError("study merge: give the folders of the parts")
-    for part, head in zip(parts, heads, strict=True):
-        if any(head[key] != heads[0][key] for key in ("study", "scope", "versions")):
-            raise MitsimError(
-                f"study merge: {part} is of another study, scope or version than {parts[0]}; run it again"
-            )
     study, known = heads[0]["study"], (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)
     if not isinstance(study, str) or study not in known:
         instead = "none that ships" if experiment is None else f"not {experiment}"
@@ -329,6 +299,12 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
             f"study merge: {parts[0]} is of the study {cut(str(study))!r}, {instead}; a study of your own is merged by "
             "its name, --experiment MODULE"
         )
+    for part, head in zip(parts, heads, strict=True):
+        if any(head[key] != heads[0][key] for key in ("study", "scope")) or head["versions"] != versions():
+            raise MitsimError(
+                f"study merge: {part} is of another study or scope than {parts[0]}, or was measured by other versions "
+                f"than this one ({cut(str(head['versions']))}); run it again"
+            )
     scope = _scope(heads[0]["scope"], parts[0])
     if study == ALL:
         for part in parts:
@@ -336,11 +312,6 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
                 _head(Path(part) / name)  # before there is a folder
         return _all(
             scope, output, lambda name, folder: merge([Path(part) / name for part in parts], folder, experiment)
-        )
-    if heads[0]["versions"] != versions():
-        raise MitsimError(
-            f"study merge: {parts[0]} was measured by other versions ({cut(str(heads[0]['versions']))}), by which it "
-            "can be merged"
         )
     found = find_experiment(study)
     points = found.points(scope)  # refuses an impossible scope before there is a folder
@@ -356,9 +327,9 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
         found = [each(name, folder / name) for name in PAPER]
         sections = [one.section for one in found if one.section]
         if len(sections) == len(found):
-            from mitsim.studies.framework.panels import build_page
+            from mitsim.studies.framework.panels import write_page
 
-            build_page(sections, folder / f"{ALL}.html", "The paper's claims on rendered frames")
+            write_page(sections, folder / f"{ALL}.html", "The paper's claims on rendered frames")
         result = StudyResult(
             ALL,
             str(folder),
@@ -391,7 +362,7 @@ def _campaign(study: str, experiment: Study, scope: Scope, output: Path | str) -
 def _finish(
     study: str, experiment: Study, scope: Scope, points: Sequence[Point], store: Store, seconds: float
 ) -> StudyResult:
-    from mitsim.studies.framework.panels import Section, build_page
+    from mitsim.studies.framework.panels import section_of, write_page
 
     folder, there, name = store.folder.parent, sum(map(store.has, points)), experiment.name
     result = StudyResult(study, str(folder), points=there, missing=len(points) - there, seconds=seconds)
@@ -399,13 +370,13 @@ def _finish(
         return result
     results = replace(store.results(points), scope=scope)
     claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
-    write_table(folder / f"{name}.csv", results.rows)
-    section = Section.of(experiment, study, claims, figures, results)
-    build_page([section], folder / f"{name}.html", section.title)
-    rows = tuple(map(dict, results.rows))
+    write_text(folder / f"{name}.csv", results.frame.to_csv(index=False))
+    section = section_of(experiment, study, claims, figures, results)
+    write_page([section], folder / f"{name}.html", section.title)
     result = replace(
-        result, rows=rows, claims=claims, figures=tuple(figures), section=section, warnings=section.warnings
-    )
+        result, rows=tuple(map(dict, results.rows)), claims=claims, figures=tuple(figures), section=section,
+        warnings=section.warnings,
+    )  # fmt: skip
     _write_head(folder, name, study, scope, status="complete", **result.payload())
     return result
 
@@ -546,19 +517,18 @@ def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tu
     except (OSError, ValueError) as error:
         raise MitsimError(f"--scheduler {address}: no Dask scheduler answers there ({error})") from error
     with client:
-        tasks = {client.submit(_batch, name, batch, pure=False): batch for batch in batches}
-        for task in as_completed(tasks):
+        for task in as_completed(client.map(partial(_batch, name), batches, pure=False)):
             found, refusal = task.result()
-            yield from zip(tasks[task], found, strict=False)
+            yield from found
             if refusal:
                 raise MitsimError(refusal)
 
 
-def _batch(name: str, batch: Batch) -> tuple[list[Found], str]:
+def _batch(name: str, batch: Batch) -> tuple[list[tuple[Point, Found]], str]:
     found = []
     for point in batch:
         try:
-            found.append(measure_point(name, point))
+            found.append((point, measure_point(name, point)))
         except MitsimError as error:
             return found, str(error)
     return found, ""

@@ -286,8 +286,6 @@ class Study:
         figures (:mod:`mitsim.studies.framework.panels`), or functions from all results to figures by file name.
     tables
         tables of the page (:class:`mitsim.studies.framework.panels.Pivot`), or functions from all results to its parts.
-    message
-        function from all results to the page's first sentence; by default the number of claims that hold.
     about
         method of measurement; empty for claims of the paper, which the page explains.
     heads
@@ -299,9 +297,6 @@ class Study:
     kept
         True to keep plans, calibrations and other shared objects in the study's folder, so that any process can measure
         any point.
-    solved
-        True if all points need more data than unknowns, for an automatic lambda; other points are refused before
-        measuring.
     """
 
     name: str
@@ -312,13 +307,11 @@ class Study:
     claims: Sequence[Any] = ()
     panels: Sequence[Any] = ()
     tables: Sequence[Any] = ()
-    message: Callable[[Results], str] = lambda results: ""
     about: str = ""
     heads: tuple[str, str, str] = HEADS
     note: str = ""
     traced: bool = True
     kept: bool = False
-    solved: bool = False
 
     def judge(self, results: Results) -> list[Claim]:
         return [claim for each in self.claims for claim in (each(results) if callable(each) else each.judge(results))]

@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 from string import Formatter
 from typing import TYPE_CHECKING, Any
@@ -351,12 +351,9 @@ def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], 
         beside = {name: [(truths[name][0], ""), *cells] for name, cells in alone.items()}
         return image_grid(beside, ["truth", *titles], title)
     rows: dict[str, list[tuple[FloatArray, str]]] = {}
-    before: Sequence[FloatArray] = ()
-    several = any(not all(map(np.array_equal, one, other)) for one, other in pairwise(truths.values()))
     for name, cells in alone.items():
-        if not before or not all(map(np.array_equal, before, truths[name])):
-            rows[f"truth, {name}" if name and several else "truth"] = [(truth, "") for truth in truths[name]]
-        rows[name or "image"], before = cells, truths[name]
+        rows[", ".join(filter(None, ("truth", name)))] = [(truth, "") for truth in truths[name]]
+        rows[name or "image"] = cells
     return image_grid(rows, titles, title)
 
 
@@ -407,35 +404,36 @@ class Section:
     quick: bool = False
     prints: int = 0
 
-    @classmethod
-    def of(
-        cls, study: Study, name: str, claims: Sequence[Claim], figures: Mapping[str, Figure], results: Results
-    ) -> Section:
-        scope = results.scope
-        prints = sorted({str(row.get("picture")) for row in results.rows} & set(TEST_IMAGES))
-        of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
-        command = ["mitsim study", name, *([] if any(scope.pictures) else [scope.setup.scene]), *_options(scope)]
-        accuracies = sorted({point.setup.accuracy for point in study.points(scope)} if study.traced else ())
-        named = " or ".join(f"{each:g}" for each in accuracies)
-        images_first = sorted(figures, key=lambda file: not file.startswith("images"))
-        good = f"; frames before noise asked to be good to {named} (relative rms)" if accuracies else ""
-        return cls(
-            study.name,
-            title=study.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
-            message=study.message(results) or tally(claims),
-            detail=study.question,
-            pictures={file: page_figure(figures[file]) for file in images_first},
-            parts=tuple(study.parts(results)),
-            claims=tuple(claims),
-            heads=study.heads,
-            warnings=flag_warnings(study.name, results),
-            note=study.note,
-            about=study.about,
-            count=f"{len(results.rows)} measurements{of}{good}",
-            command=" ".join(command),
-            quick=scope.quick,
-            prints=len(prints),
-        )
+
+def section_of(
+    study: Study, name: str, claims: Sequence[Claim], figures: Mapping[str, Figure], results: Results
+) -> Section:
+    """Return the section of a study's page; ``name`` is the study's on the command line."""
+    scope = results.scope
+    prints = sorted({str(row.get("picture")) for row in results.rows} & set(TEST_IMAGES))
+    of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
+    command = ["mitsim study", name, *([] if any(scope.pictures) else [scope.setup.scene]), *_options(scope)]
+    accuracies = sorted({point.setup.accuracy for point in study.points(scope)} if study.traced else ())
+    named = " or ".join(f"{each:g}" for each in accuracies)
+    good = f"; frames before noise asked to be good to {named} (relative rms)" if accuracies else ""
+    images_first = sorted(figures, key=lambda file: not file.startswith("images"))
+    return Section(
+        study.name,
+        title=study.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
+        message=tally(claims),
+        detail=study.question,
+        pictures={file: page_figure(figures[file]) for file in images_first},
+        parts=tuple(study.parts(results)),
+        claims=tuple(claims),
+        heads=study.heads,
+        warnings=flag_warnings(study.name, results),
+        note=study.note,
+        about=study.about,
+        count=f"{len(results.rows)} measurements{of}{good}",
+        command=" ".join(command),
+        quick=scope.quick,
+        prints=len(prints),
+    )
 
 
 def tally(claims: Sequence[Claim]) -> str:
@@ -465,13 +463,11 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     )
 
 
-def page_of(sections: Sequence[Section], title: str) -> str:
+def write_page(sections: Sequence[Section], path: Path, title: str) -> Path:
+    """Write a page of one study, or of several with the verdicts of all first."""
     message = sections[0].message if len(sections) == 1 else tally([claim for one in sections for claim in one.claims])
-    return render_page("study.html", title=title, message=message or title, sections=sections, versions=versions())
-
-
-def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
-    write_text(path, page_of(sections, title))
+    page = render_page("study.html", title=title, message=message or title, sections=sections, versions=versions())
+    write_text(path, page)
     return path
 
 

@@ -19,7 +19,7 @@ from mitsim.report import demo_page as R
 from mitsim.report.demo_page import Trust
 from mitsim.report.pages import page_figure, stages_of
 from mitsim.studies.demo import doubts
-from mitsim.studies.framework.panels import Part, Section, page_of
+from mitsim.studies.framework.panels import Part, Section, write_page
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 N = 32
@@ -340,13 +340,14 @@ def test_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyP
         R.build_report(small, tmp_path / "missing" / "report.html")
 
 
-def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
+def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left(tmp_path: Path) -> None:
     """A column of words after one of numbers does not go right."""
     rows = (("shot noise", "+7.4 +- 0.1", "2.8e+12", "1"), ("read noise", "nothing", "", "one"))
     part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
     assert part.numeric == (False, True, True, False)
     pictures = {"a.png": page_figure(Figure(figsize=(3.0, 2.0)))}
-    page = page_of([Section("toy", "A study", "7 dB", "Scene toy", pictures, (part,))], "A study")
+    section = Section("toy", "A study", "7 dB", "Scene toy", pictures, (part,))
+    page = write_page([section], tmp_path / "page.html", "A study").read_text(encoding="utf-8")
     assert (
         '<p class="verdict">7 dB</p>' in page
         and page.count('<th class="n">') == 2
@@ -355,11 +356,11 @@ def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
     assert "512 \u00d7 512 pixels" in page and "2.8\u00d710\u00b9\u00b2" in page and "wide small" in page
 
 
-def test_warnings_of_findings_stand_at_the_head_and_notes_below_the_figures() -> None:
+def test_warnings_of_findings_stand_at_the_head_and_notes_below_the_figures(tmp_path: Path) -> None:
     """(Planted: warnings on the command line alone.)"""
     part = Part("Title", "the lead", notes=("how to read it",))
     section = Section("toy", "A study", "", "Scene toy", {}, (part,), warnings=("losses: a cause is missing",))
-    page = page_of([section], "A study")
+    page = write_page([section], tmp_path / "page.html", "A study").read_text(encoding="utf-8")
     head, body = page.split("</header>")
     assert "Losses: a cause is missing." in head and body.index("the lead") < body.index("how to read it")
 

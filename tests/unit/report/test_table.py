@@ -1,15 +1,12 @@
-"""Means of studies with standard errors against numpy, and a CSV that comes back as it was."""
+"""Means of studies with standard errors, against numpy."""
 
-import csv
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.report.pages import Mean
-from mitsim.studies.framework.campaign import write_table
 
 
 def test_a_mean_has_the_standard_error_of_its_numbers() -> None:
@@ -21,15 +18,6 @@ def test_a_mean_has_the_standard_error_of_its_numbers() -> None:
     assert single.value == 40 and math.isnan(single.error) and str(single) == "40.0" and "23.0 ± 1.7" in str(mean)
     with pytest.raises(MitsimError, match="nothing was measured of psnr_db"):
         Mean.of_numbers([], "psnr_db")
-
-
-def test_a_csv_has_all_columns_and_comes_back(tmp_path: Path) -> None:
-    """Rows need not have the same columns."""
-    write_table(tmp_path / "t.csv", [{"model": "idealised", "psnr_db": 20.0}, {"psnr_db": 1.5, "note": "a, b"}])
-    rows = list(csv.DictReader((tmp_path / "t.csv").open(newline="", encoding="utf-8")))
-    assert list(rows[0]) == ["model", "psnr_db", "note"]
-    assert [float(row["psnr_db"]) for row in rows] == [20, 1.5] and rows[-1]["note"] == "a, b"
-    assert rows[0]["note"] == "" and rows[-1]["model"] == ""
 
 
 def test_an_error_of_a_mean_is_never_nought() -> None:

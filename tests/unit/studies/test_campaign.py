@@ -20,7 +20,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.studies.framework import campaign
 from mitsim.studies.framework.campaign import Shard, StudyResult, Where, merge, run_experiment
 from mitsim.studies.framework.experiment import Scope, Setup
-from mitsim.studies.framework.panels import build_page
+from mitsim.studies.framework.panels import write_page
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 
@@ -132,7 +132,7 @@ def test_a_page_of_several_has_each_claim_under_its_command(whole: Whole, tmp_pa
     """(Planted: one table without commands.)"""
     section = whole[0].section
     assert section
-    page = build_page([section, replace(section, command="mitsim study other")], tmp_path / "page.html", "Two")
+    page = write_page([section, replace(section, command="mitsim study other")], tmp_path / "page.html", "Two")
     summary = page.read_text().split("<h2")[1]
     first, second = (summary.index(f"<code>{each}</code>") for each in (section.command, "mitsim study other"))
     claim = summary.index("Two squared is four")
@@ -212,7 +212,7 @@ def test_parts_of_other_versions_are_not_signed_by_this_one(run: Run, tmp_path: 
         shutil.copytree(whole[1], part)
         reported = json.loads((part / "toy.json").read_text())
         (part / "toy.json").write_text(json.dumps({**reported, "versions": {"mitsim": "0.1"}}))
-    with pytest.raises(MitsimError, match="measured by other versions"):
+    with pytest.raises(MitsimError, match="was measured by other versions"):
         merge(parts, tmp_path / "joined", TOY)
     assert not (tmp_path / "joined").exists()
 
@@ -272,7 +272,7 @@ def test_bad_folders_are_refused(run: Run, tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match="measured by other versions"):
         run("new")
     run("fresh")
-    with pytest.raises(MitsimError, match="is of another study, scope or version"):
+    with pytest.raises(MitsimError, match="is of another study or scope than"):
         merge([tmp_path / "fresh", tmp_path / "new"], tmp_path / "joined")
     assert not (tmp_path / "joined").exists()
 

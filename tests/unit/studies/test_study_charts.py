@@ -17,8 +17,7 @@ from mitsim.report.pages import Value
 from mitsim.report.plots import curves, spans_decades, tells
 from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Claim, Point, Results, Scope, Setup
 from mitsim.studies.framework.experiment import find_experiment as find
-from mitsim.studies.framework.panels import Section, build_page, tally
-from mitsim.studies.sweep_study import axis_of
+from mitsim.studies.framework.panels import section_of, tally, write_page
 from tests.unit.report.test_charts import curve
 
 STUDIES = (
@@ -106,24 +105,6 @@ def test_the_rule_sees_what_is_wrong() -> None:
     assert faults(good) == ["axis 'y [1]' is linear from 0.0001 to 1"]
 
 
-def test_a_parameter_has_the_unit_that_its_scene_states(tmp_path: Path) -> None:
-    """(Planted: every parameter in mm.)"""
-    scene = tmp_path / "scene.xml"
-    scene.write_text(
-        '<scene version="3.0.0"> <default name="far" value="1"/> <!-- mm, how far\n   it is -->\n'
-        '<default name="lamp" value="2"/><!-- radiance [W m^-2 sr^-1] -->\n<default name="bare" value="3"/></scene>'
-    )
-    setup = Setup(str(scene))
-    assert axis_of(setup, "far") == ("far [mm]", "how far it is")
-    assert axis_of(setup, "lamp") == ("lamp [W m^-2 sr^-1]", "radiance")
-    assert axis_of(setup, "bare") == ("bare", "[as in the scene file]")
-    assert axis_of(Setup("lamp_bench"), "lamp") == ("lamp [W m^-2 sr^-1]", "radiance of the lamp")
-    rough = axis_of(Setup("cookie_bag"), "roughness")
-    assert rough == ("roughness", "of the bag's foil: alpha of a GGX distribution [as in the scene file]")
-    assert axis_of(Setup("photograph"), "sheet_z") == ("sheet_z [mm]", "where the printed sheet stands")
-    assert axis_of(Setup(str(tmp_path / "gone.xml")), "far") == ("far", "[as in the scene file]")
-
-
 def sweep(knobs: Sequence[tuple[str, tuple[str, ...]]], truth_by: str = "") -> Results:
     """Images that are even greys, each a hundredth brighter than the one before; truths of 0.9, or of another grey for
     each value of ``truth_by``."""
@@ -158,10 +139,11 @@ def test_a_sweep_shows_its_images_by_what_is_swept() -> None:
 
 
 def test_truths_stand_above_images_where_they_differ_along_a_row() -> None:
-    """Once, where all rows have the same. (Planted: the first column's truth beside all.)"""
+    """(Planted: the first column's truth beside all.)"""
     titles, names, captions = grid(sweep((KNOBS[0], KNOBS[1]), truth_by="sheet_z"))
-    assert titles == ["sheet_z 390", "sheet_z 400", "sheet_z 410"]
-    assert names == ["truth", "patterns dots:4", "patterns dots:7"] and captions[:3] == [""] * 3
+    assert titles == ["sheet_z 390", "sheet_z 400", "sheet_z 410"] and captions[:3] == [""] * 3
+    both = ("dots:4", "dots:7")
+    assert names == [f"{truth}patterns {each}" for each in both for truth in ("truth,\n", "")]
 
 
 def test_a_long_sweep_shows_both_ends_and_says_how_many_there_are() -> None:
@@ -170,7 +152,7 @@ def test_a_long_sweep_shows_both_ends_and_says_how_many_there_are() -> None:
     figure = find("sweep").draw(results)["images.png"]
     titles, names, _ = grid(results)
     assert titles == ["truth", *(f"sheet_z {390 + each}" for each in (0, 2, 4, 6, 8, 10))] and not names
-    assert figure.get_suptitle().replace("\n", " ") == "Images by sheet_z [mm] (6 of 11 columns)"
+    assert figure.get_suptitle().replace("\n", " ") == "Images by sheet_z (6 of 11 columns)"
 
 
 def test_a_page_says_first_how_many_claims_hold(tmp_path: Path) -> None:
@@ -182,7 +164,7 @@ def test_a_page_says_first_how_many_claims_hold(tmp_path: Path) -> None:
     assert tally(claims) == said and tally(claims[:1]) == "1 claim: 1 confirmed" and not tally(())
     results = invented("patterns")
     shown = {"psnr.png": curves({"": {"a": curve((1, 1.0), (2, 2.0))}}, "x [mm]")}
-    section = Section.of(find("patterns"), "patterns", claims, shown, results)
-    page = build_page([section], tmp_path / "page.html", section.title).read_text()
+    section = section_of(find("patterns"), "patterns", claims, shown, results)
+    page = write_page([section], tmp_path / "page.html", section.title).read_text()
     order = [page.index(each) for each in (said, section.detail, "claim 4", "<img", "Zheng")]
     assert order == sorted(order)
