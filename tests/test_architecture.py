@@ -564,7 +564,7 @@ SIZES = {
     "scene": (8, 1434),
     "sensor": (5, 1193),
     "sessions": (4, 805),
-    "studies": (22, 5633),
+    "studies": (22, 5574),
     "transport": (21, 4485),
     "verbs": (1, 303),
     "version": (1, 1),
