@@ -22,6 +22,7 @@ with the Q and N of the D and B steps, the best mu, and r = ||X||.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
@@ -57,15 +58,6 @@ _NOTHING = 1e-300
 _SINGLE = float(np.finfo(np.float32).eps) ** 2 / 2
 
 
-def automatic_weight(problem: DiagonalProblem) -> float:
-    """Return the root of the noise variance times Tikhonov's automatic lambda as the weight for a ``problem``.
-
-    With noise of variance v and slopes distributed as exp(-slope / b), the likeliest image has the weight v / b, and
-    the root of v over automatic lambda estimates b.
-    """
-    return float(np.sqrt(noise_variance(problem) * automatic_lambda(problem)))
-
-
 @dataclass(frozen=True)
 class Prior:
     """Prior of an image X within ``bounds``: weight TV(X) + ridge / 2 ||X||^2 is added to half the squared misfit."""
@@ -78,17 +70,6 @@ class Prior:
     def bounded(self) -> bool:
         return math.isfinite(self.bounds[0]) or math.isfinite(self.bounds[1])
 
-    def slack(self, image: FloatArray, pressed: FloatArray) -> float:
-        low, high = self.bounds
-        down, up = np.minimum(pressed, 0.0), np.maximum(pressed, 0.0)
-        total = 0.0
-        for part, bound in ((down, low), (up, high)):
-            if math.isfinite(bound):
-                total += float(np.sum(part * (bound - image)))
-            elif part.any():
-                return math.inf
-        return total
-
 
 def solve_tv(
     prepared: Prepared,
@@ -99,8 +80,14 @@ def solve_tv(
     bounds: Bounds | None = None,
 ) -> Solution:
     problem = prepared.problem(frames)
-    lam = automatic_weight(problem) if weight == "auto" else check_lambda(weight)
-    return _Minimum(prepared, problem, Prior(weight=lam, bounds=bounds or Prior.bounds)).find(iterations, tolerance)
+    if weight == "auto":
+        # With noise of variance v and slopes distributed as exp(-slope / b), the likeliest image has the weight v / b,
+        # and the root of v over Tikhonov's automatic lambda estimates b.
+        known = float(np.sqrt(noise_variance(problem) * automatic_lambda(problem)))
+    else:
+        known = check_lambda(weight)
+    prior = Prior(weight=known, bounds=bounds or Prior.bounds)
+    return _find_minimum(prepared, problem, prior, iterations, tolerance)
 
 
 def solve_nonnegative(
@@ -114,154 +101,164 @@ def solve_nonnegative(
     problem = prepared.problem(frames)
     ridge = automatic_lambda(problem) if lam == "auto" else check_lambda(lam)
     prior = Prior(ridge=ridge, bounds=bounds or (0.0, math.inf))
-    found = _Minimum(prepared, problem, prior).find(iterations, tolerance)
+    found = _find_minimum(prepared, problem, prior, iterations, tolerance)
     flags = end_of_range(problem, ridge) if lam == "auto" else ()
     return replace(found, status=replace(found.status, flags=flags))
 
 
-class _Minimum:
-    def __init__(self, prepared: Prepared, problem: DiagonalProblem, prior: Prior) -> None:
-        self.prepared, self.problem, self.prior = prepared, problem, prior
-
-    def find(self, iterations: int, tolerance: float) -> Solution:
-        if iterations < 1:
-            raise MitsimError(f"iterations are {iterations}; give at least 1")
-        problem = self.problem
-        if self.prior.weight or self.prior.bounded:
-            image, iterations, gap = self._iterate(iterations, tolerance)
-            converged = gap <= tolerance
-        else:
-            square, measured = np.square(problem.sigma) + self.prior.ridge, problem.sigma > 0
-            least = np.divide(problem.sigma * problem.projected, square, out=np.zeros_like(square), where=measured)
-            image, iterations, gap, converged = self.prepared.image(least), 0, 0.0, True
-        modelled = problem.sigma * self.prepared.coefficients(image)
-        outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
-        misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
-        lost, limit = self.prepared.lost
-        figures, name = f"{self.prepared.extent}.", "total variation" if self.prior.weight else "least squares"
-        if not converged:
-            far = f"may still be {gap:.1e} above its minimum" if gap <= 1 else "is not proven to be near its minimum"
-            status = Status(
-                Verdict.NOT_CONVERGED,
-                f"Not converged: after {iterations} iterations {name} {far}",
-                f"take a {'weight' if self.prior.weight else 'lambda'} nearer the automatic one, or allow more "
-                "iterations or a larger tolerance",
-                figures,
-            )
-        elif lost:
-            status = Status(
-                Verdict.PARTLY_MEASURED,
-                f"Solved in {iterations} iterations, but {lost} of {self.prepared.unknowns} directions are not "
-                f"measured above {limit} and follow from {name} alone",
-                "use more patterns",
-                figures,
-            )
-        else:
-            sentence = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"
-            status = Status(Verdict.SOLVED, sentence, "", figures)
-        return Solution(
-            image=image,
-            lam=self.prior.weight or self.prior.ridge,
-            iterations=iterations,
-            objective=outside / 2 + self._objective(image),
-            relative_gap=gap,
-            residual=float(np.sqrt(misfit / problem.energy)) if problem.energy > 0 else 0.0,
-            status=status,
+def _find_minimum(
+    prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float
+) -> Solution:
+    if iterations < 1:
+        raise MitsimError(f"iterations are {iterations}; give at least 1")
+    if prior.weight or prior.bounded:
+        image, iterations, gap = _iterate(prepared, problem, prior, iterations, tolerance)
+        converged = gap <= tolerance
+    else:
+        square, measured = np.square(problem.sigma) + prior.ridge, problem.sigma > 0
+        least = np.divide(problem.sigma * problem.projected, square, out=np.zeros_like(square), where=measured)
+        image, iterations, gap, converged = prepared.image(least), 0, 0.0, True
+    modelled = problem.sigma * prepared.coefficients(image)
+    outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
+    misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
+    lost, limit = prepared.lost
+    figures, name = f"{prepared.extent}.", "total variation" if prior.weight else "least squares"
+    if not converged:
+        far = f"may still be {gap:.1e} above its minimum" if gap <= 1 else "is not proven to be near its minimum"
+        status = Status(
+            Verdict.NOT_CONVERGED,
+            f"Not converged: after {iterations} iterations {name} {far}",
+            f"take a {'weight' if prior.weight else 'lambda'} nearer the automatic one, or allow more "
+            "iterations or a larger tolerance",
+            figures,
         )
+    elif lost:
+        status = Status(
+            Verdict.PARTLY_MEASURED,
+            f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not "
+            f"measured above {limit} and follow from {name} alone",
+            "use more patterns",
+            figures,
+        )
+    else:
+        sentence = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"
+        status = Status(Verdict.SOLVED, sentence, "", figures)
+    return Solution(
+        image=image,
+        lam=prior.weight or prior.ridge,
+        iterations=iterations,
+        objective=outside / 2 + _objective(prepared, problem, prior, image),
+        relative_gap=gap,
+        residual=float(np.sqrt(misfit / problem.energy)) if problem.energy > 0 else 0.0,
+        status=status,
+    )
 
-    def _iterate(self, iterations: int, tolerance: float) -> tuple[FloatArray, int, float]:
-        problem, weight, ridge = self.problem, self.prior.weight, self.prior.ridge
-        squared, data = np.square(problem.sigma) + ridge, problem.sigma * problem.projected
-        # The penalty sets the speed alone: Tikhonov's lambda balances both of its steps.
-        measured = np.square(problem.sigma[problem.sigma > 0])
-        rho = automatic_lambda(problem) if problem.data_count > measured.size else 0.0
-        if rho <= problem.scale * np.finfo(np.float64).eps:
-            rho = float(np.exp(np.mean(np.log(measured))))
-        smooth = self.prepared.image(data / (squared + rho))
+
+def _iterate(
+    prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float
+) -> tuple[FloatArray, int, float]:
+    weight, ridge = prior.weight, prior.ridge
+    squared, data = np.square(problem.sigma) + ridge, problem.sigma * problem.projected
+    # The penalty sets the speed alone: Tikhonov's lambda balances both of its steps.
+    measured = np.square(problem.sigma[problem.sigma > 0])
+    rho = automatic_lambda(problem) if problem.data_count > measured.size else 0.0
+    if rho <= problem.scale * np.finfo(np.float64).eps:
+        rho = float(np.exp(np.mean(np.log(measured))))
+    smooth = prepared.image(data / (squared + rho))
+    slopes = slopes_of(smooth)
+    rho_slopes = weight / max(float(lengths(slopes).mean()), _NOTHING)
+    # Without bounds nothing is held to them.
+    inside, rho_inside = np.clip(smooth, *prior.bounds), rho if prior.bounded else 0.0
+    dual, dual_slopes, dual_inside = np.zeros_like(smooth), np.zeros_like(slopes), np.zeros_like(smooth)
+    rows, columns = (2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in smooth.shape)
+    laplacian = rows[:, None] + columns
+    spent, relative = 0, float("inf")
+    while spent < iterations and relative > tolerance:
+        spent += 1
+        target = smooth - dual
+        seen, kept = prepared.coefficients(target), rho / (ridge + rho)
+        # Directions outside the basis (under-determined sides) are not measured: they keep the target.
+        updated = kept * target + prepared.image((data + rho * seen) / (squared + rho) - kept * seen)
+        before, before_inside = smooth, inside
+        source = rho * (_RELAXED * updated + (1 - _RELAXED) * smooth + dual)
+        total: FloatArray | float = rho
+        bounded, pressed = dual_slopes, dual_inside
+        if weight:
+            target = slopes - dual_slopes
+            length = lengths(target)
+            shrunk = target * (np.maximum(length - weight / rho_slopes, 0.0) / np.maximum(length, _NOTHING))
+            bounded = rho_slopes * (target - shrunk)
+            relaxed_slopes = _RELAXED * shrunk + (1 - _RELAXED) * slopes
+            source += rho_slopes * slopes_adjoint(relaxed_slopes + dual_slopes)
+            total = total + rho_slopes * laplacian
+        if prior.bounded:
+            target = smooth - dual_inside
+            inside = np.clip(target, *prior.bounds)
+            pressed = rho_inside * (target - inside)
+            relaxed_inside = _RELAXED * inside + (1 - _RELAXED) * smooth
+            source += rho_inside * (relaxed_inside + dual_inside)
+            total = total + rho_inside
+        smooth = idctn(dctn(source, norm="ortho") / total, norm="ortho") if weight else source / total
         slopes = slopes_of(smooth)
-        rho_slopes = weight / max(float(lengths(slopes).mean()), _NOTHING)
-        # Without bounds nothing is held to them.
-        inside, rho_inside = np.clip(smooth, *self.prior.bounds), rho if self.prior.bounded else 0.0
-        dual, dual_slopes, dual_inside = np.zeros_like(smooth), np.zeros_like(slopes), np.zeros_like(smooth)
-        rows, columns = (2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in smooth.shape)
-        laplacian = rows[:, None] + columns
-        spent, relative = 0, float("inf")
-        while spent < iterations and relative > tolerance:
-            spent += 1
-            target = smooth - dual
-            seen, kept = self.prepared.coefficients(target), rho / (ridge + rho)
-            # Directions outside the basis (under-determined sides) are not measured: they keep the target.
-            updated = kept * target + self.prepared.image((data + rho * seen) / (squared + rho) - kept * seen)
-            before, before_inside = smooth, inside
-            source = rho * (_RELAXED * updated + (1 - _RELAXED) * smooth + dual)
-            total: FloatArray | float = rho
-            bounded, pressed = dual_slopes, dual_inside
-            if weight:
-                target = slopes - dual_slopes
-                length = lengths(target)
-                shrunk = target * (np.maximum(length - weight / rho_slopes, 0.0) / np.maximum(length, _NOTHING))
-                bounded = rho_slopes * (target - shrunk)
-                relaxed_slopes = _RELAXED * shrunk + (1 - _RELAXED) * slopes
-                source += rho_slopes * slopes_adjoint(relaxed_slopes + dual_slopes)
-                total = total + rho_slopes * laplacian
-            if self.prior.bounded:
-                target = smooth - dual_inside
-                inside = np.clip(target, *self.prior.bounds)
-                pressed = rho_inside * (target - inside)
-                relaxed_inside = _RELAXED * inside + (1 - _RELAXED) * smooth
-                source += rho_inside * (relaxed_inside + dual_inside)
-                total = total + rho_inside
-            smooth = idctn(dctn(source, norm="ortho") / total, norm="ortho") if weight else source / total
-            slopes = slopes_of(smooth)
-            dual += _RELAXED * updated + (1 - _RELAXED) * before - smooth
-            if weight:
-                dual_slopes += relaxed_slopes - slopes
-            if self.prior.bounded:
-                dual_inside += relaxed_inside - smooth
-            if spent % _JUDGED_EACH == 0 or spent == iterations:
-                image = np.clip(smooth, *self.prior.bounds)
-                objective = self._objective(image)
-                parts = self._gap(image, bounded, pressed)
-                relative = sum(parts) / max(objective, _SINGLE * problem.energy, _NOTHING)
-                # Gradients that are bound too tightly leave the data behind, and the other way round.
-                factor = _towards(*parts, power=0.25)
-                rho_slopes, dual_slopes = rho_slopes * factor, dual_slopes / factor
-            if spent % _BALANCED_EACH == 0:
-                # Primal and dual residual, each over what it is a difference of (Boyd et al., sections 3.3 and 3.4.1).
-                apart = _norm(updated - smooth) / max(_norm(updated), _norm(smooth), _NOTHING)
-                moved = _norm(smooth - before) / max(_norm(dual), _NOTHING)
+        dual += _RELAXED * updated + (1 - _RELAXED) * before - smooth
+        if weight:
+            dual_slopes += relaxed_slopes - slopes
+        if prior.bounded:
+            dual_inside += relaxed_inside - smooth
+        if spent % _JUDGED_EACH == 0 or spent == iterations:
+            image = np.clip(smooth, *prior.bounds)
+            objective = _objective(prepared, problem, prior, image)
+            parts = _gap(prepared, problem, prior, image, bounded, pressed)
+            relative = sum(parts) / max(objective, _SINGLE * problem.energy, _NOTHING)
+            # Gradients that are bound too tightly leave the data behind, and the other way round.
+            factor = _towards(*parts, power=0.25)
+            rho_slopes, dual_slopes = rho_slopes * factor, dual_slopes / factor
+        if spent % _BALANCED_EACH == 0:
+            # Primal and dual residual, each over what it is a difference of (Boyd et al., sections 3.3 and 3.4.1).
+            apart = _norm(updated - smooth) / max(_norm(updated), _norm(smooth), _NOTHING)
+            moved = _norm(smooth - before) / max(_norm(dual), _NOTHING)
+            factor = _towards(apart, moved, power=0.5)
+            rho, dual = rho * factor, dual / factor
+            if prior.bounded:
+                apart = _norm(inside - smooth) / max(_norm(inside), _norm(smooth), _NOTHING)
+                moved = _norm(inside - before_inside) / max(_norm(dual_inside), _NOTHING)
                 factor = _towards(apart, moved, power=0.5)
-                rho, dual = rho * factor, dual / factor
-                if self.prior.bounded:
-                    apart = _norm(inside - smooth) / max(_norm(inside), _norm(smooth), _NOTHING)
-                    moved = _norm(inside - before_inside) / max(_norm(dual_inside), _NOTHING)
-                    factor = _towards(apart, moved, power=0.5)
-                    rho_inside, dual_inside = rho_inside * factor, dual_inside / factor
-        return np.asarray(np.clip(smooth, *self.prior.bounds)), spent, relative
+                rho_inside, dual_inside = rho_inside * factor, dual_inside / factor
+    return np.asarray(np.clip(smooth, *prior.bounds)), spent, relative
 
-    def _objective(self, image: FloatArray) -> float:
-        misfit = self.problem.projected - self.problem.sigma * self.prepared.coefficients(image)
-        variation = self.prior.weight * float(lengths(slopes_of(image)).sum()) if self.prior.weight else 0.0
-        return 0.5 * float(np.square(misfit).sum() + self.prior.ridge * np.square(image).sum()) + variation
 
-    def _gap(self, image: FloatArray, bounded: FloatArray, pressed: FloatArray) -> tuple[float, float]:
-        problem = self.problem
-        pull, variation = pressed, self.prior.slack(image, pressed)
-        if self.prior.weight:
-            slopes = slopes_of(image)
-            variation += self.prior.weight * float(lengths(slopes).sum()) - float(np.sum(bounded * slopes))
-            pull = pull + slopes_adjoint(bounded)
-        pull = pull + self.prior.ridge * image
-        along, seen = self.prepared.coefficients(pull), self.prepared.coefficients(image)
-        unmeasured = float(np.square(pull - self.prepared.image(along)).sum())
-        squared = np.square(problem.sigma) + self.prior.ridge
-        gradient = np.square(problem.sigma * (problem.sigma * seen - problem.projected) + along)
-        dampings, reach = problem.scale * _DAMPINGS, float(np.square(image).sum())
-        quadratic = min(
-            0.5 * (float(np.sum(gradient / (squared + mu))) + unmeasured / (self.prior.ridge + mu) + mu * reach)
-            for mu in dampings.tolist()
-        )
-        return max(variation, 0.0), quadratic
+def _objective(prepared: Prepared, problem: DiagonalProblem, prior: Prior, image: FloatArray) -> float:
+    misfit = problem.projected - problem.sigma * prepared.coefficients(image)
+    variation = prior.weight * float(lengths(slopes_of(image)).sum()) if prior.weight else 0.0
+    return 0.5 * float(np.square(misfit).sum() + prior.ridge * np.square(image).sum()) + variation
+
+
+def _gap(
+    prepared: Prepared,
+    problem: DiagonalProblem,
+    prior: Prior,
+    image: FloatArray,
+    bounded: FloatArray,
+    pressed: FloatArray,
+) -> tuple[float, float]:
+    variation, pull = 0.0, pressed + prior.ridge * image
+    for part, bound in zip((np.minimum(pressed, 0.0), np.maximum(pressed, 0.0)), prior.bounds, strict=True):
+        # Nothing pushes against a bound that is not there.
+        variation += float(np.sum(part * (bound - image))) if math.isfinite(bound) else 0.0
+    if prior.weight:
+        slopes = slopes_of(image)
+        variation += prior.weight * float(lengths(slopes).sum()) - float(np.sum(bounded * slopes))
+        pull = pull + slopes_adjoint(bounded)
+    along, seen = prepared.coefficients(pull), prepared.coefficients(image)
+    unmeasured = float(np.square(pull - prepared.image(along)).sum())
+    squared = np.square(problem.sigma) + prior.ridge
+    gradient = np.square(problem.sigma * (problem.sigma * seen - problem.projected) + along)
+    dampings, reach = problem.scale * _DAMPINGS, float(np.square(image).sum())
+    quadratic = min(
+        0.5 * (float(np.sum(gradient / (squared + mu))) + unmeasured / (prior.ridge + mu) + mu * reach)
+        for mu in dampings.tolist()
+    )
+    return max(variation, 0.0), quadratic
 
 
 def _towards(first: float, second: float, power: float) -> float:
@@ -319,7 +316,8 @@ class Solver(Protocol):
 class Tikhonov(Solver):
     """Least squares with lambda ||X||^2 in closed form."""
 
-    name, linear, whole = TIKHONOV, True, False
+    name: str = TIKHONOV
+    linear, whole = True, False
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         prepared = prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
@@ -343,27 +341,19 @@ class Markov(Tikhonov):
         return super().init(camera, patterns).with_correlation()
 
 
-class Nonnegative(Tikhonov):
-    """Least squares among images within bounds, by iterations."""
+class ByIterations(Tikhonov):
+    """Least squares within bounds, or with total variation."""
 
-    name, linear = NONNEGATIVE, False
+    linear = False
 
-    def compute(
-        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
-    ) -> Solution:
-        return solve_nonnegative(prepared, frames, lam, **iterative)
-
-
-class TotalVariation(Tikhonov):
-    """Least squares with lambda times the total variation of X within bounds, by iterations."""
-
-    name, linear = TV, False
+    def __init__(self, name: str, solve: Callable[..., Solution]) -> None:
+        self.name, self._solve = name, solve
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        return solve_tv(prepared, frames, lam, **iterative)
+        return self._solve(prepared, frames, lam, **iterative)
 
 
-_ALL = Tikhonov(), Markov(), Nonnegative(), TotalVariation()
+_ALL = Tikhonov(), Markov(), ByIterations(NONNEGATIVE, solve_nonnegative), ByIterations(TV, solve_tv)
 SOLVERS: dict[str, Solver] = {solver.name: solver for solver in _ALL}

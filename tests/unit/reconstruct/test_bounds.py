@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear, nnls
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from mitsim.reconstruct.solvers import Prior, solve_nonnegative, solve_tv
+from mitsim.reconstruct.solvers import solve_nonnegative, solve_tv
 
 SIZE = 9
 
@@ -80,14 +80,6 @@ def test_total_variation_within_bounds_is_least_there() -> None:
     for other in others:
         for step in (1e-3, 1e-2, 1.0):
             assert objective(held.image + step * (other - held.image)) >= held.objective * (1 - 1e-7)
-
-
-def test_what_pushes_against_no_bound_is_no_bound() -> None:
-    """Slack of multipliers: 0 at the bound that they push against, infinite where there is none."""
-    prior, image = Prior(bounds=(0.0, np.inf)), np.array([0.0, 2.0])
-    assert prior.slack(image, np.array([-3.0, 0.0])) == 0 and prior.slack(image, np.array([0.0, -3.0])) == 6
-    assert prior.slack(image, np.array([0.0, 1e-9])) == np.inf
-    assert Prior(bounds=(0.0, 2.5)).slack(image, np.array([0.0, 2.0])) == 1
 
 
 def test_too_few_steps_are_said_and_no_steps_refused() -> None:

@@ -10,7 +10,7 @@ from skimage.transform import resize
 from mitsim.metrics import psnr
 from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from mitsim.reconstruct.solvers import automatic_weight, solve_tv
+from mitsim.reconstruct.solvers import solve_tv
 
 SIZE = 12
 
@@ -147,7 +147,7 @@ def test_the_automatic_weight_serves_little_and_much_noise(noise: float) -> None
     truth = resize(data.page() / 255, (side, side), anti_aliasing=True)
     frame = left @ truth @ right.T
     prepared, sums = seen(left, right, frame + noise * frame.mean() * draws.normal(size=frame.shape))
-    automatic = automatic_weight(prepared.problem(sums))
+    automatic = solve_tv(prepared, sums, iterations=1).lam
 
     def quality(weight: float) -> float:
         return psnr(solve_tv(prepared, sums, weight, tolerance=1e-3).image, truth)
