@@ -352,11 +352,7 @@ class _Side:
 
 class _Check:
     def __init__(
-        self,
-        sums: tuple[StripeSums, StripeSums],
-        signs: FloatArray,
-        order: Sequence[Half],
-        name: Callable[[Half], str],
+        self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, order: Sequence[Half], name: Callable[[Half], str]
     ) -> None:
         self.signs, self.name, self.count = signs, name, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
