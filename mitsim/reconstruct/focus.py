@@ -15,10 +15,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
+from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 
 from mitsim.core.arrays import FloatArray
@@ -212,20 +213,12 @@ class FactorOfDepths:
         rows, count = self.factor.shape
         unlike, changes = [np.zeros(1)], [np.zeros((1, _DEGREE + 1))]
         apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
+        between = CubicSpline(np.arange(count), self.factor, axis=1)
         for offset in (*apart, *-apart):
             column = np.arange(count) - offset * self._step
             to = np.flatnonzero((column >= 0) & (column <= count - 1))
             row = np.arange(max(0, -offset), min(rows, rows - offset))[:, None]
-            start = np.clip(np.floor(column[to]).astype(np.intp) - 1, 0, count - _NEIGHBOURS)
-            t = column[to] - start
-            weights = (
-                -(t - 1) * (t - 2) * (t - 3) / 6,
-                t * (t - 2) * (t - 3) / 2,
-                -t * (t - 1) * (t - 3) / 2,
-                t * (t - 1) * (t - 2) / 6,
-            )  # of a cubic through four columns
-            own = self.factor[row, to]
-            same = sum(weight * self.factor[row + offset, start + k] for k, weight in enumerate(weights))
+            own, same = self.factor[row, to], between(column[to])[row[:, 0] + offset]
             weight = np.sqrt(np.maximum((own + same).sum(axis=0) / 2, 0.0))
             unlike.append(np.divide((own - same).sum(axis=0), weight, out=np.zeros(to.size), where=weight > 0))
             powers = [np.polynomial.polynomial.polyvander(self._across(place), _DEGREE) for place in (to, column[to])]
@@ -244,36 +237,30 @@ _SPLINE_ROWS = 5
 """Rows to either side that a row's spline is fitted to: 2, 3 and 5 leave 1.9e-3, 1.7e-3 and 1.5e-3."""
 _SPLINE_KNOTS = 4
 _STIFFNESS = 1e-2
-_THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
 class ColumnSpline:
     def __init__(self, factor: FloatArray, step: float) -> None:
         rows, count = factor.shape
         self._last, reach = (count - 1) * _SPLINE_KNOTS, min(_SPLINE_ROWS, (rows - 1) // 2)
-        self._coefficients = np.empty((rows, self._last + 3))
+        size = self._last + 3
+        self._coefficients, bends = np.empty((rows, size)), sparse.csr_array(np.diff(np.eye(size), 3, axis=0))
         # Rows away from the edges have equal neighbours, and therefore one normal matrix.
         groups = [(np.arange(reach, rows - reach), np.arange(-reach, reach + 1))]
         for row in (*range(reach), *range(rows - reach, rows)):
             first = min(max(row - reach, 0), rows - 2 * reach - 1)
             groups.append((np.array([row]), np.arange(first, first + 2 * reach + 1) - row))
         for own, neighbours in groups:
-            place = (np.arange(count) + neighbours[:, None] * step) * _SPLINE_KNOTS
-            start, parts = self._weights(place)
-            weights = np.where((place >= 0) & (place <= self._last), parts, 0.0)
-            normal, data = np.zeros((4, self._last + 3)), np.zeros((self._last + 3, len(own)))
-            for a, b in product(range(4), repeat=2):
-                if b >= a:
-                    both = (weights[a] * weights[b]).ravel()
-                    normal[b - a] += np.bincount((start + a).ravel(), both, self._last + 3)
-                    normal[b - a, a : self._last + a] += _STIFFNESS * _THIRD[a] * _THIRD[b]
-            for k, first, parts in zip(neighbours, start, np.moveaxis(weights, 1, 0), strict=True):
-                seen = factor[own + k].T
-                for a, part in enumerate(parts):
-                    # Columns are whole knots apart, so no place is named twice but by those without weight.
-                    inside = part != 0
-                    data[first[inside] + a] += part[inside, None] * seen[inside]
-            self._coefficients[own] = solveh_banded(normal, data, lower=True).T
+            place = ((np.arange(count) + neighbours[:, None] * step) * _SPLINE_KNOTS).ravel()
+            start, weights = self._weights(place)
+            parts = np.where((place >= 0) & (place <= self._last), weights, 0.0).ravel()
+            columns, equations = (start + np.arange(4)[:, None]).ravel(), np.tile(np.arange(place.size), 4)
+            design = sparse.csr_array((parts, (equations, columns)), shape=(place.size, size))
+            normal, bands = design.T @ design + _STIFFNESS * bends.T @ bends, np.zeros((4, size))
+            for k in range(4):
+                bands[k, : size - k] = normal.diagonal(-k)
+            seen = factor[own[:, None] + neighbours].reshape(len(own), -1)
+            self._coefficients[own] = solveh_banded(bands, design.T @ seen.T, lower=True).T
 
     def at(self, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
         start, weights = self._weights(column * _SPLINE_KNOTS)

@@ -43,7 +43,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +52,7 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
+from mitsim.reconstruct.request import TIKHONOV, TV, Bounds
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import check_lambda
 from mitsim.reconstruct.solvers import Prior, lengths, slopes_adjoint, slopes_of
@@ -390,7 +391,7 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
 
 # ---- The weight of the prior, and the misfit -------------------------------------------------------------------------
 
-RIDGE, WEIGHT = 50.0, 1.2
+_RIDGE, _WEIGHT = 50.0, 1.2
 """Lambda over the mean square of a pixel's light, by relative error; TV's weight in units of the gradient's error."""
 _CLEARLY = 2.0
 _SIDE, _STEPS = 128, 60
@@ -452,7 +453,7 @@ def frame_error(light: ShiftedLight, frames: Array) -> float:
     before, here, after = (error(half) for half in (best - 1, best, best + 1))
     # The vertex of the parabola through these three.
     place = best + (before - after) / 2 / max(before - 2 * here + after, 1e-300)
-    level = mean * 10 ** (place / 2) / RIDGE
+    level = mean * 10 ** (place / 2) / _RIDGE
     return level if level > _CLEARLY * noise else noise
 
 
@@ -563,6 +564,53 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
         reading=reading,
         off=(off[0] - (rows - 1) / 2, off[1] - (columns - 1) / 2),
         size=(rows, columns),
+    )
+
+
+# ---- The image, and its weight ---------------------------------------------------------------------------------------
+
+
+def solve_point_spread(
+    light: ShiftedLight,
+    frames: Array,
+    method: str,
+    lam: float | Literal["auto"] = "auto",
+    bounds: Bounds | None = None,
+    iterations: int = 300,
+    tolerance: float = 0.02,
+) -> Solution:
+    """Return the image of all frames (K K', m, m')."""
+    light.check_frames(frames)
+    if iterations < 1:
+        raise MitsimError(f"iterations are {iterations}; give at least 1")
+    prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
+    frames = frames.astype(light.precision)
+    if lam != "auto":
+        known = check_lambda(lam)
+    elif method == TV:
+        known = _WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power)
+    elif light.patterns is None:
+        known = _RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power
+    else:
+        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
+    prior = replace(prior, weight=known) if method == TV else replace(prior, ridge=known)
+    energy = float(np.vdot(frames, frames))
+    found = minimise(light, frames, prior, iterations, tolerance)
+    residual = light.image_of(found.image) - frames
+    figures = f"Objective {found.objective:.4g}."
+    lowered = f"the last half of {found.iterations} iterations lowered the objective by {found.fall:.1%}"
+    if found.fall <= tolerance:
+        status = Status(Verdict.SOLVED, f"Converged: {lowered}", "", figures)
+    else:
+        remedy = "take a larger lambda, or allow more iterations"
+        status = Status(Verdict.NOT_CONVERGED, f"Not converged: {lowered} or more", remedy, figures)
+    return Solution(
+        image=np.asarray(found.image[light.window], np.float64),
+        lam=prior.weight or prior.ridge,
+        residual=math.sqrt(float(np.vdot(residual, residual)) / energy) if energy else 0.0,
+        status=status,
+        iterations=found.iterations,
+        objective=found.objective,
     )
 
 

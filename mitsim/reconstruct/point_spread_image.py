@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,70 +15,11 @@ from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.devices.mask_profile import load_psf
-from mitsim.reconstruct.point_spread import (
-    RIDGE,
-    WEIGHT,
-    Array,
-    ShiftedLight,
-    find_fit,
-    frame_error,
-    minimise,
-    reduce_frame,
-)
+from mitsim.reconstruct.point_spread import ShiftedLight, find_fit, reduce_frame, solve_point_spread
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
-from mitsim.reconstruct.request import TIKHONOV, TV, Bounds, ImageRequest
-from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.solver import check_lambda
-from mitsim.reconstruct.solvers import Prior
+from mitsim.reconstruct.request import TIKHONOV, Bounds, ImageRequest
 
 _NUMBERS = 24
-
-
-# ---- The image -------------------------------------------------------------------------------------------------------
-
-
-def solve_point_spread(
-    light: ShiftedLight,
-    frames: Array,
-    method: str,
-    lam: float | Literal["auto"] = "auto",
-    bounds: Bounds | None = None,
-    iterations: int = 300,
-    tolerance: float = 0.02,
-) -> Solution:
-    """Return the image of all frames (K K', m, m')."""
-    light.check_frames(frames)
-    if iterations < 1:
-        raise MitsimError(f"iterations are {iterations}; give at least 1")
-    prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
-    frames = frames.astype(light.precision)
-    if lam != "auto":
-        known = check_lambda(lam)
-    elif method == TV:
-        known = WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power)
-    elif light.patterns is None:
-        known = RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power
-    else:
-        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
-    prior = replace(prior, weight=known) if method == TV else replace(prior, ridge=known)
-    energy = float(np.vdot(frames, frames))
-    found = minimise(light, frames, prior, iterations, tolerance)
-    residual = light.image_of(found.image) - frames
-    figures = f"Objective {found.objective:.4g}."
-    lowered = f"the last half of {found.iterations} iterations lowered the objective by {found.fall:.1%}"
-    if found.fall <= tolerance:
-        status = Status(Verdict.SOLVED, f"Converged: {lowered}", "", figures)
-    else:
-        remedy = "take a larger lambda, or allow more iterations"
-        status = Status(Verdict.NOT_CONVERGED, f"Not converged: {lowered} or more", remedy, figures)
-    return Solution(
-        image=np.asarray(found.image[light.window], np.float64),
-        lam=prior.weight or prior.ridge,
-        residual=math.sqrt(float(np.vdot(residual, residual)) / energy) if energy else 0.0,
-        status=status,
-        iterations=found.iterations,
-        objective=found.objective,
-    )
 
 
 # ---- From a run ------------------------------------------------------------------------------------------------------

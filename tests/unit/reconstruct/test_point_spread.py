@@ -20,8 +20,8 @@ from mitsim.reconstruct.point_spread import (
     frame_noise,
     minimise,
     reduce_frame,
+    solve_point_spread,
 )
-from mitsim.reconstruct.point_spread_image import solve_point_spread
 from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solvers import Prior
 from tests.unit.reconstruct.test_tv import SIZE, smoothed_minimum
