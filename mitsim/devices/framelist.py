@@ -407,7 +407,6 @@ def load_flats(folder: Path | str) -> FlatFrames:
 MOST_CAPTURES = 4096
 MOST_TERMS = 4
 """Most codes of a side, because a normal matrix grows with them."""
-Colour = Literal["red", "green", "blue"]
 Orientation = Literal["upright", "mirrored", "upside down", "turned"]
 """How a picture lies as the camera's code runs; turned is both others."""
 Scale = Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)]
@@ -422,8 +421,6 @@ class KnownCapture(Configuration):
     picture: Annotated[str, Field(min_length=1)]
     """File of what was before the camera, of as many pixels as the run's patterns: PNG, TIFF, NPY or OpenEXR, a path
     from the list's folder."""
-    colour: Colour | None = None
-    """Plane of a colour picture that this run shows; none: the picture is grey, or the run has planes of its own."""
 
 
 class KnownList(Configuration):
@@ -447,10 +444,10 @@ class KnownList(Configuration):
 
     @model_validator(mode="after")
     def _each_once(self) -> KnownList:
-        runs = [(each.run, each.colour) for each in self.known]
+        runs = [each.run for each in self.known]
         twice = next((run for run in runs if runs.count(run) > 1), None)
         if twice is not None:
-            raise ValueError(f"known: the run {twice[0]!r} is there twice; name each once")
+            raise ValueError(f"known: the run {twice!r} is there twice; name each once")
         return self
 
 
@@ -490,9 +487,6 @@ def load_known(path: Path | str) -> KnownCaptures:
             )
         manifests = {name: read_manifest(part, RunManifest) for name, part in lines.parts.items()}
         check_plain(found.picture(capture), "picture")
-        if capture.colour is not None and lines.colours is not None:
-            problem = f"list {path}: {capture.run} has planes of its own, so its colour is known"
-            raise MitsimError(f"{problem}; leave colour {capture.colour!r} out")
         if number == 0:
             found = KnownCaptures(path, listed, lines.colours, manifests)
         if unlike := _difference(manifests, found.manifests, capture.run, listed.known[0].run, path):

@@ -205,7 +205,6 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
 
 # ---- Frames and pictures ---------------------------------------------------------------------------------------------
 
-_COLOURS = {"red": 0, "green": 1, "blue": 2}
 _REFLECTANCE = "reflectance"
 _COPIES = 4
 
@@ -223,20 +222,16 @@ class _KnownFrames:
             picture = _light_of_picture(path, listed.gamma)
             self.sums[capture.picture] = checksum(path)
             for line in manifests:
-                problem = ""
                 if captures.lines is not None and line not in PLANES:
-                    problem = f"{capture.run} has the line {line}, whose code is its own; calibrate each line alone"
-                elif picture.ndim == 2 and capture.colour is not None:
-                    problem = f"picture {capture.picture} is grey; leave colour {capture.colour!r} out"
-                elif picture.ndim == 3 and not line and capture.colour is None:
-                    problem = (
-                        f"picture {capture.picture} is in colour; say which plane {capture.run} shows, "
-                        f"colour = {', '.join(map(repr, _COLOURS))}, or give a grey one"
+                    raise MitsimError(
+                        f"list {captures.path}: {capture.run} has the line {line}, whose code is its own; calibrate "
+                        "each line alone"
                     )
-                if problem:
-                    raise MitsimError(f"list {captures.path}: {problem}")
-                colour = "rgb".index(line[0]) if line else _COLOURS[capture.colour or "red"]
-                light = picture if picture.ndim == 2 else picture[:, :, colour]
+                if picture.ndim == 3 and not line:
+                    raise MitsimError(
+                        f"picture {path}: is in colour, and {capture.run} shows one plane; give a grey picture of that"
+                    )
+                light = picture if picture.ndim == 2 else picture[:, :, "rgb".index(line[0])]
                 folder, name = captures.run(capture, line), str(Path(capture.run) / line)
                 shots, saturated = load_run(folder), 0
                 self.sums[name] = checksum(folder / MANIFEST)

@@ -211,7 +211,6 @@ def with_grey(folder: Path, values: FloatArray) -> None:
         (lambda fields: fields["known"].append({"run": "small", "picture": "none.png"}), "none.png"),
         (lambda fields: fields["known"][0].update(picture="tiny.npy"), "is 4 x 4 pixels"),
         (lambda fields: fields["known"][0].update(picture="colour.png"), "is in colour"),
-        (lambda fields: fields["known"][0].update(colour="red"), "is grey"),
         (lambda fields: (fields["known"][0].update(picture="negative.npy"), fields.update(gamma=2.2)), "below 0"),
         (lambda fields: fields["known"][0].update(run="other"), "of another camera"),
         (lambda fields: fields["known"][0].update(picture="black.npy"), "no light"),
