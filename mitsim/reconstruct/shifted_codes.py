@@ -19,7 +19,7 @@ of two vectors only for the right orientation and scale of the scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,6 +131,7 @@ class Side:
 # ---- The fit ---------------------------------------------------------------------------------------------------------
 
 _TURNS, _STILL = 20, 1e-5
+_NO_LIGHT = "known pictures: have no light, or an even one, and tell nothing of the camera; give others"
 _VAGUE, _SMALLEST, _LARGEST = 1e-3, 1e-9, 1e6
 
 
@@ -204,12 +205,38 @@ def fit_codes(
                 added = [light @ light.T / variance, frame @ light.T / variance]
                 place = each.offset[axis]
                 sums[place] = [a + b for a, b in zip(sums[place], added, strict=True)] if place in sums else added
-            codes[axis], alphas[axis], covariances[axis], told[axis] = _solve_side(sides[axis], sums, alphas[axis])
+            own = sides[axis]
+            matrix, data = np.zeros((own.terms * own.length,) * 2), np.zeros(own.terms * own.length)
+            for place, (gram, product) in sums.items():
+                parts = own.normal(place, gram, product)
+                matrix += parts[0]
+                data += parts[1]
+            # The codes of this side by their prior, and the variance of the prior by the numbers that frames tell.
+            level = float(np.trace(matrix)) / len(matrix)
+            if not level > 0:
+                raise MitsimError(_NO_LIGHT)
+            alphas[axis] = np.where(alphas[axis] > 0, alphas[axis], _VAGUE * level)
+            factored = cho_factor(matrix + np.diag(np.repeat(alphas[axis], own.length)))
+            codes[axis] = cho_solve(factored, data).reshape(own.terms, -1)
+            covariances[axis] = cho_solve(factored, np.eye(len(matrix)))
+            unknown = alphas[axis] * np.diag(covariances[axis]).reshape(own.terms, -1).sum(axis=1)
+            numbers = np.maximum(own.length - unknown, 0.0)
+            # Codes that explain nothing would make alpha infinite, and the matrix singular to rounding.
+            sizes = np.maximum(np.square(codes[axis]).sum(axis=1), numbers / (_LARGEST * level))
+            alphas[axis] = np.clip(numbers / np.maximum(sizes, 1e-300), _SMALLEST * level, _LARGEST * level)
+            told[axis] = float(numbers.sum())
             lit = sum(float(np.trace(gram)) for gram, _ in sums.values())
             seen[axis] = float(np.sqrt(told[axis] / (sides[axis].sensor * lit)))
         phis = factors_of(0), factors_of(1)
         models = [phis[0][each.offset[0]] @ each.scene @ phis[1][each.offset[1]].T for each in exposures]
-        gains = fit_gains(exposures, models, [*gains])
+        # The light of each plane.
+        above, below = dict.fromkeys(gains, 0.0), dict.fromkeys(gains, 0.0)
+        for each, model in zip(exposures, models, strict=True):
+            above[each.plane] += float(np.vdot(model, each.frame))
+            below[each.plane] += float(np.vdot(model, model))
+        if not all(energy > 0 for energy in below.values()):
+            raise MitsimError(_NO_LIGHT)
+        gains = {name: above[name] / below[name] for name in gains}
         left_over = [
             np.mean(np.square(each.frame - gains[each.plane] * model))
             for each, model in zip(exposures, models, strict=True)
@@ -218,6 +245,7 @@ def fit_codes(
         explained = 1 - float(np.mean(variances / energies))
         if explained - before < _STILL:
             break
+    # The error of all numbers of a factor, by the covariance of its code.
     for axis, (side, covariance) in enumerate(zip(sides, covariances, strict=True)):
         block = np.zeros((side.terms, side.width, side.terms, side.width))
         whole = covariance.reshape(side.terms, side.length, side.terms, side.length)
@@ -237,40 +265,6 @@ def fit_codes(
         (seen[0] * balance, seen[1] / balance),
         (told[0], told[1]),
     )
-
-
-def _solve_side(
-    own: Side, sums: Mapping[float, Sequence[FloatArray]], before: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    matrix: FloatArray = np.zeros((own.terms * own.length,) * 2)
-    right: FloatArray = np.zeros(len(matrix))
-    for place, (gram, product) in sums.items():
-        parts = own.normal(place, gram, product)
-        matrix += parts[0]
-        right += parts[1]
-    level = float(np.trace(matrix)) / len(matrix)
-    if not level > 0:
-        raise MitsimError("known pictures: have no light, or an even one, and tell nothing of the camera; give others")
-    alphas = np.where(before > 0, before, _VAGUE * level)
-    factored = cho_factor(matrix + np.diag(np.repeat(alphas, own.length)))
-    found = cho_solve(factored, right).reshape(own.terms, -1)
-    covariance = cho_solve(factored, np.eye(len(matrix)))
-    unknown = alphas * np.diag(covariance).reshape(own.terms, -1).sum(axis=1)
-    told = np.maximum(own.length - unknown, 0.0)
-    # Codes that explain nothing would make alpha infinite, and the matrix singular to rounding.
-    energies = np.maximum(np.square(found).sum(axis=1), told / (_LARGEST * level))
-    alphas = np.clip(told / np.maximum(energies, 1e-300), _SMALLEST * level, _LARGEST * level)
-    return found, alphas, covariance, float(told.sum())
-
-
-def fit_gains(exposures: Sequence[Exposure], models: Sequence[FloatArray], planes: Sequence[str]) -> dict[str, float]:
-    above, below = dict.fromkeys(planes, 0.0), dict.fromkeys(planes, 0.0)
-    for each, model in zip(exposures, models, strict=True):
-        above[each.plane] += float(np.vdot(model, each.frame))
-        below[each.plane] += float(np.vdot(model, model))
-    if not all(energy > 0 for energy in below.values()):
-        raise MitsimError("known pictures: have no light, or an even one, and tell nothing of the camera; give others")
-    return {name: above[name] / below[name] for name in planes}
 
 
 # ---- Orientation and scale, by spectra -------------------------------------------------------------------------------
