@@ -64,18 +64,22 @@ class Repeat:
         Text of the file, with whole paths.
     warnings
         Sentences.
+    tables, notes
+        Tables of the file, and lines of comment before them.
     """
 
     text: str
     warnings: tuple[str, ...] = ()
+    tables: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    notes: tuple[str, ...] = field(default=(), repr=False)
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the session file to ``path``, which is replaced, and return the path.
+        """Write the session file to ``path``, which is replaced, with paths as seen from there; return the path.
 
         MitsimError when it cannot be written.
         """
-        write_text(path, self.text)
+        write_text(path, session_text(self.tables, Path(path).absolute().parent, *self.notes))
         return Path(path)
 
 
@@ -101,7 +105,8 @@ def session_of(folder: Path | str) -> Repeat:
     """
     folder = Path(folder)
     if (folder / SUMMARY).is_file() and (folder / SESSION_FILE).is_file():
-        return Repeat(session_text(read_session(folder / SESSION_FILE).tables))
+        tables = read_session(folder / SESSION_FILE).tables
+        return Repeat(session_text(tables), (), tables)
     place, found, coloured = folder.absolute(), _Found(), is_coloured(folder)
     data = read_json(folder / COLOUR) if coloured else {}
     if (folder / RESULT_FILE).is_file() or (isinstance(data, dict) and data.get("kind") == IMAGE):
@@ -122,7 +127,7 @@ def session_of(folder: Path | str) -> Repeat:
         )
     tables = read_session(found.tables).tables  # which refuses values that a damaged folder states
     notes = f"Repeats {place}: mitsim run FILE -o FOLDER", *found.warnings
-    return Repeat(session_text(tables, *notes), tuple(found.warnings))
+    return Repeat(session_text(tables, None, *notes), tuple(found.warnings), tables, notes)
 
 
 @dataclass

@@ -173,8 +173,8 @@ def run(
         for step, task in work:
             if step.verb in OF_A_BENCH:
                 next(task)
-        head = {"kind": KIND, "session": stated(read.tables), "versions": deciding_versions()}
-        results, text = list[StepResult](), session_text(read.tables)
+        head = {"kind": KIND, "session": stated(read.tables, folder), "versions": deciding_versions()}
+        results, text = list[StepResult](), session_text(read.tables, folder)
 
         def note(**more: Any) -> None:
             """Write the finished steps and the one at work, so that a killed session can be resumed."""

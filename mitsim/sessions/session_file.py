@@ -174,23 +174,33 @@ class Session:
 # ---- Text ------------------------------------------------------------------------------------------------------------
 
 
-def session_text(tables: Mapping[str, Any], *notes: str) -> str:
-    """Return the text of a session file, which begins with ``notes`` as comments without line ends."""
+def session_text(tables: Mapping[str, Any], base: Path | None = None, *notes: str) -> str:
+    """Return the text of a session file, which begins with ``notes`` as comments without line ends.
+
+    Paths are written as seen from the folder ``base``, so that the file can be moved with the files that it names.
+    """
     head = "".join(" ".join(f"# {printable(note)}".split()) + "\n" for note in notes)
     parts = [head] if head else []
     for name in (name for name in TABLES if name in tables):
         once = name not in SEVERAL
         # The library writes several short tables as one list on a line, which people read less well.
-        each = [tomli_w.dumps({name: stated(table)}) for table in ([tables[name]] if once else tables[name])]
+        each = [tomli_w.dumps({name: stated(table, base)}) for table in ([tables[name]] if once else tables[name])]
         parts += each if once else [text.replace(f"[{name}]", f"[[{name}]]", 1) for text in each]
     return "\n".join(parts)
 
 
-def stated(value: Any) -> Any:
-    """Return a copy of nested tables and lists without the fields that are None."""
+def stated(value: Any, base: Path | None = None) -> Any:
+    """Return a copy of nested tables and lists without the fields that are None, with paths as seen from ``base``."""
     if isinstance(value, Mapping):
-        return {key: stated(each) for key, each in value.items() if each is not None}
-    return [stated(each) for each in value] if isinstance(value, (list, tuple)) else value
+        return {key: stated(each, base) for key, each in value.items() if each is not None}
+    if isinstance(value, (list, tuple)):
+        return [stated(each, base) for each in value]
+    if base is None or not isinstance(value, str) or not os.path.isabs(value):
+        return value
+    if os.path.commonpath([place := resolve(base), value]) == os.path.sep:
+        return value
+    relative = os.path.relpath(value, place)
+    return relative if os.sep in relative else os.path.join(os.curdir, relative)  # a bare name could be a shipped one
 
 
 def value_of(text: str) -> Any:

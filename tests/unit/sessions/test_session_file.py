@@ -77,7 +77,7 @@ def test_what_is_written_is_read_again(write: Callable[[str], Path]) -> None:
     found = read_session(write(WHOLE), {"scene.camera": 'a "b"\\c.toml', "capture.effects": {"diffraction": False}})
     again = read_session(write(session_text(found.tables)))
     assert (again.scene, again.steps) == (found.scene, found.steps)
-    assert session_text({"scene": {"scene": "x", "odd name": 1e-3}}, "a note") == (
+    assert session_text({"scene": {"scene": "x", "odd name": 1e-3}}, None, "a note") == (
         '# a note\n\n[scene]\nscene = "x"\n"odd name" = 0.001\n'
     )
 
@@ -98,7 +98,7 @@ def test_any_text_is_written_and_read_again(write: Callable[[str], Path], name: 
 def test_a_note_begins_no_table(write: Callable[[str], Path]) -> None:
     """What a manifest brings into a comment stays in it. (Planted: a note that is written with its line ends.)"""
     notes = "a\n[export]\nformat = 'hdf5'", "b\r[study]", "c\x00\x1b[2J\u2028[study]", "d\x85[study]"
-    text = session_text({"scene": {"scene": "x"}, "capture": {}}, *notes)
+    text = session_text({"scene": {"scene": "x"}, "capture": {}}, None, *notes)
     assert read_session(write(text)).tables.keys() == {"scene", "capture"}
     assert all(line.startswith("#") and line.isprintable() for line in text.splitlines()[: len(notes)])
 
@@ -114,6 +114,21 @@ def test_names_of_others_are_refused(write: Callable[[str], Path], output: str) 
     with pytest.raises(ms.MitsimError) as refused:
         read_session(write(f"{SCENE}[capture]\n[calibrate]\noutput = {output!r}\n"))
     assert "calibrate.output" in str(refused.value) and len(str(refused.value).splitlines()) <= 3
+
+
+def test_paths_are_written_as_seen_from_the_file(write: Callable[[str], Path], tmp_path: Path) -> None:
+    """And read again from there; a bare name is no shipped one. (Planted: `photograph` for `./photograph`.)"""
+    (tmp_path / "s").mkdir()
+    for name in ("photograph", "s/camera.toml"):
+        (tmp_path / name).touch()
+    tables = {
+        "scene": {"scene": str(tmp_path / "s" / "photograph"), "camera": str(tmp_path / "s" / "camera.toml")},
+        "reconstruct": [{"run": str(tmp_path / "run"), "calibration": "/elsewhere/cal"}],
+    }
+    text = session_text(tables, tmp_path / "s")
+    assert 'scene = "./photograph"' in text and 'run = "../run"' in text and str(tmp_path) not in text
+    (tmp_path / "s" / "session.toml").write_text(text)
+    assert read_session(tmp_path / "s" / "session.toml").tables == tables
 
 
 def test_fields_are_those_of_the_models() -> None:
