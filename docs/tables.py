@@ -9,11 +9,13 @@ rewrites what stands between ``<!-- fields: NAME -->`` and ``<!-- end -->``, and
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel
 
-from mitsim.cli.shelf_verbs import KINDS, allowed_text, default_text, meanings
+from mitsim.cli.shelf_verbs import KINDS, meanings
 from mitsim.core.imagelist import Crop, Preparation, Raw
 from mitsim.core.manifests import (
     AmbientFile,
@@ -55,6 +57,45 @@ MODELS = (
     *(PairsManifest, Shard, Variation),
     ModelManifest,
 )
+
+
+_PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
+
+
+def default_text(value: object) -> str:
+    """Return a field's default ``value`` in words."""
+    if value is None or value in ({}, (), "") or isinstance(value, BaseModel):
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "infinite" if value == float("inf") else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def allowed_text(rules: Mapping[str, Any]) -> str:
+    """Return the values that a field may have, from the ``rules`` of its JSON schema."""
+    if "anyOf" in rules:
+        choices = rules["anyOf"]
+        return ", ".join("null" if choice.get("type") == "null" else allowed_text(choice) for choice in choices)
+    if "const" in rules or "enum" in rules:
+        return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
+    if "$ref" in rules or rules.get("type") == "object":
+        return "object"
+    if "prefixItems" in rules:
+        return f"list of {len(rules['prefixItems'])}: {allowed_text(rules['prefixItems'][0])}"
+    if rules.get("type") == "array":
+        length = f", at most {rules['maxItems']}" if "maxItems" in rules else ""
+        return f"list: {allowed_text(rules['items'])}{length}"
+    if "pattern" in rules:
+        words = re.fullmatch(r"\^\(([\w|]+)\)\$", rules["pattern"])
+        return ", ".join(f"`{word}`" for word in words[1].split("|")) if words else "text without / and \\"
+    least, above = rules.get("minimum"), rules.get("exclusiveMinimum")
+    most, below = rules.get("maximum"), rules.get("exclusiveMaximum")
+    start = f"{least:g}" if least is not None else f"above {above:g}" if above is not None else ""
+    end = f"{most:g}" if most is not None else f"below {below:g}" if below is not None else ""
+    if start and end:
+        return start if start == end else f"{start} to {end}"
+    kind = _PLAIN.get(rules.get("type", ""), "anything")
+    return f"{kind}, at least {start}" if least is not None else f"{kind}, {start}" if start else kind
 
 
 def table(model: type[BaseModel]) -> str:

@@ -17,7 +17,7 @@ import typer
 import mitsim
 from mitsim.cli.bench_verbs import capture, demo, doctor, pairs, plan, render, run_, study, transport, view
 from mitsim.cli.calibrate_verb import calibrate
-from mitsim.cli.commands import Program, Verb, message_of, parts_of
+from mitsim.cli.commands import Program, Verb, help_of, message_of
 from mitsim.cli.frame_verbs import characterise, export, import_, patterns, reconstruct, report, sense, train
 from mitsim.cli.shelf_verbs import list_, new
 from mitsim.core.errors import MitsimError, printable
@@ -111,6 +111,5 @@ _VERBS = {
 """Verbs by heading, in the order of the help."""
 for _panel, _verbs in _VERBS.items():
     for _verb in _verbs:
-        app.command(
-            _verb.__name__.rstrip("_"), cls=Verb, short_help=parts_of(_verb.__doc__)[0], rich_help_panel=_panel
-        )(_verb)
+        _name, _help = _verb.__name__.rstrip("_"), help_of(_verb.__doc__)
+        app.command(_name, cls=Verb, help=_help, short_help=_help.partition("\n")[0], rich_help_panel=_panel)(_verb)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import mitsim
 from mitsim.bench.request import NO, Coloured, LitScene, Opening, Planned, Request, Task, by_line
 from mitsim.cli.commands import (
-    LINES,
     Common,
     KnownPlan,
     Limited,
@@ -249,50 +248,44 @@ def plan(asked: Planning) -> int:
     return asked.finish({**found.payload(), **written, "kernels": kernels}, lines, found.warnings)
 
 
-_HEAD = "{:16} {:>12} {:>7}  {}"
-"""Columns of a plan: a name, two numbers and words."""
 _WORTH_NAMING = 1e-2
 """Part of the accuracy from which on what is left out is named: two decades, so a hundred may add up to it."""
 
 
 def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
-    """Return the lines that the terminal shows of a ``plan``: its result, then its effects. An effect that is left out
-    is shown if its error is unknown or within two decades of the accuracy; ``everything`` shows all effects with their
-    whole reasons. Effects without room on the screen are named at its end."""
+    """Return the lines that the terminal shows of a ``plan``: its result, then its effects by their size.
 
-    def text(row: PlanRow, words: str) -> str:
-        error = "-" if row.error_if_off is None else f"{row.error_if_off:.1e}" if row.error_if_off else "0"
-        return _HEAD.format(row.name, error, f"{row.seconds:.2f}", words)
+    An effect that is left out is shown if its error is unknown or within two decades of the accuracy; ``everything``
+    shows all effects.
+    """
+    columns = "{:16} {:>12} {:>7}  {}"
+    indent = " " * len(columns.format(*[""] * 4))
 
-    def table(heading: str, words: str, rows: Sequence[PlanRow], room: int) -> tuple[list[str], list[PlanRow]]:
-        """Return the lines of the ``rows`` for which there is ``room`` under two headings, and the other rows."""
-        indent, lines = " " * len(_HEAD.format(*[""] * 4)), [_HEAD.format(heading, "error if off", "seconds", words)]
-        for number, row in enumerate(rows):
-            more = wrap_text(text(row, row.reason or row.state), indent)
-            if len(lines) + len(more) > room:
-                return lines, [*rows[number:]]
-            lines += more
-        return (lines if rows else []), []
+    def table(heading: str, words: str, rows: Sequence[PlanRow]) -> list[str]:
+        lines = [columns.format(heading, "error if off", "seconds", words)] if rows else []
+        for row in rows:
+            error = "-" if row.error_if_off is None else f"{row.error_if_off:.1e}" if row.error_if_off else "0"
+            lines += wrap_text(columns.format(row.name, error, f"{row.seconds:.2f}", row.reason or row.state), indent)
+        return lines
 
     most = math.hypot(plan.systematic_bound, plan.sampling_target)
-    gist = f"Plan at accuracy {plan.accuracy:g}: {plan.predicted_seconds:.3g} s, error up to {most:.1e}"
     stages = ", ".join(f"{name} {seconds:.3g}" for name, seconds in plan.predicted.items())
-    after = [f"Seconds: {stages}", *plan.notes]
+    small = 0.0 if everything else plan.accuracy * _WORTH_NAMING
+    rows = sorted(plan.effects, key=lambda row: -(row.error_if_off or 0.0))
+    left_out = [row for row in rows if row.state == "off" and (row.error_if_off is None or row.error_if_off >= small)]
+    silent = sum(row.state == "off" for row in rows) - len(left_out)
+    lines = [
+        f"Plan at accuracy {plan.accuracy:g}: {plan.predicted_seconds:.3g} s, error up to {most:.1e}",
+        *table("on", "how", [row for row in rows if row.state != "off"]),
+        *table("left out", "why", left_out),
+        *([f"{silent} more that nothing calls for (--all)"] if silent else []),
+        f"Seconds: {stages}",
+        *plan.notes,
+    ]
     if plan.cost:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
-        after.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
-    if everything:
-        texts = [line for row in plan.effects for line in (text(row, row.state), f"    {row.reason}")]
-        return [gist, _HEAD.format("effect", "error if off", "seconds", "state"), *texts, *after]
-    room = LINES - sum(len(wrap_text(line)) for line in (gist, *after)) - 2  # for the names without room
-    rows, small = sorted(plan.effects, key=lambda row: -(row.error_if_off or 0.0)), plan.accuracy * _WORTH_NAMING
-    left_out = [row for row in rows if row.state == "off" and (row.error_if_off is None or row.error_if_off >= small)]
-    off, no_room = table("left out", "why", left_out, room // 2)
-    on, more = table("on", "how", [row for row in rows if row.state != "off"], room - len(off))
-    silent = sum(row.state == "off" for row in rows) - len(left_out)
-    unshown = ", ".join(row.name for row in (*more, *no_room))
-    rest = f"No room for {unshown}, and for {silent}" if unshown else f"{silent} more"
-    return [gist, *on, *off, f"{rest} that nothing calls for (--all)", *after]
+        lines.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
+    return lines
 
 
 # ---- capture ---------------------------------------------------------------------------------------------------------

@@ -3,8 +3,7 @@
 A verb is a function of one model, which declares all that its command line takes; :func:`command` makes the command.
 Errors of the library speak of arguments; :func:`message_of` writes them as options.
 
-Help is plain text, on a terminal or not: rich's panels take half as long again to show, leave a sentence 22 of 80
-characters, and take `mitsim[learn]` for markup.
+Help is plain text, because rich's panels take half as long again to show.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import groupby
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -369,116 +367,55 @@ def message_of(error: MitsimError) -> str:
 
 # ---- Pages of help ---------------------------------------------------------------------------------------------------
 
-_NARROWEST = 30
-"""Columns that a page has at least: an option and a word beside it."""
-_FIRST_COLUMN = 3 / 8
-"""Part of the width that names of options have at most, so that twelve words of 80 columns, and five of 40, fit beside
-them."""
+
+def help_of(text: str | None) -> str:
+    """Return a docstring as click takes it, with its commands, the lines after a $, as they are in the end."""
+    prose, *examples = re.split(r"\n\s*\$ ", inspect.cleandoc(text or ""))
+    return "\n\n".join([prose.rstrip(), "\b\n" + "\n".join(["Examples:", *(f"  {line}" for line in examples)])])
 
 
-def parts_of(text: str | None) -> tuple[str, str, tuple[str, ...]]:
-    """Split the ``text`` of a docstring into its first line, its other prose, and its commands, the lines after a $."""
-    prose, *examples = re.split(r"\n\s*\$ ", (text or "").rstrip())
-    summary, _, more = prose.partition("\n")
-    return summary, more.strip(), tuple(examples)
+def _write_panels(formatter: Any, rows: Iterable[tuple[str, Any]]) -> None:
+    """Write rows of names and meanings under their headings."""
+    panels = dict[str, list[Any]]()
+    for heading, row in rows:
+        panels.setdefault(heading, []).append(row)
+    for heading in sorted(panels, key=lambda each: PANELS.index(each) if each in PANELS else -1):
+        with formatter.section(heading):
+            formatter.write_dl(panels[heading])
 
 
-class _Page:
-    """A page of help, of a verb or of the program."""
-
-    help: str | None
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the page; click alone makes none narrower than 50 columns."""
-        formatter.width = min(formatter.width, max(shutil.get_terminal_size().columns - 2, _NARROWEST))
-        self.format_usage(ctx, formatter)  # type: ignore[attr-defined]
-        summary, more, examples = parts_of(self.help)
-        for text in filter(None, (summary, more)):
-            formatter.write_paragraph()
-            with formatter.indentation():
-                formatter.write_text(text)
-        self.format_options(ctx, formatter)  # type: ignore[attr-defined]
-        if examples:
-            with formatter.section(typer.style("Examples", bold=True)):
-                for line in examples:
-                    formatter.write(f"  {line}\n")
-
-
-class Verb(_Page, TyperCommand):
-    """A verb, whose page has a heading for each panel of its options, and examples in the end."""
-
-    def format_usage(self, ctx: Any, formatter: Any) -> None:
-        """Write the line of required arguments and options."""
-        words = [
-            f"{each.opts[0]} {each.metavar}" if _is_option(each) else str(each.metavar)
-            for each in self.params
-            if each.required or not _is_option(each)
-        ]
-        formatter.write_usage(ctx.command_path, " ".join([*words, "[OPTIONS]"]))
+class Verb(TyperCommand):
+    """Verb whose page has a heading for each panel of its options."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options, by panels."""
-        panels: dict[str, list[tuple[str, str]]] = {name: [] for name in ("Arguments", *PANELS)}
-        for each in self.get_params(ctx):
-            name = (getattr(each, "rich_help_panel", None) or OUTPUT) if _is_option(each) else "Arguments"
-            panels[name].append(_row(each))
-        _write_panels(panels, formatter)
+        rows = ((_heading(each), each.get_help_record(ctx)) for each in self.get_params(ctx))
+        _write_panels(formatter, (row for row in rows if row[1]))
 
 
-class Program(_Page, TyperGroup):
-    """The program, whose page has its verbs by panels, a whole line for each."""
+class Program(TyperGroup):
+    """Program whose page has its verbs by panels."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write verbs and options."""
-        panels = groupby(self.commands.values(), lambda verb: verb.rich_help_panel)  # type: ignore[attr-defined]
-        named = {name: [(str(verb.name), parts_of(verb.help)[0]) for verb in verbs] for name, verbs in panels}
-        _write_panels(named, formatter)
-        _write_panels({"Options": [_row(each) for each in self.get_params(ctx)]}, formatter)
+        verbs = ((verb.rich_help_panel, (name, verb.short_help)) for name, verb in self.commands.items())  # type: ignore[attr-defined]
+        _write_panels(formatter, [*verbs, *(("Options", each.get_help_record(ctx)) for each in self.get_params(ctx))])
 
 
-def _write_panels(panels: Mapping[str, Sequence[tuple[str, str]]], formatter: Any) -> None:
-    """Write rows of names and meanings under their headings, with the same columns for all headings."""
-    most = int(_FIRST_COLUMN * formatter.width)
-    width = max((len(name) for rows in panels.values() for name, _ in rows if len(name) <= most), default=0)
-    for heading, rows in panels.items():
-        if rows:
-            with formatter.section(typer.style(heading, bold=True)):  # which is left out where nobody would see it
-                formatter.write_dl([(name.ljust(width), meaning) for name, meaning in rows], col_max=width)
-
-
-def _is_option(parameter: Any) -> bool:
-    return bool(parameter.param_type_name == "option")
-
-
-def _row(parameter: Any) -> tuple[str, str]:
-    """Return the names of a ``parameter``, the shortest first, and its meaning, limits and default."""
-    if _is_option(parameter):
-        names = ", ".join(sorted(parameter.opts, key=len))
-        name = names if parameter.is_flag or not parameter.metavar else f"{names} {parameter.metavar}"
-        needed = "required" if parameter.required else ""
-    else:
-        name, needed = str(parameter.metavar), ""
-    least, most = (getattr(parameter, end, None) for end in ("min", "max"))
-    allowed = f"{least} to {most}" if most is not None else f"at least {least}" if least is not None else ""
-    shown, value = parameter.show_default, parameter.default
-    if isinstance(shown, str):
-        default = f"default {shown}"
-    elif not shown or value in (None, "", ()) or isinstance(value, bool):
-        default = ""
-    else:
-        default = f"default {value:g}" if isinstance(value, float) else f"default {value}"
-    return name, "; ".join(filter(None, [parameter.help, allowed, default, needed]))
+def _heading(parameter: Any) -> str:
+    is_option = parameter.param_type_name == "option"
+    return (getattr(parameter, "rich_help_panel", None) or OUTPUT) if is_option else "Arguments"
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
 
-COLUMNS, LINES = 80, 24
-"""Size of the usual terminal, and of what is no terminal."""
+COLUMNS = 80
+"""Width of the usual terminal, and of what is no terminal."""
 
 
 def wrap_text(text: str, indent: str = "") -> list[str]:
     """Wrap a ``text`` to the width of the terminal. Further lines follow an ``indent``; names and paths stay whole."""
-    width = shutil.get_terminal_size((COLUMNS, LINES)).columns
+    width = shutil.get_terminal_size((COLUMNS, 24)).columns
     indent = indent or text[: len(text) - len(text.lstrip())] or "  "
     lines = textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return lines or [""]

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 from pydantic import BaseModel
-from pydantic_core import PydanticUndefined
 
 from mitsim.cli.commands import Common, argument, command, to_make
 from mitsim.core.configuration import (
@@ -176,7 +175,7 @@ _MASKS: dict[str, dict[str, Any]] = {
 picture beside the file."""
 _FEATURE_MM = 0.06
 """Side of a feature of the shipped scenes' mask."""
-_HEAD = "# To set a field after a #, take the # away, and that of its table; what it says is its default.", ""
+_HEAD = "# Further fields are in docs/formats.md.", ""
 _CAPTURE = "mitsim capture photograph -o run --patterns dots:7 --camera {}"
 
 
@@ -265,7 +264,7 @@ class Beginning(Common):
 def new(asked: Beginning) -> int:
     """A file to begin with: commented, whole, valid as it is.
 
-    Each field says what it is and what it may be. A mask is a camera file with a table [mask], a recipe is of
+    A mask is a camera file with a table [mask], a recipe is of
     calibrate --recipe, a list is of import --list.
 
     $ mitsim new camera mine
@@ -312,20 +311,12 @@ def new(asked: Beginning) -> int:
 
 # ---- Fields of a file, explained -------------------------------------------------------------------------------------
 
-_PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
-_WIDTH = 100
-"""Columns of a comment, so that a file fits beside its neighbour on a screen."""
-
 
 def meanings(model: type[BaseModel]) -> dict[str, str]:
-    """Return the meaning of each field of a ``model``: the first paragraph of the docstring below the field. Without
-    the source it is empty."""
+    """Return the meaning of each field of a ``model``: the first paragraph of the docstring below the field."""
     found: dict[str, str] = {}
     for base in reversed([one for one in model.__mro__ if issubclass(one, BaseModel) and one.model_fields]):
-        try:
-            (written,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        except (OSError, TypeError, SyntaxError):
-            continue
+        (written,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
         for field, below in itertools.pairwise(getattr(written, "body", [])):
             text = getattr(getattr(below, "value", None), "value", None)
             if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(text, str):
@@ -335,81 +326,20 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
     return found
 
 
-def default_text(value: object) -> str:
-    """Return a field's default ``value`` in words."""
-    if value is None or value in ({}, (), "") or isinstance(value, BaseModel):
-        return "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "infinite" if value == float("inf") else f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def allowed_text(rules: Mapping[str, Any]) -> str:
-    """Return the values that a field may have, from the ``rules`` of its JSON schema."""
-    if "anyOf" in rules:
-        choices = rules["anyOf"]
-        return ", ".join("null" if choice.get("type") == "null" else allowed_text(choice) for choice in choices)
-    if "const" in rules or "enum" in rules:
-        return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
-    if "$ref" in rules or rules.get("type") == "object":
-        return "object"
-    if "prefixItems" in rules:
-        return f"list of {len(rules['prefixItems'])}: {allowed_text(rules['prefixItems'][0])}"
-    if rules.get("type") == "array":
-        length = f", at most {rules['maxItems']}" if "maxItems" in rules else ""
-        return f"list: {allowed_text(rules['items'])}{length}"
-    if "pattern" in rules:
-        words = re.fullmatch(r"\^\(([\w|]+)\)\$", rules["pattern"])
-        return ", ".join(f"`{word}`" for word in words[1].split("|")) if words else "text without / and \\"
-    least, above = rules.get("minimum"), rules.get("exclusiveMinimum")
-    most, below = rules.get("maximum"), rules.get("exclusiveMaximum")
-    start = f"{least:g}" if least is not None else f"above {above:g}" if above is not None else ""
-    end = f"{most:g}" if most is not None else f"below {below:g}" if below is not None else ""
-    if start and end:
-        return start if start == end else f"{start} to {end}"
-    kind = _PLAIN.get(rules.get("type", ""), "anything")
-    return f"{kind}, at least {start}" if least is not None else f"{kind}, {start}" if start else kind
-
-
 def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") -> Iterator[str]:
-    """Iterate over the lines of a file of a ``model``, which explain every field; fields without a value follow a #.
+    """Iterate over the lines of a file of a ``model`` with these ``values``, each below its meaning.
 
-    Parameters
-    ----------
-    model
-        Model of the file.
-    values
-        Fields that are set; they make the file whole.
-    table
-        Name of the table that the fields are in; empty for none.
+    ``table`` is the name of the table that the fields are in; empty for none.
     """
-
-    def comment(text: str) -> list[str]:
-        text = text[0].upper() + text[1:] if text[1].islower() or text[1] == " " else text
-        return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False)
-
-    def model_of(kind: Any) -> type[BaseModel] | None:
-        """Return the model of a table; None for other fields and for lists of tables."""
-        kinds = (each for each in (kind, *get_args(kind)) if isinstance(each, type))
-        return next((each for each in kinds if issubclass(each, BaseModel)), None)
-
-    parts = {name: model_of(field.annotation) for name, field in model.model_fields.items()}
-    schema, known = model.model_json_schema()["properties"], meanings(model)
+    known = meanings(model)
     if table:
-        yield f"{'' if values else '#'}[{table}]"
-    plain = [name for name, part in parts.items() if part is None]
-    given = [name for name in plain if name in values]
-    for name in (*given, *(name for name in plain if name not in values)):
-        if given and name not in values:
-            yield from ("", *comment("Further fields."))
-            given = []
-        allowed = allowed_text(schema[name]).replace("`", "").removesuffix(", null")
-        default = model.model_fields[name].default
-        lacks = default is PydanticUndefined or default_text(default) in ("none", "infinite")
-        yield from comment(f"{known[name]}. Allowed: {allowed}.")
-        shown = "..." if lacks else toml_value(default)
-        yield f"{name} = {toml_value(values[name])}" if name in values else f"#{name} = {shown}"
-    for name, part in parts.items():
-        if part is not None:
-            yield from ("", *comment(f"{known[name]}."))
-            yield from starter(part, values.get(name) or {}, f"{table}.{name}".removeprefix("."))
+        yield f"[{table}]"
+    for name, value in sorted(values.items(), key=lambda each: isinstance(each[1], Mapping)):
+        text = f"{known[name][0].upper()}{known[name][1:]}."
+        comment = textwrap.wrap(text, 100, initial_indent="# ", subsequent_indent="# ")
+        if isinstance(value, Mapping):
+            kinds = [model.model_fields[name].annotation, *get_args(model.model_fields[name].annotation)]
+            part = next(kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel))
+            yield from ("", *comment, *starter(part, value, f"{table}.{name}".removeprefix(".")))
+        else:
+            yield from (*comment, f"{name} = {toml_value(value)}")
