@@ -57,14 +57,12 @@ def test_modelled_factors_are_a_calibration_that_says_so(call: Callable[..., Any
 
 
 REFUSED = [
-    (("--plan",), ("--plan: give the PSNR",)),
+    (("--plan",), ("the PSNR that the image is to have",)),
     (("--plan", "--psnr", 0), ("--psnr 0", "1 to 100 dB")),
     (("--plan", "--psnr", 20, "--patterns", "stars"), ("stars",)),
     (("--plan", "--psnr", 20, "--resume"), ("--resume",)),
-    (("--plan", "--psnr", 20, "--model", "wave"), ("--model wave", "without --plan")),
-    (("--psnr", 20), ("--psnr 20", "--plan")),
-    (("--patterns", "dots:4"), ("--patterns dots:4", "--plan")),
-    (("--frames-used", 4), ("--frames-used 4", "--model")),
+    (("--plan", "--psnr", 20, "--model", "wave"), ("--model", "by --plan")),
+    (("--psnr", 20), ("--psnr", "by scene")),
     (("--model", "ray"), ("--model 'ray'", "geometric or wave")),
     (("--model", "wave", "--frames-used", 1), ("--frames-used 1", "2 or more")),
     (("--model", "wave", "--fit", "tilt"), ("--fit 'tilt'", "mask_distance")),
