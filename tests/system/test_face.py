@@ -149,13 +149,7 @@ def test_a_saved_capture_is_that_of_the_command_line(
     taken = reported.pop("memory_bytes")
     assert 0 <= taken < reported["predicted_memory_bytes"]
     summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": reported["output"]}
-    timed = {
-        "seconds": 0,
-        "kernels": 0,
-        "predicted_seconds": 0,
-        "report": None,
-        "colour": untimed(tmp_path / "told")["plan"]["colour"],
-    }
+    timed = {"seconds": 0, "kernels": 0, "predicted_seconds": 0, "report": None}
     assert {**summary, **timed} == {**reported, **timed}
 
 
@@ -165,9 +159,7 @@ def untimed(folder: Path) -> dict[str, Any]:
     manifest = json.loads((folder / "manifest.json").read_text())
     plan = manifest["plan"]
     rows = [{**row, "seconds": 0} for row in plan["effects"]]
-    candidates = [{**each, "seconds": 0} for each in plan["colour"]["candidates"]]
-    own = {"effects": rows, "colour": {**plan["colour"], "candidates": candidates}}
-    untimed_plan = {**plan, **own, "predicted_seconds": 0, "predicted": {}}
+    untimed_plan = {**plan, "effects": rows, "predicted_seconds": 0, "predicted": {}}
     return {**manifest, "seconds": {}, "kernels": {}, "plan": untimed_plan, "command": None}
 
 

@@ -195,9 +195,9 @@ def test_what_the_command_says_of_measured_frames(call: Callable[..., Any], tmp_
     ("arguments", "fragments"),
     [
         ((), ["give a scene, --frames DIR with the frames of a real session, or --known LIST"]),
-        (("photograph", "--frames", "frames"), ["--frames frames", "leave out SCENE"]),
-        (("--frames", "frames", "--seed", "0"), ["leave out --seed"]),
-        (("--frames", "frames", "-D", "mask=open"), ["leave out -D"]),
+        (("photograph", "--frames", "frames"), ["SCENE: has no effect", "by --frames"]),
+        (("--frames", "frames", "--seed", "0"), ["--seed: has no effect"]),
+        (("--frames", "frames", "-D", "mask=open"), ["-D: has no effect"]),
         (("--frames", "nowhere"), ["frames nowhere: no such folder"]),
         (("--frames", "frames", "-o", "no/where"), ["no/where", "does not exist"]),
     ],
