@@ -111,7 +111,7 @@ def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memo
             *([] if divisor == 1 else [f"Numbers are divided by {divisor}, which all have"]),
             *(f"Not known: {text}" for text in result.get("not_known", ())),
         ]
-    warnings = [text for each in found.values() for text in each.warnings]
+    warnings: Any = [text for each in found.values() for text in each.warnings]
     payload = results[""] if [*results] == [""] else {"depths": [*results.values()], "output": str(folder)}
     if is_coloured(folder):
         payload = {**payload_of_lines(CALIBRATION, results, folder), "memory_bytes": memory}
