@@ -460,8 +460,8 @@ SIDE = 512
 def picture(name: str) -> npt.NDArray[np.uint8]:
     """Return the (512, 512) eight-bit reflectance of the test image ``name``: its middle square, grey.
 
-    ``bars 0.26`` has bars of 0.26 line pairs per mm of the print, vertical on the left, horizontal on the right;
-    ``edge`` is an edge 5 degrees off the vertical, as in ISO 12233. MitsimError for another name.
+    ``bars 0.26`` has bars of 0.26 line pairs per mm of the print, vertical on the left, horizontal on the right.
+    MitsimError for another name.
     """
     import numpy as np
     from skimage import data
@@ -473,10 +473,6 @@ def picture(name: str) -> npt.NDArray[np.uint8]:
         white = np.floor(edges) / 2 + np.minimum(edges % 1, 0.5)  # integral of the bars, in periods
         across = np.broadcast_to(np.diff(white) / np.diff(edges), (SIDE, SIDE))
         grey = np.concatenate([across[:, : SIDE // 2], across.T[:, SIDE // 2 :]], axis=1)
-    elif name == "edge":  # black to white, each texel the part of it that is right of the edge, by 8 points a row of it
-        rows, columns = ((np.arange(8 * SIDE) + 0.5) / 8, np.arange(SIDE))
-        place = SIDE / 2 + (rows - SIDE / 2) * np.tan(np.radians(5.0))
-        grey = np.clip(columns + 1 - place[:, None], 0, 1).reshape(SIDE, 8, SIDE).mean(axis=1)
     elif name in TEST_IMAGES:
         image = np.asarray(getattr(data, name)(), dtype=np.float64)
         grey = image.mean(axis=2) if image.ndim == 3 else image
@@ -485,6 +481,6 @@ def picture(name: str) -> npt.NDArray[np.uint8]:
         square = resize(grey[top : top + side, left : left + side], (SIDE, SIDE), anti_aliasing=True)
         grey = (square - square.min()) / (square.max() - square.min())
     else:
-        raise MitsimError(f"picture {name!r}: use {', '.join((*TEST_IMAGES, 'edge', 'bars PAIRS_A_MM'))}")
+        raise MitsimError(f"picture {name!r}: use {', '.join((*TEST_IMAGES, 'bars PAIRS_A_MM'))}")
     # Reflectances of black and white print, as on the shipped scenes.
     return np.asarray(np.rint(255 * (0.05 + (0.90 - 0.05) * grey)), dtype=np.uint8)

@@ -46,7 +46,7 @@ def test_points_differ_and_share_light(name: str) -> None:
 
 
 MEASURED: dict[str, Value] = {
-    "psnr_db": 20.0, "ssim": 0.5, "flagged": True, "reason": "", "pixels": 64, "contrast_of_extremes": 0.5,
+    "psnr_db": 20.0, "ssim": 0.5, "flagged": True, "reason": "", "pixels": 64,
     "patterns_count": 4, "kind": "dots", "range_high": 0.1, "gain_db": 1.0, "artefacts_db": 18.0, "psnr_matt_db": 20.0,
     "ser_over_law": 1.0, "iterative_s": 10.0, "direct_s": 1.0, "separable_s": 0.1,
     **{f"{cause}_db": 30.0 for cause in ERROR_SOURCES},
@@ -70,8 +70,6 @@ def test_claims_and_panels_fit_the_rows_of_their_study(name: str, quick: bool) -
         own: dict[str, Value] = {"point": point.key, "scene": point.setup.scene}
         if print_.startswith("bars"):
             own |= {"pairs_a_mm": float(print_.split()[1]), "contrast": 0.5}
-        elif print_ == "edge":
-            own |= {"pairs_a_mm": 0.2, "transfer": 0.5}
         part = VARIED.get(str(values.get("part", name)), [{}])
         rows += [{**MEASURED, **own, **point.row(**each)} for each in part]
     results = Results(rows, scope=scope)
