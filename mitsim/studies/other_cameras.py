@@ -46,7 +46,7 @@ from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.point_spread import DotClasses, ShiftedLight, solve_iteratively
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
-from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.pages import Mean
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
@@ -148,12 +148,11 @@ class MovedMask:
         return self._formed[place]
 
     def seconds(self, rows_mm: Sequence[float], columns_mm: Sequence[float], exposure: str) -> float:
-        """Return the exposure time [s] of each frame of a grid by one of :data:`mitsim.report.CONVENTIONS`."""
-        places = list(product(rows_mm, columns_mm))
-        if exposure == EQUAL_PEAK:
-            brightest = max(peak_irradiance(self.expected_frames(*place)) for place in places)
-            return Exposure().choose(self.lit.bench.devices, brightest)
-        return self.lit.uniform_s(self.model) / (len(places) if exposure == EQUAL_TOTAL else 1)
+        """Return the exposure time [s] of each frame of a grid at equal peak or equal frame."""
+        if exposure == EQUAL_FRAME:
+            return self.lit.uniform_s(self.model)
+        brightest = max(peak_irradiance(self.expected_frames(*place)) for place in product(rows_mm, columns_mm))
+        return Exposure().choose(self.lit.bench.devices, brightest)
 
     def solve(self, rows_mm: Sequence[float], columns_mm: Sequence[float], seconds: float) -> Solution:
         left = np.concatenate([self.side(0, place) for place in rows_mm])
@@ -182,91 +181,65 @@ class MovedMask:
 REACH = 15.0
 GRIDS = {2: (0, 6), 3: (0, 3, 6), 4: (0, 2, 4, 6), 7: tuple(range(7))}
 """Indices along an axis of the seven calibrated places, by number of places."""
-UNIFORM, SWEPT, LINE, DOTS = "uniform frames", "SweepCam", "SweepCam, along rows alone", "shifting dots"
+UNIFORM, SWEPT, DOTS = "uniform frames", "SweepCam", "shifting dots"
 _FRAMES = 49
-_COUNTS_DB = 0.5
 
 
 def _multishot_measure(studio: Studio, point: Point) -> Found:
     model, method, seed, count = point["model"], point["patterns"], int(point["seed"]), int(point["frames"])
     lit, side = studio.lit_scene(point.setup), round(count**0.5)
     bench, noise_seed = lit.bench, seed if model == RENDERED else seed + 1
-
-    def spread(number: int) -> tuple[float, ...]:
-        return tuple(float(place) for place in np.linspace(-REACH, REACH, number) * bench.geometry.mask_feature)
-
-    def factors() -> Places:
-        places = spread(7)
-        if model == IDEALISED:
-            return ideal_places(bench, places, lit.board_flux)
+    places = tuple(float(place) for place in np.linspace(-REACH, REACH, 7) * bench.geometry.mask_feature)
+    if model == IDEALISED:
+        factors = ideal_places(bench, places, lit.board_flux)
+    else:
         key = bench.devices_digest, places, seed  # a session does not depend on the print
-        return studio.once("places", 1, key, lambda: calibrated_places(bench, places, seed))
-
+        factors = studio.once("places", 1, key, lambda: calibrated_places(bench, places, seed))
     images: dict[str, Image] = {}
-    if method in (SWEPT, LINE):
-        rows = spread(_FRAMES) if method == LINE else tuple(spread(7)[index] for index in GRIDS[side])
-        columns = (0.0,) if method == LINE else rows
-        known = ideal_places(bench, (*rows, *columns), lit.board_flux) if method == LINE else factors()
-        mask = MovedMask(lit, model, known, noise_seed)
+    if method == SWEPT:
+        along = tuple(places[index] for index in GRIDS[side])
+        mask = MovedMask(lit, model, factors, noise_seed)
         for exposure in EXPOSURES:
-            seconds = mask.seconds(rows, columns, exposure)
-            found = mask.solve(rows, columns, seconds)
+            seconds = mask.seconds(along, along, exposure)
+            found = mask.solve(along, along, seconds)
             flags = flags_of(found.status)
             images[exposure] = Image(found.image, lit.quality(found.image), found.lam, count, seconds, flags)
     else:
         ones = np.ones((bench.n, 1), np.int8)
         still = PatternFamily(UNIFORM, ones.repeat(count, axis=1), ones)
         family = bench.family(f"dots:{side}") if method == DOTS else still
-        frames = Unexposed(lit, model, family, factors()[0.0], bench.geometry.centred, noise_seed)
+        frames = Unexposed(lit, model, family, factors[0.0], bench.geometry.centred, noise_seed)
         images = {exposure: Image.of(frames, frames.seconds(exposure)) for exposure in EXPOSURES}
-    kept = point.setup.picture in (*QUICK_IMAGES, None) and side in (1, 7) and method != LINE
+    kept = point.setup.picture in (*QUICK_IMAGES, None) and side in (1, 7)
     arrays = image_arrays(images[EQUAL_FRAME].image, lit.truth) if kept else {}
     return Found(tuple(point.row(exposure=exposure, **image.row()) for exposure, image in images.items()), arrays)
 
 
-def _is_measured(values: Mapping[str, object]) -> bool:
-    if values["patterns"] == LINE:
-        return values["model"] == IDEALISED and values["frames"] == _FRAMES
-    return values["frames"] != 1 or values["patterns"] == UNIFORM
-
-
-_gain = partial(Gain, where={"frames": _FRAMES}, at_least=_COUNTS_DB)
+_gain = partial(Gain, where={"frames": _FRAMES}, at_least=0.5)
 MULTISHOT = Study(
     "multishot",
     "The mask moved, or the light",
     "Do dots beat as many uniform frames through a mask that moves?",
     points=Axes(
-        {"patterns": (UNIFORM, SWEPT, DOTS, LINE), "frames": (1, *(side**2 for side in GRIDS)), "model": MODELS},
+        {"patterns": (UNIFORM, SWEPT, DOTS), "frames": (1, *(side**2 for side in GRIDS)), "model": MODELS},
         quick={"frames": (1, _FRAMES)},
         quick_prints=1,
-        kept=_is_measured,
+        kept=lambda values: values["frames"] != 1 or values["patterns"] == UNIFORM,
     ),
     measure=_multishot_measure,
     claims=(
         stated("One uniform frame gives 21.3 to 22.9 dB", 21.3, 22.9, patterns=UNIFORM, frames=1),
         stated("SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", 24.9, 26.8, patterns=SWEPT, frames=49),
-        stated("The same on a line along the rows, idealised", 24.9, 26.8, patterns=LINE),
         stated("49 shifting dots give 34 to 35.5 dB", 34.0, 35.5, patterns=DOTS, frames=_FRAMES),
         _gain("49 dots beat SweepCam's 49 frames", DOTS, SWEPT, paper="higher"),
         _gain("SweepCam's 49 frames beat 49 frames through a mask at rest", SWEPT, UNIFORM),
     ),
     panels=(
-        Lines(
-            "frames",
-            "number of frames [1]",
-            where={"patterns": (UNIFORM, SWEPT, DOTS)},
-            each="exposure",
-            shared={"patterns": UNIFORM, "frames": 1},
-            log=True,
-        ),
-        Images(
-            "patterns",
-            title=f"Images of 49 frames, exposure {EQUAL_FRAME}",
-            where={"exposure": EQUAL_FRAME, "frames": _FRAMES},
-            columns=(UNIFORM, SWEPT, DOTS),
-        ),
+        Lines("frames", "number of frames [1]", each="exposure", shared={"patterns": UNIFORM, "frames": 1}, log=True),
+        Images("patterns", title=f"Images of 49 frames, exposure {EQUAL_FRAME}", columns=(UNIFORM, SWEPT, DOTS),
+               where={"exposure": EQUAL_FRAME, "frames": _FRAMES}),
     ),
-)
+)  # fmt: skip
 
 # -------- A diffuser for a mask: noisy frames, the image nearest to the truth, and the speed of both solvers
 
@@ -301,8 +274,6 @@ def take(
     if convention != EQUAL_PEAK:
         peak = float(camera.under(parse_patterns("uniform", family.n)).image_of(reflectance).max())
     seconds = exposure_for_peak(peak * WHITE_W_M2, Exposure().fraction, sensor, WAVELENGTH_NM)
-    if convention == EQUAL_TOTAL:
-        seconds /= len(expected)
     unit = float(electrons_from_irradiance(WHITE_W_M2, seconds, sensor, WAVELENGTH_NM))
     dark, frames = sensor.superpixel_dark_current_e_per_s * seconds, np.empty_like(expected)
     for index, frame in enumerate(expected):
@@ -418,10 +389,9 @@ def _times(rows: DataFrame, column: str, over: str, least: float) -> tuple[str, 
 
 _MODELS = ("psf", MEASURED, TRACED)
 _QUALITY, _SPEED = {"part": "quality", "exposure": EXPOSURES}, {"part": "speed"}
-_SPEED_OF_DOTS = {"part": "speed", "patterns": lambda patterns: patterns != 1}
+_SPEED_OF_DOTS = _SPEED | {"patterns": lambda patterns: patterns != 1}
 _SOLVERS = {"iterative_s": "iterative", "direct_s": "direct", "separable_s": "separable camera"}
 _by_frames = partial(Lines, "patterns", "number of frames [1]", log=True)
-
 CONVOLUTIONAL = Study(
     "convolutional",
     "A diffuser for a mask",
@@ -431,47 +401,25 @@ CONVOLUTIONAL = Study(
     claims=(
         replace(stated("Uniform light: 19 to 24.6 dB", 19.0, 24.6, part="quality", patterns=1), models=_MODELS),
         replace(stated("49 dots: 38.5 to 44.5 dB", 38.5, 44.5, part="quality", patterns=49), models=_MODELS),
-        *(
-            Judged(claim, decide, where=where, paper=paper, models=_MODELS)
-            for claim, decide, where, paper in (
-                (
-                    "Iterations take an order of magnitude longer than the separable closed form",
-                    partial(_times, column="iterative_s", over="separable_s", least=5.0),
-                    _SPEED,
-                    "10 times as long",
-                ),
-                (
-                    "Dots can be solved directly, and iterations to equal error take ten times as long",
-                    partial(_times, column="iterative_s", over="direct_s", least=10.0),
-                    _SPEED_OF_DOTS,
-                    "no closed form",
-                ),
-                (
-                    "Even so, it takes longer than the separable closed form",
-                    partial(_times, column="direct_s", over="separable_s", least=1.0),
-                    _SPEED,
-                    "",
-                ),
-            )
-        ),
+        Judged("Iterations take an order of magnitude longer than the separable closed form",
+               partial(_times, column="iterative_s", over="separable_s", least=5.0), where=_SPEED, models=_MODELS,
+               paper="10 times as long"),
+        Judged("Dots can be solved directly, and iterations to equal error take ten times as long",
+               partial(_times, column="iterative_s", over="direct_s", least=10.0), where=_SPEED_OF_DOTS,
+               models=_MODELS, paper="no closed form"),
     ),
     panels=(
         _by_frames(title="PSNR, best lambda", where=_QUALITY, each="exposure", colour="psf", facet=""),
-        _by_frames(
-            file="seconds", y_label="processor time to equal error [s]", where=_SPEED, colour=_SOLVERS, facet="psf"
-        ),
-        Images(
-            "patterns",
-            title=f"Images by the number of frames, exposure {EQUAL_FRAME}, best lambda",
-            where={"part": "quality", "exposure": EQUAL_FRAME, "patterns": (1, 9, 49)},
-            down=("picture", "psf"),
-        ),
+        _by_frames(file="seconds", y_label="processor time to equal error [s]", where=_SPEED, colour=_SOLVERS,
+                   facet="psf"),
+        Images("patterns", title=f"Images by the number of frames, exposure {EQUAL_FRAME}, best lambda",
+               where={"part": "quality", "exposure": EQUAL_FRAME, "patterns": (1, 9, 49)}, down=("picture", "psf")),
     ),
     heads=("Paper", "Measured", "Rendered"),
     note="A frame is the scene convolved with the camera's point spread function (PSF), that of a rendered diffuser "
     "and, with -D psf=FILE, a measured one besides; no light of a scene is traced. The sensor gets all light. Best "
     "lambda: that of the highest PSNR. Times are processor seconds on one thread.",
     traced=False,
-)
+)  # fmt: skip
 
 STUDIES = {each.name: each for each in (MULTISHOT, CONVOLUTIONAL)}

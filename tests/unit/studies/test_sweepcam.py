@@ -16,7 +16,7 @@ from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.job import Job
 from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
-from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS
 from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.experiment import Results, Setup, find_experiment
@@ -128,7 +128,7 @@ def test_exposures_are_the_familys(lit: dict[str, LitScene]) -> None:
     scene = lit["separable"]
     mask = MovedMask(scene, IDEALISED, {}, 5)
     uniform, places = scene.uniform_s(IDEALISED), (PLACES, PLACES)
-    assert mask.seconds(*places, EQUAL_FRAME) == uniform == 9 * mask.seconds(*places, EQUAL_TOTAL)
+    assert mask.seconds(*places, EQUAL_FRAME) == uniform
     assert mask.seconds(*places, EQUAL_PEAK) <= uniform, "the mask on its axis is one of the places"
     assert mask.seconds(*places, EQUAL_PEAK) > 0.25 * uniform, "no place lets four times the light pass"
 
@@ -170,7 +170,7 @@ def test_a_gain_within_the_noise_is_none(gain: float, verdict: str) -> None:
     """(Planted: any gain above 0.)"""
     experiment = find_experiment("multishot")
     frames = {("uniform frames", 1): 22.0, ("uniform frames", 49): 25.0, ("SweepCam", 49): 25.0 + gain}
-    frames |= {("shifting dots", 49): 34.0, ("SweepCam, along rows alone", 49): 25.0}
+    frames |= {("shifting dots", 49): 34.0}
     rows = [
         {
             "model": model,
@@ -187,4 +187,4 @@ def test_a_gain_within_the_noise_is_none(gain: float, verdict: str) -> None:
     ]
     *others, moved_or_not = experiment.judge(Results(rows))
     assert moved_or_not.verdict == verdict
-    assert [claim.verdict for claim in others] == ["confirmed"] * 5
+    assert [claim.verdict for claim in others] == ["confirmed"] * 4

@@ -76,7 +76,7 @@ def patterns(better: str, other: str) -> Build:
 
 def frames(better: str, other: str) -> Build:
     """Of moved masks: SweepCam's frames, those of uniform light and of dots."""
-    names = "uniform frames", "SweepCam", "shifting dots", "SweepCam, along rows alone"
+    names = "uniform frames", "SweepCam", "shifting dots"
     rest = [rows(25, patterns=name, exposure=each, frames=49, absolute=False) for name in names
             for each in (EQUAL_PEAK, EQUAL_FRAME) if name not in (better, other)]  # fmt: skip
     rest += [rows(22, patterns="uniform frames", exposure=each, frames=1) for each in (EQUAL_PEAK, EQUAL_FRAME)]
@@ -200,8 +200,8 @@ BORDERS = [
              {"mask_distance": "2.0", "patterns": "uniform"}),
         rows(18, mask_distance="0.75", patterns="uniform"), rows(30, mask_distance="0.75", patterns="dots:7"),
     ), -1.0, 1.0),
-    ("multishot", 4, frames("shifting dots", "SweepCam"), 0.5, math.inf),
-    ("multishot", 5, frames("SweepCam", "uniform frames"), 0.5, math.inf),
+    ("multishot", 3, frames("shifting dots", "SweepCam"), 0.5, math.inf),
+    ("multishot", 4, frames("SweepCam", "uniform frames"), 0.5, math.inf),
     ("resolution", 0, bars(
         gain("contrast", {"patterns": "dots:7"}, {"patterns": "uniform"}, pairs_a_mm=0.52)
     ), 0.0, math.inf),
