@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,6 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, behind, chart, daylight, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
 from mitsim.report import RENDERED
@@ -68,10 +67,6 @@ FULL_LX = 2.97 * 205.0
 """Illuminance of that light: 2.97 W/m^2 at the chart's middle, and 205 lm/W of D65 from 380 to 780 nm."""
 FILTERS = "ov5647"
 """Camera whose array RGGB of filters lies over the pixels."""
-_COARSE = tuple(float(relative) for relative in np.logspace(-9, -3, 7))
-"""Lambdas of the joint solve, relative to its largest eigenvalue."""
-Shots = Sequence[tuple[FloatArray, int, int]]
-"""Measured frames (m, m') [electrons/s], with the row and column of their pattern."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,47 +99,35 @@ def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
     """Return the irradiance (m, m') [W m^-2] of a scene in a lamp's daylight (D65), and its photons' mean wavelength
     [nm].
 
-    The scene's spectra are averaged over D65's photons, 380 to 780 nm, for a camera of constant efficiency.
+    The scene's spectra are averaged over D65's photons, 380 to 780 nm, for a camera of constant efficiency. MitsimError
+    for a scene without spectra.
     """
+    own = locate(setup.scene, "scenes", "scene.xml")
+    shutil.copytree(own.parent, folder / "daylight")
+    found = 0
 
-    def weigh(at: FloatArray, values: FloatArray) -> float:
-        photons = daylight(at) * at
-        return float((values * photons).sum() / photons.sum())
+    def even(match: re.Match[str]) -> str:
+        pairs = np.array([[float(part) for part in pair.split(":")] for pair in re.split(r"[,\s]+", match[1].strip())])
+        photons = daylight(pairs[:, 0]) * pairs[:, 0]
+        return f'value="{float((pairs[:, 1] * photons).sum() / photons.sum()):.9g}"'
 
-    scene = replace_spectra(setup.scene, folder / "daylight", weigh)
-    text = scene.read_text(encoding="utf-8")
-    end = text.rindex("</scene>")
-    scene.write_text(text[:end] + _LAMP.format(radiance=DAYLIGHT_RADIANCE), encoding="utf-8")
+    for file in (folder / "daylight").glob("*.xml"):
+        text, count = _SPECTRUM.subn(even, file.read_text(encoding="utf-8"))
+        found += count
+        if file.name == own.name:
+            text = text[: text.rindex("</scene>")] + _LAMP.format(radiance=DAYLIGHT_RADIANCE)
+        file.write_text(text, encoding="utf-8")
+    if not found:
+        raise MitsimError(
+            f"scene {setup.scene}: has no spectra (nm:value), so it looks alike in all lines; give one such as "
+            "colour_checker"
+        )
     wavelengths = np.arange(380.0, 781.0, 5.0)
     mean = float((daylight(wavelengths) * wavelengths).sum() / daylight(wavelengths).sum())
-    bench = _open(setup, scene)
+    bench = _open(setup, folder / "daylight" / own.name)
     bench = replace(bench, devices=replace(bench.devices, projector=bench.projector.at(mean)))
     light = bench.light("uniform", accuracy=setup.accuracy)
     return light.merge().frames(bench.family("uniform").lighting, light.seed).projector_off.irradiance, mean
-
-
-def replace_spectra(scene: str, folder: Path, weigh: Callable[[FloatArray, FloatArray], float]) -> Path:
-    """Copy a scene to a new ``folder`` with each spectrum replaced by one number, and return the copy's XML.
-
-    ``weigh`` returns the number from wavelengths [nm] and values. MitsimError for a scene without spectra.
-    """
-    own = locate(scene, "scenes", "scene.xml")
-    shutil.copytree(own.parent, folder)
-    found = 0
-
-    def number(match: re.Match[str]) -> str:
-        pairs = np.array([[float(part) for part in pair.split(":")] for pair in re.split(r"[,\s]+", match[1].strip())])
-        return f'value="{weigh(pairs[:, 0], pairs[:, 1]):.9g}"'
-
-    for file in folder.glob("*.xml"):
-        text, count = _SPECTRUM.subn(number, file.read_text(encoding="utf-8"))
-        file.write_text(text, encoding="utf-8")
-        found += count
-    if not found:
-        raise MitsimError(
-            f"scene {scene}: has no spectra (nm:value), so it looks alike in all lines; give one such as colour_checker"
-        )
-    return folder / own.name
 
 
 def serving(line: LitLine, other: LitLine) -> Factors:
@@ -166,8 +149,9 @@ def _open(setup: Setup, scene: Path) -> Bench:
 # -------- Filters over the sensor's pixels, and daylight beside the projector
 
 
-def mosaic_shots(lines: Sequence[LitLine], family: PatternFamily, seed: int) -> Shots:
-    """Expose all lines at once, at equal peak, behind filters.
+def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, seed: int) -> Solution:
+    """Expose all lines at once, at equal peak, behind filters, and solve their images (lines, n, n') with the best
+    lambda.
 
     MitsimError for a line outside the filters' curves.
     """
@@ -181,28 +165,22 @@ def mosaic_shots(lines: Sequence[LitLine], family: PatternFamily, seed: int) -> 
         for shot in zip(*expected, strict=True)
     ]
     exposer = Exposer(devices, _peak_seconds(devices.sensor, rates), integer(seed, "mosaic"))
-    return tuple(_measured(exposer, family, rates))
+    return solve_mosaic(lines, family, _measured(exposer, family, rates))
 
 
-def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, shots: Shots) -> Solution:
-    """Solve the images (lines, n, n') of all lines with the best lambda."""
+@single_threaded_blas()
+def solve_mosaic(
+    lines: Sequence[LitLine], family: PatternFamily, shots: Iterable[tuple[FloatArray, int, int]]
+) -> Solution:
     factors = [(line.factors.left, line.factors.right) for line in lines]
-    flat = np.stack([line.lit.truth for line in lines]).reshape(len(lines), -1)
-    solved: dict[float, Solution] = {}
-    with single_threaded_blas():
-        patterns = family.left.astype(np.float64), family.right.astype(np.float64)
-        solver = MosaicSolver(factors, filter_weights(lines), patterns)
-        for each in shots:
-            solver.add(*each)
-
-        def quality(lam: float) -> float:
-            if lam not in solved:
-                solved[lam] = solver.solve(lam, relative=True)[0]
-            return psnr(solved[lam].image.reshape(flat.shape), flat)
-
-        best = max(_COARSE, key=quality)
-        best = max((best, best * 10**0.5, best / 10**0.5), key=quality)
-    return solved[best]
+    truth = np.stack([line.lit.truth for line in lines]).reshape(len(lines), -1)
+    solver = MosaicSolver(
+        factors, filter_weights(lines), (family.left.astype(np.float64), family.right.astype(np.float64))
+    )
+    for each in shots:
+        solver.add(*each)
+    solved = [solver.solve(float(lam), relative=True)[0] for lam in np.logspace(-9, -3, 13)]
+    return max(solved, key=lambda each: psnr(each.image.reshape(truth.shape), truth))
 
 
 def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
@@ -218,9 +196,7 @@ def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
 
 
 @single_threaded_blas()
-def daylit_images(
-    line: LitLine, light: tuple[FloatArray, float], lux: float, patterns: str, seed: int
-) -> list[Solution]:
+def daylit_image(line: LitLine, light: tuple[FloatArray, float], lux: float, patterns: str, seed: int) -> Solution:
     bench, family = line.lit.bench, line.lit.bench.family(patterns, seed)
     lamp = lux / FULL_LX * electrons_from_irradiance(light[0], 1.0, bench.sensor, light[1])
     unit = Exposer(bench.devices, 1.0, 0)
@@ -229,13 +205,12 @@ def daylit_images(
     off, count = np.zeros(()), 0 if family.signed else len(family.shots)
     for shot in range(count):
         off = off + exposer.rate(exposer.digital(lamp * exposer.exposure_s, "ambient", shot)) / count
-    model = prepare(*line.factors.sides, family.left, family.right, centre=line.factors.manifest.centre)
-    models = (model, model.with_correlation())
-    sums = [each.accumulator() for each in models]
+    plain = prepare(*line.factors.sides, family.left, family.right, centre=line.factors.manifest.centre)
+    model = plain.with_correlation()
+    sums = model.accumulator()
     for frame, row, column in _measured(exposer, family, rates):
-        for each in sums:
-            each.add(frame if family.signed else frame - off, row, column)
-    return [each.solve(own, "auto") for each, own in zip(models, sums, strict=True)]
+        sums.add(frame if family.signed else frame - off, row, column)
+    return model.solve(sums, "auto")
 
 
 def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
@@ -266,37 +241,27 @@ _SHOWN = "dots:7"
 def _measure(studio: Studio, point: Point) -> Found:
     setup, way, patterns, seed = point.setup, str(point["way"]), str(point["patterns"]), int(point["seed"])
     lines = studio.once("lines", 1, (setup, seed), lambda: light_lines(setup, seed))
-    found: list[tuple[FloatArray, dict[str, Any]]] = []
     if way == MOSAIC:
-        family = lines[0].lit.bench.family(patterns, seed)
-        shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: mosaic_shots(lines, family, seed))
-        solved = mosaic_images(lines, family, shots)
-        found = [(np.moveaxis(solved.image, 0, -1), flags_of(solved.status))]
-    elif way == D65:
-        light = studio.once("daylight", 1, setup, lambda: daylight_frame(setup, studio.folder("daylight")))
-        by_line = [daylit_images(line, light, point["lux"], patterns, seed) for line in lines]
-        for method, images in zip((TIKHONOV, MARKOV), zip(*by_line, strict=True), strict=True):
-            found.append((_stacked(images), {"method": method, **flags_of(*(each.status for each in images))}))
+        joint = mosaic_images(lines, lines[0].lit.bench.family(patterns, seed), seed)
+        images, flags = np.moveaxis(joint.image, 0, -1), flags_of(joint.status)
     else:
-        factors = [line.factors if way == OWN else serving(line, lines[len(lines) // 2]) for line in lines]
-        shown = [
-            reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), own)
-            for line, own in zip(lines, factors, strict=True)
-        ]
-        found = [(_stacked(shown), flags_of(*(each.status for each in shown)))]
+        if way == D65:
+            light = studio.once("daylight", 1, setup, lambda: daylight_frame(setup, studio.folder("daylight")))
+            solved = [daylit_image(line, light, point["lux"], patterns, seed) for line in lines]
+        else:
+            factors = [line.factors if way == OWN else serving(line, lines[len(lines) // 2]) for line in lines]
+            solved = [
+                reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), own)
+                for line, own in zip(lines, factors, strict=True)
+            ]
+        images, flags = np.stack([each.image for each in solved], axis=-1), flags_of(*(each.status for each in solved))
     truth = np.stack([line.lit.truth for line in lines], axis=-1)
     board = lines[0].factors.manifest.board_reflectance or 1.0
-    wavelengths = [line.wavelength_nm for line in lines]
-    judged = [judge_colours(point, wavelengths, images * board, truth * board, named) for images, named in found]
-    return Found(tuple(row for each in judged for row in each.rows), judged[0].arrays)
-
-
-def _stacked(solved: Sequence[Solution]) -> FloatArray:
-    return np.stack([each.image for each in solved], axis=-1)
+    return judge_colours(point, [line.wavelength_nm for line in lines], images * board, truth * board, flags)
 
 
 def judge_colours(
-    point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray, named: Mapping[str, Any]
+    point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray, flags: Mapping[str, Any]
 ) -> Found:
     """Return a row for each patch of the point's chart, and the colours of both images.
 
@@ -305,27 +270,12 @@ def judge_colours(
     path = Path(point.setup.scene)
     place = load_chart(path.with_name("chart.json") if path.suffix == ".xml" else point.setup.scene)
     known, fixed = chart(), ColourModel.of_lines(wavelengths)
-    means, true = place.means(images), place.means(truth)
-    seen = fixed.xyz(means)
-    columns: dict[str, Any] = {
-        "floor": delta_e(fixed.xyz(known.at(wavelengths)), known.xyz),
-        "delta_e": delta_e(seen, known.xyz),
-        "delta_e_fitted": delta_e(ColourModel.fit(wavelengths, means, "").xyz(means), known.xyz),
-        "delta_e_pixel": [
-            float(delta_e(fixed.xyz(block), xyz).mean())
-            for block, xyz in zip(place.blocks(images), known.xyz, strict=True)
-        ],
-        "delta_e_truth": delta_e(fixed.xyz(true), known.xyz),
-        "delta_e_to_noise_free": delta_e(seen, fixed.xyz(true)),
-        **{f"truth_{axis}": known.xyz[:, index] for index, axis in enumerate("XYZ")},
-        **{axis: seen[:, index] for index, axis in enumerate("XYZ")},
-    }
-    n = images.shape[0]
-    shared = {"lines": len(wavelengths), "psnr_db": psnr(images.reshape(n, -1), truth.reshape(n, -1)), **named}
-    shared |= {f"psnr_{wave:g}nm": psnr(images[..., k], truth[..., k]) for k, wave in enumerate(wavelengths)}
+    floor = delta_e(fixed.xyz(known.at(wavelengths)), known.xyz)
+    found = delta_e(fixed.xyz(place.means(images)), known.xyz)
+    psnr_db = psnr(images.reshape(len(images), -1), truth.reshape(len(images), -1))
     rows = [
-        point.row(number=number, patch=name, **shared, **{key: float(all_[number]) for key, all_ in columns.items()})
-        for number, name in enumerate(known.names)
+        point.row(patch=name, psnr_db=psnr_db, floor=float(least), delta_e=float(own), **flags)
+        for name, least, own in zip(known.names, floor, found, strict=True)
     ]
     colours = {IMAGE: linear_srgb(fixed.xyz(images)), TRUTH: linear_srgb(fixed.xyz(truth))}
     return Found(tuple(rows), single_precision(colours))
@@ -350,7 +300,7 @@ STUDY = Study(
         {
             "way": (OWN, ONE, MOSAIC, D65),
             "patterns": ("uniform", _SHOWN, "hadamard:8"),
-            "lux": (None, 0.0, 5.0, 20.0, 60.0, 200.0, 600.0),
+            "lux": (None, 5.0, 20.0, 60.0, 200.0, 600.0),
         },
         quick={"patterns": (_SHOWN,), "lux": (None, 60.0)},
         prints=(None,), repeats=True, default="colour_checker", kept=_is_point,
@@ -358,20 +308,17 @@ STUDY = Study(
     measure=_measure,
     claims=(
         _added("49 dots add", way=OWN, patterns=_SHOWN),
-        replace(_added("Beside D65 of {lux} lx, 49 dots add (markov)", way=D65, method=MARKOV, lux=(60.0, 600.0),
-                       patterns=_SHOWN), each="lux"),
-        replace(_added("Beside D65 of {lux} lx, 64 Hadamard patterns add (markov)", way=D65, method=MARKOV,
-                       lux=(60.0, 600.0), patterns="hadamard:8"), each="lux", optional=True),
+        replace(_added("Beside D65 of {lux} lx, 49 dots add (markov)", way=D65, lux=(60.0, 600.0), patterns=_SHOWN),
+                each="lux"),
+        replace(_added("Beside D65 of {lux} lx, 64 Hadamard patterns add (markov)", way=D65, lux=(60.0, 600.0),
+                       patterns="hadamard:8"), each="lux", optional=True),
         Gain("Each line needs a calibration of its own (49 dots)", {"way": OWN}, {"way": ONE}, where=_DOTS),
     ),
     panels=(
         Bars("way", file="ways", title="Mean Delta E 2000 of 24 patches, 49 dots", where={**_DOTS, "lux": None},
              colour={"delta_e": "found", "floor": "floor: no camera"}, x_label="mean Delta E 2000 [1]"),
         Lines("lux", "D65 on the chart [lx]", file="daylight", y="delta_e", y_label="mean Delta E 2000 [1]", log=True,
-              colour="method", facet="patterns", where={"way": D65, "lux": lambda lux: lux > 0}),
-        Bars("patch", file="delta_e", title="Delta E 2000 of each patch, 49 dots, one line at a time",
-             where={**_DOTS, "way": OWN}, colour={"delta_e": "found", "floor": "floor: no camera"},
-             x_label="Delta E 2000 to the spectrum in D65 [1]"),
+              facet="", where={"way": D65}),
         Images("patterns", down=("way",), where={"way": OWN}, title="Colours by patterns, PSNR of all lines"),
     ),
     about="A chart of known spectra on rendered frames: light of each line traced with diffraction at the mask and "
