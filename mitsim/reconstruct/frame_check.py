@@ -10,21 +10,22 @@ stencil of neighbours, fitted to the run itself, predicts each pixel from other 
 the differences r between pixels and predictions:
 
 1. the mean of log(1 + u^2) over a frame, u being r over its robust scale, detects a foreign frame;
-2. least squares of the power of all frames, because a frame of power 1 + a adds a X at its own pixels and changes the
-   predictions of its neighbours;
+2. least squares of the power and then of the shift of all frames, because a frame of power 1 + a adds a X at its own
+   pixels and changes the predictions of its neighbours;
 3. the mean of 1 over windows of a few dots and one to four consecutive shots detects a hand in a few frames.
 
-The undecided rest is stated as a standard error of the power of single frames.
+The undecided rest is stated as a standard error of the power and of the place of single frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import correlate1d, uniform_filter
 from scipy.optimize import nnls
 from scipy.sparse import csr_matrix
 
@@ -37,7 +38,7 @@ from mitsim.reconstruct.uncertainty import Propagation
 
 # ---- The picture of shifting dots -----------------------------------------------------------------------------------
 
-_PRIOR = 0.1
+_PRIOR_POWER, _PRIOR_SHIFT = 0.1, 0.5
 _SCALES = 8.0, 3.0, 1.0, 1.0
 _PIXELS, _FEWEST = 2500, 4
 _WINDOWS, _LONGEST = (3, 5), 4
@@ -74,8 +75,9 @@ class PictureCheck:
         # Differences along a line of pixels that the same frame lights share their error.
         along = [axis for axis in (0, 1) if (np.diff(frame_of, axis=axis) == 0).all()]
         self._line_of: IndexArray = np.indices(image.shape)[1 - along[0]].ravel() if along else np.arange(image.size)
-        self.power, self.power_error = self._fit(image)
-        left_over = self._differences(image * (1 - self.power[frame_of]))
+        self.power, self.power_error = self._fit(image, [image], _PRIOR_POWER, _SCALES)
+        self._even = image * (1 - self.power[frame_of])
+        left_over = self._differences(self._even)
         differences = left_over / self._scale(left_over, self._pixels)
         self.predicted = float(np.sqrt(np.mean(np.square(left_over))))
         moved, roughness = np.clip(differences, -_MOST, _MOST), np.log1p(np.square(differences))
@@ -101,14 +103,28 @@ class PictureCheck:
         common = float(shared.sum() / (np.square(moved).sum() + 1e-300)) if along else 0.0
         self.disturbed = self._disturbance(moved, periods, common)
 
-    @property
-    def scatter(self) -> float:
-        """Scatter of the power of single frames beyond its own error.
+    @cached_property
+    def place(self) -> tuple[FloatArray, FloatArray]:
+        # Looked for in the picture without the powers, because in even parts these look like a slope.
+        place, error = self._fit(self._even, [*np.gradient(self._even)], _PRIOR_SHIFT)
+        return place.reshape(2, -1), error.reshape(2, -1)
 
-        It is at least its standard error, because a flicker as small as the errors is not seen.
+    def uncertainty(self, image: FloatArray) -> FloatArray:
+        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames.
+
+        The scatter over the frames beyond its own error is stated, and at least its standard error, because a flicker
+        as small as the errors is not seen.
         """
-        scatter, known = float(np.var(self.power)), float(np.mean(np.square(_UNDERSTATED * self.power_error)))
-        return float(np.sqrt(max(scatter - known, scatter * np.sqrt(2 / self._count))))
+        found, errors = (
+            np.stack([own, *others]) for own, others in zip((self.power, self.power_error), self.place, strict=True)
+        )
+        scatter, known = np.var(found, axis=1), np.mean(np.square(_UNDERSTATED * errors), axis=1)
+        power, *moves = np.sqrt(np.maximum(scatter - known, scatter * np.sqrt(2 / self._count)))
+        variance = np.square(image * power)
+        for axis, move in enumerate(moves):  # to either side, because a slope over both misses the finest print
+            for step in ([0.0, -1.0, 1.0], [-1.0, 1.0, 0.0]):
+                variance += np.square(move * correlate1d(image, step, axis, mode="nearest")) / 2
+        return np.asarray(np.sqrt(variance))
 
     def _disturbance(self, moved: FloatArray, periods: Sequence[int], common: float) -> FloatArray:
         cells = [
@@ -135,46 +151,38 @@ class PictureCheck:
                     found[k : k + length] = np.maximum(found[k : k + length], worst)
         return found
 
-    def _fit(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Learn the stencil's weights, and return the relative power (K,) of each frame, with errors.
+    def _fit(
+        self, image: FloatArray, changes: Sequence[FloatArray], prior: float, learned: Sequence[float] = ()
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return how far each frame is off by each of the ``changes`` (n, n') of an ``image``, with errors.
 
         The errors are those of the sandwich estimator (Huber 1967), because differences are not normal. Least squares
         are reweighted by Cauchy's weights, because edges of the print are outliers. The stencil has no negative
         weights, because these imitate a lamp that flickers in the period of the dots.
         """
-        values, count, place = image.ravel(), len(self._some), np.arange(len(self._some))
-        own, target = self._pairs(image, self._some), values[self._some]
-        # The same power of all frames is a change of the picture, and is held at zero.
-        known = np.eye(self._count) / _PRIOR**2 + _FIXED
-        found, left_over = np.zeros(self._count), target - own @ self._weights
-        design = self._sensitivity(values)
-        for wider in _SCALES:
+        own, target = self._pairs(image, self._some), image.ravel()[self._some]
+        # The same change of all frames is a change of the picture, and is held at zero.
+        known = np.kron(np.eye(len(changes)), np.eye(self._count) / prior**2 + _FIXED)
+        found, left_over = np.zeros(len(known)), target - own @ self._weights
+        design = self._sensitivity(changes)
+        for wider in learned or (1.0, 1.0):
             weights = 1 / (np.square(wider * self._scale(left_over, self._some)) + np.square(left_over))
-            normal = own.T @ (weights[:, None] * own)
-            normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
-            root = np.linalg.cholesky(normal)
-            self._weights = nnls(root.T, np.linalg.solve(root, own.T @ (weights * (target - design @ found))))[0]
-            design = self._sensitivity(values)
+            if learned:
+                normal = own.T @ (weights[:, None] * own)
+                normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
+                root = np.linalg.cholesky(normal)
+                side = own.T @ (weights * (target - design @ found))
+                self._weights = nnls(root.T, np.linalg.solve(root, side))[0]
+                design = self._sensitivity(changes)
             rest, weighted = target - own @ self._weights, design.multiply(weights[:, None]).tocsr()
             inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
             found = inverse @ (weighted.T @ rest)
             left_over = rest - design @ found
-        scores = (
-            csr_matrix((np.ones(count), (self._line_of[self._some], place)))
-            @ weighted.multiply(left_over[:, None]).tocsr()
-        )
-        covariance = inverse @ ((scores.T @ scores).toarray() + np.eye(self._count) / _PRIOR**2) @ inverse
-        spare = max(count - len(inverse), 1) / count
+        lines, place = self._line_of[self._some], np.arange(len(self._some))
+        scores = csr_matrix((np.ones(len(lines)), (lines, place))) @ weighted.multiply(left_over[:, None]).tocsr()
+        covariance = inverse @ ((scores.T @ scores).toarray() + np.eye(len(known)) / prior**2) @ inverse
+        spare = max(len(left_over) - len(inverse), 1) / len(left_over)
         return found, np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare)
-
-    def _sensitivity(self, values: FloatArray) -> csr_matrix:
-        """Return the change (pixels, K) of the differences by the power of each frame."""
-        near = zip(self._offsets, self._weights, strict=False)
-        terms = [(0, 1.0), *((sign * offset, -weight / 2) for offset, weight in near for sign in (1, -1) if weight)]
-        lit = [self._some + offset for offset, _ in terms]
-        changes = np.concatenate([weight * values[places] for places, (_, weight) in zip(lit, terms, strict=True)])
-        rows, frames = np.tile(np.arange(len(self._some)), len(terms)), self._frames[np.concatenate(lit)]
-        return csr_matrix((changes, (rows, frames)), shape=(len(self._some), self._count))
 
     def _differences(self, image: FloatArray) -> FloatArray:
         return np.asarray(image.ravel()[self._pixels] - self._pairs(image, self._pixels) @ self._weights)
@@ -187,6 +195,18 @@ class PictureCheck:
         pairs = [(values[pixels + each] + values[pixels - each]) / 2 for each in self._offsets]
         return np.stack([*pairs, ones, -ones], axis=1)
 
+    def _sensitivity(self, changes: Sequence[FloatArray]) -> csr_matrix:
+        place, near = np.arange(len(self._some)), zip(self._offsets, self._weights, strict=False)
+        terms = [(0, 1.0), *((sign * offset, -weight / 2) for offset, weight in near for sign in (1, -1) if weight)]
+        parts = [
+            (weight * change.ravel()[places], place, self._frames[places] + number * self._count)
+            for number, change in enumerate(changes)
+            for offset, weight in terms
+            for places in (self._some + offset,)
+        ]
+        values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return csr_matrix((values, (rows, columns)), shape=(len(place), len(changes) * self._count))
+
 
 OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
@@ -195,7 +215,7 @@ _TURNED, _SIDE = 0.5, 0.3
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
 _FOREIGN, _DISTURBED = 6.5, 7.5
 _FLICKERS, _POWER = 15.0, 0.01
-_FEWEST_PAIRS, _FEWEST_FRAMES, _MOST_NUMBERS = 4, 3, 3e7
+_FEWEST_PAIRS = 4
 _DOTS = "under dots each scene pixel is in one frame, so that only the picture shows a change of lamp, camera or scene."
 _LEAKING = "Light of the room cancels. A projector that leaks it since it was calibrated darkens the image as much."
 _REMEDY = "A closing frame (--closing-frame uniform) decides it."
@@ -266,7 +286,10 @@ class FrameCheck:
                 words = "show a part of the scene otherwise than the frames around"
                 powers.append(self._fault("picture", strongest, words))
             powers += self._powers(picture.power, picture.power_error, range(count), _FLICKERS)
-        powers += self._flicker()
+        if len(sums.powers) >= _FEWEST_PAIRS and noise.stated:
+            power, error = np.concatenate([*sums.powers.values()], axis=1)
+            numbers = [self._number[(*pattern, sign)] for pattern in sums.powers for sign in (1, -1)]
+            powers += self._powers(power, error, numbers, CHANCE)
         # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
         if by_model and by_model[0].part >= _SCATTERS * max((fault.part for fault in powers), default=0.0):
             found += by_model
@@ -304,33 +327,6 @@ class FrameCheck:
             numbers = [self._number[row, column, sign] for sign in (signs if self._signed else [0])]
             size = float(np.sqrt(off[row, column]))
             yield self._fault("model", numbers, f"differ by {size:.1%} from what the other frames predict", size)
-
-    def _flicker(self) -> Iterator[FrameFault]:
-        """Report shots of another power.
-
-        Where patterns overlap, a frame of power 1 + a adds a (I - H) Y to all residuals, so that the powers follow
-        from normal equations with the matrix |Y_k|^2 delta_kl - C_k . C_l, C being the coefficients of frames in the
-        model's range.
-        """
-        powers, weights, count = self._sums.powers, self._sums.weights, self._variance.size
-        if len(powers) >= _FEWEST_PAIRS and self._data.noise.stated:
-            power, error = np.concatenate([*powers.values()], axis=1)
-            numbers = [self._number[(*pattern, sign)] for pattern in powers for sign in (1, -1)]
-            yield from self._powers(power, error, numbers, CHANCE)
-        if self._signed or self._exclusive or count < _FEWEST_FRAMES or count * weights.size > _MOST_NUMBERS:
-            return
-        seen, whole, patterns = np.zeros((count, *weights.shape)), np.zeros(count), [*np.ndindex(*self._variance.shape)]
-        for k, pattern in enumerate(patterns):
-            places = self._data.prepared.places(pattern)
-            left, right = (slab.matrix.T @ slab.matrix for slab in self._data.prepared.slabs(pattern))
-            seen[k][places] = left @ weights[places] @ right
-            whole[k] = float(np.vdot(weights, seen[k]))
-        flat, variance = seen.reshape(count, -1), float(self._variance.mean())
-        values, vectors = np.linalg.eigh(np.diag(whole) - flat @ flat.T)
-        known = values > max(variance, 1e-9 * float(values.max()))
-        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
-        power, error = inverse @ self._sums.fitted.ravel(), np.sqrt(variance * np.diag(inverse))
-        yield from self._powers(power, error, [self._number[(*pattern, 0)] for pattern in patterns], CHANCE)
 
     def _powers(self, power: FloatArray, error: FloatArray, of: Sequence[int], errors: float) -> Iterator[FrameFault]:
         scatter, middle = robust_scatter(power), float(np.median(power))
@@ -382,9 +378,9 @@ class FrameCheck:
             sizes: dict[str, float | None] = dict.fromkeys(("pixel", "power", "place"))
             told = "is too small, or too much the same along the dots' lines, to decide about single frames"
             if found:
-                power = float(np.median(found.power_error))
-                sizes |= {"pixel": found.predicted, "power": power}
-                told = f"decides pixels to {found.predicted:.2g} and power to {power:.1%}"
+                values = found.predicted, np.median(found.power_error), np.median(found.place[1])
+                sizes = dict(zip(sizes, map(float, values), strict=True))
+                told = "decides pixels to {:.2g}, power to {:.1%}, places to {:.2g} scene pixels".format(*values)
             words = f"{_DOTS} The picture {told}; an object over few dots of some frames is not seen. {_REMEDY}"
             return ({"words": words, **sizes},)
         contrast = float(self._sums.contrast[whole]) if whole and self._sums.powers else 1.0

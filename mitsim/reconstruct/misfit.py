@@ -5,10 +5,9 @@ data that restore the fit. Four measurements decide, in this order:
 
 1. Noise: second differences of the residuals (:mod:`mitsim.reconstruct.residuals`).
 2. Energy: the residuals' energy beyond that of noise, calibration error, rendering and print finer than a scene pixel,
-   for the whole sensor, its tiles, rows, columns and pixels, and in time.
+   for the whole sensor, its tiles, rows, columns and pixels.
 3. Frames: each frame against the prediction of the others (:mod:`mitsim.reconstruct.frame_check`).
-4. Readings, if one of these is off: turned frames and shots in another order. Besides, light that is the same in all
-   frames.
+4. Readings, if one of these is off: turned frames and shots in another order.
 
 *Defective pixels.* A defective pixel is off in every frame, and its neighbours are not. A separable solver cannot
 weigh single pixels, so their readings are replaced by the prediction from all others: setting y - r / (1 - h) at a
@@ -25,7 +24,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
-from mitsim.core.arrays import FloatArray, sum_of_squares
+from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Measurement
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise, print_energy
 from mitsim.reconstruct.factorisation import IndexArray
@@ -33,7 +32,6 @@ from mitsim.reconstruct.factors import decibels
 from mitsim.reconstruct.focus import DerivedCapture
 from mitsim.reconstruct.frame_check import FrameCheck, FrameFault, PictureCheck
 from mitsim.reconstruct.residuals import (
-    CHANCE,
     TINY,
     NoiseTest,
     Place,
@@ -44,7 +42,6 @@ from mitsim.reconstruct.residuals import (
     noise_chance,
 )
 from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.uncertainty import Propagation
 
 # ---- Defective pixels -----------------------------------------------------------------------------------------------
 
@@ -149,7 +146,6 @@ UNEXPLAINED = 3.5e-3
 GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
 _LAMBDA_BESIDE = 1e-3
 _SHOWN, _MOSTLY = 4, 0.5
-_IN_RANGE, _COMMON_IMAGE = 1e-6, 0.01
 
 
 class Cause(Enum):
@@ -160,13 +156,13 @@ class Cause(Enum):
     READING = "another reading of the frames", "see which of the readings is true, and import the frames so"
     FRAMES = "frames that do not fit the others", "capture these frames again"
     PIXELS = "a part of the sensor or of the session", "look at the map of the misfit, and capture again"
-    LIGHT = "light that is the same in all frames", "darken the room, or capture with ambient_frame=yes"
     SATURATION = "readings at the full well or the ADC's end", "expose for less"
     MODEL = (
         "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, "
-        "gloss, indirect light, print finer than a scene pixel, numbers that are not linear in the light, or another "
-        "camera",
-        "try `--focus auto`, check that the camera is the calibrated one, and compare the misfit's map with the scene",
+        "gloss, indirect light, light of the room, print finer than a scene pixel, numbers that are not linear in the "
+        "light, or another camera",
+        "try `--focus auto`, darken the room or take an ambient_frame, check that the camera is the calibrated one, and "
+        "compare the misfit's map with the scene",
     )
 
 
@@ -177,7 +173,7 @@ class Misfit:
     ``chi_square`` is the residual's energy over the expected one, by tile in ``tiles``; ``unexplained`` is the rms of
     the excess beyond print, relative to the measurements, of which the calibration predicts ``predicted``. Without
     ``stated`` noise only gross misfit is flagged. ``noise`` is measured over stated noise, ``gain`` the camera's stated
-    gain [DN per electron], and ``common`` the relative change of the image by light that all frames share.
+    gain [DN per electron].
     """
 
     chi_square: float
@@ -195,7 +191,6 @@ class Misfit:
     readings: tuple[Reading, ...] = ()
     defects: Defects | None = None
     picture: PictureCheck | None = None
-    common: float = 0.0
     limits: tuple[dict[str, Any], ...] = ()
 
     @property
@@ -218,8 +213,6 @@ class Misfit:
             words = "; ".join(map(str, self.faults[:_SHOWN]))
         elif self.cause is Cause.PIXELS and self.places:
             words = f"the misfit is in {self.places[0].words}"
-        elif self.cause is Cause.LIGHT:
-            words = f"light that is the same in all frames changes the image by {self.common:.1%}"
         elif self.cause is Cause.NOISE and self.noise:
             words = f"the frames' noise has {self.noise.ratio:.3g} times the variance that the camera file states"
             if self.gain and self.noise.gain_error < 0.1 * self.noise.gain:
@@ -284,11 +277,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     beside, known = noise.rendering + (factor_energy or 0.0), factor_energy is not None
     stated = float(noise.variance.sum()) * noise.light.size * prepared.spare
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
-    sums, change = Residuals(data), 0.0
-    if (common := _common_light(data, sums, stated, beside)) is not None:
-        sums = Residuals(data, common)
-        moved = prepared.image(Propagation(data.model, lam).gain * (data.weights - sums.weights))
-        change = float(np.sqrt(sum_of_squares(moved) / max(sum_of_squares(image), TINY)))
+    sums = Residuals(data)
     test, energy, whole = sums.noise_test, max(float(sums.energy.sum()), TINY), float(sums.squares.sum())
     # Numbers without an ADC may be means of many shots.
     off = test is not None and test.off(noise, whole, stated, beside) and bool(test.ratio >= 1 or data.digital.step_dn)
@@ -296,7 +285,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     energies = sums.residual, sums.energy, sums.expected_energy(ratio, factor_energy or 0.0), sums.pixels
     found, excess = weigh(energies, known, noise, of_ramps)
     chi_square = whole / max(stated + beside, TINY) if off else found.chi_square  # by the stated noise
-    found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change, chi_square=chi_square)
+    found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, chi_square=chi_square)
     if lack := data.lack(image):
         found = replace(found, predicted=float(np.sqrt(lack.energy / energy)))
     if with_defects and noise.stated and not sums.clipped and (defects := find_defects(data, sums.squares, ratio)):
@@ -311,8 +300,8 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     readings = find_readings(data, ratio, beside + of_ramps) if suspect else ()
     full, local = noise.saturated > 1e-5 * noise.readings, bool(places) and places[0].energy > _MOSTLY * excess
     unlike = Cause.SATURATION if full else Cause.PIXELS if local else Cause.MODEL
-    findings = {Cause.READING: readings, Cause.FRAMES: faults, unlike: found.flagged}
-    later = {Cause.PIXELS: places, Cause.MODEL: turned, Cause.NOISE: off, Cause.LIGHT: change > _COMMON_IMAGE}
+    findings = {Cause.READING: readings, Cause.FRAMES: faults, unlike: found.flagged and not off}
+    later = {Cause.PIXELS: places, Cause.MODEL: turned, Cause.NOISE: off}
     cause = next((cause for some in (findings, later) for cause, finding in some.items() if finding), None)
     found = replace(found, faults=faults, places=places, readings=readings, flagged=cause is not None, cause=cause)
     return replace(found, picture=check.picture, limits=check.limits())
@@ -321,31 +310,6 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
 def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:
     beside = data.noise.rendering + (data.factor_energy(image) or 0.0) + print_energy(data.model, image)
     return FrameCheck(data, Residuals(data), lam, 1.0, beside).faults()
-
-
-def _common_light(data: Accumulation, sums: Residuals, stated: float, beside: float) -> FloatArray | None:
-    """Return the light (m, m') that is the same in all measurements; None if chance or factor errors explain it.
-
-    The light is even (a wrong black level), or that of an even scene (a lamp in the room).
-    """
-    prepared, count = data.prepared, data.noise.variance.size
-    if data.noise.shots == 2 or count < 2:
-        return None
-    lights = [side.sum(axis=1) for side in data.factors.sides]
-    lights = [np.stack([np.ones(len(seen)), seen / max(float(np.abs(seen).max()), TINY)]) for seen in lights]
-    if prepared.centre:
-        lights = [light - light.mean(axis=1, keepdims=True) for light in lights]
-    weights = [light @ side.common for light, side in zip(lights, (prepared.left, prepared.right), strict=True)]
-    whole, normal = (np.prod([each @ each.T for each in sides], axis=0) for sides in (lights, weights))
-    whole, normal = count * whole, count * whole - normal
-    # Light of an even scene may lie in the model's range, and light without contrast is lost by centring.
-    scale = np.sqrt(np.maximum(np.diag(normal), _IN_RANGE * np.diag(whole)) + TINY)
-    side = np.einsum("fi,ij,fj->f", lights[0], sums.total, lights[1], optimize=True) / scale
-    found = np.linalg.pinv(normal / np.outer(scale, scale), rcond=_IN_RANGE) @ side
-    least = max(2 * CHANCE**2 * float(data.noise.variance.mean()), (UNEXPLAINED / 4) ** 2 * float(sums.energy.sum()))
-    if found @ side < max(least, beside, _MOSTLY * (float(sums.squares.sum()) - stated - beside)):
-        return None
-    return np.asarray((lights[0] * (found / scale)[:, None]).T @ lights[1])
 
 
 # ---- Energies found and expected ----

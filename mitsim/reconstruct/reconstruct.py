@@ -346,8 +346,8 @@ def reconstruct_request(
         shown = misfit.chi_square if misfit else 1.0
         uncertainties = uncertainty(data, solution, shown) if solver.linear and not depths else None
         if uncertainties and misfit and misfit.picture and shots.manifest.plan is None:
-            # Of a simulated run the power of every frame is known.
-            frames = np.abs(solution.image) * misfit.picture.scatter
+            # Of a simulated run the lamp and the place of every frame are known.
+            frames = misfit.picture.uncertainty(solution.image)
             uncertainties = replace(uncertainties, sources={**uncertainties.sources, "frames": frames})
     status, image = misfit.judge(solution.status) if misfit else solution.status, solution.image
     doubts.append(uncertainties.loss(image) if uncertainties else "")

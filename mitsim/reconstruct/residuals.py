@@ -193,8 +193,8 @@ class Residuals:
     ----------
     leave_out
         e^T (I - H_kk)^-1 e of a pattern's residual e, its difference from the prediction of all others.
-    free, fitted
-        Data of a pattern that others predict too, and product of its residual and model.
+    free
+        Data of a pattern that others predict too.
     powers
         By signed pattern, relative power of its halves beyond the other pairs', and standard errors, which are
         infinite where a half is black or equals the other.
@@ -206,41 +206,36 @@ class Residuals:
         Difference of the halves' light over their sum.
     """
 
-    def __init__(self, data: Accumulation, light: FloatArray | None = None) -> None:
+    def __init__(self, data: Accumulation) -> None:
         prepared, self.noise = data.prepared, data.noise
-        self._prepared, self._light = prepared, light
-        self._sides = sides = prepared.left, prepared.right
+        self._prepared, self._sides = prepared, (prepared.left, prepared.right)
+        sides = self._sides
         sizes, counts = ([getattr(side, name) for side in sides] for name in ("sensor_size", "pattern_count"))
         edges = [np.linspace(0, size, min(_TILES, size) + 1).astype(np.intp) for size in sizes]
         self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
-        self.leave_out, self.shots, self.free, self.fitted, self.rest, self.side, self.contrast = np.zeros((7, *counts))
+        self.leave_out, self.shots, self.free, self.rest, self.side, self.contrast = np.zeros((6, *counts))
         self.powers: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
         self.same: dict[int, list[tuple[int, int, int]]] = {}
         self.clipped: dict[tuple[int, int, int], int] = {}
         # Two arrays of one frame are kept, because to make them anew takes longer than to fill them.
-        self.squares, self._early, self.total, self._powers, self._residual, self._squared = np.zeros((6, *sizes))
+        self.squares, self._powers, self._residual, self._squared = np.zeros((4, *sizes))
         self.weights = data.weights
-        if light is not None:
-            self.weights = self.weights - sides[0].common.T @ prepared.as_solved(light) @ sides[1].common
         self._grams = [[np.linalg.eigh(slab.matrix.T @ slab.matrix) for slab in side.slabs] for side in sides]
         self._rough = [[sum_of_squares(np.diff(slab.matrix, 2, axis=0)) for slab in side.slabs] for side in sides]
         self._noises: list[FloatArray] = []
-        for number, measurement in enumerate(data.measurements_again()):
-            if number == (self.noise.variance.size - 1) // 2:
-                self._early = self.squares.copy()
+        for measurement in data.measurements_again():
             self._add(measurement, data.coefficients.get((measurement.row, measurement.column)))
         self.energy, self.residual = self._tiles(self._powers), self._tiles(self.squares)
 
     def _add(self, measurement: Measurement, coefficients: FloatArray | None) -> None:
         pattern, prepared = (measurement.row, measurement.column), self._prepared
-        frame = prepared.as_solved(measurement.frame if self._light is None else measurement.frame - self._light)
+        frame = prepared.as_solved(measurement.frame)
         left, right = prepared.slabs(pattern)
         own = self.weights[left.columns][:, right.columns]
         residual = np.matmul(left.matrix @ own, right.matrix.T, out=self._residual)
         np.subtract(frame, residual, out=residual)
         self.squares += np.multiply(residual, residual, out=self._squared)
-        self.total += residual
         self._powers += np.multiply(frame, frame, out=self._squared)
         # Behind a mask with a constant term most of the light contributes nothing to the image.
         self.shots[pattern] = float(self._squared.sum()) if prepared.centre else measurement.power
@@ -250,11 +245,10 @@ class Residuals:
         self.free[pattern] = residual.size - np.count_nonzero(alone)
         self.leave_out[pattern] = sum_of_squares(residual)
         if not alone.all():
-            if coefficients is None or self._light is not None:
+            if coefficients is None:
                 coefficients = left.matrix.T @ frame @ right.matrix
             fit, read = (turn.T @ each @ other_turn for each in (own, coefficients))
             seen = read - known * fit
-            self.fitted[pattern] = float(np.vdot(fit, seen))
             self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
         self._noises.append(self._noise_tiles(measurement, residual, pattern))
         signs = (1, -1) if measurement.shots == 2 else (0,)
@@ -341,12 +335,18 @@ class Residuals:
             away = _deviations((np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread))
             usual = np.median((squares / own).ravel()[:: max(own.size // _SAMPLE, 1)])
             beyond[name] = np.where(away > _PLACE, squares - usual * own, 0.0)
-        change, means = tiles[0] - 2 * self._tiles(self._early), _deviations(self.total / np.sqrt(whole[1]))
-        changes = _deviations(change / tiles[1] / np.sqrt(2 / tiles[2]))
-        beyond["half"] = np.where(np.abs(changes) > _PLACE, np.abs(change), 0.0)
-        beyond["mean"] = np.where(np.abs(means) > _PLACE, np.maximum(self.squares - whole[1], 0.0), 0.0)
         least = _PLACE_ENERGY * float(whole[1].sum())
-        found = [Place(_words(name, each), float(each.sum())) for name, each in beyond.items() if each.sum() > least]
+        found = []
+        for name, each in beyond.items():
+            if each.sum() > least:
+                spans = [" to ".join(dict.fromkeys((str(at.min()), str(at.max())))) for at in np.nonzero(each)]
+                words = f"sensor {name} {spans[0]}"
+                if name == "pixel":
+                    words = f"{np.count_nonzero(each)} pixels in rows {spans[0]}, columns {spans[1]}"
+                elif name == "tile":
+                    size = f"{each.shape[0]} x {each.shape[1]}"
+                    words = f"tile rows {spans[0]}, columns {spans[1]} of {size} tiles"
+                found.append(Place(words, float(each.sum())))
         return sorted(found, key=lambda place: -place.energy)
 
     def _tiles(self, values: FloatArray) -> FloatArray:
@@ -366,13 +366,3 @@ def noise_chance(noise: FrameNoise, pixels: float) -> float:
 def _deviations(values: FloatArray) -> FloatArray:
     some = values.ravel()[:: max(values.size // _SAMPLE, 1)]
     return np.asarray((values - np.median(some)) / max(robust_scatter(some), 1.0))
-
-
-def _words(name: str, beyond: FloatArray) -> str:
-    spans = [" to ".join(dict.fromkeys((str(each.min()), str(each.max())))) for each in np.nonzero(beyond)]
-    if beyond.ndim == 1:
-        return f"sensor {name} {spans[0]}"
-    if name in ("pixel", "mean"):
-        return f"{np.count_nonzero(beyond)} pixels in rows {spans[0]}, columns {spans[1]}"
-    words = f"tile rows {spans[0]}, columns {spans[1]} of {beyond.shape[0]} x {beyond.shape[1]} tiles"
-    return f"{words} in one half of the session" if name == "half" else words

@@ -270,7 +270,7 @@ def test_light_of_a_lamp_does_not_move_depth(fine: Factors) -> None:
     print(image.focus, image.status)
     assert isinstance(image.focus, Depth) and image.focus.error_mm is not None
     assert abs(image.focus.mm - 440) < 2 * image.focus.error_mm
-    assert not image.ok and image.misfit and image.misfit.cause is Cause.LIGHT
+    assert not image.ok and image.misfit and image.misfit.cause is Cause.MODEL
 
 
 @pytest.mark.parametrize(
