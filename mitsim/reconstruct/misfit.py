@@ -161,8 +161,8 @@ class Cause(Enum):
         "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, "
         "gloss, indirect light, light of the room, print finer than a scene pixel, numbers that are not linear in the "
         "light, or another camera",
-        "try `--focus auto`, darken the room or take an ambient_frame, check that the camera is the calibrated one, and "
-        "compare the misfit's map with the scene",
+        "try `--focus auto`, darken the room or take an ambient_frame, check that the camera is the calibrated one "
+        "and compare the misfit's map with the scene",
     )
 
 
