@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mitsim.bench.request import (
+    AUTO,
     MOSAIC,
     NO,
     Exposure,
@@ -48,7 +49,7 @@ from mitsim.core.configuration import (
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.job import Job
-from mitsim.core.manifests import BANDS, RUN, bands_of
+from mitsim.core.manifests import BANDS, LINES, RUN, bands_of
 from mitsim.core.manifests import MOSAIC as MOSAIC_RUN
 from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
@@ -122,6 +123,8 @@ def in_colour(bench: Bench, colour: str) -> Bench:
 
 def plan_in(bench: Bench, colour: str, request: Planned) -> Plan:
     """Return the plan of a ``request`` on a ``bench``, for light in a ``colour``."""
+    if colour == AUTO:
+        return bench.choose_colour(**request.given).plan
     if colour == NO:
         return bench.plan(**request.given)
     from mitsim.acquire.spectral import SpectralBench
@@ -155,6 +158,9 @@ def capture_in(
         from mitsim.acquire.capture import expose
 
         return expose(light, str(what), output, job, resume, **request)
+    if colour == AUTO:
+        chosen = bench.choose_colour(str(what), **request)
+        bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
     if by_line(colour):
         return in_colour(bench, colour).capture_lines(what, output, resume, job, **request)
     take: Any = bench.capture_mosaic if colour == MOSAIC else bench.capture

@@ -28,7 +28,7 @@ CALLS = {
     "demo": ["demo"],
     "run": ["run", "session_of"],
     "view": ["Bench.view"],
-    "plan": ["Bench.plan", "Plan.save"],
+    "plan": ["Bench.plan", "Bench.choose_colour", "Plan.save"],
     "capture": ["Bench.capture", "Bench.capture_lines", "Bench.capture_mosaic", "Light.expose"],
     "calibrate": ["Bench.calibrate", "Bench.calibrate_lines", "Bench.calibrate_mosaic", "Bench.calibrate_depths",
                   "Bench.write_session", "calibrate_frames", "calibrate_known", "calibrate_model", "plan_calibration"],

@@ -12,14 +12,15 @@ counts lamps' light itself (:mod:`mitsim.devices.projector`): a count c is an ir
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mitsim.bench.apparatus import Apparatus, Opened
+from mitsim.bench.apparatus import Apparatus, Opened, reopen
 from mitsim.bench.effects import present
 from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request
@@ -33,10 +34,10 @@ from mitsim.light.cost_model import frame_seconds, frames_cost
 from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.planner.planner import make_plan
+from mitsim.planner.planner import make_plan, plan_within
 from mitsim.reconstruct.colour import PLANES, behind
 from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.records import PathSamples
@@ -87,6 +88,8 @@ class SpectralBench:
         request.timing.check(self.whole.sensor, self.whole.devices.camera_file)
         if self.manifest is None:
             return
+        if request.seconds is not None:
+            raise ArgumentError("seconds", f"{request.seconds:g}: runs in colour need an accuracy in place of a time")
         projector = self.whole.projector
         add_speckle = request.effects.get("speckle", True) and (projector.speckle_contrast or projector.speckle)
         if self.whole.filters and add_speckle:  # each line has its own, and each filter another mixture of them
@@ -151,10 +154,74 @@ def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
     family, effects = bench.family(request.patterns, request.seed), request.effects
     lighting = family.lighting
     exposing = frame_seconds(bench, lines * len(lighting.weights))
-    plan = make_plan(bench, lighting, request.accuracy, request.seed, effects, lines).taking(**exposing)
+    if request.seconds is None:
+        plan = make_plan(bench, lighting, request.accuracy, request.seed, effects, lines)
+    else:
+        plan = plan_within(bench, lighting, request.seconds, request.seed, effects)
+    plan = plan.taking(**exposing)
     cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, lines=lines)
     warnings = (*plan.warnings, *obstacles(bench, family))
     return replace(plan, request=request, cost=cost, made_of=bench.deciding, warnings=warnings)
+
+
+# -------- Choice between mono light and all lines
+#
+# A monochrome camera that sees all lines l of a projector at once makes electrons from their irradiances E_l in
+# proportion to sum_l q_l lambda_l E_l, with its quantum efficiency q. Mono light has one panchromatic reflectance and
+# the mean of the lines' shadows. Its error is the relative difference of frames of direct light, formed of the same few
+# rays of a projector pixel, so that it contains no noise of the geometry.
+
+_SHOTS = 4
+_PART = 0.5
+"""Part of the accuracy that mono light may use: the frames then keep 0.87 of it, at a third more paths."""
+_NONE = 1e-6
+"""Difference that counts as none in single precision (photograph: 3e-8)."""
+
+
+class Coloured(NamedTuple):
+    plan: Plan
+    bench: Any
+    mono: bool
+
+
+def choose_colour(bench: Opened, request: Request) -> Coloured:
+    if request.seconds is not None or bench.variant.endswith("_spectral"):
+        raise ArgumentError("colour", "auto: give an accuracy in place of a time, and a mono or rgb variant")
+    started, error, whole = time.perf_counter(), 0.0, None
+    if bench.loaded.coloured or bench.sensor.quantum_efficiency_curve is not None:
+        shots = len((family := bench.family(request.patterns, request.seed).lighting).weights)
+        lighting = family.shots(np.unique(np.linspace(0, shots - 1, min(shots, _SHOTS)).astype(int)))
+        waves = bench.geometry.diffracts and request.effects.get("diffraction", True)
+        settings = Settings(bench.geometry.scene_distance, effects=frozenset({"diffraction"} if waves else ()))
+
+        def electrons(of: Apparatus, lines: Sequence[Apparatus]) -> FloatArray:
+            light, total = Simulation(of, settings).direct.trace(integer(request.seed, "colour"), 0, _RAYS), []
+            for line, own in zip(lines, light.by_line(len(lines)), strict=True):
+                simulation, nm = Simulation(line, settings), line.projector.effective_wavelength_nm
+                accumulated = simulation.accumulate("direct", own, lighting.labels, _RAYS)
+                rows = np.arange(lighting.weights.shape[1])
+                frames = expected_of([(simulation, [accumulated])], rows, lighting, request.seed, leaking=False)
+                total.append(np.stack([frame.irradiance for frame in frames]) * line.sensor.efficiency(nm) * nm)
+            return np.asarray(sum(total))
+
+        mono = electrons(bench, (bench,))  # before another variant is set
+        whole = SpectralBench.of(reopen(bench, manifests.spectral_of(bench.variant)), manifests.RUN)
+        seen = electrons(whole.whole, whole.benches)
+        error = float(np.linalg.norm(mono - seen) / np.linalg.norm(seen)) if seen.any() else 0.0
+        error = 0.0 if error < _NONE else float(f"{error:.1e}")
+    is_mono = error <= _PART * request.accuracy
+    if is_mono or whole is None:
+        bench = reopen(bench, bench.variant) if whole else bench
+        left = request.with_values(accuracy=math.sqrt(request.accuracy**2 - error**2)) if error else request
+        plan = plan_request(bench, left)
+    else:
+        bench, plan = whole.whole, whole.plan(request)
+    looked = time.perf_counter() - started - plan.predicted["plan"]
+    ways = [{"name": manifests.MONO, "error": error}, {"name": manifests.LINES, "error": 0.0}]
+    choice = {"chosen": manifests.MONO if is_mono else manifests.LINES, "candidates": ways}
+    note = f"colour: {choice['chosen']}, because mono leaves {error:.1e} of direct light in frames"
+    plan = replace(plan.taking(plan=plan.predicted["plan"] + looked), request=request, colour=choice)
+    return Coloured(replace(plan, notes=(*plan.notes, note)), bench, is_mono)
 
 
 # -------- All lines at once behind colour filters

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from mitsim.acquire.capture import Light
     from mitsim.acquire.reference import Rendered
+    from mitsim.acquire.spectral import Coloured
     from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.devices.session import BoardShape
     from mitsim.light.plan import Plan
@@ -204,6 +205,25 @@ class Bench(Apparatus):
 
         known = None if isinstance(patterns, str) else patterns
         return capture_lines(self, request_of(patterns, request), task, known)
+
+    @takes(Request, without="patterns")
+    def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured:
+        """Choose mono light if it leaves at most half of the accuracy as error of colours, else all lines. The result
+        has the ``plan``, the ``bench`` in the variant that it needs, which is set, and True for ``mono``.
+
+        Parameters
+        ----------
+        patterns
+            Name of the family.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture_lines`, and for a bench in a spectral variant.
+        """
+        from mitsim.acquire.spectral import choose_colour
+
+        return choose_colour(self, Request(patterns=patterns, **request))
 
     @check_arguments
     def in_variant(self, variant: str) -> Bench:

@@ -48,6 +48,8 @@ LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 worth its name."""
 PSNR_DB = 1.0, 100.0
 """PSNR that may be asked of an image: below, its error is its whole range; above, the truth is not known."""
+LONGEST_S = 1e6
+"""Seconds that may be asked for: eleven days, far beyond what any accuracy takes."""
 REFERENCE, FACTORED = ESTIMATORS = ("reference", "factored")
 """Of the expected irradiance."""
 VIEWS = (".png", ".html")
@@ -216,7 +218,16 @@ class Timed(Seeded):
 class Planned(Sampled, Family):
     """Which light is simulated, and how finely."""
 
+    seconds: float | None = option(
+        None, "the accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
+    )
     effects: Effects = option({}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY)
+
+    def model_post_init(self, context: object) -> None:
+        """Refuse an accuracy beside the seconds that decide it."""
+        super().model_post_init(context)
+        if self.seconds is not None and "accuracy" in self.model_fields_set:
+            raise ArgumentError("seconds", f"{self.seconds:g}: decides the accuracy; give one of both, not both")
 
 
 class Request(Timed, Planned):
@@ -238,7 +249,7 @@ class Request(Timed, Planned):
     @property
     def deciding(self) -> dict[str, Any]:
         """Return the fields that decide frames, as the manifest's configuration holds them."""
-        return self.model_dump(mode="json")
+        return self.model_dump(mode="json", exclude={"seconds" if self.seconds is None else "accuracy"})
 
 
 class SessionRequest(Sampled):
@@ -251,7 +262,7 @@ class SessionRequest(Sampled):
 
 # ---- A scene and its devices ----
 
-NO, MOSAIC = "no", "mosaic"
+NO, MOSAIC, AUTO = "no", "mosaic", "auto"
 """Words of ``colour`` beside ``lines`` and ``bands:K``."""
 
 
@@ -307,7 +318,7 @@ class Opening(LitScene):
 
     def traced_in(self, colour: str) -> str:
         """Return the variant that traces light for a ``colour``: one that knows wavelengths if lines are told apart."""
-        return self.variant if colour == NO else spectral_of(self.variant)
+        return self.variant if colour in (NO, AUTO) else spectral_of(self.variant)
 
     def check(
         self,
@@ -380,6 +391,22 @@ class Coloured(Options):
         "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K bands of "
         "its lines; mosaic: all lines at once, by a camera under colour filters; no: light that is not told apart",
         metavar="no|lines|bands:K|mosaic",
+    )
+
+
+def _known_or_auto(colour: str) -> None:
+    """Refuse a word of ``colour`` that is neither known nor auto."""
+    if colour != AUTO:
+        _known_colour(colour)
+
+
+class AnyColour(Coloured):
+    """Which of the projector's light is told apart, or auto."""
+
+    colour: Annotated[str, validated_by(_known_or_auto)] = option(
+        NO,
+        "as of calibrate: no, lines, bands:K or mosaic; auto: no if that keeps half of the accuracy, else lines",
+        metavar="no|lines|bands:K|mosaic|auto",
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import mitsim
-from mitsim.bench.request import NO, Coloured, LitScene, Opening, Planned, Request, Task, by_line
+from mitsim.bench.request import AUTO, NO, AnyColour, LitScene, Opening, Planned, Request, Task, by_line
 from mitsim.cli.commands import (
     Common,
     KnownPlan,
@@ -28,7 +28,7 @@ from mitsim.cli.commands import (
 )
 from mitsim.core.configuration import OUTPUT, QUALITY, WHAT, option
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import RUN, read_colours
+from mitsim.core.manifests import MANIFEST, MONO, RUN, read_colours
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.requests import PairOptions, PairsRequest
@@ -206,7 +206,7 @@ def doctor(asked: Common) -> int:
 # ---- plan ------------------------------------------------------------------------------------------------------------
 
 
-class Planning(OfScene, Planned, Coloured, Opening, Overwritten, Common):
+class Planning(OfScene, Planned, AnyColour, Opening, Overwritten, Common):
     """Options of `mitsim plan`."""
 
     FIRST = "scene patterns colour"
@@ -282,6 +282,8 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
         f"Seconds: {stages}",
         *plan.notes,
     ]
+    if plan.asked_seconds is not None:
+        lines.append(f"Accuracy {plan.accuracy:g} is what {plan.asked_seconds:g} s buy")
     if plan.cost:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
         lines.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
@@ -291,7 +293,7 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
 # ---- capture ---------------------------------------------------------------------------------------------------------
 
 
-class Capturing(OfScene, Request, KnownPlan, Resumed, Coloured, Opening, LimitedPictured):
+class Capturing(OfScene, Request, KnownPlan, Resumed, AnyColour, Opening, LimitedPictured):
     """Options of `mitsim capture`."""
 
     FIRST = "scene patterns exposure exposure_fraction ambient_frame"
@@ -307,7 +309,7 @@ def capture(asked: Capturing) -> int:
     Renders, exposes and writes them; in colour, one for each pattern and line of the projector.
 
     $ mitsim capture photograph -o run --patterns dots:7
-    $ mitsim capture cookie_bag -o bag --patterns hadamard:8 --accuracy 0.003
+    $ mitsim capture cookie_bag -o bag --patterns hadamard:8 --seconds 20
     $ mitsim capture photograph -o again --plan plan.json
     """
     from mitsim.core.job import memory_from_here, memory_since
@@ -318,7 +320,11 @@ def capture(asked: Capturing) -> int:
         raise MitsimError("Missing option '--patterns': give it, or a plan with --plan")
     known = asked.read(given, colour != NO)
     request = asked.part(Request) if known is None else known.request_with(given)
-    check_work(output, asked.resume, "capture", several=by_line(colour))
+    if known is not None and colour == AUTO:
+        chosen = (known.colour or {}).get("chosen", MONO)
+        colour = NO if chosen == MONO else chosen
+    begun_in_one = (output / MANIFEST).is_file()  # which auto may decide for
+    check_work(output, asked.resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
     asked.check(asked.scene, request.patterns, request.timing, colour)
     advise(RESUME)
     with asked.job() as job:
@@ -433,7 +439,7 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
 class Rendering(OfScene, Planned, LitScene, LimitedPictured):
     """Options of `mitsim render`."""
 
-    FIRST, HIDDEN = "scene output estimator spp", "patterns"
+    FIRST, HIDDEN = "scene output estimator spp", "patterns seconds"
 
     output: Path = to_make(..., "frame to write", "FRAME.exr")
     estimator: str = option("reference", "reference or factored", metavar="NAME", panel=QUALITY)
@@ -528,7 +534,7 @@ def transport(asked: Tracing) -> int:
 class Pairing(OfScene, PairOptions, Request, Resumed, Opening, Limited):
     """Options of `mitsim pairs`."""
 
-    FIRST = "scene output count"
+    FIRST, HIDDEN = "scene output count", "seconds"
     CHANGES = shown(exposure={"help": "seconds a frame, or auto: each pair for itself"})
 
     output: Path = to_make(..., "folder to make", "DIR")

@@ -503,8 +503,8 @@ _COMMANDS = {
     MOSAIC: "capture --colour mosaic",
 }
 """Commands that make a folder of each kind."""
-LINES, BANDS = "lines", "bands"
-"""Ways to simulate a projector's light by wavelength: each line, or ``bands:K`` of lines."""
+MONO, LINES, BANDS = "mono", "lines", "bands"
+"""Ways to simulate a projector's light: one effective wavelength, each line, or ``bands:K`` of lines."""
 MOST_LINES = 4
 """Lines traced together: wavelengths of a path in Mitsuba's spectral variants."""
 JOINT = "joint"

@@ -80,6 +80,8 @@ class PairsRequest(PairOptions):
 
     def model_post_init(self, _: object) -> None:
         capture, vary = self.capture, self.vary
+        if capture.seconds is not None:
+            raise ArgumentError("seconds", "pairs share their light; give an accuracy")
         if self.pictures is not None:
             picture_files(Path(self.pictures))
         if vary is None:

@@ -62,6 +62,10 @@ class Plan:
         Reasons why a result will be flagged, and choices that were made safely instead of measured more closely.
     request, cost, made_of
         Request, predicted cost, and properties of the bench that the plan depends on; None without a request.
+    asked_seconds
+        Time of the whole run that decided the accuracy; None if the accuracy was asked for.
+    colour
+        ``chosen`` of the ``candidates`` mono and lines, with the error that each leaves; None if nothing was to choose.
     """
 
     accuracy: float
@@ -75,6 +79,8 @@ class Plan:
     predicted: Mapping[str, float] = field(default_factory=dict)
     request: Request | None = None
     cost: Cost | None = None
+    asked_seconds: float | None = None
+    colour: Mapping[str, Any] | None = None
     notes: tuple[str, ...] = ()
     made_of: Mapping[str, Any] | None = None
 
@@ -116,7 +122,7 @@ class Plan:
         Raises MitsimError for a plan without a request, or if the file cannot be written.
         """
         known = self.known_request
-        asked = {name: getattr(known, name) for name in ("patterns", "seed", "effects")}
+        asked = {name: getattr(known, name) for name in ("patterns", "seconds", "seed", "effects")}
         asked |= known.model_dump(mode="json", exclude_unset=True)
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
         own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
@@ -170,7 +176,7 @@ class Plan:
         """
         planned = self.known_request
         request = planned.with_values(**changes)
-        for name in ("accuracy", "effects"):
+        for name in ("accuracy", "seconds", "effects"):
             if getattr(request, name) != getattr(planned, name):
                 raise ArgumentError(name, f"{_words(getattr(request, name))}: {self.made_for(name)}")
         return request

@@ -50,6 +50,8 @@ _OF_FOLLOWED = 0.5
 """Part of the accuracy at which more anchors of followed light are no longer tried."""
 _FRAMES_AS_MANY = 20.0
 _OF_EFFECTS = 3
+_OVER_WORK, _LESS_S = 4.2, 0.6
+"""Ratio and offset [s] of a pilot's time to the work of its samples."""
 _LOBE_RAYS = 2**22
 """Rays that search for sharp lobes, 0.5 s."""
 _CAUSTIC_PATHS = 2**20
@@ -154,6 +156,11 @@ class PilotRuns:
             paths = costs["direct"] * self.bench.n**2 * finer.direct + indirect * finer.followed
             changes = _OF_EFFECTS * len(self.present)
         return REPLICATES * paths + changes * float(one)
+
+    @property
+    def seconds(self) -> float:
+        repeats = [work / FINER for work in map(self.work, RUNS) if math.isfinite(work)]
+        return max(_OVER_WORK * sum(repeats) - _LESS_S, 0.0)
 
     # ---- Measured quantities, and the frames for them ----
 

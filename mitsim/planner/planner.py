@@ -1,4 +1,4 @@
-"""The plan of a capture, made from a short pilot run for a given accuracy.
+"""The plan of a capture, made from a short pilot run for a given accuracy or a given time.
 
 Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels, from
 sampling, omissions and coarse numbers.
@@ -10,13 +10,13 @@ import math
 import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import EFFECTS
-from mitsim.bench.request import check_accuracy
+from mitsim.bench.request import HIGHEST_ACCURACY, check_accuracy
 from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
@@ -35,6 +35,12 @@ from mitsim.transport.plugins.base import turn_and_origin
 if TYPE_CHECKING:
     from mitsim.scene.load import LoadedScene
 
+_OPENING_S = 1.5
+"""Seconds to start the program and open a scene (1.2 to 1.6 on two cores)."""
+_FIRST_ACCURACY, _FINEST_ACCURACY = 1e-3, 1e-5
+"""Accuracy that is tried first for a time, and the finest, near the end of the ladders of anchors and cells."""
+_TRIES, _NEAR, _LEAST_S = 4, 0.9, 0.05
+"""Tries of an accuracy for a time, the step to a finer one that is not worth another pilot, and least time of light."""
 _TIMED = 2**18
 """Paths that measure the pace of this machine."""
 _FOR_HEAVY_PATHS = 2**21
@@ -55,13 +61,53 @@ def make_plan(
     lines: int = 1,
 ) -> Plan:
     check_accuracy(accuracy)
-    switches = switches or {}
+    started, chosen = time.perf_counter(), _choose(bench, lighting, accuracy, seed, switches or {}, lines)
+    return _explain(accuracy, chosen, switches or {}, started)
+
+
+@single_threaded_blas()
+def plan_within(bench: Apparatus, lighting: Lighting, seconds: float, seed: int, switches: Mapping[str, bool]) -> Plan:
+    """Make the plan of the finest accuracy, of a few tries, that is predicted to take at most ``seconds``.
+
+    They begin with the program. Predictions use fixed unit costs, so that the same time gives the same plan.
+    """
+    started, accuracy, found = time.perf_counter(), _FIRST_ACCURACY, list[tuple[bool, float, float, _Chosen]]()
+    around = _OPENING_S + sum(cost_model.frame_seconds(bench, len(lighting.weights)).values())
+    while len(found) < _TRIES and accuracy not in [tried for _, tried, _, _ in found]:
+        chosen = _choose(bench, lighting, accuracy, seed, switches, 1)
+        pilot_s = chosen.runs.seconds
+        light, around = sum(_stages(chosen.runs.pilot_result, chosen.taken.settings, 1.0).values()), around + pilot_s
+        fits = light <= seconds - around and chosen.taken.fits
+        found.append((fits, accuracy, light + around, chosen))
+        # Light takes seconds as the inverse square of its accuracy, and another try another pilot.
+        step = math.sqrt(light / max(seconds - around - pilot_s, _LEAST_S))
+        if fits and step > _NEAR:
+            break
+        accuracy = float(f"{min(max(step * accuracy, _FINEST_ACCURACY), HIGHEST_ACCURACY):.3g}")
+    fits, accuracy, taken, chosen = min(found, key=lambda each: (not each[0], each[1] if each[0] else -each[1]))
+    plan = replace(_explain(accuracy, chosen, switches, started), asked_seconds=seconds)
+    few = (
+        f"{seconds:g} seconds are too few: accuracy {accuracy:g}, which was taken, is predicted to take {taken:.1f} s "
+        "from start to finish, or is not kept; give more"
+    )
+    return plan if fits else replace(plan, warnings=(few, *plan.warnings))
+
+
+class _Chosen(NamedTuple):
+    runs: pilot.PilotRuns
+    taken: choose.Candidate
+    notes: tuple[str, ...]
+
+
+def _choose(
+    bench: Apparatus, lighting: Lighting, accuracy: float, seed: int, switches: Mapping[str, bool], lines: int
+) -> _Chosen:
     if bench.loaded.unfit.factored is not None:
         raise bench.loaded.unfit.factored
     if bench.geometry.diffracts and switches.get("diffraction") is not False:
         check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
         check_waves(bench.geometry, bench.spectrum)
-    started, spent, notes = time.perf_counter(), 0.0, tuple[str, ...]()
+    spent, notes = 0.0, tuple[str, ...]()
     runs = pilot.PilotRuns(bench, lighting, accuracy, seed, lines)
     while True:  # Pilot runs are repeated with more samples while that is worth its work.
         candidates = choose.Candidates(runs.pilot_result, switches)
@@ -88,10 +134,14 @@ def make_plan(
             if samples.get(name) and costs[name].paths:
                 samples[name] = max(samples[name], _FOR_HEAVY_PATHS / (GROUPS * costs[name].paths))
         chosen = replace(chosen, settings=replace(chosen.settings, samples=samples))
-    simulation = Simulation(bench, chosen.settings)
-    pace = _measure_pace(runs.pilot_result, simulation, lighting.labels, integer(seed, "pilot", "paces"))
-    facts = SceneFacts.of(bench, switches)
-    plan = explain_plan(accuracy, runs.pilot_result, facts, switches, chosen, pace)
+    return _Chosen(runs, chosen, notes)
+
+
+def _explain(accuracy: float, chosen: _Chosen, switches: Mapping[str, bool], started: float) -> Plan:
+    (runs, taken, notes), bench = chosen, chosen.runs.bench
+    simulation = Simulation(bench, taken.settings)
+    pace = _measure_pace(runs.pilot_result, simulation, runs.lighting.labels, integer(runs.seed, "pilot", "paces"))
+    plan = explain_plan(accuracy, runs.pilot_result, SceneFacts.of(bench, switches), switches, taken, pace)
     if simulation.physics.mirrors:
         # The pilot formed the frames of other shots, or of fewer effects, from the same beams.
         plan = plan.taking(optics=plan.predicted["optics"] + bench.specular.seconds)

@@ -194,9 +194,11 @@ class _Found:
         conf = manifest.configuration
         self.add_scene(manifest, folder, is_coloured(folder))
         request = {name: conf[name] for name in Request.model_fields if name in conf}
-        if gone := [name for name in ("seconds", "noise_fraction", "closing_frame", "ambient_shots") if conf.get(name)]:
-            self.warn(f"it was made with {' and '.join(gone)}, which are no more; the accuracy is that of its plan")
+        if gone := [name for name in ("noise_fraction", "closing_frame", "ambient_shots") if conf.get(name)]:
+            self.warn(f"it was made with {' and '.join(gone)}, which are no more")
+        if request.pop("seconds", None) is not None:
             request["accuracy"] = (manifest.plan or {}).get("accuracy")
+            self.warn("it was planned by seconds: the accuracy is what they bought then")
         always = "patterns", "accuracy", "seed"
         asked = {
             name: value

@@ -369,7 +369,7 @@ def _check_step(session: Session, step: Step, place: Place, found: _Mistakes) ->
     colour = values.get("colour", NO)
     needed = {"run": "capture", "calibration": "calibrate"} if step.verb == "reconstruct" else {}
     if step.verb == "capture" and session.step("transport"):
-        for name in ("accuracy", "effects"):
+        for name in ("accuracy", "seconds", "effects"):
             if name in values:
                 found.say((*place, name), "is the transport's; give it in [transport]")
         if colour != NO:

@@ -447,7 +447,7 @@ def test_every_wrong_argument_is_refused_in_a_line(
 
 FACE = {
     "ms": [name for name in ms.__all__ if not name[0].isupper()] + ["Limits", "Modelling", "Clock", "Job"],
-    "bench": ["plan", "light", "capture", "capture_lines", "in_variant", "in_bands", "calibrate_lines",
+    "bench": ["plan", "light", "capture", "capture_lines", "choose_colour", "in_variant", "in_bands", "calibrate_lines",
               "capture_mosaic", "calibrate_mosaic", "calibrate", "calibrate_depths", "write_session", "render",
               "with_board", "family", "windows_at", "parallax_from"],
     "shots": ["save"],

@@ -187,6 +187,25 @@ def test_resume_makes_the_missing_frames_and_keeps_the_rest(bench: Bench, captur
     assert all(checksum(folder / name) == value for name, value in checksums.items())
 
 
+def test_seconds_buy_an_accuracy_that_the_manifest_states(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The choice knows no clock: made again by a machine that looks far slower, it is the same."""
+    shots = bench.capture("dots:3", tmp_path / "run", seconds=6.0, seed=5)
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["configuration"]["seconds"] == 6.0 and "accuracy" not in manifest["configuration"]
+    summary = shots.summary()
+    assert summary["asked_seconds"] == manifest["plan"]["asked_seconds"] == 6.0
+    assert summary["accuracy"] == manifest["plan"]["accuracy"] < 0.3 and not shots.warnings
+    monkeypatch.setattr("mitsim.planner.planner._measure_pace", lambda *_: 100.0)
+    whole = pixels(tmp_path / "run")
+    (tmp_path / "run" / FILES[3]).unlink()
+    with pytest.raises(MitsimError, match="other"):
+        bench.capture("dots:3", tmp_path / "run", seconds=4.0, seed=5, resume=True)
+    bench.capture("dots:3", tmp_path / "run", seconds=6.0, seed=5, resume=True)
+    assert pixels(tmp_path / "run") == whole
+
+
 @pytest.mark.parametrize(("asked", "accuracy"), [({"accuracy": 2e-2}, 2e-2), ({}, 1e-3)])
 def test_a_plan_is_made_of_what_is_asked(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, asked: dict[str, float], accuracy: float

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mitsim.bench.request import HIGHEST_ACCURACY, LOWEST_ACCURACY, Exposure, Request
+from mitsim.bench.request import HIGHEST_ACCURACY, LONGEST_S, LOWEST_ACCURACY, Exposure, Request
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S
 
@@ -36,9 +36,20 @@ def test_a_request_is_a_value() -> None:
     assert Request.of(**request.model_dump(mode="json")) == request, "as the manifest holds it"
 
 
+def test_seconds_or_an_accuracy() -> None:
+    """Not both; the manifest holds the one that was asked for, and reads back as the same request."""
+    request = Request.of(seconds=10.0, seed=2)
+    assert Request.of(**request.deciding) == request and "accuracy" not in request.deciding
+    assert "seconds" not in Request.of().deciding and Request.of().deciding["accuracy"] == 1e-3
+    for ask in (Request.of, request.with_values):
+        with pytest.raises(ArgumentError, match=r"^seconds 10: decides the accuracy; give one of both"):
+            ask(seconds=10.0, accuracy=1e-3)
+
+
 @pytest.mark.parametrize(
     ("argument", "ends"),
     [
+        ("seconds", (5e-324, LONGEST_S)),
         ("accuracy", (LOWEST_ACCURACY, HIGHEST_ACCURACY)),
         ("exposure", EXPOSURE_S),
         ("exposure_fraction", EXPOSURE_FRACTION),
@@ -52,6 +63,7 @@ def test_the_ends_of_a_range_are_within_it(argument: str, ends: tuple[float, flo
 @pytest.mark.parametrize(
     ("argument", "value", "allowed"),
     [
+        *(("seconds", value, "above 0, at most 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
         *(("accuracy", value, "from 1e-06 to 0.3") for value in (0.0, -1e-3, 0.5, math.nan, math.inf)),
         *(("exposure", value, "to 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
         *(("exposure_fraction", value, "to 1") for value in (0.0, -0.5, 1.01, math.nan)),
