@@ -184,7 +184,7 @@ class Coloured(NamedTuple):
     mono: bool
 
 
-def choose_colour(bench: Opened, request: Request) -> Coloured:
+def choose_colour(bench: Apparatus, request: Request) -> Coloured:
     if request.seconds is not None or bench.variant.endswith("_spectral"):
         raise ArgumentError("colour", "auto: give an accuracy in place of a time, and a mono or rgb variant")
     started, error, whole = time.perf_counter(), 0.0, None
@@ -211,17 +211,17 @@ def choose_colour(bench: Opened, request: Request) -> Coloured:
         error = 0.0 if error < _NONE else float(f"{error:.1e}")
     is_mono = error <= _PART * request.accuracy
     if is_mono or whole is None:
-        bench = reopen(bench, bench.variant) if whole else bench
+        own: Apparatus = reopen(bench, bench.variant) if whole else bench
         left = request.with_values(accuracy=math.sqrt(request.accuracy**2 - error**2)) if error else request
-        plan = plan_request(bench, left)
+        plan = plan_request(own, left)
     else:
-        bench, plan = whole.whole, whole.plan(request)
+        own, plan = whole.whole, whole.plan(request)
     looked = time.perf_counter() - started - plan.predicted["plan"]
     ways = [{"name": manifests.MONO, "error": error}, {"name": manifests.LINES, "error": 0.0}]
     choice = {"chosen": manifests.MONO if is_mono else manifests.LINES, "candidates": ways}
     note = f"colour: {choice['chosen']}, because mono leaves {error:.1e} of direct light in frames"
     plan = replace(plan.taking(plan=plan.predicted["plan"] + looked), request=request, colour=choice)
-    return Coloured(replace(plan, notes=(*plan.notes, note)), bench, is_mono)
+    return Coloured(replace(plan, notes=(*plan.notes, note)), own, is_mono)
 
 
 # -------- All lines at once behind colour filters
