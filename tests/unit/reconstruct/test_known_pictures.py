@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from mitsim import calibrate_known, load_calibration, load_run, reconstruct
-from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.imagelist import Preparation
@@ -35,11 +34,15 @@ def error_of(factors: Factors, camera: KnownCamera) -> float:
     return float(np.hypot(*factor_error((factors.left, factors.right), camera.factors())))
 
 
-@pytest.mark.parametrize(("pictures", "light"), [(3, 3e4), (6, 3e3)])
-def test_planted_codes_come_back_within_the_stated_error(tmp_path: Path, pictures: int, light: float) -> None:
+@pytest.mark.parametrize(
+    ("pictures", "patterns", "light"), [(3, "uniform", 3e4), (1, "dots:3", 3e4), (6, "uniform", 3e3)]
+)
+def test_planted_codes_come_back_within_the_stated_error(
+    tmp_path: Path, pictures: int, patterns: str, light: float
+) -> None:
     """Some 60 effective numbers a side: the error's own spread is 10 %. Scales that are fitted too add to it."""
     camera = KnownCamera(1, light)
-    factors = one(camera.write_session(tmp_path, pictures, terms=1))
+    factors = one(camera.write_session(tmp_path, pictures, patterns=patterns, terms=1))
     result = factors.manifest.result
     assert factors.ok
     assert result["orientation"] == "upright"
@@ -49,20 +52,7 @@ def test_planted_codes_come_back_within_the_stated_error(tmp_path: Path, picture
     assert min(result["rank"]) >= 10
 
 
-def test_more_pictures_and_more_light_make_the_error_smaller(tmp_path: Path) -> None:
-    """Noise of independent frames: half the error of four times the pictures or of four times the light, but for the
-    numbers that few pictures do not tell at all."""
-    errors = {}
-    for pictures, light in ((2, 1e4), (8, 1e4), (8, 4e4)):
-        camera = KnownCamera(3, light)
-        listed = camera.write_session(tmp_path / f"{pictures}_{light:g}", pictures, terms=1, orientation="upright")
-        errors[pictures, light] = error_of(one(listed), camera)
-    few, many, bright = errors.values()
-    assert many < 0.7 * few
-    assert bright < 0.7 * many
-
-
-@pytest.mark.parametrize("name", [name for name in TURNS if "transposed" not in name])
+@pytest.mark.parametrize("name", ["mirrored", "upside down"])
 def test_pictures_may_lie_any_way_and_images_lie_as_they_do(tmp_path: Path, name: str) -> None:
     camera = KnownCamera(2)
     factors = one(camera.write_session(tmp_path, 3, TURNS[name]), tmp_path / "cal")
@@ -81,15 +71,6 @@ def test_transposed_pictures_are_refused_by_what_to_do(tmp_path: Path) -> None:
     assert not (tmp_path / "cal").exists()
 
 
-def test_patterns_tell_more_than_even_light(tmp_path: Path) -> None:
-    """One picture under nine patterns is nine pictures."""
-    camera = KnownCamera(4)
-    even = one(camera.write_session(tmp_path / "even", 1, orientation="upright", terms=1))
-    dots = one(camera.write_session(tmp_path / "dots", 1, patterns="dots:3", orientation="upright", terms=1))
-    assert sum(dots.manifest.result["told"]) > sum(even.manifest.result["told"])
-    assert dots.manifest.result["frames"] == 9
-
-
 @pytest.mark.parametrize(("falloff", "terms"), [(0.0, 1), (0.3, 2)])
 def test_held_out_frames_tell_how_many_codes_there_are(tmp_path: Path, falloff: float, terms: int) -> None:
     """A code that loses 30 % from the middle to an edge, and gains as much to the other, is two: c(x) and i c(x)."""
@@ -99,10 +80,9 @@ def test_held_out_frames_tell_how_many_codes_there_are(tmp_path: Path, falloff: 
     assert error_of(factors, camera) < 0.1
 
 
-@pytest.mark.parametrize("mosaic", PLANES)
-def test_all_planes_of_a_sensor_make_one_coloured_calibration(tmp_path: Path, mosaic: str) -> None:
+def test_all_planes_of_a_sensor_make_one_coloured_calibration(tmp_path: Path) -> None:
     """(Planted: places of BGGR for all mosaics.)"""
-    camera = KnownCamera(6)
+    mosaic, camera = "RGGB", KnownCamera(6)
     found = calibrate_known(with_planes(camera, tmp_path, mosaic), tmp_path / "cal")
     assert set(read_colours(tmp_path / "cal", CALIBRATION).names) == set(PLANES[mosaic]) == set(found)
     for name, offset in PLANES[mosaic].items():
@@ -196,10 +176,6 @@ def test_saturated_frames_are_named(tmp_path: Path) -> None:
 # ---- What is refused ----
 
 
-def with_grey(folder: Path, values: FloatArray) -> None:
-    np.save(folder / "picture.npy", values)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -253,7 +229,7 @@ def test_a_truth_is_a_picture(tmp_path: Path) -> None:
     assert error_of(one(listed), camera) < 1
 
 
-@pytest.mark.parametrize("method", ["tikhonov", "markov", "tv"])
+@pytest.mark.parametrize("method", ["markov", "tv"])
 def test_an_image_has_no_more_directions_than_its_calibration_states(method: str, tmp_path: Path) -> None:
     """One dim picture tells some directions of the codes alone; under nine patterns the same factors tell all.
     (Planted: the rank of the factors' own numbers.)"""

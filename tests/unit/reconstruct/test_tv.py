@@ -156,12 +156,6 @@ def test_the_automatic_weight_serves_little_and_much_noise(noise: float) -> None
     assert quality(automatic) > best - 0.5
 
 
-def test_frames_of_nothing_have_no_residual() -> None:
-    prepared, sums = seen(np.eye(SIZE), np.eye(SIZE), np.zeros((SIZE, SIZE)))
-    found = solve_tv(prepared, sums, 0.1)
-    assert found.residual == 0.0 and not found.image.any()
-
-
 def test_without_weight_what_no_frame_measures_is_zero() -> None:
     """Least squares of least norm. (Planted: coefficients of 1 there.)"""
     scene = np.repeat(np.linspace(0.2, 0.9, SIZE)[:, None], SIZE, axis=1)
