@@ -188,14 +188,8 @@ def chart() -> Chart:
     return Chart(names, np.array(values[0].wavelengths), np.array([each.values for each in values]), xyz)
 
 
-@cache
-def _white_xy() -> tuple[float, float]:
-    x, y = _colour().CCS_ILLUMINANTS[_OBSERVER][_WHITE]
-    return float(x), float(y)
-
-
 def white_xyz() -> FloatArray:
-    return np.asarray(_colour().xy_to_XYZ(_white_xy()), dtype=np.float64)
+    return np.asarray(_colour().xy_to_XYZ(_colour().CCS_ILLUMINANTS[_OBSERVER][_WHITE]), dtype=np.float64)
 
 
 def daylight(wavelengths_nm: npt.ArrayLike) -> FloatArray:
@@ -247,10 +241,9 @@ def linear_srgb(xyz: npt.ArrayLike) -> FloatArray:
 
 def delta_e(xyz: npt.ArrayLike, reference: npt.ArrayLike) -> FloatArray:
     colour = _colour()
+    white = colour.CCS_ILLUMINANTS[_OBSERVER][_WHITE]
     # CIELAB ends at black, so negative noise has no colour.
-    labs = (
-        colour.XYZ_to_Lab(np.maximum(np.asarray(each, dtype=np.float64), 0), _white_xy()) for each in (xyz, reference)
-    )
+    labs = (colour.XYZ_to_Lab(np.maximum(np.asarray(each, dtype=np.float64), 0), white) for each in (xyz, reference))
     return np.asarray(colour.delta_E(*labs, method="CIE 2000"), dtype=np.float64)
 
 

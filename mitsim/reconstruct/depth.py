@@ -152,7 +152,7 @@ class CommonBasis:
                     "know the shadow at all of these depths; give a range nearer to the calibrated "
                     f"{parallax.depth_mm:g} mm",
                 )
-            own = [self._centred(columns[part]) for columns, _ in found]
+            own = [centre_columns(columns[part]) if self._centre else columns[part] for columns, _ in found]
             energies, vectors = np.linalg.eigh(sum(each @ each.T for each in own))
             lost = np.cumsum(np.maximum(energies, 0.0))
             self._parts.append(part)
@@ -179,20 +179,15 @@ class CommonBasis:
         return len(self.patterns[0]), len(self.patterns[1])
 
     def side(self, axis: int, shift: float | FloatArray, margin: int = 0) -> FloatArray:
-        columns = self._columns(axis, shift)
+        side, part = self.sides[axis], self._parts[axis]
+        columns = side.at(shift)[0][part]
         if margin:
-            before, beyond = (self._columns(axis, away / self.sides[axis].edges) for away in (-margin, margin))
+            before, beyond = (side.at(away / side.edges)[0][part] for away in (-margin, margin))
             columns = np.hstack([before[:, :margin], columns, beyond[:, columns.shape[1] - margin :]])
-        return np.asarray(self._bases[axis].T @ self._centred(columns))
+        return np.asarray(self._bases[axis].T @ (centre_columns(columns) if self._centre else columns))
 
     def smoothing(self, shift: float) -> float:
         return float(np.mean([side.noise(shift) ** 2 for side in self.sides]))
-
-    def _columns(self, axis: int, shift: float | FloatArray) -> FloatArray:
-        return self.sides[axis].at(shift)[0][self._parts[axis]]
-
-    def _centred(self, columns: FloatArray) -> FloatArray:
-        return centre_columns(columns) if self._centre else columns
 
 
 # ---- The search for the depth that leaves least ----------------------------------------------------------------------

@@ -140,6 +140,7 @@ class FactorOfDepths:
     def __init__(self, factor: FloatArray, parallax: Parallax, axis: int) -> None:
         self.factor, self.parallax = factor, parallax
         rows, count = factor.shape
+        self._middle = (count - 1) / 2
         first, last, self._by_place = pixels_of_parallax(parallax, axis, count)
         pitch = parallax.pitch_mm(axis)
         self._place: FloatArray = (np.arange(rows) - (rows - 1) / 2) * pitch
@@ -158,9 +159,10 @@ class FactorOfDepths:
         row, within, known = self._sources(column)
         shadows = self._shadow.at(row, within) * self.brightness(np.arange(self.factor.shape[1]))
         passed = self._transmission(column)
-        mean = passed.mean(axis=0)
+        mean, rows = passed.mean(axis=0), np.flatnonzero(known.all(axis=1))
+        inside = slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, 0)
         # The image stays light relative to the board's, as the sensor as a whole sees it.
-        return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
+        return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), inside
 
     def hidden_part(self, shift: float) -> FloatArray:
         return np.asarray(1 - self._transmission(self._source_columns(shift)).mean(axis=0))
@@ -171,7 +173,7 @@ class FactorOfDepths:
         return float(np.sqrt(np.mean(np.square(ColumnSpline(white, self._step).at(row, within)))))
 
     def brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
+        return np.asarray(np.exp(np.polynomial.polynomial.polyval(column / self._middle - 1, self._falloff)))
 
     def _source_columns(self, shift: float | FloatArray) -> FloatArray:
         return np.arange(self.factor.shape[1]) + (self.edges - self._by_place * self._place[:, None]) * shift
@@ -204,10 +206,6 @@ class FactorOfDepths:
     def _shadow(self) -> ColumnSpline:
         return ColumnSpline(self.factor / self.brightness(np.arange(self.factor.shape[1])), self._step)
 
-    def _across(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        middle = (self.factor.shape[1] - 1) / 2
-        return np.asarray((column - middle) / middle)
-
     @cached_property
     def _falloff(self) -> FloatArray:
         rows, count = self.factor.shape
@@ -221,14 +219,11 @@ class FactorOfDepths:
             own, same = self.factor[row, to], between(column[to])[row[:, 0] + offset]
             weight = np.sqrt(np.maximum((own + same).sum(axis=0) / 2, 0.0))
             unlike.append(np.divide((own - same).sum(axis=0), weight, out=np.zeros(to.size), where=weight > 0))
-            powers = [np.polynomial.polynomial.polyvander(self._across(place), _DEGREE) for place in (to, column[to])]
+            powers = [
+                np.polynomial.polynomial.polyvander(place / self._middle - 1, _DEGREE) for place in (to, column[to])
+            ]
             changes.append(weight[:, None] * (powers[0] - powers[1]))
         return np.asarray(np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0])
-
-
-def _whole(known: npt.NDArray[np.bool_]) -> slice:
-    inside = np.flatnonzero(known.all(axis=1))
-    return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
 
 
 # ---- A factor as a smooth function of the place between its columns --------------------------------------------------

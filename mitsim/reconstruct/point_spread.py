@@ -185,7 +185,7 @@ class ShiftedLight:
         for axis in (0, 1):
             smaller = np.repeat(smaller, 2, axis=axis)
             before = np.roll(smaller, 1, axis=axis)
-            smaller = (smaller + before) / self.precision(2)
+            smaller = (smaller + before) / 2
         rows, columns = (min(sizes) for sizes in zip(place.shape, smaller.shape, strict=True))
         place[:rows, :columns] = smaller[:rows, :columns]
         return image
@@ -276,9 +276,9 @@ class _State:
         return free
 
     def move(self, direction: Array, seen: Array, length: float) -> _State:
-        image = self.image + self.precise(length) * direction
+        image = self.image + length * direction
         if not self.prior.bounded:
-            return replace(self, image=image, residual=self.residual + self.precise(length) * seen)
+            return replace(self, image=image, residual=self.residual + length * seen)
         np.clip(image, *self.prior.bounds, out=image)
         return replace(self, image=image, residual=self.residual + self.light.image_of(image - self.image))
 
@@ -292,9 +292,6 @@ class _State:
         rows, columns = image.shape
         turned = fft.rfft2(image, self.light.grid) * self._divisor
         return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
-
-    def precise(self, number: float) -> Any:
-        return self.image.dtype.type(number)
 
 
 def _dot(first: Array, second: Array) -> float:
@@ -368,7 +365,7 @@ def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, 
 
 def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
     free = state.free
-    left = np.where(free, state.gradient, state.precise(0))
+    left = np.where(free, state.gradient, 0)
     total, seen = np.zeros_like(left), np.zeros_like(state.residual)
     direction, power, promised = np.zeros_like(left), math.inf, 0.0
     for step in range(steps):
@@ -376,16 +373,16 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
         before, power = power, _dot(left, turned)
         if power <= 0:
             break
-        direction = state.precise(power / before) * direction - turned
+        direction = (power / before) * direction - turned
         ahead, bent = state.light.image_of(direction), state.bend(direction)
         length = power / max(_dot(ahead, ahead) + _dot(direction, bent), _NOTHING)
-        total += state.precise(length) * direction
-        seen += state.precise(length) * ahead
+        total += length * direction
+        seen += length * ahead
         promised += length * power / 2
         if step < steps - 1:
             bent += state.light.correlate(ahead)
             bent *= free
-            left += state.precise(length) * bent
+            left += length * bent
     return total, seen, promised
 
 

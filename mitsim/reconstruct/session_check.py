@@ -73,9 +73,25 @@ class MovingShadow:
     def __init__(self, vectors: FloatArray, signs: FloatArray, unknown: Sequence[int] = ()) -> None:
         n, count = signs.shape
         signs = signs / np.sqrt(count)
-        spectra, self._angles = _spectra(vectors)
+        taper = np.square(np.sin(np.pi * (np.arange(len(vectors)) + 0.5) / len(vectors)))
+        spectra = np.fft.rfft((vectors - taper @ vectors / taper.sum()) * taper[:, None], axis=0)[1:]
+        stride = -(-len(spectra) // _FREQUENCIES)
+        self.angles: FloatArray = 2 * np.pi * np.arange(1, len(spectra) + 1)[::stride] / len(vectors)
+        spectra = spectra[::stride]
         columns = spectra @ signs.T
-        modes = _modes(self._angles, _step(columns, self._angles, len(vectors)), n)
+        # The step of the shadow from column to column is the one whose phases have most power.
+        power = np.square(np.abs(np.fft.fft(columns, 8 * n, axis=1)))
+        most = int(_FARTHEST * len(vectors))
+        steps = np.linspace(-most, most, 40 * most + 1) / n
+        places = np.rint(-np.outer(steps, self.angles) * (8 * n / (2 * np.pi))).astype(np.int64) % (8 * n)
+        step = float(steps[int(np.argmax(power[np.arange(len(self.angles)), places].sum(axis=1)))])
+        # The modes are these phases, and those of aliases, times slow polynomials.
+        degree = max(min(_DEGREE, n // _LINES - 1), 0)
+        slow, aliases = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree), list[ComplexArray]()
+        for turns, sign in _MOVES[: max(1, 3 * n // _LINES // (degree + 1))]:
+            phase = np.exp(1j * step * np.outer(2 * np.pi * turns + sign * self.angles, np.arange(n)))
+            aliases.append(phase[..., None] * slow)
+        modes = np.asarray(np.linalg.qr(np.concatenate(aliases, axis=2))[0])
         turned = modes.conj().transpose(0, 2, 1)
         # Squared length of each pattern's stripes beyond the modes.
         own = np.maximum(n / count - np.square(np.abs(np.matmul(turned, signs))).sum(axis=1), 1e-9)
@@ -85,7 +101,7 @@ class MovingShadow:
             columns = spectra @ signs.T
             rest = columns - np.matmul(modes, np.matmul(turned, columns[..., None]))[..., 0]
             left = rest @ signs
-        self._spectra, self._left, self._own = spectra, left, own
+        self.spectra, self._left, self._own = spectra, left, own
         squares = np.square(np.abs(spectra))
         deviations = (np.square(np.abs(left)) / own).sum(axis=0)
         self._unit = (float(np.median(deviations)) + _ROUNDING * float(squares.sum(axis=0).mean())) or 1.0
@@ -105,38 +121,6 @@ class MovingShadow:
         size = np.maximum((np.square(np.abs(shapes)) * self._own).sum(axis=0), 1e-300)
         # The deviation at each frequency is complex: half of its noise is along the shape.
         return np.real(shapes.conj() * self._left).sum(axis=0) / size, self._unit / len(self._own) / 2 / size
-
-    def powers(self) -> tuple[FloatArray, FloatArray]:
-        """Return (N,) 1 - 1 / p and its variance, where p (u_i + u_0) - u_0 is the vector of a frame of power p."""
-        return self.along(self._spectra + self._spectra[:, :1])
-
-    def moves(self) -> tuple[FloatArray, FloatArray]:
-        return self.along(-1j * self._angles[:, None] * self._spectra)
-
-
-def _spectra(columns: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    taper = np.square(np.sin(np.pi * (np.arange(len(columns)) + 0.5) / len(columns)))
-    spectra = np.fft.rfft((columns - taper @ columns / taper.sum()) * taper[:, None], axis=0)[1:]
-    stride = -(-len(spectra) // _FREQUENCIES)
-    return spectra[::stride], 2 * np.pi * np.arange(1, len(spectra) + 1)[::stride] / len(columns)
-
-
-def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
-    degree = max(min(_DEGREE, n // _LINES - 1), 0)
-    slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree)
-    moves = _MOVES[: max(1, 3 * n // _LINES // (degree + 1))]
-    phases = [np.exp(1j * step * np.outer(2 * np.pi * turns + sign * angles, np.arange(n))) for turns, sign in moves]
-    return np.asarray(np.linalg.qr(np.concatenate([phase[..., None] * slow for phase in phases], axis=2))[0])
-
-
-def _step(columns: ComplexArray, angles: FloatArray, pixels: int) -> float:
-    n = columns.shape[1]
-    length = 8 * n
-    power = np.square(np.abs(np.fft.fft(columns, length, axis=1)))
-    most = int(_FARTHEST * pixels)
-    steps = np.linspace(-most, most, 40 * most + 1) / n
-    places = np.rint(-np.outer(steps, angles) * (length / (2 * np.pi))).astype(np.int64) % length
-    return float(steps[int(np.argmax(power[np.arange(len(angles)), places].sum(axis=1)))])
 
 
 MOST_FAULTS = 0.1
@@ -551,10 +535,12 @@ class _Check:
             # The first line is +1 in all patterns, and every other one as often -1: light that all share is there.
             offset = shadow.lines[0] / len(shadow.lines) * own.size
             own.add(_OFFSET, 4 * offset * (offset > 3 * own.noise * self.count))  # smooth light is seen in part
-            places, variances = shadow.moves()
+            places, variances = shadow.along(-1j * shadow.angles[:, None] * shadow.spectra)
             own.add_motion(places[1:], variances[1:], self.times[own.axis][1:])
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
-            squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
+            # 1 - 1 / p, where p (u_i + u_0) - u_0 is the vector of a frame of power p.
+            powers, variances = shadow.along(shadow.spectra + shadow.spectra[:, :1])
+            squares = np.square(powers)
             counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > 4)
             own.add(_POWER, float(((squares - variances) * counted)[1:] @ shown[1:]))
 
