@@ -559,7 +559,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (10, 1850),
     "planner": (6, 1673),
-    "reconstruct": (22, 5964),
+    "reconstruct": (22, 5944),
     "report": (9, 2042),
     "scene": (8, 1434),
     "sensor": (5, 1193),
