@@ -478,15 +478,13 @@ def _load(variant: str, path: Path, defines: Mapping[str, str], **options: Any) 
     plugins.register()
     loaded = load_scene(path, defines, **options)
     refusals = list[MitsimError | None]()
-    for contact, estimator in zip(contacts(loaded.scene), ("the factored estimator", "the reference"), strict=True):
+    for contact in contacts(loaded.scene):
         if contact is None:
             refusals.append(None)
             continue
-        got, rule = contact.words(estimator)
-        if loaded.shapes:
-            refusals.append(loaded.shapes[contact.shape].refusal("shape", got, rule))
-        else:
-            refusals.append(MitsimError(f"{loaded.path}: shape {contact.shape}: got {got}; {rule}"))
+        shape, got, rule = contact
+        refusal = MitsimError(f"{loaded.path}: shape {shape}: got {got}; {rule}")
+        refusals.append(loaded.shapes[shape].refusal("shape", got, rule) if loaded.shapes else refusal)
     factored, reference = refusals
     if factored is not None and options.get("needs_projector", True):
         raise factored

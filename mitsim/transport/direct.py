@@ -146,45 +146,43 @@ class FluxTracer:
     def _light(
         self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32, lines: Lines | None
     ) -> mi.UnpolarizedSpectrum:
-        pixels = dr.opaque(mi.UInt32, self._setup.projector.n**2)
+        setup, glossy = self._setup, self._glossy
+        pixels = dr.opaque(mi.UInt32, setup.projector.n**2)
         shared, rng = streams(seed, pixel + group * pixels, sample)
         jitter = sobol_point(sample, shared)
-        wavelengths, spectral = sample_wavelengths(self._setup.camera, rng, lines)
-        ray = self._setup.rays.sample(pixel, jitter, rng, wavelengths)
+        wavelengths, spectral = sample_wavelengths(setup.camera, rng, lines)
+        ray = setup.rays.sample(pixel, jitter, rng, wavelengths)
         point = sobol_point(shuffle(sample, shared), shared)
-        turn = sobol_point(shuffle(sample, shared), shared) if self._glossy else None
-        sensor, flux = self._sensor.inside(point), self._setup.rays.flux(pixel, wavelengths) * spectral
+        turned = sobol_point(shuffle(sample, shared), shared) if glossy else None
+        sensor, flux = self._sensor.inside(point), setup.rays.flux(pixel, wavelengths) * spectral
+        half = dr.opaque(mi.Float, self._sensor.half_width) if glossy else None
+
+        def connected(at: Arrival, point: mi.Point3f) -> mi.UnpolarizedSpectrum:
+            reception = setup.receive(at.si, -at.direction, point, at.active)
+            value = reception.irradiance * at.light
+            if half is None:
+                return value
+            density = at.density(at.si.to_local(reception.way.direction))
+            area = 4 * dr.square(half)
+            # A spectrum is used, because Dr.Jit divides by a number as multiplication with the rounded reciprocal.
+            share = mi.UnpolarizedSpectrum(1 + area * density * reception.solid_angle(point))
+            # A choice between a spectrum and a number is a plain array, which loops of spectral variants refuse.
+            return mi.UnpolarizedSpectrum(dr.select(value > 0, value / share, 0))
 
         def add_light(
             at: Arrival, state: tuple[mi.UnpolarizedSpectrum, mi.PCG32]
         ) -> tuple[mi.UnpolarizedSpectrum, mi.PCG32]:
             total, rng = state
-            if turn is not None:
-                total = total + self._by_turn(at, rng.next_float32(), turn)
-            return total + self._by_connection(at, sensor), rng
+            if turned is not None and half is not None:
+                turn = at.turn(rng.next_float32(), turned)
+                lobe = at.active & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+                place = landing(setup, at.si, at.si.to_world(turn.wo), lobe)
+                lobe = place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
+                total = total + connected(replace(at, active=lobe), mi.Point3f(place.x, place.y, 0))
+            return total + connected(at, sensor), rng
 
-        total, _ = self._setup.passage.along(ray, flux, (mi.UnpolarizedSpectrum(0), rng), add_light)
+        total, _ = setup.passage.along(ray, flux, (mi.UnpolarizedSpectrum(0), rng), add_light)
         return total
-
-    def _by_turn(self, at: Arrival, number: mi.Float, point: mi.Point2f) -> mi.UnpolarizedSpectrum:
-        turn = at.turn(number, point)
-        lobe = at.active & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        place = landing(self._setup, at.si, at.si.to_world(turn.wo), lobe)
-        half = dr.opaque(mi.Float, self._sensor.half_width)
-        lobe = place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
-        return self._by_connection(replace(at, active=lobe), mi.Point3f(place.x, place.y, 0))
-
-    def _by_connection(self, at: Arrival, point: mi.Point3f) -> mi.UnpolarizedSpectrum:
-        reception = self._setup.receive(at.si, -at.direction, point, at.active)
-        value = reception.irradiance * at.light
-        if not self._glossy:
-            return value
-        density = at.density(at.si.to_local(reception.way.direction))
-        area = 4 * dr.square(dr.opaque(mi.Float, self._sensor.half_width))
-        # A spectrum is used, because Dr.Jit divides by a number as multiplication with the rounded reciprocal.
-        share = mi.UnpolarizedSpectrum(1 + area * density * reception.solid_angle(point))
-        # A choice between a spectrum and a number is a plain array, which loops of spectral variants refuse.
-        return mi.UnpolarizedSpectrum(dr.select(value > 0, value / share, 0))
 
 
 # -------- Direct light aimed at the anchors that sharp lobes meet
@@ -207,14 +205,6 @@ _SEED = 20
 _ROUND = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class _Aims:
-    centre: FloatArray
-    slope: FloatArray
-    scale: FloatArray
-    known: npt.NDArray[np.bool_]
-
-
 @dataclass
 class _Axis:
     x: mi.Float
@@ -226,8 +216,30 @@ class _Axis:
 class AimedTracer(DirectTracer):
     def __init__(self, setup: OpticalSetup, anchors: int, pixels: IntArray) -> None:
         super().__init__(setup, anchors, pixels=pixels)
-        self._aims = self._aim()
-        near = self._is_near().ravel()
+        count = len(pixels)
+        place, sensor, width, valid = (values.reshape(_AXES, count, -1) for values in self._axes())
+        self._centre, self._slope, self._scale = np.zeros((count, 2)), np.zeros((count, 2, 2)), np.ones((count, 2))
+        self._known = np.zeros(count, bool)
+        for number in range(count):
+            known = valid[:, number, 0] > 0
+            if np.count_nonzero(known) < _FEWEST:
+                continue
+            design = np.concatenate([np.ones((known.sum(), 1)), place[known, number] - 0.5], axis=1)
+            fit = np.linalg.lstsq(design, sensor[known, number], rcond=None)[0]
+            jacobian, spread = fit[1:].T, sensor[known, number] - design @ fit
+            if abs(np.linalg.det(jacobian)) < _ROUND * np.square(jacobian).sum():
+                continue
+            slope = np.linalg.inv(jacobian)
+            radius = np.hypot(np.median(width[known, number]), np.median(np.abs(spread)))
+            self._known[number] = True
+            self._slope[number], self._centre[number] = slope, 0.5 - slope @ fit[0]
+            self._scale[number] = np.linalg.norm(slope, axis=1) * radius
+        # Pairs of an anchor and a pixel, by whether the place that is lit most lies in the pixel or near it.
+        row, column = np.meshgrid(self.points.positions, self.points.positions, indexing="ij")
+        at = np.stack([row.ravel(), column.ravel()], axis=1)
+        middle = self._centre + np.einsum("mij,aj->ami", self._slope, at)
+        beyond = np.abs(middle - np.clip(middle, 0, 1)) / self._scale
+        near = ((np.hypot(beyond[..., 0], beyond[..., 1]) < _NEAR) | ~self._known).ravel()
         pairs = np.arange(len(near), dtype=np.int64)
         self._near, self.far = pairs[near], pairs[~near]
 
@@ -250,55 +262,26 @@ class AimedTracer(DirectTracer):
     def _place(
         self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
     ) -> tuple[mi.Point2f, mi.Float]:
-        aims, positions = self._aims, mi.Float(self.points.positions.astype(np.float32))
+        def of(values: npt.NDArray[np.generic]) -> mi.Float:
+            return dr.gather(mi.Float, mi.Float(np.ascontiguousarray(values, dtype=np.float32)), number)
+
+        positions = mi.Float(self.points.positions.astype(np.float32))
         at = [dr.gather(mi.Float, positions, index) for index in (row, column)]
-        aimed = (self._of(aims.known, number) > 0) & (jitter.x >= _EVEN)
-        even = dr.select(self._of(aims.known, number) > 0, mi.Float(_EVEN), 1)
+        aimed = (of(self._known) > 0) & (jitter.x >= _EVEN)
+        even = dr.select(of(self._known) > 0, mi.Float(_EVEN), 1)
         # The part that is even is a strip of the unit square: both parts stay stratified.
         strip = dr.select(aimed, (jitter.x - even) / (1 - _EVEN), jitter.x / even)
         places, density = [], 1 - even
         for axis, x in enumerate((jitter.y, strip)):
-            centre = self._of(aims.centre[:, axis], number)
+            centre = of(self._centre[:, axis])
             for other in range(2):
-                centre += self._of(aims.slope[:, axis, other], number) * at[other]
-            scale = self._of(aims.scale[:, axis], number)
+                centre += of(self._slope[:, axis, other]) * at[other]
+            scale = of(self._scale[:, axis])
             low, high = dr.atan(-centre / scale), dr.atan((1 - centre) / scale)
             drawn = dr.clip(centre + scale * dr.tan(dr.lerp(low, high, x)), 0, 1)
             places.append(dr.select(aimed, drawn, x))
             density *= scale / (dr.square(scale) + dr.square(places[axis] - centre)) / (high - low)
         return mi.Point2f(places[1], places[0]), dr.rcp(even + density)
-
-    @staticmethod
-    def _of(values: npt.NDArray[np.generic], number: mi.UInt32) -> mi.Float:
-        return dr.gather(mi.Float, mi.Float(np.ascontiguousarray(values, dtype=np.float32)), number)
-
-    def _aim(self) -> _Aims:
-        count = len(self._pixels)
-        place, sensor, width, valid = (values.reshape(_AXES, count, -1) for values in self._axes())
-        aims = _Aims(np.zeros((count, 2)), np.zeros((count, 2, 2)), np.ones((count, 2)), np.zeros(count, bool))
-        for number in range(count):
-            known = valid[:, number, 0] > 0
-            if np.count_nonzero(known) < _FEWEST:
-                continue
-            design = np.concatenate([np.ones((known.sum(), 1)), place[known, number] - 0.5], axis=1)
-            fit = np.linalg.lstsq(design, sensor[known, number], rcond=None)[0]
-            jacobian, spread = fit[1:].T, sensor[known, number] - design @ fit
-            if abs(np.linalg.det(jacobian)) < _ROUND * np.square(jacobian).sum():
-                continue
-            slope = np.linalg.inv(jacobian)
-            radius = np.hypot(np.median(width[known, number]), np.median(np.abs(spread)))
-            aims.known[number] = True
-            aims.slope[number], aims.centre[number] = slope, 0.5 - slope @ fit[0]
-            aims.scale[number] = np.linalg.norm(slope, axis=1) * radius
-        return aims
-
-    def _is_near(self) -> npt.NDArray[np.bool_]:
-        aims = self._aims
-        row, column = np.meshgrid(self.points.positions, self.points.positions, indexing="ij")
-        at = np.stack([row.ravel(), column.ravel()], axis=1)
-        place = aims.centre + np.einsum("mij,aj->ami", aims.slope, at)
-        beyond = np.abs(place - np.clip(place, 0, 1)) / aims.scale
-        return np.asarray((np.hypot(beyond[..., 0], beyond[..., 1]) < _NEAR) | ~aims.known)
 
     def _axes(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         count = len(self._pixels)
@@ -310,20 +293,21 @@ class AimedTracer(DirectTracer):
         wavelengths, _ = sample_wavelengths(self.setup.camera, rng, self.projector.lines)
         ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
         none = _Axis(mi.Float(0), mi.Float(0), mi.Float(1), mi.Bool(False))
-        axis, _ = self.setup.passage.along(ray, mi.Spectrum(1), (none, rng), self._axis)
+
+        def follow(at: Arrival, state: tuple[_Axis, mi.PCG32]) -> tuple[_Axis, mi.PCG32]:
+            axis, rng = state
+            # The middle of the random numbers is the middle of a lobe, or near it.
+            turn = at.turn(rng.next_float32(), mi.Point2f(0.5))
+            sharp = at.active & (turn.pdf > dr.opaque(mi.Float, _SHARP_AXIS))
+            sharp &= ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+            place = landing(self.setup, at.si, at.si.to_world(turn.wo), sharp & ~axis.known)
+            # 1 / sqrt(pi q), q the density on the sensor.
+            width = place.length * dr.rsqrt(dr.pi * turn.pdf * place.cosine)
+            return dr.select(place.arrives, _Axis(place.x, place.y, width, place.arrives), axis), rng
+
+        axis, _ = self.setup.passage.along(ray, mi.Spectrum(1), (none, rng), follow)
         row, column = rows_columns(axis.x, axis.y)
         width, valid = axis.width, axis.known
         dr.eval(jitter, row, column, width, valid)
         stacked = [np.stack([np.array(a), np.array(b)], axis=1) for a, b in ((jitter.y, jitter.x), (row, column))]
         return stacked[0], stacked[1], np.array(width, dtype=np.float64), np.array(valid, dtype=np.float64)
-
-    def _axis(self, at: Arrival, state: tuple[_Axis, mi.PCG32]) -> tuple[_Axis, mi.PCG32]:
-        axis, rng = state
-        # The middle of the random numbers is the middle of a lobe, or near it.
-        turn = at.turn(rng.next_float32(), mi.Point2f(0.5))
-        sharp = at.active & (turn.pdf > dr.opaque(mi.Float, _SHARP_AXIS))
-        sharp &= ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        place = landing(self.setup, at.si, at.si.to_world(turn.wo), sharp & ~axis.known)
-        # 1 / sqrt(pi q), q the density on the sensor.
-        width = place.length * dr.rsqrt(dr.pi * turn.pdf * place.cosine)
-        return dr.select(place.arrives, _Axis(place.x, place.y, width, place.arrives), axis), rng

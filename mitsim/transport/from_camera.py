@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +24,7 @@ import numpy as np
 from mitsim.core.manifests import MOST_LINES
 from mitsim.devices.projector import SPECTRA_NM, Band, Response
 from mitsim.transport import integrator
-from mitsim.transport.connect import Connection, OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
+from mitsim.transport.connect import OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
 from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, streams, x_y
 from mitsim.transport.records import CellAxis, CellGrid, DeviceAccumulator, PathSamples, Sightings
 from mitsim.transport.transmission import refracted_way
@@ -51,10 +51,7 @@ class FromCameraTracer(integrator.FollowingTracer):
         return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
     def _launch(self, flight: integrator.InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        return self._paths(flight).path_samples()
-
-    def _paths(self, flight: integrator.InFlight) -> CameraPaths[Any]:
-        return CameraPaths(self, CameraState, flight)
+        return CameraPaths(self, CameraState, flight).path_samples()
 
 
 @dataclass(kw_only=True)
@@ -91,8 +88,6 @@ class CameraPaths(integrator.PathIntegrator[State]):
         self.anchor = row, column
         self.tracer, self.geometry, self.connector = tracer, tracer.setup.geometry, tracer.connector
         self.emitters, self.lens = tracer.paths.emitters, tracer.projector.aperture > 0
-        # A light that a path runs into has one turn less than a light that it is connected to.
-        self.reach = 0 if self.emitters or self.lens else 1
 
         # ---- Rays from the sensor through the cells
         grid, columns = tracer.grid, dr.opaque(mi.UInt32, tracer.grid.shape[1])
@@ -137,7 +132,16 @@ class CameraPaths(integrator.PathIntegrator[State]):
         elif self.tracer.of_projector and self.lens:
             self._hit_lens(paths, si)
         if self.emitters:
-            self._hit_lamp(paths, si)
+            emitter = si.emitter(self.scene, paths.active)
+            before = dr.zeros(mi.Interaction3f)
+            before.p = paths.came_from
+            lamp = paths.active & (emitter != None)  # noqa: E711 - a Dr.Jit comparison, lane by lane
+            ds = mi.DirectionSample3f(self.scene, si, before)
+            unconnected = paths.by_delta | paths.behind_glass
+            pdf = emitter.pdf_direction(before, ds, lamp & ~unconnected)
+            share = dr.select(unconnected, 1, _share(paths.came_pdf, pdf))
+            light = self._irradiance(paths, emitter.eval(si, lamp)) * share
+            self._keep(paths, "ambient", lamp, light, self._lamps)
 
     def _hit_lens(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
         """Keep light of the projector's lens.
@@ -151,72 +155,53 @@ class CameraPaths(integrator.PathIntegrator[State]):
         light = self._irradiance(paths, hit.radiance) * share * self._part(paths, paths.kept)
         self._keep_projector(paths, hit.met, light, hit.pixel, paths.scattered)
 
-    def _hit_lamp(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
-        emitter = si.emitter(self.scene, paths.active)
-        before = dr.zeros(mi.Interaction3f)
-        before.p = paths.came_from
-        lamp = paths.active & (emitter != None)  # noqa: E711 - a Dr.Jit comparison, lane by lane
-        ds = mi.DirectionSample3f(self.scene, si, before)
-        unconnected = paths.by_delta | paths.behind_glass
-        pdf = emitter.pdf_direction(before, ds, lamp & ~unconnected)
-        share = dr.select(unconnected, 1, _share(paths.came_pdf, pdf))
-        light = self._irradiance(paths, emitter.eval(si, lamp)) * share
-        self._keep(paths, "ambient", lamp & self._is_wanted(paths.scattered), light, self._lamps)
-
     # ---- connections ------------------------------------------------------------------------------------------------
 
     def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        bsdf = si.bsdf()
+        bsdf, passage = si.bsdf(), self.passage
+
+        # ---- To the projector; a vertex that is seen straight is the projector's side's
         if not first and self.tracer.of_projector:
-            self._connect_projector(paths, si, bsdf)
+            active = paths.active & ~paths.straight
+            if passage.panes:
+                lens = self.connector.lens_point(paths.rng)
+                way = refracted_way(passage, si, self.connector.projector.emitter.world_transform() @ lens, active)
+                connection = self.connector.connect(_seen_at(si, way.apparent), paths.rng, active & way.open, lens)
+                # The way's length is counted, as for a path that runs into the lens.
+                connection.pdf *= dr.square(way.length) / dr.squared_norm(connection.target - way.apparent)
+                connection.direction, passed = way.direction, way.part / dr.square(way.eta)
+            else:
+                connection = self.connector.connect(si, paths.rng, active)
+                seen, passed = passage.between(si, connection.target, connection.valid)
+                connection.valid = connection.valid & seen
+            active, toward = connection.valid, si.to_local(connection.direction)
+            if self.lens and self.rules.interreflection:
+                value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, toward, active)
+                value *= _share(connection.pdf, pdf)
+            else:
+                value = bsdf.eval(mi.BSDFContext(), si, toward, active)
+            light = self._irradiance(paths, value * connection.weight * passed)
+            kept = paths.kept * paths.turned * (integrator.matt_part(si) if self.rules.steep else 1)
+            light *= self._part(paths, kept)
+            self._keep_projector(paths, active, light, connection.pixel, paths.scattered + 1)
+
+        # ---- To lamps
         for emitter in self.emitters:
-            self._connect_lamp(paths, si, bsdf, emitter)
-
-    def _connect_projector(self, paths: State, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
-        # A vertex that is seen straight is the projector's side's.
-        connection, passed = self._connection(paths, si, paths.active & ~paths.straight)
-        active = connection.valid
-        toward = si.to_local(connection.direction)
-        if self.lens and self.rules.interreflection:
-            value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, toward, active)
-            value *= _share(connection.pdf, pdf)
-        else:
-            value = bsdf.eval(mi.BSDFContext(), si, toward, active)
-        light = self._irradiance(paths, value * connection.weight * passed)
-        light *= self._part(paths, paths.kept * paths.turned * (integrator.matt_part(si) if self.rules.steep else 1))
-        self._keep_projector(paths, active, light, connection.pixel, paths.scattered + 1)
-
-    def _connection(self, paths: State, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
-        if not self.passage.panes:
-            connection = self.connector.connect(si, paths.rng, active)
-            seen, passed = self.passage.between(si, connection.target, connection.valid)
-            connection.valid = connection.valid & seen
-            return connection, passed
-        lens = self.connector.lens_point(paths.rng)
-        way = refracted_way(self.passage, si, self.connector.projector.emitter.world_transform() @ lens, active)
-        connection = self.connector.connect(_seen_at(si, way.apparent), paths.rng, active & way.open, lens)
-        # The way's length is counted, as for a path that runs into the lens.
-        connection.pdf *= dr.square(way.length) / dr.squared_norm(connection.target - way.apparent)
-        connection.direction = way.direction
-        return connection, way.part / dr.square(way.eta)
-
-    def _connect_lamp(self, paths: State, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, emitter: mi.Emitter) -> None:
-        point = mi.Point2f(paths.rng.next_float32(), paths.rng.next_float32())
-        ds, light = emitter.sample_direction(si, point, paths.active)
-        active, direction = paths.active & (ds.pdf > 0), ds.d
-        if self.passage.panes and mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
-            # No path runs into such a lamp behind glass, but there is one way to it.
-            way = refracted_way(self.passage, si, ds.p, active)
-            ds, light = emitter.sample_direction(_seen_at(si, way.apparent), point, active & way.open)
-            seen, passed, direction = way.open, way.part / dr.square(way.eta), way.direction
-        else:
-            seen, passed = self.passage.between(si, ds.p, active)
-        active &= seen
-        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
-        # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
-        share = dr.select(ds.delta, 1, _share(ds.pdf, pdf)) if self.rules.interreflection else 1
-        active &= self._is_wanted(paths.scattered + 1)
-        self._keep(paths, "ambient", active, self._irradiance(paths, value * light * passed) * share, self._lamps)
+            point = mi.Point2f(paths.rng.next_float32(), paths.rng.next_float32())
+            ds, light = emitter.sample_direction(si, point, paths.active)
+            active, direction = paths.active & (ds.pdf > 0), ds.d
+            if passage.panes and mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+                # No path runs into such a lamp behind glass, but there is one way to it.
+                way = refracted_way(passage, si, ds.p, active)
+                ds, light = emitter.sample_direction(_seen_at(si, way.apparent), point, active & way.open)
+                seen, passed, direction = way.open, way.part / dr.square(way.eta), way.direction
+            else:
+                seen, passed = passage.between(si, ds.p, active)
+            active &= seen
+            value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
+            # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
+            share = dr.select(ds.delta, 1, _share(ds.pdf, pdf)) if self.rules.interreflection else 1
+            self._keep(paths, "ambient", active, self._irradiance(paths, value * light * passed) * share, self._lamps)
 
     # ---- turns ------------------------------------------------------------------------------------------------------
 
@@ -258,7 +243,6 @@ class CameraPaths(integrator.PathIntegrator[State]):
     def _keep_projector(
         self, paths: State, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, order: mi.UInt32
     ) -> None:
-        active &= self._is_wanted(order)
         self._keep(paths, "direct", active & (order == 1), light, pixel)
         if self.rules.interreflection:
             self._keep(paths, "indirect", active & (order > 1), light, pixel)
@@ -269,8 +253,8 @@ class CameraPaths(integrator.PathIntegrator[State]):
     def _keep(self, paths: State, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
         # Accumulated as the sensor's centre sees it.
         row, column = (t + s * paths.inverse_depth for t, s in zip((self.row, self.column), self.origin, strict=True))
-        lit = dr.select(active, light, 0)
-        self._join(paths, kind, Sightings.of(lit, self.by_line, pixel, row, column, paths.inverse_depth))
+        seen = Sightings.of(dr.select(active, light, 0), self.by_line, pixel, row, column, paths.inverse_depth)
+        self._join(paths, kind, seen)
 
     def _join(self, paths: State, kind: str, seen: Sightings) -> None:
         paths.sightings[kind] = paths.sightings[kind].joined_by(seen, paths.rng.next_float32())
@@ -324,12 +308,12 @@ class LampTracer(FromCameraTracer):
     def per_wavelength(self) -> Sequence[LampTracer]:
         if not self.projector.parted:
             return [self]
-        return [self._of(band) for band, (first, last) in enumerate(self.counted.bands) if last > first]
-
-    def _of(self, band: int) -> LampTracer:
-        again = copy(self)
-        again._alone = dr.opaque(mi.UInt32, band)
-        return again
+        tracers = []
+        for band, (first, last) in enumerate(self.counted.bands):
+            if last > first:
+                tracers.append(copy(self))
+                tracers[-1]._alone = dr.opaque(mi.UInt32, band)
+        return tracers
 
     def wavelengths(
         self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32
@@ -356,25 +340,22 @@ class LampTracer(FromCameraTracer):
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
     def _launch(self, flight: integrator.InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        return [self._by_band(found) for found in super()._launch(flight)]
-
-    def _by_band(self, found: PathSamples) -> PathSamples:
-        assert found.lines is not None and found.lane is not None, "told apart by band"
-        light = found.lines.T.ravel().astype(np.float64)
-        several = PathSamples(
-            **{
-                name: np.repeat(getattr(found, name), MOST_LINES)
-                for name in ("anchor_row", "anchor_column", "row", "column", "inverse_depth", "kind")
-            },
-            pixel=(found.pixel[:, None] + self.counted.first + np.arange(MOST_LINES)).ravel(),
-            value=light * self.counted.units[0],
-            lane=np.repeat(found.lane, MOST_LINES),
-        )
-        if not self.projector.by_line:
-            return several
-        units = np.zeros(MOST_LINES)
-        units[: len(self.counted.units)] = self.counted.units
-        return replace(several, lines=(units[:, None] * light).astype(np.float32))
+        traced = []
+        for found in super()._launch(flight):
+            assert found.lines is not None and found.lane is not None, "told apart by band"
+            light = found.lines.T.ravel().astype(np.float64)
+            alike = ("anchor_row", "anchor_column", "row", "column", "inverse_depth", "kind", "lane")
+            several = PathSamples(
+                **{name: np.repeat(getattr(found, name), MOST_LINES) for name in alike},
+                pixel=(found.pixel[:, None] + self.counted.first + np.arange(MOST_LINES)).ravel(),
+                value=light * self.counted.units[0],
+            )
+            if self.projector.by_line:
+                units = np.zeros(MOST_LINES)
+                units[: len(self.counted.units)] = self.counted.units
+                several = replace(several, lines=(units[:, None] * light).astype(np.float32))
+            traced.append(several)
+        return traced
 
 
 class CombinedTracer:

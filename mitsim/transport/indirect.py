@@ -110,7 +110,7 @@ class ProjectorPaths(integrator.PathIntegrator[integrator.PathState]):
 
     def _way(self, paths: integrator.PathState, si: mi.SurfaceInteraction3f, sensor: mi.Point3f) -> Way:
         # Light that has only passed surfaces belongs to the direct tracer.
-        active = paths.active & ~paths.straight & self._is_wanted(paths.scattered + 1)
+        active = paths.active & ~paths.straight
         return self.setup.way(si, sensor, active)
 
     def _keep_light(

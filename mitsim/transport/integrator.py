@@ -25,7 +25,6 @@ from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, DeviceAccumulato
 if TYPE_CHECKING:
     from typing import Self
 
-    from mitsim.transport.projector import ProjectorOptics
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 PATHS_PER_LAUNCH = 2**22
@@ -40,7 +39,6 @@ _LONGEST = 0.999
 In a closed room of reflectance rho the light of a path grows by rho / chance a reflection, and its second moment is
 finite only while rho^2 < chance. A chance of 0.95 lost 10 % of the light at reflectance 0.99, 79 % at 0.999.
 """
-ANY = 2**31
 _NOTED = 32
 _LEAST_CHANCE = 1e-6
 
@@ -82,12 +80,12 @@ class Tracer(ABC):
     @property
     def per_wavelength(self) -> Sequence[Self]:
         projectors = self.projector.per_wavelength
-        return [self] if len(projectors) == 1 else [self._lit_by(projector) for projector in projectors]
-
-    def _lit_by(self, projector: ProjectorOptics) -> Self:
-        again = copy(self)
-        again.projector = projector
-        return again
+        if len(projectors) == 1:
+            return [self]
+        tracers = [copy(self) for _ in projectors]
+        for tracer, projector in zip(tracers, projectors, strict=True):
+            tracer.projector = projector
+        return tracers
 
     @abstractmethod
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
@@ -154,12 +152,10 @@ class Paths:
 
 
 class FollowingTracer(Tracer):
-    """Tracer of light over any number of surfaces, or of some orders.
+    """Tracer of light over any number of surfaces.
 
     The *order* of light is the number of surfaces that have turned it and are no mirrors; a lamp in view has 0.
     """
-
-    orders: tuple[int, int] | None = None
 
     def __init__(self, setup: OpticalSetup, paths: Paths, points: SensorPoints | None = None) -> None:
         super().__init__(setup, points)
@@ -168,11 +164,6 @@ class FollowingTracer(Tracer):
     @property
     def by_line(self) -> bool:
         return self.projector.by_line
-
-    def of_orders(self, fewest: int, most: int) -> Self:
-        again = copy(self)
-        again.orders = fewest, most
-        return again
 
 
 # -------- The path loop
@@ -215,14 +206,11 @@ class PathIntegrator(ABC, Generic[State]):
     IMPORTANCE: ClassVar[bool]
 
     first_turn: mi.Point2f | None = None
-    reach: int = 1
-    """Least number of surfaces that still turn the light of a path that goes on."""
 
     def __init__(self, tracer: FollowingTracer) -> None:
         self.rules, self.setup, self.by_line = tracer.paths, tracer.setup, tracer.by_line
         self.scene, self.passage = tracer.setup.scene, tracer.setup.passage
         self.followed = self.rules.mirrors or self.rules.interreflection or self.passage.open
-        self._orders = [dr.opaque(mi.UInt32, order) for order in tracer.orders or ()]
 
     def follow(self, paths: State) -> State:
         self.vertex(paths, first=True)
@@ -291,8 +279,6 @@ class PathIntegrator(ABC, Generic[State]):
 
         # ---- Order of the light, and the next ray
         paths.scattered += dr.select(turn.delta | passing, mi.UInt32(0), mi.UInt32(1))
-        if self._orders:
-            paths.active &= paths.scattered + self.reach <= self._orders[1]
         if first or self.passage.open:
             paths.straight &= passing
         paths.ray = self.passage.leaving(si, onward)
@@ -306,12 +292,6 @@ class PathIntegrator(ABC, Generic[State]):
 
     def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
         return mi.Bool(True)
-
-    def _is_wanted(self, order: mi.UInt32) -> mi.Bool:
-        if not self._orders:
-            return mi.Bool(True)
-        fewest, most = self._orders
-        return (order >= fewest) & (order <= most)
 
 
 def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -25,13 +24,13 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
 from mitsim.core.environment import keep_scenes
-from mitsim.transport.connect import LensHit, OpticalSetup, Reception, landing, sample_wavelengths
+from mitsim.transport.connect import OpticalSetup, Reception, landing, sample_wavelengths
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer
 from mitsim.transport.integrator import InFlight, Paths, Turn, camera_part, launches
 from mitsim.transport.plugins import base
 from mitsim.transport.projector import PinholeRays, wavelength_sets
-from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, PathSamples, Sightings, check_finite
+from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, DeviceAccumulator, PathSamples, Sightings, check_finite
 from mitsim.transport.specular import turned_by_mirrors
 from mitsim.transport.transmission import Arrival
 
@@ -142,8 +141,8 @@ def _cube(place: mi.Point3f, side: mi.Float) -> mi.UInt32:
 class _MissedTracer(FromCameraTracer):
     landed: _Landed | None
 
-    def _paths(self, flight: InFlight) -> _MissedPaths:
-        return _MissedPaths(self, flight)
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        return _MissedPaths(self, flight).path_samples()
 
 
 @dataclass(kw_only=True)
@@ -176,20 +175,15 @@ class _MissedPaths(CameraPaths[_MissedState]):
         light, none = self._irradiance(paths, hit.radiance), mi.Float(0)
         met &= hit.met
         in_mirror = base.panchromatic(light) * paths.density / hit.pdf
-        connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, self._projector_light(paths, hit)), 0)
-        self._join(
-            paths, "direct", Sightings.of(dr.select(met, light, 0), self.by_line, paths.lobe, connected, none, none)
-        )
-
-    def _projector_light(self, paths: _MissedState, hit: LensHit) -> mi.Float:
-        grid = self.tracer.grid
-        flux = self._rays.flux(hit.pixel, paths.ray.wavelengths)
-        # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
+        # Otherwise the projector lights the lobe: the path's weight without its part of the view. The first surface is
+        # at 1 / (inverse depth * slope).
+        grid, flux = self.tracer.grid, self._rays.flux(hit.pixel, paths.ray.wavelengths)
         view = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) * dr.square(dr.square(self.slope))
-        distance = paths.inverse_depth * self.slope
-        return (
-            base.panchromatic(self._irradiance(paths, flux)) / view * paths.density * self.slope * dr.square(distance)
-        )
+        sent = base.panchromatic(self._irradiance(paths, flux)) / view * paths.density * self.slope
+        lit = sent * dr.square(paths.inverse_depth * self.slope)
+        connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, lit), 0)
+        seen = Sightings.of(dr.select(met, light, 0), self.by_line, paths.lobe, connected, none, none)
+        self._join(paths, "direct", seen)
 
     def _note_turn(self, paths: _MissedState, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
         going = super()._note_turn(paths, si, turn, first)
@@ -234,7 +228,8 @@ class Highlights:
 @keep_scenes()
 def highlights(setup: OpticalSetup) -> Highlights:
     scene, projector = setup.scene, setup.projector
-    balls = [s for s in scene.shapes() if s.class_name() == "Sphere" and s.bsdf() is not None and _glossy(s.bsdf())]
+    shiny = int(mi.BSDFFlags.GlossyReflection)
+    balls = [s for s in scene.shapes() if s.class_name() == "Sphere" and s.bsdf() and s.bsdf().flags() & shiny]
     balls = balls[:: -(-len(balls) // _MOST_BALLS)] if balls else []
     if not balls:
         return Highlights(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
@@ -243,14 +238,24 @@ def highlights(setup: OpticalSetup) -> Highlights:
     turn, eye = base.turn_and_origin(setup.camera.world_transform())
     centre = np.array([np.array(ball.bbox().center(), dtype=np.float64).ravel() for ball in balls])
     radius = np.array([float(np.array(ball.bbox().extents()).max()) / 2 for ball in balls])
-    normal = _mirror_normals(centre, radius, rays.origin, eye)
+    # The normal that mirrors the projector into the eye, and directions across it.
+    normal = np.zeros_like(centre)
+    for _ in range(50):
+        at = centre + radius[:, None] * normal
+        ways = [(place - at) / np.linalg.norm(place - at, axis=1, keepdims=True) for place in (rays.origin, eye)]
+        normal = ways[0] + ways[1]
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normal, first)
     # Angles from the middle, evenly in their logarithm, and about it.
     octaves = math.log(math.pi / 2 / _NEAREST)
     angle = np.asarray(_NEAREST * np.exp(octaves * (np.arange(_POINTS) + 0.5) / _POINTS), dtype=np.float64)
     area = np.sin(angle) * angle * octaves * 2 * math.pi / _POINTS
-    points = centre[:, None] + radius[:, None, None] * _directions_about(
-        normal, angle, np.asarray(_GOLDEN * np.arange(_POINTS, dtype=np.float64))
-    )
+    turned = np.asarray(_GOLDEN * np.arange(_POINTS, dtype=np.float64))
+    across = np.cos(turned)[:, None] * first[:, None] + np.sin(turned)[:, None] * second[:, None]
+    directions = np.cos(angle)[:, None] * normal[:, None] + np.sin(angle)[:, None] * across
+    points = centre[:, None] + radius[:, None, None] * directions
     aimed = points.reshape(-1, 3)
     out = aimed - np.repeat(centre, _POINTS, axis=0)
     out /= np.linalg.norm(out, axis=1, keepdims=True)
@@ -272,29 +277,6 @@ def highlights(setup: OpticalSetup) -> Highlights:
     each = seen * light
     irradiance, moments = (v.reshape(len(balls), -1).sum(axis=1) for v in (each, each * light * rays.area))
     return Highlights(pixel[::_POINTS], irradiance, moments)
-
-
-def _glossy(bsdf: mi.BSDF) -> bool:
-    return bool(bsdf.flags() & int(mi.BSDFFlags.GlossyReflection))
-
-
-def _mirror_normals(centre: FloatArray, radius: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
-    normal = np.zeros_like(centre)
-    for _ in range(50):
-        at = centre + radius[:, None] * normal
-        ways = [(place - at) / np.linalg.norm(place - at, axis=1, keepdims=True) for place in (one, other)]
-        normal = ways[0] + ways[1]
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return normal
-
-
-def _directions_about(normal: FloatArray, angle: FloatArray, turned: FloatArray) -> FloatArray:
-    helper = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = np.cross(normal, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normal, first)
-    across = np.cos(turned)[:, None] * first[:, None] + np.sin(turned)[:, None] * second[:, None]
-    return np.asarray(np.cos(angle)[:, None] * normal[:, None] + np.sin(angle)[:, None] * across)
 
 
 def _radiance_toward(
@@ -390,9 +372,19 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
         return SharpLight.none(paths_per_sample)
     lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
     if first.widths.min() >= _BROAD * setup.geometry.half_width:
-        broad = _broad_light(setup, least, seed, float(first.widths.min()))
-        if broad.hits * max(1, _CONNECTIONS // paths_per_sample) >= _WELL_MET:
-            return broad
+        # Broad lobes are met by connections, which measure their light.
+        count, width = max(1, _CONNECTIONS // paths_per_sample), float(first.widths.min())
+        met, others = (
+            _Connections(setup, 1, spread=True).over(least, sharp).trace(seed, 0, count) for sharp in (True, False)
+        )
+        by_pixel, moments = (
+            np.bincount(met.pixel, met.value**power, minlength=paths_per_sample) / count for power in (1, 2)
+        )
+        total, moment = float(by_pixel.sum()), float(moments.sum())
+        error = math.sqrt(max(moment - float(np.square(by_pixel).sum()), 0.0) / count)
+        hits = total**2 / moment if moment else 0.0
+        if hits * count >= _WELL_MET:
+            return SharpLight(total, error, hits, by_pixel, moments, width, float(others.value.sum()) / count)
     few = -(-samples // _QUARTER)
     found = lobes.trace(np.arange(paths_per_sample), seed, 0, few)
     if len(found.widths) < _ENOUGH_MET:
@@ -422,19 +414,6 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     return SharpLight(total, found.error, hits, found.by_pixel, found.moments, width, rest)
 
 
-def _broad_light(setup: OpticalSetup, least: mi.Float, seed: int, width: float) -> SharpLight:
-    pixels = setup.projector.n**2
-    count = max(1, _CONNECTIONS // pixels)
-    met, others = (
-        _Connections(setup, 1, spread=True).over(least, sharp).trace(seed, 0, count) for sharp in (True, False)
-    )
-    by_pixel, moments = (np.bincount(met.pixel, met.value**power, minlength=pixels) / count for power in (1, 2))
-    total, moment = float(by_pixel.sum()), float(moments.sum())
-    error = math.sqrt(max(moment - float(np.square(by_pixel).sum()), 0.0) / count)
-    hits = total**2 / moment if moment else 0.0
-    return SharpLight(total, error, hits, by_pixel, moments, width, float(others.value.sum()) / count)
-
-
 def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
     return np.flatnonzero(mean_of_neighbours(chosen.reshape(side, side).astype(np.float64)) > 0)
 
@@ -458,12 +437,6 @@ class _SensorHits:
     moment: mi.Float
     density: mi.Float
     turns: mi.Float
-
-    def joined_by(self, more: _SensorHits, rng: mi.PCG32) -> _SensorHits:
-        mean = self.mean + more.mean
-        new = rng.next_float32() * mean < more.mean
-        density = dr.select(new, more.density, self.density)
-        return _SensorHits(mean, self.moment + more.moment, density, self.turns + more.turns)
 
 
 # ---- Connections over sharp lobes alone
@@ -504,7 +477,20 @@ class _Lobes:
         turned = dr.zeros(mi.Float, len(by_pixel))
         for sample, place in launches(len(pixels), first, samples):
             pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
-            number, mean, product, density = self.meet(seed, sample, pixel, wider, turned)
+            hits = self.meet(seed, sample, pixel, wider)
+            # Whole numbers, whose sums in any order are the same.
+            dr.scatter_reduce(dr.ReduceOp.Add, turned, hits.turns, pixel, hits.turns > 0)
+            # Few rays meet the sensor: of the others nothing is fetched. What is not a number is no zero either.
+            lit = ~(hits.mean == 0)
+            dr.eval(hits, turned, lit)
+            lit = dr.compress(lit)
+            number = np.array(dr.gather(mi.UInt32, pixel, lit), dtype=np.int64)
+            mean, product, density = (
+                np.array(dr.gather(mi.Float, values, lit), dtype=np.float64)
+                for values in (hits.mean, hits.moment, hits.density)
+            )
+            check_finite(mean)
+            check_finite(product)
             by_pixel += np.bincount(number, mean, minlength=len(by_pixel)) / samples
             moments += np.bincount(number, product, minlength=len(by_pixel)) / samples
             squares += float(np.square(mean).sum())
@@ -516,48 +502,33 @@ class _Lobes:
         widths = np.sqrt(sharp[pixel_of] / (np.pi * densities))
         return _LobeLight(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
 
-    def meet(
-        self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float, turned: mi.Float
-    ) -> tuple[Labels, FloatArray, FloatArray, FloatArray]:
-        half = dr.opaque(mi.Float, wider * self.setup.geometry.half_width)
+    def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float) -> _SensorHits:
+        setup, half = self.setup, dr.opaque(mi.Float, wider * self.setup.geometry.half_width)
         _, rng = base.streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-        wavelengths, spectral = sample_wavelengths(self.setup.camera, rng, self.setup.projector.lines)
-        ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
-        flux = self.setup.rays.flux(pixel, wavelengths) * spectral
-        none = _SensorHits(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
-        met, _ = self.setup.passage.along(
-            ray, flux, (none, rng), partial(self._meet_sensor, half, dr.gather(mi.Float, self.least, pixel))
-        )
-        # Whole numbers, whose sums in any order are the same.
-        dr.scatter_reduce(dr.ReduceOp.Add, turned, met.turns, pixel, met.turns > 0)
-        # Few rays meet the sensor: of the others nothing is fetched. What is not a number is no zero either.
-        lit = ~(met.mean == 0)
-        dr.eval(met, turned, lit)
-        lit = dr.compress(lit)
-        number = np.array(dr.gather(mi.UInt32, pixel, lit), dtype=np.int64)
-        mean, product, density = (
-            np.array(dr.gather(mi.Float, values, lit), dtype=np.float64)
-            for values in (met.mean, met.moment, met.density)
-        )
-        check_finite(mean)
-        check_finite(product)
-        return number, mean, product, density
+        wavelengths, spectral = sample_wavelengths(setup.camera, rng, setup.projector.lines)
+        ray = setup.rays.sample(pixel, jitter, rng, wavelengths)
+        flux, least = setup.rays.flux(pixel, wavelengths) * spectral, dr.gather(mi.Float, self.least, pixel)
 
-    def _meet_sensor(
-        self, half: mi.Float, least: mi.Float, at: Arrival, state: tuple[_SensorHits, mi.PCG32]
-    ) -> tuple[_SensorHits, mi.PCG32]:
-        met, rng = state
-        turn = at.turn(rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
-        density = at.density(turn.wo)
-        active = at.active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        turns = dr.select(active & (density > least), mi.Float(1), 0)
-        place = landing(self.setup, at.si, at.si.to_world(turn.wo), active)
-        active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
-        sensor = mi.Point3f(place.x, place.y, 0)
-        reception = self.setup.receive(at.si, -at.direction, sensor, active)
-        active &= reception.pdf > least
-        per_area = density * reception.solid_angle(sensor)
-        connected = dr.select(active, base.panchromatic(reception.irradiance * at.light), 0)
-        mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
-        return met.joined_by(_SensorHits(mean, mean * connected, per_area, turns), rng), rng
+        def meet_sensor(at: Arrival, state: tuple[_SensorHits, mi.PCG32]) -> tuple[_SensorHits, mi.PCG32]:
+            met, rng = state
+            turn = at.turn(rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+            density = at.density(turn.wo)
+            active = at.active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+            turns = dr.select(active & (density > least), mi.Float(1), 0)
+            place = landing(setup, at.si, at.si.to_world(turn.wo), active)
+            active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
+            sensor = mi.Point3f(place.x, place.y, 0)
+            reception = setup.receive(at.si, -at.direction, sensor, active)
+            active &= reception.pdf > least
+            per_area = density * reception.solid_angle(sensor)
+            connected = dr.select(active, base.panchromatic(reception.irradiance * at.light), 0)
+            mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
+            # One of the hits, drawn in proportion to its light, gives the density of all.
+            total = met.mean + mean
+            new = rng.next_float32() * total < mean
+            density = dr.select(new, per_area, met.density)
+            return _SensorHits(total, met.moment + mean * connected, density, met.turns + turns), rng
+
+        none = _SensorHits(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
+        return setup.passage.along(ray, flux, (none, rng), meet_sensor)[0]

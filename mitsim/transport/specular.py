@@ -48,9 +48,6 @@ _SMALL = 2.0
 _PAINT = 0.5
 _RIM = 1 / 16
 """The limit for beams that a rim cuts: 1.5 % of a pixel along a straight rim; each halving doubles the beams."""
-_THIN, _MANY = 0.25, 8.0
-"""Sensor pixels across, and ratio of length, of squares that are thinned out: half a pixel wide at most."""
-_STRAIGHT = 0.1
 _SHARES = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
 _MARGIN = 0.02
 _ARRAYS = ("pixel", "flux", "sensor", "tangent", "throughput")
@@ -66,27 +63,25 @@ def trace_specular_chains(
     """
     if max_depth < 1:
         raise MitsimError(f"max_depth of specular chains is {max_depth}; give at least 1")
-    parts, left = [], np.zeros(2)
-    for each in projector.per_wavelength:
-        beams, lost = _projector_beams(SpecularRays(scene, camera, each, max_depth), projector.n, camera.geometry)
-        parts += beams
-        left += lost
-    return _join(parts, left)
-
-
-def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
-    arcs, close = grazing(tracer, geometry.half_width, _UNIT)
-    parts, left = [], np.array([close, 0.0])
+    geometry, n = camera.geometry, projector.n
+    nothing = np.zeros((0, 2, 2, 2))
+    parts = [Beams(np.zeros(0, np.int64), np.zeros(0), nothing, nothing, np.zeros((0, 2, 2)), 0.0)]
+    left = np.zeros(2)
     # A sensor within the window is searched as finely as small mirrors.
     sides = np.array([[geometry.half_width], [2 * geometry.half_width / _ACROSS_SENSOR]])
-    arcs.append(_window_boxes(_Spots(tracer.camera_place[None], *sides), tracer.rays))
-    for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _COARSE, arcs):
-        for first in range(0, len(row), _AT_ONCE):
-            chosen = slice(first, first + _AT_ONCE)
-            beams, lost = _search(tracer, row[chosen], column[chosen], size, n, geometry)
-            parts += beams
-            left += lost
-    return parts, left
+    for each in projector.per_wavelength:
+        tracer = SpecularRays(scene, camera, each, max_depth)
+        arcs, close = grazing(tracer, geometry.half_width, _UNIT)
+        left[0] += close
+        arcs.append(_window_boxes(_Spots(tracer.camera_place[None], *sides), tracer.rays))
+        for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _COARSE, arcs):
+            for first in range(0, len(row), _AT_ONCE):
+                chosen = slice(first, first + _AT_ONCE)
+                beams, lost = _search(tracer, row[chosen], column[chosen], size, n, geometry)
+                parts += beams
+                left += lost
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+    return Beams(**arrays, unresolved=float(left[0]), error=math.sqrt(left[1]))
 
 
 def turned_by_mirrors(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics) -> Rays:
@@ -182,8 +177,7 @@ def _refine(
     chain, row, column, spread = squares
     parts: list[Beams] = []
     unresolved = variance = 0.0
-    finest = max(1, size // _DIVISIONS)
-    pitch, stands_for, turn = min(geometry.pitches), np.ones(len(row), np.int64), 0
+    finest, pitch = max(1, size // _DIVISIONS), min(geometry.pitches)
     while len(row):
         half = size // 2
         crossings, place = _trace_squares(tracer, row, column, half * np.arange(3))
@@ -198,76 +192,34 @@ def _refine(
         # Light that small balls send to each other is faint, and its place is known too late.
         unknown = (half <= finest * _DEEPER) & (spread[:, 0] > pitch)
         lost = ~done & (edge | unknown | (half == finest) | (len(row) > _MOST))
-        flux, pixel = stands_for * _fluxes(tracer, row, column, size, n), _pixel(row, column, n)
-        points, number = _points(nodes.take(lost), flux[lost], pixel[lost], geometry)
+        # Squares that are given up become points of light at those of their nodes that the sensor sees.
+        left, flux = nodes.take(lost), _fluxes(tracer, row, column, size, n)[lost]
+        seen = left.valid & (np.abs(left.sensor) < geometry.half_width).all(axis=-1)
+        seen &= (np.abs(left.tangent) <= geometry.tan_half_fov).all(axis=-1)
         if len(row) <= _MOST:
-            kept = ~unknown[lost][number]
-            unresolved += float(points.flux[~kept].sum())
-            points = replace(points, **{name: getattr(points, name)[kept] for name in _ARRAYS})
-            number = number[kept]
-        parts.append(points)
-        variance += float(np.square(np.bincount(number, points.flux)).sum()) if len(number) else 0.0
-        thin, way = _thinness(nodes)
-        for i, j in np.ndindex(2, 2):
-            corners = _stretch(nodes.quarter(i, j).take(done), way[done], stands_for[done])
-            at = row[done] + i * half, column[done] + j * half
-            quarter = stands_for[done] * _fluxes(tracer, *at, half, n)
-            parts.append(Beams(_pixel(*at, n), quarter, corners.sensor, corners.tangent, corners.throughput, 0.0))
-        # In thin squares every second row or column also represents its neighbour.
-        straight = _departure(nodes.sensor) < _STRAIGHT * extent
-        halved = whole & ~done & straight & (stands_for * thin < _THIN * pitch)
-        by_row = np.abs(way[:, 0]) >= np.abs(way[:, 1])
+            light = _SHARES * left.throughput * flux[:, None, None]
+            unresolved += float(light[seen & unknown[lost][:, None, None]].sum())
+            seen &= ~unknown[lost][:, None, None]
+        number, i, j = np.nonzero(seen)
+        light = (_SHARES * left.throughput * flux[:, None, None])[number, i, j]
+        sensor, tangent = (
+            np.broadcast_to(values[number, i, j][:, None, None], (len(number), 2, 2, 2))
+            for values in (left.sensor, left.tangent)
+        )
+        pixel = _pixel(row, column, n)[lost][number]
+        parts.append(Beams(pixel, light, sensor, tangent, np.ones((len(number), 2, 2)), 0.0))
+        variance += float(np.square(np.bincount(number, light)).sum()) if len(number) else 0.0
         following = []
         for i, j in np.ndindex(2, 2):
-            kept = ~halved | np.equal(np.where(by_row, i, j), turn)
-            goes_on = ~done & ~lost & kept & _near(nodes.quarter(i, j), spread, geometry)
-            more = stands_for[goes_on] * np.where(halved[goes_on], 2, 1)
+            corners, at = nodes.quarter(i, j).take(done), (row[done] + i * half, column[done] + j * half)
+            flux = _fluxes(tracer, *at, half, n)
+            parts.append(Beams(_pixel(*at, n), flux, corners.sensor, corners.tangent, corners.throughput, 0.0))
+            goes_on = ~done & ~lost & _near(nodes.quarter(i, j), spread, geometry)
             at = row[goes_on] + i * half, column[goes_on] + j * half
-            following.append((chain[goes_on], *at, more, spread[goes_on]))
-        chain, row, column, stands_for, spread = (np.concatenate(part) for part in zip(*following, strict=True))
-        size, turn = half, 1 - turn
+            following.append((chain[goes_on], *at, spread[goes_on]))
+        chain, row, column, spread = (np.concatenate(part) for part in zip(*following, strict=True))
+        size = half
     return parts, np.array([unresolved, variance])
-
-
-def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
-    """Return the width (q,) of long squares' light [mm], infinite if compact, and the direction of least motion."""
-    corners = nodes.sensor[:, ::2, ::2]
-    # Shift of the place on the sensor over the square, for a step down and a step across.
-    down, across = ((c[:, 1] - c[:, 0]).mean(axis=1) for c in (corners, corners.transpose(0, 2, 1, 3)))
-    a, b, c = (np.square(down).sum(axis=1), (down * across).sum(axis=1), np.square(across).sum(axis=1))
-    # Eigenvectors of [[a, b], [b, c]], the smaller value's by half the angle.
-    angle = np.arctan2(2 * b, a - c) / 2 + np.pi / 2
-    way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    least, most = (np.linalg.norm(down * v[:, :1] + across * v[:, 1:], axis=1) for v in (way, way[:, ::-1] * [-1, 1]))
-    with np.errstate(invalid="ignore"):
-        return np.where(most > _MANY * least, least, np.inf), way
-
-
-def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
-    wide = np.flatnonzero(factor > 1)
-    if not len(wide):
-        return corners
-    # A corner lies at -1/2 or 1/2 of the square; the part of that along the way grows.
-    place = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1)
-    along = np.einsum("ijk,qk->qij", place, way[wide]) * (factor[wide] - 1)[:, None, None]
-    for values in (corners.sensor, corners.tangent):
-        v = values[wide]
-        down, across = ((c[:, 1] - c[:, 0]).mean(axis=1) for c in (v, v.transpose(0, 2, 1, 3)))
-        slope = down * way[wide, :1] + across * way[wide, 1:]
-        values[wide] = v + along[..., None] * slope[:, None, None]
-    return corners
-
-
-def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> tuple[Beams, IntArray]:
-    seen = nodes.valid & (np.abs(nodes.sensor) < geometry.half_width).all(axis=-1)
-    seen &= (np.abs(nodes.tangent) <= geometry.tan_half_fov).all(axis=-1)
-    light = _SHARES * nodes.throughput * flux[:, None, None]
-    square, i, j = np.nonzero(seen)
-    sensor, tangent = (
-        np.broadcast_to(v[square, i, j][:, None, None], (len(square), 2, 2, 2)) for v in (nodes.sensor, nodes.tangent)
-    )
-    whole = np.ones((len(square), 2, 2))
-    return Beams(pixel[square], light[square, i, j], sensor, tangent, whole, 0.0), square
 
 
 def _box(valid: Mask, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -315,13 +267,6 @@ def _fluxes(tracer: SpecularRays, row: IntArray, column: IntArray, size: int, n:
 
 def _pixel(row: IntArray, column: IntArray, n: int) -> IntArray:
     return (row // _UNIT) * n + column // _UNIT
-
-
-def _join(parts: list[Beams], left: FloatArray) -> Beams:
-    pair = np.zeros((0, 2, 2, 2))
-    none = Beams(np.zeros(0, np.int64), np.zeros(0), pair, pair, np.zeros((0, 2, 2)), 0.0)
-    arrays = {name: np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in _ARRAYS}
-    return Beams(**arrays, unresolved=float(left[0]), error=math.sqrt(left[1]))
 
 
 # -------- Small mirrors: how finely each square of a grid over the window is divided

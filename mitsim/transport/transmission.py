@@ -7,15 +7,15 @@ surface, but weaker: direct light stays direct.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
 from mitsim.transport.plugins.base import generator
 from mitsim.transport.plugins.glass import is_glass
 
@@ -35,11 +35,8 @@ def lets_through(material: mi.BSDF) -> bool:
 
 def transmits(scene: mi.Scene) -> bool:
     materials = [shape.bsdf() for shape in scene.shapes()]
-    return any(bsdf is not None and lets_through(bsdf) for bsdf in materials) or _has_instances(scene)
-
-
-def _has_instances(scene: mi.Scene) -> bool:
-    return any(shape.class_name() == "Instance" for shape in scene.shapes())
+    instances = any(shape.class_name() == "Instance" for shape in scene.shapes())
+    return instances or any(bsdf is not None and lets_through(bsdf) for bsdf in materials)
 
 
 @dataclass
@@ -71,13 +68,11 @@ class Passage:
 
     def __init__(self, scene: mi.Scene) -> None:
         self.scene, self.panes = scene, flat_panes(scene)
-        materials = [shape.bsdf() for shape in scene.shapes()]
-        self.open = any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in materials)
-        self.open |= _has_instances(scene) or bool(self.panes)
-        self.transmits = transmits(scene)
-        kinds = {int(shape.shape_type()) for shape in scene.shapes()}
-        self._instanced = _has_instances(scene)
-        self._round = int(mi.ShapeType.Cylinder) in kinds
+        self._instanced = any(shape.class_name() == "Instance" for shape in scene.shapes())
+        self._round = any(int(shape.shape_type()) == int(mi.ShapeType.Cylinder) for shape in scene.shapes())
+        self.open, self.transmits = self._instanced or bool(self.panes), transmits(scene)
+        for bsdf in (shape.bsdf() for shape in scene.shapes()):
+            self.open |= bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
 
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
         if not self.open:
@@ -209,31 +204,25 @@ _FLAT = 1e-4
 
 
 def flat_panes(scene: mi.Scene) -> list[mi.ShapePtr]:
-    return [
-        mi.ShapePtr(shape)
-        for shape in scene.shapes()
-        if shape.bsdf() is not None and _is_glass(shape.bsdf()) and _is_flat(shape)
-    ]
-
-
-def _is_glass(material: mi.BSDF) -> bool:
-    return material.class_name() == "SmoothDielectric" or is_glass(material)
-
-
-def _is_flat(shape: mi.Shape) -> bool:
-    if not shape.is_mesh():
-        return shape.class_name() in ("Rectangle", "Disk")
-    if shape.face_count() > _MOST_FACES:
-        return False
-    faces = np.arange(shape.face_count(), dtype=np.uint32)
-    normal = np.array(shape.face_normal(mi.UInt32(faces)), dtype=np.float64).T
-    if shape.has_vertex_normals() and not shape.has_face_normals():
-        corners = np.array(shape.face_indices(mi.UInt32(faces))).T
-        shading = np.array(shape.vertex_normal(mi.UInt32(corners.ravel())), dtype=np.float64).T
-        if np.abs(np.cross(shading, np.repeat(normal, 3, axis=0))).max() > _FLAT:
-            return False
-    cosine = np.abs(normal @ normal.T)
-    return bool(np.minimum(cosine, 1 - cosine).max() < _FLAT)
+    """Return the shapes of smooth glass whose faces are flat, with normals along few axes."""
+    panes = []
+    for shape in scene.shapes():
+        glass = shape.bsdf() is not None and (shape.bsdf().class_name() == "SmoothDielectric" or is_glass(shape.bsdf()))
+        if glass and not shape.is_mesh() and shape.class_name() in ("Rectangle", "Disk"):
+            panes.append(mi.ShapePtr(shape))
+        if not glass or not shape.is_mesh() or shape.face_count() > _MOST_FACES:
+            continue
+        faces = np.arange(shape.face_count(), dtype=np.uint32)
+        normal = np.array(shape.face_normal(mi.UInt32(faces)), dtype=np.float64).T
+        if shape.has_vertex_normals() and not shape.has_face_normals():
+            corners = np.array(shape.face_indices(mi.UInt32(faces))).T
+            shading = np.array(shape.vertex_normal(mi.UInt32(corners.ravel())), dtype=np.float64).T
+            if np.abs(np.cross(shading, np.repeat(normal, 3, axis=0))).max() > _FLAT:
+                continue
+        cosine = np.abs(normal @ normal.T)
+        if np.minimum(cosine, 1 - cosine).max() < _FLAT:
+            panes.append(mi.ShapePtr(shape))
+    return panes
 
 
 @dataclass
@@ -375,60 +364,48 @@ _PARALLEL = 0.999
 _MOST = 16
 
 
-@dataclass(frozen=True)
-class Contact:
-    shape: int
-    gap: float
-    least: float
+def contacts(scene: mi.Scene) -> tuple[tuple[int, str, str] | None, tuple[int, str, str] | None]:
+    """Return what the factored estimator and the reference do not see behind surfaces that let light pass.
 
-    def words(self, estimator: str) -> tuple[str, str]:
-        rule = (
-            f"{estimator} sees what stands at least {self.least:.2g} mm from a surface that lets light through; leave "
-            "a gap of air, or take one surface with the material of both"
-        )
-        return f"another surface at a distance of {self.gap:.2g} mm", rule
-
-
-def contacts(scene: mi.Scene) -> tuple[Contact | None, Contact | None]:
-    shapes = [shape for shape in scene.shapes() if shape.bsdf() is not None]
-    clear = [shape for shape in shapes if lets_through(shape.bsdf())]
-    found: list[Contact | None] = [None, None]
-    for shape in clear[:_MOST]:
-        gap, size = _gaps(shape, [other for other in shapes if other is not shape and _close(shape, other)])
-        at = np.argsort(gap / size)[_FEWEST - 1]
-        for which, limit in enumerate((_OWN, _MITSUBA)):
-            if found[which] is None and gap[at] < limit * size[at]:
-                index = list(scene.shapes()).index(shape)
-                found[which] = Contact(index, float(gap[at]), float(limit * size[at]))
-    return found[0], found[1]
-
-
-def _close(shape: mi.Shape, other: mi.Shape) -> bool:
-    (low, high), (first, last) = ([np.array(box.min), np.array(box.max)] for box in (shape.bbox(), other.bbox()))
-    reach = _MITSUBA * (1 + max(np.abs(low).max(), np.abs(high).max()))
-    return bool((first - reach <= high).all() and (low - reach <= last).all())
-
-
-def _gaps(shape: mi.Shape, others: Sequence[mi.Shape]) -> tuple[FloatArray, FloatArray]:
-    named = {f"shape{i}": other for i, other in enumerate(others)}
-    # Surfaces that coincide with the shape's own are found without it.
-    scenes = [(mi.load_dict({"type": "scene", **named, "own": shape}), 2 * CLEAR)]
-    if named:
-        scenes.append((mi.load_dict({"type": "scene", **named}), -CLEAR))
-    rng = generator(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
-    sample = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
-    size = 1 + dr.max(dr.abs(sample.p))
-    # A disk in its own plane has one normal for all points. Of a single direction for many rays Dr.Jit 1.5.0 writes a
-    # kernel that LLVM cannot parse, and ends the process.
-    normal = mi.Vector3f(sample.n) + 0 * sample.p
-    gap = mi.Float(dr.inf)
-    for sign in (1, -1):
-        direction = normal * sign
-        for among, first in scenes:
-            ray = mi.Ray3f(sample.p + direction * (first * size), direction)
+    It is the number of a shape in the scene, the distance of its neighbour, and the rule; None if all is seen. Rays go
+    along the normals of points of a shape, among its neighbours alone, and with the shape itself, because surfaces that
+    coincide with its own are found without it.
+    """
+    found: list[tuple[int, str, str] | None] = [None, None]
+    shapes = list(scene.shapes())
+    clear = [index for index, shape in enumerate(shapes) if shape.bsdf() is not None and lets_through(shape.bsdf())]
+    for index in clear[:_MOST]:
+        shape, box = shapes[index], shapes[index].bbox()
+        low, high = np.array(box.min), np.array(box.max)
+        reach = _MITSUBA * (1 + max(np.abs(low).max(), np.abs(high).max()))
+        beside = {
+            f"shape{place}": other
+            for place, other in enumerate(shapes)
+            if place != index
+            and other.bsdf() is not None
+            and (np.array(other.bbox().min) - reach <= high).all()
+            and (low - reach <= np.array(other.bbox().max)).all()
+        }
+        scenes = [(mi.load_dict({"type": "scene", **beside, "own": shape}), 2 * CLEAR)]
+        scenes += [(mi.load_dict({"type": "scene", **beside}), -CLEAR)] if beside else []
+        rng = generator(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
+        sample = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        size, gap = 1 + dr.max(dr.abs(sample.p)), mi.Float(dr.inf)
+        # A disk in its own plane has one normal for all points. Of a single direction for many rays Dr.Jit 1.5.0 writes
+        # a kernel that LLVM cannot parse, and ends the process.
+        normal = mi.Vector3f(sample.n) + 0 * sample.p
+        for sign, (among, first) in product((1, -1), scenes):
+            ray = mi.Ray3f(sample.p + normal * sign * (first * size), normal * sign)
             ray.maxt = (_MITSUBA - first) * size
             met = among.ray_intersect(ray)
             parallel = met.is_valid() & (dr.abs(dr.dot(met.n, normal)) > _PARALLEL)
             gap = dr.minimum(gap, dr.select(parallel, dr.abs(met.t + first * size), dr.inf))
-    dr.eval(gap, size)
-    return np.array(gap, dtype=np.float64), np.array(size, dtype=np.float64)
+        dr.eval(gap, size)
+        gaps, sizes = np.array(gap, dtype=np.float64), np.array(size, dtype=np.float64)
+        at = np.argsort(gaps / sizes)[_FEWEST - 1]
+        for which, (limit, name) in enumerate(((_OWN, "the factored estimator"), (_MITSUBA, "the reference"))):
+            if found[which] is None and gaps[at] < limit * sizes[at]:
+                least = f"{name} sees what stands at least {limit * sizes[at]:.2g} mm from a surface that lets light"
+                rule = f"{least} through; leave a gap of air, or take one surface with the material of both"
+                found[which] = index, f"another surface at a distance of {gaps[at]:.2g} mm", rule
+    return found[0], found[1]

@@ -177,7 +177,7 @@ def reference_with_lens(bench: Bench, shown: np.ndarray, spp: int) -> tuple[np.n
     import mitsuba as mi
 
     from mitsim.transport import plugins
-    from mitsim.transport.plugins.lens import aperture_scene_parts
+    from tests.aperture import aperture_scene_parts
 
     plugins.register()
     with show_pattern(bench, shown):

@@ -23,10 +23,10 @@ from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import SpecularFrames, specular_frames
 from mitsim.planner.planner import make_plan
 from mitsim.transport import plugins
-from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.specular import trace_specular_chains
 from mitsim.transport.specular_rays import SpecularRays
+from tests.aperture import aperture_scene_parts
 from tests.physics.test_diffraction import by_point_source
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -21,8 +21,8 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.transport import plugins
-from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT
+from tests.aperture import aperture_scene_parts
 from tests.physics.passages import LAMP, METAL, MIRROR, SEEDS, SIGMAS, THIN, all_light, direct_light, mean, plate
 from tests.unit.transport.test_panes import WALL, slab
 

@@ -37,69 +37,18 @@ XML::
         </emitter>
     </shape>
 
-Python: :func:`aperture_scene_parts` turns a stock ``projector`` into such a disk.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.base import RIGID, rigidity_error
-from mitsim.transport.projector import CanvasMap
 
 PLUGIN = "mitsim_projector"
-
-
-def aperture_scene_parts(projector: mi.Emitter, radius: float, focus: float) -> dict[str, Any]:
-    """Return scene parts that replace a stock projector: its aperture as a disk that shines alike.
-
-    Raises MitsimError for a radius or focus [mm] that is not above 0, or a projector without a bitmap or with a scaled
-    ``to_world``. The bitmap is taken to be nearest and clamped.
-    """
-    for name, value in (("radius", radius), ("focus", focus)):
-        if not (math.isfinite(value) and value > 0):
-            raise MitsimError(f"projector aperture: {name} is {value} mm; give a finite number above 0")
-    parameters = mi.traverse(projector)
-    if "irradiance.data" not in parameters:
-        raise MitsimError("projector aperture: the projector's irradiance is not a bitmap; give it a raw bitmap")
-    canvas = CanvasMap.of(projector)
-    if rigidity_error(canvas.turn) > RIGID:
-        raise MitsimError("projector aperture: the projector's to_world scales or shears; move and turn it only")
-    to_world = mi.ScalarAffineTransform4f(
-        np.block([[canvas.turn, canvas.origin[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]).tolist()
-    )
-    emitter = {
-        "type": PLUGIN,
-        "to_world": to_world,
-        "fov": math.degrees(2 * math.atan(abs(float(canvas.x[0])) / 2)),
-        "scale": float(np.array(parameters["scale"]).ravel()[0]),
-        "focus": float(focus),
-        "irradiance": {
-            "type": "bitmap",
-            "bitmap": mi.Bitmap(np.array(parameters["irradiance.data"])),
-            "raw": True,
-            "filter_type": "nearest",
-            "wrap_mode": "clamp",
-        },
-    }
-    black = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}
-    disk = to_world @ mi.ScalarAffineTransform4f().scale([radius, radius, 1])
-    return {"projector_aperture": {"type": "disk", "to_world": disk, "bsdf": black, "emitter": emitter}}
-
-
-def _number(props: mi.Properties, name: str, low: float, high: float) -> float:
-    if name not in props:
-        raise MitsimError(f"{PLUGIN}: {name} is missing; give a number above {low:g}")
-    value = float(props[name])
-    if not low < value < high:
-        raise MitsimError(f"{PLUGIN}: {name} is {value:g}; give a number above {low:g} and below {high:g}")
-    return value
 
 
 def plugin_class() -> type:
@@ -108,18 +57,21 @@ def plugin_class() -> type:
             super().__init__(props)
             self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
             self.scale = float(props.get("scale", 1.0))
-            self.focus = _number(props, "focus", 0, math.inf)
-            self.reach = math.tan(math.radians(_number(props, "fov", 0, 180)) / 2)
+            for name, high in (("focus", math.inf), ("fov", 180)):
+                if not 0 < float(props.get(name, 0)) < high:
+                    got = f"{props[name]:g}" if name in props else "missing"
+                    raise MitsimError(f"{PLUGIN}: {name} is {got}; give a number above 0 and below {high:g}")
             if "irradiance" not in props:
                 raise MitsimError(f"{PLUGIN}: irradiance is missing; give a bitmap texture")
+            self.focus, self.reach = float(props["focus"]), math.tan(math.radians(float(props["fov"])) / 2)
             self.irradiance = props["irradiance"]
             width, height = self.irradiance.resolution()
             self.aspect = float(width) / float(height)
             self.to_world = mi.Transform4f(props.get("to_world", mi.ScalarAffineTransform4f()).matrix)
 
-        def _power(
+        def _radiance(
             self, point: mi.Point3f, direction: mi.Vector3f, wavelengths: mi.Color0f, active: mi.Bool
-        ) -> tuple[mi.Spectrum, mi.Float]:
+        ) -> mi.Spectrum:
             inverse = self.to_world.inverse()
             o, d = inverse @ point, inverse @ direction
             active &= d.z > 0
@@ -129,13 +81,8 @@ def plugin_class() -> type:
             si.uv = mi.Point2f(0.5 - 0.5 * x, 0.5 - 0.5 * y)
             si.wavelengths = wavelengths
             active &= (dr.abs(x) <= 1) & (dr.abs(y) <= 1)
-            return dr.select(active, dr.pi * self.scale * self.irradiance.eval(si, active), 0), d.z
-
-        def _radiance(
-            self, point: mi.Point3f, direction: mi.Vector3f, wavelengths: mi.Color0f, active: mi.Bool
-        ) -> mi.Spectrum:
-            power, cosine = self._power(point, direction, wavelengths, active)
-            return dr.select(cosine > 0, power / (self.get_shape().surface_area() * dr.square(dr.square(cosine))), 0)
+            power = dr.select(active, dr.pi * self.scale * self.irradiance.eval(si, active), 0)
+            return dr.select(d.z > 0, power / (self.get_shape().surface_area() * dr.square(dr.square(d.z))), 0)
 
         def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
             active &= si.wi.z > 0

@@ -10,7 +10,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.transport import plugins
-from mitsim.transport.plugins.lens import aperture_scene_parts
+from tests.aperture import aperture_scene_parts
 from tests.unit.transport.closed_forms import stock_projector
 
 SCALE, ALBEDO, N = 111000.0, 0.5, 16
@@ -145,17 +145,6 @@ def lensless_without_mis(light: dict, bsdf: dict, seed: int) -> float:
     scene = mi.load_dict({"type": "scene", "camera": camera, "mirror": board(400, bsdf), **light})
     integrator = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
     return float(np.array(mi.render(scene, integrator=integrator, spp=4096, seed=seed)).mean())
-
-
-@pytest.mark.parametrize(("radius", "focus"), [(0.0, 400.0), (2.0, -1.0), (float("nan"), 400.0), (2.0, float("inf"))])
-def test_an_aperture_without_size_is_refused(radius: float, focus: float) -> None:
-    with pytest.raises(MitsimError, match=r"projector aperture: (radius|focus) is"):
-        aperture_scene_parts(stock(), radius, focus)
-
-
-def test_a_projector_without_a_bitmap_is_refused() -> None:
-    with pytest.raises(MitsimError, match="not a bitmap"):
-        aperture_scene_parts(mi.load_dict({"type": "projector", "fov": 30}), 1.0, 400.0)
 
 
 @pytest.mark.parametrize(("name", "value"), [("focus", 0.0), ("fov", 180.0), ("focus", None), ("irradiance", None)])

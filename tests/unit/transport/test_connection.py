@@ -14,8 +14,8 @@ import pytest
 from mitsim.transport import plugins
 from mitsim.transport.connect import Connection, LensHit, ProjectorConnector
 from mitsim.transport.plugins.base import generator
-from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.projector import ProjectorOptics
+from tests.aperture import aperture_scene_parts
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
