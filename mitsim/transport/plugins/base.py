@@ -115,12 +115,8 @@ def generator(seed: mi.UInt32, stream: mi.UInt32) -> mi.PCG32:
 
 
 def streams(seed: int | mi.UInt32, stream: mi.UInt32, sample: mi.UInt32) -> tuple[mi.PCG32, mi.PCG32]:
-    shared = seed_of(seed)
+    shared = dr.opaque(mi.UInt32, seed) if isinstance(seed, int) else seed
     return generator(shared, stream), generator(shared ^ (sample * 0x9E3779B9 + 1), stream)
-
-
-def seed_of(seed: int | mi.UInt32) -> mi.UInt32:
-    return dr.opaque(mi.UInt32, seed) if isinstance(seed, int) else seed
 
 
 def sobol_point(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:

@@ -42,9 +42,7 @@ The projector is calibration/mp_cl1.toml. Mono variants see the mean over the li
 gratings at each of them, where light would keep its line). RGB variants want three lines, one for each channel, and no
 shares. Spectral variants diffract the traced wavelengths and use neither. One-sided; no polarisation.
 
-Lists are texts in scene files and dictionaries ("0.3, 0.15"). ``mi.traverse`` shows ``pitch``, ``sigma``,
-``sigma_groove``, ``diffuse``, ``reflectance`` and ``efficiencies`` (here from the lowest order to the highest); changes
-are checked as at loading.
+Lists are texts in scene files ("0.3, 0.15").
 
 XML, a compact disc::
 
@@ -61,7 +59,7 @@ Python: ``register(); mi.load_dict({"type": "mitsim_grating", "grooves": "linear
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import drjit as dr
@@ -130,22 +128,18 @@ def _model(props: mi.Properties) -> GratingModel:
     if "wavelengths" not in props:
         values = {"wavelengths": light["wavelengths_nm"], "shares": light["radiant_shares"]}
     for name in GratingModel.model_fields:
-        if name in props:
-            value = props[name]
-            values[name] = value if name == "grooves" else _numbers(name, value)
+        if name not in props:
+            continue
+        values[name] = value = props[name]
+        if name != "grooves" and not isinstance(value, bool | int | float):
+            try:
+                values[name] = numbers(value) if isinstance(value, str) else np.array(value, dtype=np.float64).tolist()
+            except (TypeError, ValueError):
+                raise MitsimError(f"{PLUGIN}: {name}: got {value!r}; give numbers separated by commas") from None
+        elif name in ("efficiencies", "negative_efficiencies", "wavelengths", "shares"):
+            values[name] = [value]
     values.setdefault("shares", [1.0] * len(values["wavelengths"]))
     return GratingModel.build(**values)
-
-
-def _numbers(name: str, value: Any) -> object:
-    if isinstance(value, bool | int | float):
-        return [value] if name in ("efficiencies", "negative_efficiencies", "wavelengths", "shares") else value
-    try:
-        if isinstance(value, str):
-            return numbers(value)
-        return [float(number) for number in np.array(value, dtype=np.float64).ravel()]
-    except (TypeError, ValueError):
-        raise MitsimError(f"{PLUGIN}: {name}: got {value!r}; give numbers separated by commas") from None
 
 
 def plugin_class() -> type:
@@ -167,32 +161,14 @@ def plugin_class() -> type:
             self.diffuse, self.reflectance = mi.Float(self.model.diffuse), mi.Float(self.model.reflectance)
             self.efficiencies = mi.Float(list(self.model.orders.values()))
             # Parameters as data, not as constants: gratings that differ by numbers share one kernel.
-            dr.make_opaque(*(getattr(self, name) for name in self._parameters()))
+            dr.make_opaque(
+                *(self.pitch, self.sigma, self.sigma_groove, self.diffuse, self.reflectance, self.efficiencies)
+            )
             total = sum(self.model.shares)
             self._shares = tuple(share / total for share in self.model.shares)
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.Anisotropic
             self.m_components = [flags]
             self.m_flags = flags
-
-        @staticmethod
-        def _parameters() -> tuple[str, ...]:
-            return ("pitch", "sigma", "sigma_groove", "diffuse", "reflectance", "efficiencies")
-
-        def traverse(self, callback: mi.TraversalCallback) -> None:
-            for name in self._parameters():
-                callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
-
-        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-            changed = {name: np.array(dr.detach(getattr(self, name)), dtype=np.float64) for name in self._parameters()}
-            parts = changed.pop("efficiencies")
-            if len(parts) != len(self.orders):
-                raise MitsimError(
-                    f"{PLUGIN}: efficiencies: got {len(parts)} numbers; orders {self.orders} have one each"
-                )
-            zero = self.orders.index(0)
-            values = {name: float(value.ravel()[0]) for name, value in changed.items()}
-            lists = {"efficiencies": parts[zero:].tolist(), "negative_efficiencies": parts[:zero][::-1].tolist()}
-            self.model = GratingModel.build(**{**self.model.model_dump(), **values, **lists})
 
         # ---- formula of the module's docstring
 
@@ -203,31 +179,19 @@ def plugin_class() -> type:
             length = dr.norm(flat)
             return dr.select(length > 0, flat / length, mi.Vector2f(1, 0))
 
-        def _lines(self, si: mi.SurfaceInteraction3f) -> Iterable[tuple[float, mi.UnpolarizedSpectrum]]:
-            if mi.is_spectral:
-                return [(1.0, mi.UnpolarizedSpectrum(si.wavelengths))]
-            if mi.is_rgb:
-                return [(1.0, mi.UnpolarizedSpectrum(list(self.model.wavelengths)))]
-            return zip(self._shares, map(mi.UnpolarizedSpectrum, self.model.wavelengths), strict=True)
-
         def _lobes(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.Float, mi.UnpolarizedSpectrum]]:
-            for share, wavelength in self._lines(si):
+            lines = zip(self._shares, map(mi.UnpolarizedSpectrum, self.model.wavelengths), strict=True)
+            if mi.is_spectral:
+                lines = [(1.0, mi.UnpolarizedSpectrum(si.wavelengths))]
+            elif mi.is_rgb:
+                lines = [(1.0, mi.UnpolarizedSpectrum(list(self.model.wavelengths)))]
+            for share, wavelength in lines:
                 for index, order in enumerate(self.orders):
                     part = share * dr.gather(mi.Float, self.efficiencies, index)
                     yield part, order * wavelength / self.pitch
 
         def _total(self) -> mi.Float:
             return self.diffuse + dr.sum(self.efficiencies)
-
-        def _distribution(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.UnpolarizedSpectrum:
-            g = self._grating_vector(si)
-            q = mi.Vector2f(si.wi.x + wo.x, si.wi.y + wo.y)
-            along = (q.y * g.x - q.x * g.y) / self.sigma_groove
-            value = mi.UnpolarizedSpectrum(0)
-            for part, shift in self._lobes(si):
-                across = (dr.dot(q, g) - shift) / self.sigma
-                value += part * dr.exp(-0.5 * (dr.square(across) + dr.square(along)))
-            return value / (dr.two_pi * self.sigma * self.sigma_groove) + self.diffuse * dr.inv_pi
 
         # ---- Mitsuba's interface
 
@@ -238,8 +202,14 @@ def plugin_class() -> type:
                 return mi.Spectrum(0), mi.Float(0)
             cosine_i, cosine_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
             active = active & (cosine_i > 0) & (cosine_o > 0)
-            density = self._distribution(si, wo) * cosine_o
-            total = self._total()
+            g, total = self._grating_vector(si), self._total()
+            q = mi.Vector2f(si.wi.x + wo.x, si.wi.y + wo.y)
+            along = (q.y * g.x - q.x * g.y) / self.sigma_groove
+            value = mi.UnpolarizedSpectrum(0)
+            for part, shift in self._lobes(si):
+                across = (dr.dot(q, g) - shift) / self.sigma
+                value += part * dr.exp(-0.5 * (dr.square(across) + dr.square(along)))
+            density = (value / (dr.two_pi * self.sigma * self.sigma_groove) + self.diffuse * dr.inv_pi) * cosine_o
             # Lobes are drawn by their part and the channel evenly: the pdf is the mean over channels.
             pdf = dr.select(active & (total > 0), dr.sum(density) / len(density) / total, 0)
             return mi.depolarizer(dr.select(active, self.reflectance * density, 0)), pdf

@@ -75,27 +75,6 @@ _BOX_RADIUS = 0.5 + 1e-4
 """Radius [pixels] of a filter that keeps light in its pixel; Mitsuba's box states 0.5 in float32."""
 
 
-def _geometry(props: mi.Properties, film: mi.Film) -> CameraGeometry:
-    of_film = ("pixels", "rows", "columns", "roi")
-    values = {name: props[name] for name in CameraGeometry.model_fields if name not in of_film and name in props}
-    (columns, rows), first, shown = ([*map(int, part)] for part in (film.size(), film.crop_offset(), film.crop_size()))
-    if rows != columns:
-        values |= {"rows": rows, "columns": columns}
-    if shown != [columns, rows]:
-        values["roi"] = first[1], first[0], shown[1], shown[0]
-    return CameraGeometry.build(PLUGIN, pixels=max(rows, columns), **values)
-
-
-def _check_rigid(transform: mi.AffineTransform4f) -> None:
-    turn, origin = base.turn_and_origin(transform)
-    error = base.rigidity_error(turn)
-    if not (np.isfinite(turn).all() and np.isfinite(origin).all() and error < base.RIGID and np.linalg.det(turn) > 0):
-        raise MitsimError(
-            f"{PLUGIN}: to_world is no rotation and translation (it scales, shears or mirrors: R^T R is {error:.2g} "
-            "from 1); lengths are mm everywhere, so move and turn the camera only"
-        )
-
-
 def plugin_class() -> type:
     class Lensless(mi.Sensor):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
@@ -105,16 +84,33 @@ def plugin_class() -> type:
                 raise MitsimError(
                     f"{PLUGIN}: the film's filter spreads light between pixels; use <rfilter type='box'/>"
                 )
-            _check_rigid(self.world_transform())
+            turn, origin = base.turn_and_origin(self.world_transform())
+            error = base.rigidity_error(turn)
+            finite = np.isfinite(turn).all() and np.isfinite(origin).all()
+            if not (finite and error < base.RIGID and np.linalg.det(turn) > 0):
+                raise MitsimError(
+                    f"{PLUGIN}: to_world is no rotation and translation (it scales, shears or mirrors: R^T R is "
+                    f"{error:.2g} from 1); lengths are mm everywhere, so move and turn the camera only"
+                )
             self._points: tuple[int, int] | None = None
-            self.wear(_geometry(props, self.film()))
+            film, of_film = self.film(), ("pixels", "rows", "columns", "roi")
+            values = {
+                name: props[name] for name in CameraGeometry.model_fields if name not in of_film and name in props
+            }
+            parts = film.size(), film.crop_offset(), film.crop_size()
+            (columns, rows), first, shown = ([*map(int, part)] for part in parts)
+            if rows != columns:
+                values |= {"rows": rows, "columns": columns}
+            if shown != [columns, rows]:
+                values["roi"] = first[1], first[0], shown[1], shown[0]
+            self.wear(CameraGeometry.build(PLUGIN, pixels=max(rows, columns), **values))
 
         def wear(self, geometry: CameraGeometry) -> None:
             self.geometry = geometry
             mask = geometry.build_mask()
             self._openings, self._feature = Openings(mask), mask.feature_mm
             self._features = self._cover = round(mask.extent_mm / mask.feature_mm)
-            self._weights, self._rows, self._columns, self._values = [], [], [], None
+            self._terms, self._values = [], None
             self._whole = isinstance(mask, Plate) and mask.grids is None
             self._lines, self._flaws = None, Flaws()
             if isinstance(mask, Plate):
@@ -124,9 +120,7 @@ def plugin_class() -> type:
                     self._lines = mi.Float(mask.lines.astype(np.float32))
                 return
             for weight, rows, columns in mask.terms:
-                self._weights.append(weight)
-                self._rows.append(mi.Float(rows.astype(np.float32)))
-                self._columns.append(mi.Float(columns.astype(np.float32)))
+                self._terms.append((weight, *(mi.Float(each.astype(np.float32)) for each in (rows, columns))))
 
         def stratify(self, points: tuple[int, int] | None) -> None:
             """Draw u and t of each pixel from Sobol points scrambled by (seed, paths a pixel); None: at random."""
@@ -139,9 +133,26 @@ def plugin_class() -> type:
             wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
             if self._points:
                 sample2, sample3 = self._stratify(sample2, *self._points)
+            # ---- u: in the region of interest, and in the active part of its pixel
+            if geometry.roi is not None:
+                roi, whole = geometry.roi, geometry.shape
+                first, shown, whole = (mi.Point2f(part[1], part[0]) for part in (roi[:2], roi[2:], whole))
+                sample2 = (first + sample2 * shown) / whole
+            if geometry.pixel_fill_factor != 1:
+                count = mi.Point2f(geometry.shape[1], geometry.shape[0])
+                middle = (dr.floor(sample2 * count) + 0.5) / count
+                sample2 = middle + (sample2 - middle) * (geometry.active_sides[1] / geometry.pixel_pitch)
             height, width = geometry.half_sides
-            u = (1 - 2 * self._active(self._on_sensor(sample2))) * mi.Point2f(width, height)
-            t, weight = self._direction(u, sample3)
+            u = (1 - 2 * sample2) * mi.Point2f(width, height)
+            # ---- t: toward an open place of what the field stop shows, in features from the mask's first corner
+            stop, side = geometry.tan_half_fov, self._feature
+            corner = [
+                (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._cover
+                for start, centre in zip(base.rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
+            ]
+            view = 2 * stop * geometry.mask_distance / side
+            row, column, weight = self._openings.draw(mi.Point2f(*corner), view, sample3)
+            t = mi.Vector2f(*base.x_y(*(place * (2 * stop / view) - stop for place in (row, column))))
             squared = 1 + dr.squared_norm(t)
             if self._whole:
                 weight *= self._transmission(self._crossing(u, t, sample3), active)
@@ -175,34 +186,6 @@ def plugin_class() -> type:
             film = (place + base.sobol_point(index, rng)) / count
             return film, base.sobol_point(base.shuffle(index, rng), rng)
 
-        def _on_sensor(self, film: mi.Point2f) -> mi.Point2f:
-            geometry, roi = self.geometry, self.geometry.roi
-            if roi is None:
-                return film
-            first, shown, whole = (mi.Point2f(part[1], part[0]) for part in (roi[:2], roi[2:], geometry.shape))
-            return (first + film * shown) / whole
-
-        def _active(self, sample: mi.Point2f) -> mi.Point2f:
-            geometry = self.geometry
-            if geometry.pixel_fill_factor == 1:
-                return sample
-            count = mi.Point2f(geometry.shape[1], geometry.shape[0])
-            middle = (dr.floor(sample * count) + 0.5) / count
-            return middle + (sample - middle) * (geometry.active_sides[1] / geometry.pixel_pitch)
-
-        def _direction(self, u: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
-            geometry = self.geometry
-            stop, side = geometry.tan_half_fov, self._feature
-            # Part of the mask within the field stop, in features from the mask's first corner.
-            first = [
-                (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._cover
-                for start, centre in zip(base.rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
-            ]
-            width = 2 * stop * geometry.mask_distance / side
-            row, column, part = self._openings.draw(mi.Point2f(*first), width, sample)
-            t = mi.Vector2f(*base.x_y(*(place * (2 * stop / width) - stop for place in (row, column))))
-            return t, part
-
         def _crossing(self, u: mi.Point2f, t: mi.Vector2f, sample: mi.Point2f) -> mi.Point2f:
             distance, flaws = self.geometry.mask_distance, self._flaws
             if any(flaws.tilt_mrad):
@@ -220,30 +203,26 @@ def plugin_class() -> type:
                 point += flaws.blur_mm * mi.warp.square_to_std_normal(moved)
             return point
 
-        def _place(self, row: mi.Float, column: mi.Float) -> tuple[mi.Float, mi.Float]:
-            if self._lines is None:
-                return tuple(dr.floor(s / self._feature + 0.5 * self._features) for s in (row, column))
-            angle = np.radians(self._flaws.turn_deg)
-            if angle:
-                cosine, sine = float(np.cos(angle)), float(np.sin(angle))
-                row, column = cosine * row + sine * column, cosine * column - sine * row
-            lines, count = self._lines, self._features + 1
-            return tuple(
-                mi.Float(dr.binary_search(0, count, lambda k, s=s: dr.gather(mi.Float, lines, k) <= s)) - 1
-                for s in (row, column)
-            )
-
         def _transmission(self, point: mi.Point2f, active: mi.Bool) -> mi.Float:
-            row, column = base.rows_columns(point.x, point.y)
-            row_centre, column_centre = self.geometry.mask_offset
-            row, column = self._place(row - row_centre, column - column_centre)
-            inside = (row >= 0) & (row < self._features) & (column >= 0) & (column < self._features)
-            inside &= active
+            centre, count = self.geometry.mask_offset, self._features
+            row, column = (s - off for s, off in zip(base.rows_columns(point.x, point.y), centre, strict=True))
+            if self._lines is None:
+                row, column = (dr.floor(s / self._feature + 0.5 * count) for s in (row, column))
+            else:
+                lines, angle = self._lines, np.radians(self._flaws.turn_deg)
+                if angle:
+                    cosine, sine = float(np.cos(angle)), float(np.sin(angle))
+                    row, column = cosine * row + sine * column, cosine * column - sine * row
+                row, column = (
+                    mi.Float(dr.binary_search(0, count + 1, lambda k, s=s: dr.gather(mi.Float, lines, k) <= s)) - 1
+                    for s in (row, column)
+                )
+            inside = (row >= 0) & (row < count) & (column >= 0) & (column < count) & active
             row, column = mi.UInt32(dr.maximum(row, 0)), mi.UInt32(dr.maximum(column, 0))
             if self._values is not None:
-                return dr.gather(mi.Float, self._values, row * self._features + column, inside)
+                return dr.gather(mi.Float, self._values, row * count + column, inside)
             total = mi.Float(0)
-            for weight, rows, columns in zip(self._weights, self._rows, self._columns, strict=True):
+            for weight, rows, columns in self._terms:
                 left = dr.gather(mi.Float, rows, row, inside)
                 total += weight * left * dr.gather(mi.Float, columns, column, inside)
             return total
@@ -321,15 +300,13 @@ class Openings:
         ]
         areas = [rows.length * columns.length for rows, columns in grids]
         total = sum(areas[1:], areas[0])
-        left, (rows, columns) = number.y * total, grids[0]
-        chosen = [rows.draw(number.x), columns.draw(_part(left, areas[0]))]
-        for (rows, columns), area, before in zip(grids[1:], areas[1:], areas, strict=False):
-            further, left = left >= before, left - before
-            place = rows.draw(number.x), columns.draw(_part(left, area))
-            chosen = [dr.select(further, new, old) for new, old in zip(place, chosen, strict=True)]
+        left, chosen = number.y * total, list[mi.Float]()
+        for index, ((rows, columns), area) in enumerate(zip(grids, areas, strict=True)):
+            if index:
+                further, left = left >= areas[index - 1], left - areas[index - 1]
+            place = rows.draw(number.x), columns.draw(dr.select(area > 0, left / area, 0))
+            if index:
+                place = [dr.select(further, new, old) for new, old in zip(place, chosen, strict=True)]
+            chosen = list(place)
         row, column = (dr.clip(place, 0, width) for place in chosen)
         return row, column, total / width**2
-
-
-def _part(amount: mi.Float, whole: mi.Float) -> mi.Float:
-    return dr.select(whole > 0, amount / whole, 0)

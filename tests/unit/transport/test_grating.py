@@ -388,22 +388,6 @@ def test_what_no_grating_can_have_is_refused_in_one_line(name: str) -> None:
     assert "MitsimError: mitsim_grating: " in last and words in last, last
 
 
-def test_parameters_can_be_changed_and_are_checked_again() -> None:
-    import mitsuba as mi
-
-    bsdf = grating(diffuse=0.1)
-    parameters = mi.traverse(bsdf)
-    parameters["pitch"] = 1000.0
-    parameters["efficiencies"] = mi.Float([0.05, 0.1, 0.4, 0.2, 0.0])
-    parameters.update()
-    wo = np.random.default_rng(10).uniform(-0.6, 0.6, (2, 500))
-    changed = grating(diffuse=0.1, pitch=1000.0, efficiencies="0.4, 0.2, 0", negative_efficiencies="0.1, 0.05")
-    assert np.allclose(evaluate(bsdf, (0.1, 0), wo), evaluate(changed, (0.1, 0), wo), rtol=1e-5, atol=1e-6)
-    parameters["sigma"] = 0.0
-    with pytest.raises(Exception, match="sigma: got 0"):
-        parameters.update()
-
-
 def test_orders_are_symmetric_unless_both_sides_are_given() -> None:
     assert grating(efficiencies="0.3, 0.2, 0.1").model.orders == {-2: 0.1, -1: 0.2, 0: 0.3, 1: 0.2, 2: 0.1}
     blazed = grating(efficiencies="0.3, 0.2", negative_efficiencies="0.05, 0.4").model
