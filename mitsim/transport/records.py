@@ -220,12 +220,18 @@ class Bundle:
             path_samples = path_samples.where(inside)
         width = self.anchors * self.cells[1]
         plane = self.anchors * self.cells[0] * width
+        layers = [(np.zeros(1, dtype=np.int64), np.ones(1))]
+        if len(self.depths) > 1:
+            nodes = 1 / np.asarray(self.depths)
+            position = np.interp(path_samples.inverse_depth, nodes, np.arange(len(nodes), dtype=np.float64))
+            first = np.minimum(position.astype(np.int64), len(nodes) - 2)
+            layers = [(first, 1 - (position - first)), (first + 1, position - first)]
         parts = [
             (layer * plane + (first + line) * width + second + place, share * line_share * place_share)
             for first, second in [(path_samples.anchor_row * self.cells[0], path_samples.anchor_column * self.cells[1])]
             for line, line_share in self._cells(self.grid.rows, path_samples.row)
             for place, place_share in self._cells(self.grid.columns, path_samples.column)
-            for layer, share in self._layers(path_samples.inverse_depth)
+            for layer, share in layers
         ]
         values = np.concatenate([path_samples.value * (share / samples) for _, share in parts])
         return np.concatenate([place for place, _ in parts]), values, np.tile(path_samples.pixel, len(parts))
@@ -267,15 +273,6 @@ class Bundle:
         first = np.minimum(position.astype(np.int64), axis.count - 2)
         beyond = position - first
         return [(first, 1 - beyond), (first + 1, beyond)]
-
-    def _layers(self, inverse_depth: FloatArray) -> list[tuple[IntArray, FloatArray]]:
-        if len(self.depths) == 1:
-            return [(np.zeros(1, dtype=np.int64), np.ones(1))]
-        nodes = 1 / np.asarray(self.depths)
-        position = np.interp(inverse_depth, nodes, np.arange(len(nodes), dtype=np.float64))
-        layer = np.minimum(position.astype(np.int64), len(nodes) - 2)
-        nearer = position - layer
-        return [(layer, 1 - nearer), (layer + 1, nearer)]
 
 
 def _index_type(*shape: int) -> type[np.int32] | type[np.int64]:
@@ -377,10 +374,6 @@ class Lit:
             shared.flags.writeable = False
         return found
 
-    def matrix(self, light: FloatArray) -> sparse.csr_array:
-        layout = self.layout
-        return sparse.csr_array((light[layout.data], layout.indices, layout.indptr), shape=layout.shape)
-
 
 class DeviceAccumulator:
     """Sums of light by row and place; ``one`` is the irradiance of about a bright path [W m^-2].
@@ -399,15 +392,6 @@ class DeviceAccumulator:
         self.sums = dr.zeros(mi.UInt64, self._entries * lines)
         self.traced = 0
 
-    def _of_line(self, line: int, entries: mi.UInt32 | None = None) -> mi.UInt64:
-        if entries is None and self.lines == 1:
-            return self.sums
-        if entries is None:
-            entries = dr.arange(mi.UInt32, self._entries)
-        if not len(entries):  # of which there are no multiples
-            return mi.UInt64()
-        return dr.gather(mi.UInt64, self.sums, entries * self.lines + line)
-
     @staticmethod
     def _places(bundle: Bundle) -> int:
         return bundle.size + bundle.anchors**2
@@ -422,18 +406,24 @@ class DeviceAccumulator:
         layer = mi.UInt32(0)
         for part in self._parts_beyond(seen):
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
-        cells = [self._cell(axis, tau) for axis, tau in self._axes(seen)]
-        return self._place(seen, layer, cells, anchor)
+        axes = (self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)
+        return self._place(seen, layer, [self._cell(axis, tau) for axis, tau in axes], anchor)
 
     def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
+        """Yield the places that light is split between, and its share in each."""
         passed = [dr.clip(part, 0, 1) for part in self._parts_beyond(seen)]
         layers = [(mi.UInt32(k), a - b) for k, (a, b) in enumerate(pairwise([mi.Float(1), *passed, mi.Float(0)]))]
-        rows, columns = (self._cells(axis, tau) for axis, tau in self._axes(seen))
-        for (layer, part), (row, row_part), (column, column_part) in product(layers, rows, columns):
+        cells = []
+        for axis, tau in ((self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)):
+            if not self._bundle.between or axis.count == 1:
+                cells.append([(self._cell(axis, tau), mi.Float(1))])
+                continue
+            position = dr.clip(self._position(axis, tau) - 0.5, 0, dr.opaque(mi.Float, axis.count - 1))
+            first = dr.minimum(mi.UInt32(position), dr.opaque(mi.UInt32, axis.count - 2))
+            beyond = position - mi.Float(first)
+            cells.append([(first, 1 - beyond), (first + 1, beyond)])
+        for (layer, part), (row, row_part), (column, column_part) in product(layers, *cells):
             yield self._place(seen, layer, [row, column], anchor), part * row_part * column_part
-
-    def _axes(self, seen: Sightings) -> tuple[tuple[CellAxis, mi.Float], tuple[CellAxis, mi.Float]]:
-        return (self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)
 
     def _parts_beyond(self, seen: Sightings) -> Iterator[mi.Float]:
         for low, high in pairwise(1 / depth for depth in self._bundle.depths):
@@ -446,22 +436,13 @@ class DeviceAccumulator:
     def _cell(self, axis: CellAxis, tau: mi.Float) -> mi.UInt32:
         return mi.UInt32(dr.maximum(dr.floor(self._position(axis, tau)), 0))
 
-    def _cells(self, axis: CellAxis, tau: mi.Float) -> list[tuple[mi.UInt32, mi.Float]]:
-        if not self._bundle.between or axis.count == 1:
-            return [(self._cell(axis, tau), mi.Float(1))]
-        position = dr.clip(self._position(axis, tau) - 0.5, 0, dr.opaque(mi.Float, axis.count - 1))
-        first = dr.minimum(mi.UInt32(position), dr.opaque(mi.UInt32, axis.count - 2))
-        beyond = position - mi.Float(first)
-        return [(first, 1 - beyond), (first + 1, beyond)]
-
     def _place(
         self, seen: Sightings, layer: mi.UInt32, cells: Sequence[mi.UInt32], anchor: tuple[mi.UInt32, mi.UInt32] | None
     ) -> mi.UInt32:
-        inside = mi.Bool(True)
-        for axis, tau in self._axes(seen):
+        inside, grid = mi.Bool(True), self._bundle.grid
+        for axis, tau in ((grid.rows, seen.row), (grid.columns, seen.column)):
             position = self._position(axis, tau)
             inside &= (position >= 0) & (position < dr.opaque(mi.Float, axis.count))
-        grid = self._bundle.grid
         rows, columns, anchors = (dr.opaque(mi.UInt32, count) for count in (*grid.shape, self._bundle.anchors))
         line, column = anchor or (mi.UInt32(0), mi.UInt32(0))
         place = ((layer * anchors + line) * rows + cells[0]) * (anchors * columns) + column * columns + cells[1]
@@ -481,9 +462,18 @@ class DeviceAccumulator:
             dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, lit, mode=dr.ReduceMode.Direct)
 
     def fetch(self) -> list[DeviceSums]:
-        lines = range(self.lines)
-        lit = dr.compress(reduce(or_, (self._of_line(line) != 0 for line in lines)))
-        units = [self._of_line(line, lit) for line in lines]
+        """Return the sums of each line, and begin anew."""
+        rows = self.sums
+        if self.lines > 1:
+            every = dr.arange(mi.UInt32, self._entries)
+            by_line = [dr.gather(mi.UInt64, self.sums, every * self.lines + line) for line in range(self.lines)]
+            rows = reduce(or_, (each != 0 for each in by_line))
+        lit = dr.compress(rows != 0 if self.lines == 1 else rows)
+        # Of no entries there are no multiples.
+        units = [
+            dr.gather(mi.UInt64, self.sums, lit * self.lines + line) if len(lit) else mi.UInt64()
+            for line in range(self.lines)
+        ]
         dr.eval(lit, units)
         self.sums = dr.zeros(mi.UInt64, self._entries * self.lines)
         found = Lit(np.array(lit), self._rows, self._bundle.size, self._bundle.lamps)
@@ -507,10 +497,12 @@ class DeviceSums:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-        light = units.astype(np.float64) * (accumulator._unit / samples)
-        return lit.matrix(light), float(light.sum()), float(light[lit.inside :].sum())
+        light, layout = units.astype(np.float64) * (accumulator._unit / samples), lit.layout
+        matrix = sparse.csr_array((light[layout.data], layout.indices, layout.indptr), shape=layout.shape)
+        return matrix, float(light.sum()), float(light[lit.inside :].sum())
 
     def beyond(self, samples: int = 1) -> FloatArray:
+        """Return the light outside by row and anchor, (rows, anchors, anchors)."""
         lit, accumulator = self.lit, self.accumulator
         rows, anchors = accumulator._rows, accumulator._bundle.anchors
         # The last entry counts refused light: negative, not finite or too bright.

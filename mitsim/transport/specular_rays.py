@@ -8,9 +8,9 @@ Round surfaces and smooth meshes are met in float64 too.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -32,15 +32,6 @@ _OFFSET = 1e-4
 """Start of a ray off its surface, for each mm of its coordinates: Mitsuba's own ray epsilon."""
 _GRAZING = 0.02
 _CHAIN = np.uint64(0x9E3779B97F4A7C15)
-
-
-def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
-    materials: list[mi.BSDF] = []
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if bsdf is not None and bsdf.flags() & kinds and bsdf not in materials:
-            materials.append(bsdf)
-    return materials
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +80,22 @@ class SpecularRays:
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
         self.colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
-        self._lobes = _lobes(delta_bsdfs(scene, int(mi.BSDFFlags.Delta)))
+        # Registry numbers of materials with a delta part, by its kind and component.
+        self._lobes: dict[tuple[int, int], list[int]] = {}
+        straight, known = int(mi.BSDFFlags.Null), list[mi.BSDF]()
+        for bsdf in (shape.bsdf() for shape in scene.shapes()):
+            if bsdf is None or not bsdf.flags() & int(mi.BSDFFlags.Delta) or bsdf in known:
+                continue
+            known.append(bsdf)
+            kinds = [int(bsdf.flags(i)) & int(mi.BSDFFlags.Delta) for i in range(bsdf.component_count())]
+            parts = [(kind, i) for i, kind in enumerate(kinds) if kind not in (0, straight)]
+            for part in [(straight, 0)] * (straight in kinds) + parts:
+                number = np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf)))
+                self._lobes.setdefault(part, []).append(int(number.ravel()[0]))
         polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
         self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
-        self._exact = ExactHits(self.mirrors)
+        exact = {_number(shape): exact_hits(shape) for shape in self.mirrors}
+        self._exact = {number: meet for number, meet in exact.items() if meet is not None}
         self._panes = [_number(pane) for pane in flat_panes(scene)]
         self._camera_turn, self.camera_place = turn_and_origin(camera.world_transform())
 
@@ -115,8 +118,17 @@ class SpecularRays:
             dr.eval(si)
             distance = np.where(host_values(si.is_valid(), len(rays.index)), host_values(si.t, len(rays.index)), np.inf)
             distance = distance + np.linalg.norm(rays.start - rays.origin, axis=1)
-            crossing, arrived = self._cross(rays, distance)
-            crossings.append(crossing)
+            # Those that cross the sensor plane from the front before they meet another surface.
+            place = (rays.origin - self.camera_place) @ self._camera_turn
+            way = rays.direction @ self._camera_turn
+            ahead = (place[:, 2] > 0) & (way[:, 2] < 0)
+            reach = np.full(len(ahead), np.inf)
+            np.divide(-place[:, 2], way[:, 2], out=reach, where=ahead)
+            arrived = ahead & (reach < distance)
+            o, d, r = place[arrived], way[arrived], reach[arrived, None]
+            rows_columns = -(o + d * r)[:, 1::-1], -(d / d[:, 2:])[:, 1::-1]
+            light = rays.spectrum[arrived] @ self.colour
+            crossings.append(Crossings(rays.index[arrived], rays.chain[arrived], *rows_columns, light))
             met = ~arrived & np.isfinite(distance)
             if turned is not None:
                 own = met & (rays.mirror != 0)
@@ -127,31 +139,27 @@ class SpecularRays:
             rays = join(onward)
         return join(crossings)
 
-    def _cross(self, rays: Rays, distance: FloatArray) -> tuple[Crossings, Mask]:
-        origin = (rays.origin - self.camera_place) @ self._camera_turn
-        direction = rays.direction @ self._camera_turn
-        ahead = (origin[:, 2] > 0) & (direction[:, 2] < 0)
-        reach = np.full(len(ahead), np.inf)
-        np.divide(-origin[:, 2], direction[:, 2], out=reach, where=ahead)
-        arrived = ahead & (reach < distance)
-        o, d, r = origin[arrived], direction[arrived], reach[arrived, None]
-        crossing = Crossings(
-            rays.index[arrived],
-            rays.chain[arrived],
-            -(o + d * r)[:, 1::-1],  # rows and columns
-            -(d / d[:, 2:])[:, 1::-1],
-            rays.spectrum[arrived] @ self.colour,
-        )
-        return crossing, arrived
-
     def _bounce(self, rays: Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[Rays]:
         count = len(active)
-        hits = _plane_hits(rays, si)
-        shading = hits.normal.copy()
+        # Each ray meets the tangent plane of the surface, or its round or smooth shape.
+        hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
+        with np.errstate(all="ignore"):
+            geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
+            along = ((hit - rays.origin) * geometric).sum(axis=1) / (rays.direction * geometric).sum(axis=1)
+            point = rays.origin + rays.direction * along[:, None]
+            good = np.linalg.norm(point - hit, axis=1) < 10 * _OFFSET * (1 + np.abs(hit).max(axis=1))
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        point, shading = np.where(good[:, None], point, hit), normal.copy()
         shapes = host_values(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
-        numbers = shapes.astype(np.int64), host_values(si.prim_index, count).astype(np.int64)
-        self._exact.refine(rays.origin, rays.direction, hits, *numbers)
-        point, geometric, normal = hits.point, hits.geometric, hits.normal
+        numbers, faces = shapes.astype(np.int64), host_values(si.prim_index, count).astype(np.int64)
+        for number in np.intersect1d(numbers, list(self._exact)) if self._exact else ():
+            mine = np.flatnonzero(numbers == number)
+            with np.errstate(all="ignore"):
+                old = Hits(point[mine], geometric[mine], normal[mine])
+                new = self._exact[int(number)](rays.origin[mine], rays.direction[mine], old, faces[mine])
+            good = np.isfinite(new.point).all(axis=1) & np.isfinite(new.normal).all(axis=1)
+            for values, better in ((point, new.point), (geometric, new.geometric), (normal, new.normal)):
+                values[mine[good]] = better[good]
         onward: list[Rays] = []
         materials = host_values(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
         for (lobe, component), own in self._lobes.items():
@@ -159,7 +167,20 @@ class SpecularRays:
             if not own_lobe.any():
                 continue
             here = mi.Bool(own_lobe)
-            sample, weight = self._sample_lobe(lobe, component, si, here)
+            weights = []
+            context = mi.BSDFContext(mi.TransportMode.Importance)
+            context.component = component
+            for wavelengths in self._wavelengths:
+                if wavelengths is not None:
+                    si.wavelengths = wavelengths
+                sample, part = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), here)
+                if lobe == int(mi.BSDFFlags.Null):
+                    # Whatever was sampled, light that passes keeps its direction.
+                    part, sample.wo = si.bsdf().eval_null_transmission(si, here), -si.wi
+                    sample.sampled_type, sample.eta = mi.UInt32(lobe), mi.Float(1)
+                part = dr.select((sample.sampled_type & lobe) != 0, part, 0)
+                weights.append(channels(mi.unpolarized_spectrum(part), dr.width(si.t)))
+            weight = np.concatenate(weights, axis=1)
             kind, eta = host_values(sample.sampled_type, count), host_values(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
@@ -178,55 +199,12 @@ class SpecularRays:
             code += np.maximum(component - ~reflected, 0).astype(np.uint64) << np.uint64(40)
             straight = lobe == int(mi.BSDFFlags.Null)
             chain = rays.chain[chosen] if straight else rays.chain[chosen] * _CHAIN + code
-            passes = straight | (np.isin(numbers[0][chosen], self._panes) & ~reflected)
-            mirror = np.where(passes, rays.mirror[chosen], numbers[0][chosen])
+            passes = straight | (np.isin(numbers[chosen], self._panes) & ~reflected)
+            mirror = np.where(passes, rays.mirror[chosen], numbers[chosen])
             ways = point[chosen], direction, point[chosen] + direction * clear[:, None]
             if len(chosen):
                 onward.append(Rays(rays.index[chosen], mirror, *ways, chain, spectrum[chosen]))
         return onward
-
-    def _sample_lobe(
-        self, kind: int, component: int, si: mi.SurfaceInteraction3f, active: mi.Bool
-    ) -> tuple[mi.BSDFSample3f, FloatArray]:
-        weights = []
-        context = mi.BSDFContext(mi.TransportMode.Importance)
-        context.component = component
-        for wavelengths in self._wavelengths:
-            if wavelengths is not None:
-                si.wavelengths = wavelengths
-            sample, weight = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), active)
-            if kind == int(mi.BSDFFlags.Null):
-                # Whatever was sampled, light that passes keeps its direction.
-                weight, sample.wo = si.bsdf().eval_null_transmission(si, active), -si.wi
-                sample.sampled_type, sample.eta = mi.UInt32(kind), mi.Float(1)
-            weight = dr.select((sample.sampled_type & kind) != 0, weight, 0)
-            weights.append(channels(mi.unpolarized_spectrum(weight), dr.width(si.t)))
-        return sample, np.concatenate(weights, axis=1)
-
-
-def _lobes(materials: Iterable[mi.BSDF]) -> dict[tuple[int, int], list[int]]:
-    """Return the registry numbers of materials with a delta part, by its kind and component."""
-    found: dict[tuple[int, int], list[int]] = {}
-    straight = int(mi.BSDFFlags.Null)
-    for bsdf in materials:
-        kinds = [int(bsdf.flags(i)) & int(mi.BSDFFlags.Delta) for i in range(bsdf.component_count())]
-        parts = [(kind, i) for i, kind in enumerate(kinds) if kind not in (0, straight)]
-        for part in [(straight, 0)] * (straight in kinds) + parts:
-            number = np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf)))
-            found.setdefault(part, []).append(int(number.ravel()[0]))
-    return found
-
-
-def _plane_hits(rays: Rays, si: mi.SurfaceInteraction3f) -> Hits:
-    count = len(rays.index)
-    hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
-    with np.errstate(all="ignore"):
-        geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
-        along = ((hit - rays.origin) * geometric).sum(axis=1) / (rays.direction * geometric).sum(axis=1)
-        point = rays.origin + rays.direction * along[:, None]
-        good = np.linalg.norm(point - hit, axis=1) < 10 * _OFFSET * (1 + np.abs(hit).max(axis=1))
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return Hits(np.where(good[:, None], point, hit), geometric, normal)
 
 
 def _redirect(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: FloatArray) -> FloatArray:
@@ -251,100 +229,71 @@ class Hits:
     geometric: FloatArray
     normal: FloatArray
 
-    def put(self, chosen: IntArray, other: Hits) -> None:
-        good = np.isfinite(other.point).all(axis=1) & np.isfinite(other.normal).all(axis=1)
-        for name in vars(self):
-            getattr(self, name)[chosen[good]] = getattr(other, name)[good]
+
+Meet = Callable[[FloatArray, FloatArray, Hits, IntArray], Hits]
+"""Function of origins, directions, hits in single precision and numbers of faces that returns better hits."""
 
 
-class _Surface(Protocol):
-    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits: ...
-
-
-class ExactHits:
-    def __init__(self, shapes: Sequence[mi.Shape]) -> None:
-        self._surfaces: dict[int, _Surface] = {}
-        for shape in shapes:
-            surface = _surface(shape)
-            if surface is not None:
-                self._surfaces[_number(shape)] = surface
-
-    def refine(self, origin: FloatArray, direction: FloatArray, hits: Hits, shape: IntArray, face: IntArray) -> None:
-        for number in np.intersect1d(shape, list(self._surfaces)) if self._surfaces else ():
-            mine = np.flatnonzero(shape == number)
-            old = Hits(*(getattr(hits, name)[mine] for name in vars(hits)))
-            with np.errstate(all="ignore"):
-                hits.put(mine, self._surfaces[int(number)].meet(origin[mine], direction[mine], old, face[mine]))
-
-
-def _number(shape: mi.Shape) -> int:
-    return int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
-
-
-def _surface(shape: mi.Shape) -> _Surface | None:
+def exact_hits(shape: mi.Shape) -> Meet | None:
+    """Return the function that meets a round or smooth shape in double precision; None for a flat one."""
     if shape.is_mesh():
         data = mi.traverse(shape)
         smooth = shape.has_vertex_normals() and not shape.has_face_normals() and "faces" in data
-        return _Mesh.of(data) if smooth else None
+        return _smooth_mesh(data) if smooth else None
     kind = shape.class_name()
     if kind not in ("Sphere", "Cylinder"):
         return None
-    turn, origin = turn_and_origin(mi.traverse(shape)["to_world"])
+    turn, centre = turn_and_origin(mi.traverse(shape)["to_world"])
     radius = float(np.linalg.norm(turn[:, 0]))
     axis = turn[:, 2] / np.linalg.norm(turn[:, 2]) if kind == "Cylinder" else np.zeros(3)
-    return _Round(origin, axis, radius)
 
+    def across(vectors: FloatArray) -> FloatArray:
+        return np.asarray(vectors - (vectors @ axis)[:, None] * axis)
 
-@dataclass(frozen=True, eq=False)
-class _Round:
-    centre: FloatArray
-    axis: FloatArray
-    radius: float
-
-    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
-        start, way = (self._across(vectors) for vectors in (origin - self.centre, direction))
+    def meet(origin: FloatArray, direction: FloatArray, hits: Hits, _: IntArray) -> Hits:
+        start, way = across(origin - centre), across(direction)
         a, b = np.square(way).sum(axis=1), (start * way).sum(axis=1)
-        root = np.sqrt(b**2 - a * (np.square(start).sum(axis=1) - self.radius**2))
+        root = np.sqrt(b**2 - a * (np.square(start).sum(axis=1) - radius**2))
         near = ((hits.point - origin) * direction).sum(axis=1)
         # Of the two, the crossing that was hit: b and a root of the other sign cancel only where it is far from both.
         first, second = (-b - root) / a, (-b + root) / a
         distance = np.where(np.abs(first - near) < np.abs(second - near), first, second)
         point = origin + direction * distance[:, None]
-        normal = self._across(point - self.centre) / self.radius
+        normal = across(point - centre) / radius
         normal *= np.sign((normal * hits.normal).sum(axis=1))[:, None]
         return Hits(point, normal, normal)
 
-    def _across(self, vectors: FloatArray) -> FloatArray:
-        return np.asarray(vectors - (vectors @ self.axis)[:, None] * self.axis)
+    return meet
 
 
-@dataclass(frozen=True, eq=False)
-class _Mesh:
-    places: FloatArray
-    normals: FloatArray
+def _smooth_mesh(data: mi.SceneParameters) -> Meet:
+    corners = np.array(data["faces"]).reshape(-1, 3)
+    places, normals = (
+        np.array(data[name], dtype=np.float64).reshape(-1, 3)[corners]
+        for name in ("vertex_positions", "vertex_normals")
+    )
 
-    @classmethod
-    def of(cls, data: mi.SceneParameters) -> _Mesh:
-        corners = np.array(data["faces"]).reshape(-1, 3)
-        of_vertices = (data["vertex_positions"], data["vertex_normals"])
-        return cls(*(np.array(values, dtype=np.float64).reshape(-1, 3)[corners] for values in of_vertices))
-
-    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
-        corner, *others = np.moveaxis(self.places[face], 1, 0)
+    def meet(origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
+        corner, *others = np.moveaxis(places[face], 1, 0)
         along, across = (other - corner for other in others)
         geometric = np.cross(along, across)
         scale = (direction * geometric).sum(axis=1)
         offset = origin - corner
         turned = np.cross(offset, direction)
         b, c = (across * turned).sum(axis=1) / -scale, (along * turned).sum(axis=1) / scale
-        normals = self.normals[face]
         weights = np.stack([1 - b - c, b, c], axis=1)
-        normal = (normals * weights[:, :, None]).sum(axis=1)
+        normal = (normals[face] * weights[:, :, None]).sum(axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         normal *= np.sign((normal * hits.normal).sum(axis=1))[:, None]
         geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
         geometric *= np.sign((geometric * hits.geometric).sum(axis=1))[:, None]
         return Hits(corner + along * b[:, None] + across * c[:, None], geometric, normal)
+
+    return meet
+
+
+def _number(shape: mi.Shape) -> int:
+    return int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
 
 
 # -------- Balls of glass, whose light comes from close to their rim
