@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mitsim.transport.projector import CanvasMap
+from mitsim.transport.connect import CanvasMap
 
 
 def aperture_scene_parts(projector: mi.Emitter, radius: float, focus: float) -> dict[str, Any]:

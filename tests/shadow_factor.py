@@ -6,8 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.optics.edge_profile import Steps
-from mitsim.optics.shadow import trapezoid_mean
+from mitsim.optics.shadow import Steps, trapezoid_mean
 
 
 def shadow_factor(

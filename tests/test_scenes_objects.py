@@ -215,7 +215,7 @@ def test_keystone_lands_as_a_trapezium() -> None:
         wanted = math.pi * POWER * long**3 * (ray[2] / long) / distance**2
         assert irradiance[0] == pytest.approx(wanted, rel=1e-4)
     # The corners that the scene file states.
-    from mitsim.scene.window import locate_projector
+    from mitsim.scene.load import locate_projector
 
     grid = locate_projector("keystone", emitter(loaded, "Projector"), loaded.sensors()[0])
     assert np.array(grid.column_tan) * 400 == pytest.approx([-59.35, 62.05], abs=0.01)

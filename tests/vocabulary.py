@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.limits import PLUGINS, STRAIGHT
+from mitsim.scene.check import PLUGINS, STRAIGHT
 from tests.conftest import write_png, write_small_scene
 
 PLATE = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><scale x="20" y="20"/>'

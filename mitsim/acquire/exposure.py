@@ -26,9 +26,8 @@ from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import Drift
 from mitsim.light.cost_model import frames_at_once
 from mitsim.light.settings import Estimate
-from mitsim.optics.forming import bound_of
-from mitsim.optics.frames import ExpectedFrames, Frame, add_speckle
-from mitsim.scene.window import window_at
+from mitsim.optics.frames import ExpectedFrames, Frame, add_speckle, bound_of
+from mitsim.scene.load import window_at
 from mitsim.sensor.chain import (
     Digital,
     dn_to_electrons,

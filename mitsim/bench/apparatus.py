@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from mitsim.devices.sensor import SensorModel
     from mitsim.optics.mirror_frames import SpecularLight
     from mitsim.scene.load import LoadedScene
-    from mitsim.transport.connect import OpticalSetup
-    from mitsim.transport.projector import ProjectorOptics
+    from mitsim.transport.connect import OpticalSetup, ProjectorOptics
 
 
 _OF_COLOURS = {"quantum_efficiency_curve", "mosaic", "mosaic_curves"}
@@ -126,7 +125,7 @@ class Apparatus:
     @cached_property
     def projector_optics(self) -> ProjectorOptics:
         """Return the projector as tracers need it."""
-        from mitsim.transport.projector import ProjectorOptics
+        from mitsim.transport.connect import ProjectorOptics
 
         grid, model = self.loaded.pixels, self.projector
         window = grid.n, grid.first_row, grid.first_column, grid.canvas
@@ -181,7 +180,7 @@ class Apparatus:
         if depth == self.geometry.scene_distance:
             return self.windows
         if depth not in self._windows:
-            from mitsim.scene.window import window_at
+            from mitsim.scene.load import window_at
 
             loaded = self.loaded
             found = window_at(str(loaded.path), loaded.projector, loaded.camera, loaded.pixels, depth)

@@ -16,9 +16,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.session import BoardShape
-from mitsim.scene.limits import Unfit
+from mitsim.scene.check import Unfit
+from mitsim.transport.connect import PinholeRays
 from mitsim.transport.plugins.base import host_values, turn_and_origin
-from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:
     from mitsim.bench.apparatus import Apparatus

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mitsim.bench.apparatus import Apparatus
     from mitsim.devices.camera import CameraGeometry
     from mitsim.devices.projector import Spectrum
-    from mitsim.transport.projector import ProjectorOptics
+    from mitsim.transport.connect import ProjectorOptics
 
 DIRECT, FOLLOWED = "direct", "followed"
 """Kinds of traced light: from one surface, and over several surfaces or from the camera."""

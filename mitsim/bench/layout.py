@@ -22,9 +22,9 @@ from mitsim.devices.mask import Mask
 from mitsim.devices.patterns import PatternFamily
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.scene.load import why_dark
+from mitsim.transport.connect import PinholeRays
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.plugins.base import channels, host_values, turn_and_origin, vectors
-from mitsim.transport.projector import PinholeRays
 
 _GRID = 48
 """Cells per side of a shape without faces, by its surface parameters."""

@@ -32,8 +32,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import Lighting, PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of
-from mitsim.optics.forming import AccumulatedLight
-from mitsim.optics.frames import ExpectedFrames, add_speckle
+from mitsim.optics.frames import AccumulatedLight, ExpectedFrames, add_speckle
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.sensor.chain import expose
 

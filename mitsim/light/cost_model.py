@@ -35,8 +35,7 @@ from mitsim.light.settings import (
 )
 from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS, cells_a_side, cells_per_pixel, points_per_cell
-from mitsim.optics.forming import PROBES
-from mitsim.optics.frames import formed_frames, frames_in_memory, mixes
+from mitsim.optics.frames import PROBES, formed_frames, frames_in_memory, mixes
 from mitsim.optics.image_formation import SUMMED_BYTES
 from mitsim.transport.records import MOST_PLACES
 

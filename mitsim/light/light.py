@@ -26,8 +26,7 @@ from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, PATHS_AT_ONCE, Estimate, Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.light.truth import Truth, trace_truth
-from mitsim.optics.forming import bound_of
-from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import DeviceSums, PathSamples
 

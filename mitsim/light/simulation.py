@@ -19,8 +19,7 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.devices.patterns import Lighting
 from mitsim.light.passes import GRIDS, PASSES, LightEstimate, Pass, PassTracer, Tracers
 from mitsim.light.settings import PATHS_AT_ONCE
-from mitsim.optics.forming import AccumulatedLight
-from mitsim.optics.frames import ClassFrames, ExpectedFrames
+from mitsim.optics.frames import AccumulatedLight, ClassFrames, ExpectedFrames
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.records import DIRECT, INDIRECT, Bundle, DeviceAccumulator, DeviceSums, PathSamples

@@ -37,8 +37,16 @@ from mitsim.core.parallel import in_threads
 from mitsim.devices.mask import Mask
 from mitsim.devices.plate import FEW, Plate
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.edge_profile import Antiderivative, Steps
-from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes, lagrange_weights, nodes_between
+from mitsim.optics.shadow import (
+    Antiderivative,
+    Directions,
+    SeparableTerms,
+    ShadowGeometry,
+    Steps,
+    both_axes,
+    lagrange_weights,
+    nodes_between,
+)
 
 ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4

@@ -26,8 +26,7 @@ from mitsim.devices.mask import NO_FLAWS, Flaws, Mask, Term
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
-from mitsim.optics.edge_profile import Steps, blurred_step
-from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
+from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, Steps, blurred_step
 
 _CELLS_PER_PIXEL = 6
 """Raster cells along a pixel: with 4 the error doubles (tests/physics/test_raster.py). In pixels of 12 um, random masks

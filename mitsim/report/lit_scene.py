@@ -29,8 +29,7 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.projector import Spectrum
 from mitsim.light.light import SampledLight
 from mitsim.metrics import Quality, psnr
-from mitsim.optics.forming import AccumulatedLight
-from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.frames import AccumulatedLight, ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms

@@ -14,8 +14,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.sensor import PITCH_TOLERANCE, SensorModel
-from mitsim.scene.check import CheckedScene
-from mitsim.scene.limits import CHOICES, DIRECTED, MIRRORS, PLUGINS, STRAIGHT, references
+from mitsim.scene.check import CHOICES, DIRECTED, MIRRORS, PLUGINS, STRAIGHT, CheckedScene, references
 from mitsim.scene.outline import Outline
 
 _CENTRES = {"sphere": "center", "cylinder": "p0"}

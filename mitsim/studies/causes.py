@@ -71,9 +71,9 @@ from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, TracedPass, expected_of
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.scene.window import straightening
+from mitsim.scene.load import straightening
+from mitsim.transport.connect import CanvasMap
 from mitsim.transport.plugins.base import rows_columns, turn_and_origin
-from mitsim.transport.projector import CanvasMap
 from mitsim.transport.records import DIRECT, DeviceAccumulator, DeviceSums, PathSamples
 
 FALLOFF, DIFFRACTION, KEYSTONE, DEPTH, OCCLUSION, DETAIL, INTERREFLECTION, MIRRORS = (

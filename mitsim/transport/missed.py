@@ -24,12 +24,11 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
 from mitsim.core.environment import keep_scenes
-from mitsim.transport.connect import OpticalSetup, Reception, landing, sample_wavelengths
+from mitsim.transport.connect import OpticalSetup, PinholeRays, Reception, landing, sample_wavelengths, wavelength_sets
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer
 from mitsim.transport.integrator import InFlight, Paths, Turn, camera_part, launches
 from mitsim.transport.plugins import base
-from mitsim.transport.projector import PinholeRays, wavelength_sets
 from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, DeviceAccumulator, PathSamples, Sightings, check_finite
 from mitsim.transport.specular import turned_by_mirrors
 from mitsim.transport.transmission import Arrival

@@ -23,8 +23,8 @@ from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.optics.mirror_frames import Beams
+from mitsim.transport.connect import PinholeRays, ProjectorOptics
 from mitsim.transport.plugins.base import turn_and_origin
-from mitsim.transport.projector import PinholeRays, ProjectorOptics
 from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, Rays, SpecularRays, grazing, join
 
 _UNIT = 2**24

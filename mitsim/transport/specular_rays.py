@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
+from mitsim.transport.connect import PinholeRays, ProjectorOptics, wavelength_sets
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
-from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 from mitsim.transport.transmission import CLEAR, flat_panes, transmits
 
 IntArray = npt.NDArray[np.int64]

@@ -23,8 +23,7 @@ import numpy as np
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
 from mitsim.core.runs import load_run
-from mitsim.scene.check import check_file
-from mitsim.scene.limits import PLUGINS
+from mitsim.scene.check import PLUGINS, check_file
 from tests.hard.hostile import GOOD, MESH, OBJ, beside, file
 
 LONGEST = 5.0

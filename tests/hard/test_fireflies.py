@@ -15,8 +15,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import GROUPS, Settings
-from mitsim.optics.forming import AccumulatedLight
-from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.frames import AccumulatedLight, ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.planner.planner import make_plan

@@ -18,9 +18,8 @@ from mitsim.devices.mask import mls_mask
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves
-from mitsim.optics.edge_profile import Steps
 from mitsim.optics.image_formation import FrameOptics
-from mitsim.optics.shadow import Directions
+from mitsim.optics.shadow import Directions, Steps
 from mitsim.optics.terms import shadow_terms
 from tests.robustness import Recorder
 

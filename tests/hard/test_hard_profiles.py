@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.edge_profile import Antiderivative, Steps
 from mitsim.optics.fft_shadow import ProfileSampler
+from mitsim.optics.shadow import Antiderivative, Steps
 from tests.hard.exact_shadows import EPS, exact_mean, power
 from tests.robustness import Recorder
 from tests.shadow_factor import steps_of

@@ -25,7 +25,7 @@ from mitsim.core.exr import read_frame
 from mitsim.light import light
 from mitsim.light.light import trace_light
 from mitsim.light.settings import GROUPS, REPLICATES, Approximation, ErrorCovariance, Settings
-from mitsim.optics import forming
+from mitsim.optics import frames as forming
 from mitsim.planner import pilot_direct
 from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer

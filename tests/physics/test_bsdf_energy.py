@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mitsim.transport
-from mitsim.scene.limits import DIRECTED, LIMITS
+from mitsim.scene.check import DIRECTED, LIMITS
 from mitsim.transport.plugins import wrappers
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -17,8 +17,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics import diffraction
 from mitsim.optics.diffraction import EdgeWaves, edge_wave, fast_length, grid_step, wave_profiles
-from mitsim.optics.edge_profile import Antiderivative, Steps
-from mitsim.optics.shadow import Directions, ShadowGeometry
+from mitsim.optics.shadow import Antiderivative, Directions, ShadowGeometry, Steps
 from mitsim.optics.terms import shadow_terms
 from tests.shadow_factor import steps_of
 

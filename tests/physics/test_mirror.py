@@ -23,7 +23,7 @@ from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import SpecularFrames, specular_frames
 from mitsim.planner.planner import make_plan
 from mitsim.transport import plugins
-from mitsim.transport.projector import ProjectorOptics
+from mitsim.transport.connect import ProjectorOptics
 from mitsim.transport.specular import trace_specular_chains
 from mitsim.transport.specular_rays import SpecularRays
 from tests.aperture import aperture_scene_parts

@@ -24,7 +24,7 @@ parameter        unit  default      meaning
 Mono variants have one wavelength: the projector's effective one, which a bench sets (:func:`tune`), or the one given.
 In spectral variants light of several wavelengths on one path would part at the glass. A face refracts by the path's
 first wavelength, so each path must carry one alone
-(:attr:`mitsim.transport.projector.ProjectorOptics.per_wavelength`). Glass
+(:attr:`mitsim.transport.connect.ProjectorOptics.per_wavelength`). Glass
 absorbs nothing. No polarisation. ``mi.traverse`` shows ``wavelength``.
 
 XML, a prism's material::

@@ -30,7 +30,7 @@ from operator import or_
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.scene.limits import BUMPS, CHOICES, DIRECTED
+from mitsim.scene.check import BUMPS, CHOICES, DIRECTED
 from mitsim.transport.plugins.base import bsdf_class
 
 PREFIX = "mitsim_"

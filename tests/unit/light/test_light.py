@@ -24,8 +24,7 @@ from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, PilotResult, Settings
 from mitsim.light.simulation import Simulation, TracedPass
-from mitsim.optics.forming import bound_of
-from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
+from mitsim.optics.frames import ExpectedFrames, bound_of, monte_carlo_error
 from mitsim.planner import choose, planner
 from mitsim.planner.planner import SceneFacts, make_plan
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT

@@ -18,7 +18,7 @@ from mitsim.light.cost_model import (
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import GROUPS, Forming, SampleCost, Settings
 from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS
-from mitsim.optics.forming import PROBES
+from mitsim.optics.frames import PROBES
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT, plan, with_sample_costs
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)

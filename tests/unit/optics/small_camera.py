@@ -9,8 +9,7 @@ from scipy import sparse
 
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
-from mitsim.optics.forming import AccumulatedLight
-from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.frames import AccumulatedLight, ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 

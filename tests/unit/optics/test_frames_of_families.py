@@ -6,8 +6,20 @@ from scipy import sparse
 from scipy.linalg import hadamard
 
 from mitsim.optics import frames as frames_module
-from mitsim.optics.forming import AccumulatedLight, _product, form_frames, pair_shots, probe_frames, probe_vectors
-from mitsim.optics.frames import ClassFrames, ExpectedFrames, at_once, formed_frames, frames_in_memory, mixes
+from mitsim.optics.frames import (
+    AccumulatedLight,
+    ClassFrames,
+    ExpectedFrames,
+    _product,
+    at_once,
+    form_frames,
+    formed_frames,
+    frames_in_memory,
+    mixes,
+    pair_shots,
+    probe_frames,
+    probe_vectors,
+)
 from mitsim.optics.image_formation import FrameOptics
 from tests.unit.optics.small_camera import (
     BESIDE,

@@ -5,8 +5,14 @@ import pytest
 from scipy import sparse
 from scipy.special import stdtrit
 
-from mitsim.optics.forming import AccumulatedLight, bound_of, probe_vectors
-from mitsim.optics.frames import ClassFrames, monte_carlo_bound, monte_carlo_error
+from mitsim.optics.frames import (
+    AccumulatedLight,
+    ClassFrames,
+    bound_of,
+    monte_carlo_bound,
+    monte_carlo_error,
+    probe_vectors,
+)
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from tests.unit.optics.small_camera import (

@@ -6,7 +6,7 @@ from scipy.special import ndtr
 
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.edge_profile import Antiderivative, Steps, blurred_step
+from mitsim.optics.shadow import Antiderivative, Steps, blurred_step
 from tests.shadow_factor import scene_factor, steps_of
 
 

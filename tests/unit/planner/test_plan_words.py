@@ -10,7 +10,7 @@ import pytest
 from mitsim.api.bench import Bench
 from mitsim.light.settings import Approximation, PilotResult, Settings
 from mitsim.planner.planner import SceneFacts
-from mitsim.scene.limits import Unfit
+from mitsim.scene.check import Unfit
 from mitsim.scene.outline import Tag
 from tests.unit.planner.invented_pilot_result import (
     ONE_CLASS,

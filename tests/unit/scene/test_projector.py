@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.load import load_scene
-from mitsim.scene.window import ProjectorGrid
+from mitsim.scene.load import ProjectorGrid, load_scene
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, Z = 16, 400.0

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from mitsim.transport import plugins
-from mitsim.transport.connect import Connection, LensHit, ProjectorConnector
+from mitsim.transport.connect import Connection, LensHit, ProjectorConnector, ProjectorOptics
 from mitsim.transport.plugins.base import generator
-from mitsim.transport.projector import ProjectorOptics
 from tests.aperture import aperture_scene_parts
 from tests.unit.transport.closed_forms import stock_projector
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.transport.connect import OpticalSetup
+from mitsim.transport.connect import OpticalSetup, ProjectorOptics
 from mitsim.transport.missed import Highlights, highlights
-from mitsim.transport.projector import ProjectorOptics
 from tests.physics.test_mirror import SCALE, MirrorBench, N
 
 PLACES = np.array([[12.3, 5.1, 371.0], [-31.7, 20.9, 388.3], [2.6, -33.2, 362.9]])

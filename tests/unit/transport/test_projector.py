@@ -8,9 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.transport.connect import ProjectorConnector
+from mitsim.transport.connect import PinholeRays, ProjectorConnector, ProjectorOptics, ProjectorRays
 from mitsim.transport.plugins.base import RIGID, generator, rigidity_error, rows_columns, turn_and_origin, x_y
-from mitsim.transport.projector import PinholeRays, ProjectorOptics, ProjectorRays
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")

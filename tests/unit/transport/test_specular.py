@@ -10,8 +10,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import specular_frames
-from mitsim.transport.connect import shines_in
-from mitsim.transport.projector import PinholeRays, ProjectorOptics
+from mitsim.transport.connect import PinholeRays, ProjectorOptics, shines_in
 from mitsim.transport.specular import trace_specular_chains
 from mitsim.transport.specular_rays import SpecularRays
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.scene.limits import DIRECTED, PLUGINS
+from mitsim.scene.check import DIRECTED, PLUGINS
 from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer
