@@ -320,7 +320,9 @@ class ExpectedFrames:
     ) -> None:
         self._restated = restated
         self._lights, self._ambient, self._specular = tuple(lights), tuple(ambient), specular
-        self._seed, self._weights = seed, lighting.weights
+        self._weights = lighting.weights
+        self._groups, self._shape = len(lights[0].groups), lights[0].optics.frame_shape
+        self._probes = probe_vectors(self._shape[1], seed)
         (shots, classes), rows = lighting.weights.shape, lighting.labels.size
         indicator = sparse.csr_array((np.ones(rows), (lighting.labels, np.arange(rows))), shape=(classes, rows))
         self._mixed = mixes(classes, shots, side_of(self._shape))
@@ -386,7 +388,25 @@ class ExpectedFrames:
         if count < 2:
             return parts, energy, noise
         for start in range(0, len(self), _AT_ONCE):
-            shots, of_lights = self._shots_probed(start, min(start + _AT_ONCE, len(self)))
+            stop = min(start + _AT_ONCE, len(self))
+            classes, weights = self.probed, self._weights[start:stop]
+            if classes is not None:
+                shots = np.stack(self._of_classes.shots(classes, start, stop))
+                unknown = np.zeros((1, len(self._lights), count, count))
+                of_classes = unknown if self._noise is None else self._noise
+                of_lights = (np.square(weights).sum(axis=0)[:, None, None, None] * of_classes).sum(axis=0)
+            else:
+                shots, of_shots = probe_frames(self._lights, self._basis[start:stop], self._probes)
+                of_lights = of_shots.sum(axis=0)
+                if self._leaked_light is not None:
+                    shots += self._leaked_light[1][0]
+            if self._specular is not None:  # in every group
+                brought = np.repeat((self._specular.irradiance @ self._probes)[:, :, None], count, axis=2)
+                shots += weights[:, self._specular.classes] @ brought.reshape(len(brought), -1)
+            if self._ambient:
+                seen, of_one = probe_frames(self._ambient, _ALL, self._probes)
+                shots += seen
+                of_lights = np.concatenate([of_lights, len(weights) * of_one[0]])
             noise += of_lights
             for probed in shots:
                 energy += float(np.square(probed.reshape(self._shape[0], count, -1).mean(axis=1)).sum())
@@ -399,27 +419,6 @@ class ExpectedFrames:
         if self._mixed and self._probed is None:
             self._probed, self._noise = probe_frames(self._lights, self._basis, self._probes)
         return self._probed
-
-    def _shots_probed(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
-        classes, weights = self.probed, self._weights[start:stop]
-        if classes is not None:
-            probed = np.stack(self._of_classes.shots(classes, start, stop))
-            unknown = np.zeros((1, len(self._lights), self._groups, self._groups))
-            of_classes = unknown if self._noise is None else self._noise
-            noise = (np.square(weights).sum(axis=0)[:, None, None, None] * of_classes).sum(axis=0)
-        else:
-            probed, of_shots = probe_frames(self._lights, self._basis[start:stop], self._probes)
-            noise = of_shots.sum(axis=0)
-            if self._leaked_light is not None:
-                probed += self._leaked_light[1][0]
-        if self._specular is not None:  # in every group
-            brought = np.repeat((self._specular.irradiance @ self._probes)[:, :, None], self._groups, axis=2)
-            probed += weights[:, self._specular.classes] @ brought.reshape(len(brought), -1)
-        if self._ambient:
-            seen, of_one = probe_frames(self._ambient, _ALL, self._probes)
-            probed += seen
-            noise = np.concatenate([noise, len(weights) * of_one[0]])
-        return probed, noise
 
     # ---- Forming, once for all iterations ----
 
@@ -456,18 +455,6 @@ class ExpectedFrames:
 
     def _form_with_probes(self, lights: Sequence[AccumulatedLight], basis: sparse.csr_array) -> Formed:
         return form_frames(lights, basis, self._probes if self._groups > 1 else None)
-
-    @cached_property
-    def _probes(self) -> FloatArray:
-        return probe_vectors(self._shape[1], self._seed)
-
-    @property
-    def _groups(self) -> int:
-        return len(self._lights[0].groups)
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self._lights[0].optics.frame_shape
 
     def _frames(self, light: Sequence[FloatArray], probes: Sequence[FloatArray]) -> list[Frame]:
         ambient, count = self._ambient_light, self._groups

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -13,9 +12,6 @@ from hypothesis import strategies as st
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.devices.patterns import Lighting
-from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
@@ -40,36 +36,6 @@ def scaled_scene(write: Callable[..., Path], scale: float) -> Path:
         text = text.replace(old, re.sub(r'"\d+"', f'"{new * scale}"', old))
     path.write_text(text)
     return path
-
-
-SCALED = Settings(depth=Z, subdivision=2, effects=frozenset({"interreflection"}))
-
-
-def frame_at(write: Callable[..., Path], scale: float) -> np.ndarray:
-    """One frame of direct and indirect light, geometric shadow, with the paths of seed 1."""
-    bench = open_bench(scaled_scene(write, scale), for_render=True)
-    simulation = Simulation(bench, replace(SCALED, depth=Z * scale))
-    uniform = Lighting.uniform(N)
-    found = simulation.accumulate("direct", simulation.direct.trace(1, 0, 64), uniform.labels, 64)
-    found = found + simulation.accumulate("indirect", simulation.follow(1, 64), uniform.labels, 64)
-    return next(iter(expected_of([(simulation, [found])], np.arange(1), uniform, 0))).irradiance
-
-
-@pytest.mark.slow
-def test_scenes_in_other_units(
-    measured: Recorder, small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All lengths times s: the same frame over s^2, for the projector's irradiance is stated at a distance of 1.
-
-    The same paths; float32 turns some of 16 384 at edges of the box: from 1e-4 to 1e3 less than 2e-3. A ray epsilon of
-    9e-5 units is then 0.2 % of the scene. The check that refuses metres is switched off.
-    """
-    monkeypatch.setattr("mitsim.scene.check._check_node", lambda *_: None)
-    judge = frame_at(small_scene, 1.0)
-    for scale in (1e-4, 1e-3, 1e-2, 1e2, 1e3):
-        frame = frame_at(small_scene, scale) * scale**2
-        assert np.isfinite(frame).all()
-        measured(np.linalg.norm(frame - judge) / np.linalg.norm(judge), at_most=2e-3, what=f"times {scale:g}")
 
 
 @pytest.mark.parametrize(("scale", "words"), [(1e-3, "this looks like metres"), (1e3, "pixel pitch")])

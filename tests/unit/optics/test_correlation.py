@@ -158,19 +158,6 @@ def test_an_even_drawings_waves_are_those_of_its_part(monkeypatch: pytest.Monkey
     rasters.draw_raster.cache_clear()
 
 
-def test_frames_that_are_compared_change_alike_in_fewer_cells() -> None:
-    """What two anchors' light changes a frame by, in a third of the raster cells: to 3e-3. (Planted: a sixth.)"""
-    camera, light = turned(BARE.model_copy(update={"pixels": 64})), np.zeros((2, 9, 2, 11))
-    light[0, :5, 1], light[1, :5, 0] = 1.0, -1.0
-    flat, few = np.flatnonzero(light), rasters.with_few_cells(camera, None)
-    assert rasters.cells_per_pixel(few) < rasters.cells_per_pixel(camera)
-    assert rasters.with_few_cells(BARE, None) is BARE
-    fewer, frame = (
-        FrameOptics(each, ROWS, COLUMNS, (300.0,), 2).frame(flat, light.ravel()[flat]) for each in (few, camera)
-    )
-    assert np.linalg.norm(fewer - frame) < 5e-3 * np.linalg.norm(frame)
-
-
 def test_waves_of_large_drawings_are_refused_before_they_are_drawn() -> None:
     """4096 features a side would take minutes for each line; their geometric shadow is drawn. (Planted: no check.)"""
     values = np.random.default_rng(0).integers(0, 2, (4096, 4096)).astype(np.float64)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.devices.mask import Mask
-from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_weights
+from mitsim.optics.image_formation import FrameOptics, anchor_positions
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from tests.unit.optics.small_camera import CAMERA, WINDOW, Z, cell_optics
@@ -94,12 +94,6 @@ def test_a_lambertian_board_through_the_mask(kind: str) -> None:
     assert error(kind, 96, 4) < 2e-5
 
 
-def test_anchors_converge() -> None:
-    found = [error("separable", 192, anchors) for anchors in (1, 2, 3)]
-    assert found[0] > 5e-3, "this geometry has to need anchors"
-    assert found[1] < found[0] / 3 and found[2] < found[1] / 5
-
-
 def test_cells_converge_at_least_with_the_square_of_their_size() -> None:
     found = [error("separable", cells, 5) for cells in (6, 12, 24)]
     assert found[0] > 1e-4
@@ -133,40 +127,7 @@ def test_both_orders_of_the_product_agree_with_the_dense_one(lit: str) -> None:
     assert np.allclose(optics.frame(flat, light.ravel()[flat]), dense, rtol=1e-12)
 
 
-def test_no_light_is_a_black_frame() -> None:
-    edges = np.linspace(*WINDOW, 5)
-    optics = cell_optics(CAMERA, edges, edges)
-    assert not optics.frame(np.empty(0, np.int64), np.empty(0)).any()
-
-
-@pytest.mark.parametrize("anchors", [1, 3])
-def test_the_mean_of_an_open_frame_is_the_irradiance(anchors: int) -> None:
-    """Through an open mask a frame's mean is the light itself, by the anchors' mean weights."""
-    edges = np.linspace(*WINDOW, 9)
-    camera = CAMERA.model_copy(update={"mask": "open", "mask_feature": 6.0})
-    flat, light = board_light(edges, anchors)
-    frame = cell_optics(camera, edges, edges, anchors).frame(flat, light)
-    middle = (CAMERA.pixel_edges[:-1] + CAMERA.pixel_edges[1:]) / 2
-    mean = anchor_weights(anchor_positions(anchors, CAMERA.half_width), middle).mean(axis=0)
-    expected = np.einsum("a,b,aibj->", mean, mean, light.reshape(anchors, 8, anchors, 8))
-    assert frame.mean() == pytest.approx(expected, rel=1e-12)
-
-
 # ---- layers
-
-
-def test_layers_add_up() -> None:
-    """Light in two layers casts the sum of two shadows, each with its own magnification."""
-    rng, edges, depths = np.random.default_rng(5), np.linspace(-0.2, 0.2, 11), (60.0, 20.0)
-    camera = CAMERA.model_copy(update={"mask": "flatcam"})
-    light = rng.random((2, 400))
-    directions = Directions.cells(edges)
-    both = FrameOptics(camera, directions, directions, depths, 2)
-    single = [FrameOptics(camera, directions, directions, (depth,), 2) for depth in depths]
-    parts = [optics.frame(np.arange(400), values) for optics, values in zip(single, light, strict=True)]
-    assert np.allclose(both.frame(np.arange(800), light.ravel()), sum(parts), rtol=1e-12)
-    assert np.allclose(both.frame(np.arange(400) + 400, light[1]), parts[1], rtol=1e-12)
-    assert np.abs(single[0].frame(np.arange(400), light[1]) - parts[1]).max() > 0.05 * parts[1].max()
 
 
 def test_probes_see_the_frames_of_all_layers() -> None:
@@ -191,21 +152,3 @@ def test_estimates_that_light_different_places_are_seen_as_each_is() -> None:
     assert np.allclose(frame, sum(alone) / 3, rtol=1e-12)
     assert np.allclose(probed, np.concatenate([one @ vectors for one in alone], axis=1), rtol=1e-10)
     assert np.array_equal(probed, optics.probe(estimates, vectors))
-
-
-def test_light_that_fills_its_cells_casts_what_its_parts_do() -> None:
-    """It is laid out whole, and parts by the rows and columns that they light: two layers, of different fill."""
-    rng, rows = np.random.default_rng(9), Directions.cells(np.linspace(-0.2, 0.2, 11))
-    columns = Directions.cells(np.linspace(-0.1, 0.3, 9))
-    optics = FrameOptics(CAMERA, rows, columns, (60.0, 20.0), 2)
-    estimates = [(np.sort(rng.choice(500, 300, replace=False)), rng.random(300)) for _ in range(3)]
-    vectors = rng.standard_normal((96, 4))
-    parts = [
-        [optics.frame(flat[start : start + 20], light[start : start + 20]) for start in range(0, 300, 20)]
-        for flat, light in estimates
-    ]
-    alone = [np.sum(each, axis=0) for each in parts]
-    frame, probed = optics.frame_and_products(estimates, vectors)
-    np.testing.assert_allclose(frame, sum(alone) / 3, rtol=1e-12)
-    np.testing.assert_allclose(probed, np.concatenate([one @ vectors for one in alone], axis=1), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(optics.frame_and_products(estimates, None)[0], frame, rtol=1e-12)

@@ -11,27 +11,18 @@ from mitsim.optics.frames import (
     ClassFrames,
     ExpectedFrames,
     _product,
-    at_once,
-    form_frames,
     formed_frames,
-    frames_in_memory,
-    mixes,
     pair_shots,
-    probe_frames,
-    probe_vectors,
 )
 from mitsim.optics.image_formation import FrameOptics
 from tests.unit.optics.small_camera import (
     BESIDE,
-    CAMERA,
     CELLS,
     FAMILIES,
     LABELS,
     PIXELS,
     SPLIT,
-    WINDOW,
     ambient_groups,
-    cell_optics,
     expected_frames,
     random_groups,
     small_optics,
@@ -53,18 +44,6 @@ def test_mixing_classes_equals_weighing_every_pixel(family: str) -> None:
         assert np.abs(one.irradiance - plain).max() < 1e-12 * scale
         assert np.abs(other.irradiance - plain).max() < 1e-12 * scale
         assert one.variance == pytest.approx(other.variance, rel=1e-9)
-
-
-def test_more_frames_than_one_block() -> None:
-    weights = np.random.default_rng(2).random((70, 4))
-    expected = expected_frames(small_optics(8), random_groups(2, 3, 0.1), LABELS, weights, 0)
-    frames = [frame.irradiance for frame in expected]
-    assert len(frames) == len(expected) == 70
-    again = [frame.irradiance for frame in expected]
-    assert all(np.array_equal(a, b) for a, b in zip(frames, again, strict=True)), "iterable as often as needed"
-    # Linear: frame 69 is the same mix of the first four as its weights are.
-    mix = np.linalg.solve(weights[:4].T, weights[69])
-    assert np.allclose(frames[69], np.tensordot(mix, np.stack(frames[:4]), axes=1), rtol=1e-9)
 
 
 def test_what_interpolation_leaves_below_zero_is_reported() -> None:
@@ -116,14 +95,6 @@ def test_what_leaks_in_all_shots_is_formed_once(monkeypatch: pytest.MonkeyPatch)
     assert leaking.sampling_error() == pytest.approx(three.sampling_error(), rel=1e-9)
 
 
-def test_frames_of_large_sensors_are_held_by_their_bytes() -> None:
-    """2048 x 2048 pixels are 32 MiB: 4 at a time, and no more than 56 to be mixed; 512 x 512 as many as ever."""
-    assert [at_once(pixels) for pixels in (64, 512, 1024, 2048, 4096, 20_000)] == [32, 32, 16, 4, 1, 1]
-    assert mixes(256, 256, 512) and not mixes(257, 300, 512) and not mixes(3, 2, 64)
-    assert mixes(49, 49, 2048) and mixes(56, 56, 2048) and not mixes(57, 64, 2048)
-    assert frames_in_memory(49, 49, 2048) == 61 and frames_in_memory(64, 64, 2048) == 12
-
-
 @pytest.mark.parametrize("lamps", [False, True])
 @pytest.mark.parametrize("black", [0.0, 0.02])
 @pytest.mark.parametrize("most", [1.0, 0.7])
@@ -141,21 +112,6 @@ def test_shots_of_a_class_each_are_the_same_when_asked_for_twice(lamps: bool, bl
     for found, again in zip(once, twice, strict=True):
         assert found.irradiance.tobytes() == again.irradiance.tobytes()
         assert np.array_equal(found.by_group, again.by_group)
-
-
-@pytest.mark.parametrize("held", [True, False])
-def test_frames_are_the_same_however_many_are_formed_at_a_time(held: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bit by bit, one at a time and all at once; of classes that are held, and of shots that are formed alone."""
-    if not held:
-        monkeypatch.setattr(frames_module, "_BASIS_BYTES", 1)
-
-    def formed() -> list[np.ndarray]:
-        expected = expected_frames(small_optics(8), random_groups(2, 7, 0.2), LABELS, FAMILIES["identity"], 0)
-        return [frame.irradiance for frame in expected]
-
-    whole = formed()
-    monkeypatch.setattr(frames_module, "_BYTES_AT_ONCE", 1)
-    assert at_once(8) == 1 and all(np.array_equal(a, b) for a, b in zip(whole, formed(), strict=True))
 
 
 def test_light_in_very_many_places_is_mixed_where_it_is() -> None:
@@ -204,33 +160,6 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
     assert dark.irradiance.shape == expected.shape and not dark.irradiance.any()
 
 
-def test_ambient_light_of_two_kinds() -> None:
-    """Fine and coarse cells: their frames add, and so do the deviations of paired groups, before they are squared."""
-    optics, groups, lamps, others = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3), ambient_groups(3, 32)
-    apart = expected_frames(
-        optics,
-        groups,
-        LABELS,
-        np.eye(4),
-        5,
-        ambient=[AccumulatedLight(optics, lamps), AccumulatedLight(optics, others)],
-    )
-    summed = tuple(a + b for a, b in zip(lamps, others, strict=True))
-    alike(apart, expected_frames(optics, groups, LABELS, np.eye(4), 5, ambient=[AccumulatedLight(optics, summed)]))
-
-
-def test_ambient_light_has_a_shadow_of_its_own() -> None:
-    optics, other, lamps = small_optics(), small_optics(), ambient_groups(2)
-    edges = np.linspace(*WINDOW, CELLS + 1)
-    other = cell_optics(CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15, "mask": "open"}), edges, edges)
-    groups = random_groups(2, 7, 0.2)
-    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, ambient=[AccumulatedLight(other, lamps)])
-    plain = expected_frames(optics, groups, LABELS, np.eye(4), 0)
-    mean = np.asarray((lamps[0] + lamps[1]).todense()).ravel() / 2
-    expected = other.frame(np.arange(CELLS**2), mean)
-    assert np.allclose(next(iter(frames)).irradiance - next(iter(plain)).irradiance, expected, rtol=1e-9)
-
-
 @pytest.mark.parametrize("family", BESIDE)
 def test_more_light_adds_to_the_light_of_its_rows(family: str) -> None:
     """Filed in the same cells it is as if it had been added; errors of one path go together, so they add first."""
@@ -238,19 +167,6 @@ def test_more_light_adds_to_the_light_of_its_rows(family: str) -> None:
     optics, groups, more = small_optics(), random_groups(3, 7, 0.2), random_groups(3, 8, 0.2)
     apart = expected_frames(optics, groups, labels, weights, 5, more=[AccumulatedLight(optics, tuple(more))])
     alike(apart, expected_frames(optics, [a + b for a, b in zip(groups, more, strict=True)], labels, weights, 5))
-
-
-def test_more_light_in_cells_of_its_own() -> None:
-    edges = np.linspace(*WINDOW, 4)
-    camera = CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15})
-    coarse, optics = cell_optics(camera, edges, edges), small_optics()
-    groups = random_groups(2, 7, 0.2)
-    more = tuple(sparse.csr_array(np.random.default_rng(seed).random((PIXELS, 9))) for seed in (1, 2))
-    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, more=[AccumulatedLight(coarse, more)])
-    plain = expected_frames(optics, groups, LABELS, np.eye(4), 0)
-    light = np.asarray((more[0] + more[1]).todense())[LABELS == 2].sum(axis=0) / 2
-    difference = list(frames)[2].irradiance - list(plain)[2].irradiance
-    assert np.allclose(difference, coarse.frame(np.arange(9), light), rtol=1e-9)
 
 
 @pytest.mark.parametrize("family", [*BESIDE, "identity", "many"])
@@ -291,17 +207,6 @@ def test_shots_of_signed_patterns_are_pairs(low: float) -> None:
         assert np.abs(shots - np.tensordot(weights[start:stop], basis, axes=1)).max() < 1e-14
 
 
-@pytest.mark.parametrize("name", ["three values", "no light of all", "more pairs than classes", "one value"])
-def test_other_shots_are_not_pairs(name: str) -> None:
-    weights = {
-        "three values": np.array([[1.0, 1, 1], [1, 0, 0.5], [0, 1, 0.5]]),
-        "no light of all": np.array([[1.0, 1, 0], [0, 0, 1], [0, 1, 1]]),
-        "more pairs than classes": np.concatenate([np.ones((1, 3)), np.eye(3)]),
-        "one value": np.ones((2, 2)),
-    }[name]
-    assert pair_shots(weights) is None
-
-
 def test_frames_of_pairs_are_those_of_classes() -> None:
     """Signed patterns through a camera, asked for twice; the probes of another family are left as they were. (Planted:
     probes mixed in place.)"""
@@ -322,39 +227,6 @@ def test_frames_of_pairs_are_those_of_classes() -> None:
 
 
 # ---- what frames are, besides their light
-
-
-@pytest.mark.parametrize("family", BESIDE)
-def test_shots_in_a_dark_room_are_those_without_lamps(family: str) -> None:
-    """Also where frames with lamps were formed before, which stay. (Planted: lamps left on.)"""
-    labels, weights = BESIDE[family]
-    optics, groups, lamps = small_optics(8), random_groups(3, 7, 0.2), ambient_groups(3)
-    lit = expected_frames(optics, groups, labels, weights, 5, ambient=[AccumulatedLight(optics, lamps)])
-    before = [frame.irradiance.copy() for frame in lit]
-    dark, plain = lit.of_projector, expected_frames(optics, groups, labels, weights, 5)
-    alike(dark, plain)
-    assert lit.has_ambient and not dark.has_ambient and not dark.projector_off.irradiance.any()
-    assert all(np.array_equal(frame.irradiance, light) for frame, light in zip(lit, before, strict=True))
-
-
-@pytest.mark.parametrize("sign", [1, -1], ids=["light", "below zero"])
-def test_frames_are_read_only_and_have_no_heavy_group_without_noise(sign: int) -> None:
-    """(Planted: frames that a reader may change for the next one; a heaviest group among equal ones.)"""
-    light = [sparse.csr_array(sign * random_groups(1, 7, 0.0)[0])]
-    for frame in expected_frames(small_optics(8), light * 2, LABELS, np.eye(4), 0):
-        assert frame.variance == frame.heaviest == 0 and frame.irradiance.any() == (sign > 0)
-        with pytest.raises(ValueError, match="read-only"):
-            frame.irradiance[0, 0] = 1
-
-
-def test_replicates_of_which_one_group_is_dark_are_seen() -> None:
-    """As they are beside the frames. (Planted: left out unless all groups hold light.)"""
-    optics, (group,) = small_optics(8), random_groups(1, 7)
-    lights = [AccumulatedLight(optics, (group, sparse.csr_array(group.shape)))]
-    basis, probes = sparse.eye_array(2, PIXELS, format="csr"), probe_vectors(8, 0)
-    probed, noise = probe_frames(lights, basis, probes)
-    assert np.array_equal(probed, form_frames(lights, basis, probes)[1])
-    assert (np.diagonal(noise, axis1=2, axis2=3) > 0).all()
 
 
 def test_no_product_is_taken_over_more_than_four_million_places() -> None:

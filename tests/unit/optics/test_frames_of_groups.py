@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy import sparse
-from scipy.special import stdtrit
 
 from mitsim.optics.frames import (
     AccumulatedLight,
@@ -13,16 +12,9 @@ from mitsim.optics.frames import (
     monte_carlo_error,
     probe_vectors,
 )
-from mitsim.optics.image_formation import FrameOptics
-from mitsim.optics.shadow import Directions
 from tests.unit.optics.small_camera import (
     BESIDE,
-    CAMERA,
-    CELLS,
-    LABELS,
     PIXELS,
-    WINDOW,
-    Z,
     ambient_groups,
     expected_frames,
     random_groups,
@@ -106,13 +98,6 @@ def test_noise_is_told_by_light(family: str) -> None:
     assert found == pytest.approx(apart, rel=1e-9)
 
 
-def test_one_group_has_no_variance_to_tell() -> None:
-    frames = expected_frames(small_optics(), random_groups(1, 7, 0.2), LABELS, np.eye(4), 0)
-    assert all(frame.variance == 0 and frame.irradiance.any() for frame in frames)
-    assert monte_carlo_error(frames) == monte_carlo_bound(frames) == 0
-    assert frames.sampling_error() == (0.0, 0.0)
-
-
 def test_probes_see_every_matrix_with_its_norm_and_what_columns_share_exactly() -> None:
     """sum |A v|^2 is ||A||^2 in the mean; for equal columns it is no estimate.
 
@@ -150,26 +135,3 @@ def test_the_bound_of_a_monte_carlo_error_holds(kinds: str) -> None:
     held = float((made <= bounds**2).mean())
     assert 0.935 < held < 0.997
     assert bound_of(np.zeros((4, 4)), 1.0) == bound_of(np.eye(4), 0.0) == 0.0
-
-
-def test_the_bound_of_one_kind_of_noise_is_students() -> None:
-    """The ratio is Student's two-sided quantile, for the two to four groups that lights have."""
-    for groups in (2, 3, 4):
-        off = np.arange(groups) - (groups - 1) / 2
-        bound = bound_of(np.outer(off, off), 1.0) / np.sqrt(off @ off)
-        assert bound == pytest.approx(stdtrit(groups - 1, 0.975))
-
-
-@pytest.mark.parametrize("shots", [2, 4], ids=["formed by shot", "mixed of classes"])
-def test_layers_add_up_whatever_order_a_products_entries_have(shots: int) -> None:
-    """Frames of light in two layers are those of each layer's light (planted: entries as products leave them)."""
-    edges, depths = np.linspace(*WINDOW, CELLS + 1), (Z, 30.0)
-    both = FrameOptics(CAMERA, Directions.cells(edges), Directions.cells(edges), depths, 1)
-    single = [FrameOptics(CAMERA, Directions.cells(edges), Directions.cells(edges), (depth,), 1) for depth in depths]
-    layers = [random_groups(3, seed) for seed in (1, 2)]
-    stacked = [sparse.csr_array(sparse.hstack(pair)) for pair in zip(*layers, strict=True)]
-    weights = np.random.default_rng(3).random((shots, 4))
-    found = expected_frames(both, stacked, LABELS, weights, 0)
-    parts = [expected_frames(optics, groups, LABELS, weights, 0) for optics, groups in zip(single, layers, strict=True)]
-    for frame, *of_layers in zip(found, *parts, strict=True):
-        np.testing.assert_allclose(frame.irradiance, sum(part.irradiance for part in of_layers), rtol=1e-12)

@@ -5,8 +5,8 @@ import pytest
 
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.fft_shadow import ProfileSampler, geometric_samplers, wave_samplers
-from mitsim.optics.mirror_frames import Beams, SpecularLight, _bilinear, _cuts, _gradients, specular_frames
+from mitsim.optics.fft_shadow import geometric_samplers, wave_samplers
+from mitsim.optics.mirror_frames import Beams, SpecularLight, _cuts, specular_frames
 
 PITCH = 0.05
 LABELS = np.arange(9) % 3
@@ -73,15 +73,6 @@ def test_a_turned_beam_lights_its_inside_evenly() -> None:
     assert not frame[0].any() and not frame[:, 0].any()
 
 
-def test_light_beside_the_sensor_is_not_counted() -> None:
-    half = beams(square((-0.1, 0.3), (0.1, 0.5)))  # the sensor ends at 0.4
-    found = specular_frames(half, geometry(), geometric_samplers(geometry()), LABELS)
-    assert found.flux == pytest.approx(1.0, rel=1e-12)
-    outside = beams(square((-0.1, 0.41), (0.1, 0.5)))
-    found = specular_frames(outside, geometry(), geometric_samplers(geometry()), LABELS)
-    assert (found.flux, len(found.classes), found.irradiance.shape) == (0, 0, (0, 16, 16))
-
-
 def test_the_field_stop_and_a_response_weigh_directions() -> None:
     corners = square((-0.2, -0.2), (0.2, 0.2))
     tangent = np.zeros((1, 2, 2, 2))
@@ -93,15 +84,6 @@ def test_the_field_stop_and_a_response_weigh_directions() -> None:
     wide = geometry(fov=120, angular_exponent=2.0)
     answered = specular_frames(beams(corners, tangent=tangent), wide, geometric_samplers(wide), LABELS, 64)
     assert answered.flux == pytest.approx(2 * np.pi / 4, rel=1e-5)
-
-
-def test_throughput_dims_where_it_is_low() -> None:
-    throughput = np.array([[[0.0, 0.0], [1.0, 1.0]]])
-    lit = beams(square((-0.2, -0.2), (0.2, 0.2)), throughput=throughput)
-    found = specular_frames(lit, geometry(), geometric_samplers(geometry()), LABELS)
-    assert found.flux == pytest.approx(1.0, rel=1e-12) and lit.delivered == pytest.approx([1.0])
-    rows = found.irradiance[0].sum(axis=1)
-    assert rows[11] / rows[4] == pytest.approx(15, rel=1e-6)
 
 
 @pytest.mark.parametrize("depth", [800.0, 30.0, 4.0, -50.0])
@@ -132,17 +114,6 @@ def test_the_virtual_source_is_found_however_a_beam_lies(angle: float) -> None:
     slopes = np.array([[1 / 500, 1 / 3000], [-1 / 4000, -1 / 200]])
     found = beams(corners, tangent=-(corners @ slopes.T)[None]).inverse_depth
     np.testing.assert_allclose(found, [[1 / 500, -1 / 200]], rtol=1e-12)
-
-
-def test_gradients_are_those_of_the_bilinear_map() -> None:
-    """Of a beam whose opposite sides are not parallel, by differences of 1e-6 (the map is quadratic at most)."""
-    corners = np.random.default_rng(4).normal(size=(2, 2, 2, 2))
-    a, b, step = np.array([0.1, 0.5, 0.9]), np.array([0.2, 0.7]), 1e-6
-    along, across = _gradients(corners, a, b)
-    by_a = (_bilinear(corners, a + step, b) - _bilinear(corners, a - step, b)) / (2 * step)
-    by_b = (_bilinear(corners, a, b + step) - _bilinear(corners, a, b - step)) / (2 * step)
-    np.testing.assert_allclose(np.broadcast_to(along, by_a.shape), by_a, atol=1e-8)
-    np.testing.assert_allclose(np.broadcast_to(across, by_b.shape), by_b, atol=1e-8)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.1, np.pi / 4, np.pi / 2])
@@ -182,27 +153,6 @@ def test_wave_samplers_hold_all_that_a_box_at_the_sensor_s_and_the_field_stop_s_
             assert np.abs(other(at, width)).max() > 0.01, "there is light to lose"
 
 
-def test_flatcam_terms_add_up() -> None:
-    camera = geometry("flatcam")
-    lit = beams(square((-0.4, -0.4), (0.4, 0.4)), depth=1e9)
-    frame = specular_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
-    fine = (np.arange(16 * 40) + 0.5) / 40 * PITCH - 0.4
-    mask = camera.build_mask().transmission(fine[:, None], fine).reshape(16, 40, 16, 40).mean(axis=(1, 3))
-    assert np.abs(frame - 2 / 0.64 * mask).max() < 0.05 * frame.max()
-    assert specular_frames(lit, camera, [], LABELS).irradiance.sum() == 0
-
-
-def test_an_active_side_takes_the_mean_over_the_pixels_middle() -> None:
-    """A quarter of the area is active, so a quarter of the light counts; the mask is seen by that quarter alone."""
-    camera = geometry("separable", pixel_fill_factor=0.25)
-    lit = beams(square((-0.4, -0.4), (0.4, 0.4)), depth=1e9)
-    frame = 4 * specular_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
-    mask = camera.build_mask()
-    sampler, middle = ProfileSampler(mask.bits, mask.feature_mm), (np.arange(16) - 7.5) * PITCH
-    profile = sampler(middle, np.full(16, PITCH / 2))
-    assert np.allclose(frame, 2 / 0.64 * np.outer(profile, profile), rtol=0, atol=1e-6)
-
-
 def test_classes_are_told_apart_and_add_up() -> None:
     first, second = beams(square((-0.2, -0.2), (0.2, 0.2)), 4), beams(square((0.0, 0.0), (0.3, 0.3)), 8, 5.0)
     both = Beams(*(np.concatenate([getattr(b, name) for b in (first, second)]) for name in ORDER), 0.5)
@@ -214,47 +164,6 @@ def test_classes_are_told_apart_and_add_up() -> None:
 
 
 ORDER = ("pixel", "flux", "sensor", "tangent", "throughput")
-
-
-def test_a_profile_sampler_takes_means() -> None:
-    sampler = ProfileSampler([1.0, 0.0, 3.0, 2.0], 0.5)  # features from -1 to 1
-    assert sampler(np.array([0.0]), np.array([2.0])) == pytest.approx([1.5])
-    assert sampler(np.array([0.0]), np.array([8.0])) == pytest.approx([0.375])
-    assert sampler(np.array([-0.75, 0.25, 5.0, -5.0]), np.full(4, 0.0)) == pytest.approx([1, 3, 0, 0])
-    assert sampler(np.array([0.5]), np.array([0.2])) == pytest.approx([2.5])
-
-
-def test_a_beam_that_passes_the_sensors_corner_lights_no_pixel() -> None:
-    """Its bounding box meets the sensor, none of its light does. (Planted: boxes on the sensor in one axis.)"""
-    thin = np.array([[[0.35, 0.74], [0.36, 0.75]], [[0.74, 0.35], [0.75, 0.36]]])
-    found = specular_frames(beams(thin), geometry(), geometric_samplers(geometry()), LABELS)
-    assert (found.flux, found.lit_pixels.tolist(), found.classes.tolist()) == (0, [], [])
-
-
-def test_the_virtual_source_is_that_at_an_uneven_beams_middle() -> None:
-    """By differences there, of a beam whose tan-angles are not linear in place. (Planted: at its last corner.)"""
-    rng, half, step = np.random.default_rng(6), np.array([0.5]), 1e-6
-    uneven = beams(turned(0.3, 0.4) + 0.05 * rng.normal(size=(2, 2, 2)), tangent=0.01 * rng.normal(size=(1, 2, 2, 2)))
-    by_a, by_b = (
-        [
-            (_bilinear(corners, half + step * a, half + step * b) - _bilinear(corners, half, half))[0, 0, 0] / step
-            for corners in (uneven.sensor, uneven.tangent)
-        ]
-        for a, b in ((1, 0), (0, 1))
-    )
-    (u_a, t_a), (u_b, t_b) = by_a, by_b
-    slopes = np.stack([t_a, t_b], axis=1) @ np.linalg.inv(np.stack([u_a, u_b], axis=1))
-    np.testing.assert_allclose(uneven.inverse_depth[0], -np.diag(slopes), rtol=1e-4)
-
-
-def test_mean_irradiance_is_that_of_beams_on_the_sensor() -> None:
-    """One on it, one beside its columns; what lacks is in one beam, what may be off a point of one of 256 pixels.
-    (Planted: the mean over one side of a beam and both its coordinates.)"""
-    met, beside = beams(square((-0.1, -0.1), (0.1, 0.1))), beams(square((-0.1, 0.5), (0.1, 0.7)), flux=5.0)
-    both = Beams(*(np.concatenate([getattr(b, name) for b in (met, beside)]) for name in ORDER), 0.3, 0.025)
-    irradiance, unsure = SpecularLight(both).irradiance(geometry())
-    assert irradiance == pytest.approx(2.0 / (16 * PITCH) ** 2, rel=1e-12)
-    assert unsure == pytest.approx(0.5 / (16 * PITCH) ** 2, rel=1e-12)
 
 
 def test_parallel_light_has_waves_of_a_far_source() -> None:

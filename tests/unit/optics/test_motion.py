@@ -10,7 +10,6 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import MaskMotion
 from mitsim.optics.diffraction import wave_profiles
-from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 
@@ -59,13 +58,6 @@ def test_a_turned_mask_is_the_mask_at_turned_coordinates() -> None:
     assert np.linalg.norm(expected) > 0.005
 
 
-def test_a_turned_mask_on_a_region_casts_that_part_of_its_shadow() -> None:
-    """All rows, which reach farthest and so have the whole sensor's nodes. (Planted: rows' pixels for columns'.)"""
-    part = CAMERA.model_copy(update={"roi": (0, 5, 24, 12), "mask_motion": MaskMotion(rotation_mrad=2.0)})
-    found, whole = (operator(shadow_terms(each, ROWS, COLUMNS, DEPTH)) for each in (part, moving(rotation_mrad=2.0)))
-    np.testing.assert_allclose(found, whole[:, :, 5:17], rtol=0, atol=1e-12)
-
-
 def test_fine_nodes_are_as_good_as_finer_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     """The anchor's pixels of 11.7 um: hats 0.5 um apart leave 1 % of what turning by 1 mrad changes, against a tenth of
     that spacing. (Planted: 5 um apart, 17 %.)"""
@@ -108,18 +100,3 @@ def test_vibration_is_the_convolution_of_the_shadow(spectrum: Spectrum | None) -
     scale = np.vdot(expected, after) / np.vdot(expected, expected)
     assert np.linalg.norm(after - scale * expected) < 0.01 * np.linalg.norm(after - before)
     assert scale == pytest.approx(weight, rel=1e-3) or spectrum is not None
-
-
-def test_a_mask_that_neither_turns_nor_shakes_casts_the_same_shadow() -> None:
-    """Bit for bit. (Planted: a node of its own.)"""
-    found, still = (shadow_terms(camera, ROWS, COLUMNS, DEPTH) for camera in (moving(), CAMERA))
-    assert all(np.array_equal(a, b) for pair in zip(found, still, strict=True) for a, b in zip(*pair, strict=True))
-
-
-def test_frames_of_a_turned_mask_are_those_of_its_terms() -> None:
-    """Through the optics that form frames, which keep no shadow of hundreds of terms. (Planted: the mask at rest.)"""
-    light = np.random.default_rng(0).random((5, 4))
-    turned = moving(rotation_mrad=2.0)
-    frame = FrameOptics(turned, ROWS, COLUMNS, (DEPTH,), 1).frame(np.arange(20), light.ravel())
-    expected = sum(left @ light @ right.T for left, right in shadow_terms(turned, ROWS, COLUMNS, DEPTH))
-    assert np.allclose(frame, expected, rtol=1e-12)

@@ -10,21 +10,6 @@ from mitsim.optics.shadow import Antiderivative, Steps, blurred_step
 from tests.shadow_factor import scene_factor, steps_of
 
 
-def test_neighbours_of_equal_value_are_merged_and_outside_is_zero() -> None:
-    steps = steps_of([1, 1, 0, 2], 0.5)
-    assert np.array_equal(steps.edges, [-1.0, 0.0, 0.5, 1.0])
-    assert np.array_equal(steps.values, [1.0, 0.0, 2.0])
-    assert np.array_equal(steps.at(np.array([-1.01, -1.0, 0.2, 0.5, 0.99, 1.0])), [0, 1, 0, 2, 2, 0])
-
-
-def test_functions_are_equal_by_edges_and_values() -> None:
-    """What is kept of one serves an equal one alone. (Planted: equal by edges.)"""
-    one, same, other = (
-        Steps(np.array([0.0, 1.0, 2.0]), np.array(values)) for values in ([1.0, 3.0], [1.0, 3.0], [2.0, 3.0])
-    )
-    assert one == same and hash(one) == hash(same) and one != other
-
-
 def test_a_product_holds_at_every_point() -> None:
     rng = np.random.default_rng(4)
     one, other = (steps_of(rng.integers(-1, 2, 12), 0.3) for _ in range(2))
@@ -32,11 +17,6 @@ def test_a_product_holds_at_every_point() -> None:
     s = rng.uniform(-3, 3, 2000)
     assert np.array_equal(product.at(s), one.at(s) * other.at(0.9 * s + 0.17))
     assert (np.diff(product.edges) > 0).all()
-
-
-def test_cells_that_hold_an_edge_get_its_share() -> None:
-    steps = Steps(np.array([0.0, 0.25, 1.0]), np.array([1.0, 4.0]))
-    assert np.allclose(steps.cell_means(-0.5, 0.5, 4), [0.0, 0.5 * 1 + 0.5 * 4, 4.0, 0.0])
 
 
 @pytest.mark.parametrize(("half_pixel", "half_cell"), [(0.2, 0.07), (0.03, 0.4), (0.1, 0.1), (0.2, 0.0), (0.2, 1e-9)])

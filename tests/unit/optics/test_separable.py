@@ -33,30 +33,6 @@ def test_the_best_term_is_the_first_singular_pair_of_the_dense_operator(count: i
     assert best.residual == pytest.approx(error, rel=1e-10)
 
 
-def test_one_term_is_its_own_best_term_balanced_and_of_the_same_sign() -> None:
-    ((left, right),) = random_terms(1, 2)
-    best = best_term([(left, right)])
-    assert best.residual < 1e-14
-    scale = np.sqrt(np.linalg.norm(right) / np.linalg.norm(left))
-    assert np.allclose(best.left, scale * left) and np.allclose(best.right, right / scale)
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_the_best_term_s_sign_is_that_of_the_largest(sign: int) -> None:
-    """A singular pair's own sign is anyone's: both signs of the same operator, and a small term that says otherwise."""
-    ((left, right),) = random_terms(1, 2)
-    best = best_term([(-0.01 * sign * left, -right), (sign * left, sign * right), (-0.02 * left, right)])
-    assert sign * np.vdot(best.left, left) > 0 and sign * np.vdot(best.right, right) > 0
-
-
-def test_the_same_operator_in_other_terms_does_not_differ() -> None:
-    terms = random_terms(2, 3)
-    (left, right), second = terms
-    split = [(0.25 * left, right), second, (left, 0.75 * right)]
-    assert best_term(split).residual == pytest.approx(best_term(terms).residual, rel=1e-10)
-    assert best_term([(left, right), (2 * left, right)]).residual < 1e-14
-
-
 def test_centred_factors_give_centred_frames() -> None:
     """Whatever the scene, frames lose the means of their rows and columns, and nothing else."""
     terms = random_terms(3, 6)

@@ -66,12 +66,6 @@ def test_wide_and_far_off_cells_equal_quadrature():
             assert got[i, j] == pytest.approx(values.mean(), abs=0.02)
 
 
-def test_flatcam_constant_term_is_exactly_one_inside_the_mask():
-    # The solver's centring relies on it: the weights of the features must sum to 1 to rounding.
-    factor = scene_factor(np.ones(511), *ANCHOR)
-    np.testing.assert_allclose(factor, 1.0, rtol=0, atol=4e-16)
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.integers(0, 1), min_size=1, max_size=40),
@@ -91,49 +85,10 @@ def test_energy_and_bounds(bits, feature, distance, depth):
     np.testing.assert_allclose(area, sum(bits) * feature, rtol=1e-9, atol=1e-9)
 
 
-def test_finer_cells_average_to_coarse_ones():
-    bits = mls_mask(order=5).bits
-    fine = shadow_factor(bits, 0.06, centred_edges(20, 0.02), centred_edges(60, 0.003), 2.0, np.inf)
-    coarse = shadow_factor(bits, 0.06, centred_edges(10, 0.04), centred_edges(12, 0.015), 2.0, np.inf)
-    np.testing.assert_allclose(fine.reshape(10, 2, 12, 5).mean(axis=(1, 3)), coarse, atol=1e-13)
-
-
 @pytest.mark.parametrize("depth", [2.0, float("nan")])
 def test_a_scene_at_the_mask_is_refused_in_one_line(depth):
     with pytest.raises(MitsimError, match=r"^[^\n]+$"):
         ShadowGeometry(mls_mask(), np.zeros(1), 0.1, 2.0, 0.0, depth)
-
-
-def test_point_directions_average_over_the_pixel_alone():
-    """Width 0: the share of each pixel's ray crossings that are open, from exact interval arithmetic."""
-    mask = mls_mask(order=5)
-    pixels = centred_edges(40, 0.017)
-    at = Directions([-0.31, 0.0, 0.0123], 0.0)
-    setting = ShadowGeometry(mask, (pixels[:-1] + pixels[1:]) / 2, 0.017, 2.0, 0.0, 50.0)
-    ((left, _),) = geometric_terms(setting, at, at)
-    openings = (np.flatnonzero(mask.bits)[:, None] + [0, 1] - 31 / 2) * 0.06
-    for j, tau in enumerate(at.centres):
-        edges = pixels * (1 - 2 / 50) + 2 * tau
-        inside = np.minimum(edges[1:, None], openings[:, 1]) - np.maximum(edges[:-1, None], openings[:, 0])
-        expected = np.maximum(inside, 0).sum(axis=1) / np.diff(edges)
-        np.testing.assert_allclose(left[:, j], expected, rtol=0, atol=1e-12)
-
-
-def test_narrow_cells_tend_to_points():
-    mask, pixels = mls_mask(order=5), centred_edges(40, 0.017)
-    setting = ShadowGeometry(mask, (pixels[:-1] + pixels[1:]) / 2, 0.017, 2.0, 0.0, 50.0)
-    factors = [geometric_terms(setting, at, at)[0][0] for at in (Directions([0.02], w) for w in (0.0, 1e-6, 1e-300))]
-    np.testing.assert_allclose(factors[1], factors[0], rtol=0, atol=1e-4)
-    np.testing.assert_allclose(factors[2], factors[0], rtol=0, atol=1e-12)
-
-
-def test_equal_edges_make_directions():
-    at = Directions.cells([-0.2, -0.1, 0.0, 0.1])
-    np.testing.assert_allclose(at.centres, [-0.15, -0.05, 0.05], rtol=0, atol=1e-15)
-    assert at.width == pytest.approx(0.1)
-    assert at == Directions([*at.centres], at.width) and at != Directions(at.centres, 0.0)
-    with pytest.raises(ValueError, match="read-only"):
-        at.centres[0] = 1
 
 
 def test_a_fill_factor_dims_both_axes_once_and_shades_each_by_its_own_directions():

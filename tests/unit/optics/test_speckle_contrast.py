@@ -1,7 +1,5 @@
 """Computed speckle contrast against fields of a rough surface that are added up, point by point and beam by beam."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import ndtri
@@ -9,7 +7,7 @@ from scipy.special import ndtri
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence, ProjectorModel
-from mitsim.optics.frames import _between_pixels, contrast_of
+from mitsim.optics.frames import contrast_of
 from tests.invented import sensor
 
 N, POINTS, SIDE = 8, 6, 0.5  # projector pixels a side, points a pixel, a pixel's side [mm]
@@ -99,13 +97,6 @@ def test_a_scanned_beam_has_as_many_modes_as_its_area_fits() -> None:
     assert (few / found) ** 2 == pytest.approx(16, rel=0.15), "edges of dots have less of the beam's neighbours"
 
 
-def test_light_at_once_has_as_many_modes_as_grains_fit_a_large_pixel() -> None:
-    """M = pixel area x solid angle / lambda^2 (Goodman, 4.4), where that is many."""
-    found = contrast_of(devices(pitch=1.0, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
-    grains = 1.0**2 * (N * SIDE / DISTANCE) ** 2 / (WAVELENGTH * 1e-6) ** 2
-    assert found**-2 == pytest.approx(grains, rel=0.03)
-
-
 def test_polarisations_and_lines_speckle_apart() -> None:
     tiny = {"pitch": 1e-6}
     single = contrast_of(devices(**tiny, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
@@ -130,33 +121,3 @@ def test_lines_are_as_coherent_as_the_surface_is_smooth(roughness_um: float, lin
     found = contrast_of(devices(pitch=1e-6, lines=LINES, polarisation=1.0, **given), (SIDE, SIDE), np.ones((N, N)))
     # One in sqrt(2 x 6400) of a standard deviation, four times; 60 points are not quite many.
     assert found == pytest.approx(float(light.std()), rel=4 / np.sqrt(2 * count) + 1 / points)
-
-
-def test_pixels_that_are_tall_leave_what_wide_ones_leave_of_turned_light() -> None:
-    """And other than square ones do. (Planted: a pixel's width for its height.)"""
-    lit = np.random.default_rng(2).random((4, 6))
-    tall, wide, square = (
-        contrast_of(replace(made, camera=made.camera.model_copy(update=update)), (SIDE, SIDE), light)
-        for made in (devices("separable"),)
-        for update, light in (
-            ({"row_pitch": 2 * PITCH}, lit),
-            ({"pixel_pitch": 2 * PITCH, "row_pitch": PITCH}, lit.T),
-            ({}, lit),
-        )
-    )
-    assert tall == pytest.approx(wide, rel=1e-9) and tall < 0.9 * square
-
-
-def test_partly_polarised_light_is_between() -> None:
-    """(1 + P^2) / 2 of a point's variance (Goodman, 3.3). (Planted: the cube of P.)"""
-    found = contrast_of(devices(pitch=1e-6, polarisation=0.5), (SIDE, SIDE), np.ones((N, N)))
-    assert found**2 == pytest.approx((1 + 0.5**2) / 2, rel=1e-6)
-
-
-def test_pairs_of_points_are_weighed_as_often_as_they_are_apart() -> None:
-    """Two kernels' mean over points of two pixels, 300 of each. (Planted: a scale, which contrast does not show.)"""
-    points = (np.arange(300) + 0.5) / 300 * SIDE
-    found = _between_pixels((np.cos, lambda distance: np.exp(-np.square(distance))), SIDE, 3)
-    for lag, value in zip((0, 1, 2, -3, -2, -1), found, strict=True):
-        apart = lag * SIDE + points[:, None] - points
-        assert value == pytest.approx((np.cos(apart) * np.exp(-np.square(apart))).mean(), abs=1e-5), lag

@@ -70,18 +70,6 @@ def test_a_projector_whose_pixels_run_into_each_other_is_for_the_reference_alone
     assert bench.render("reference", spp=4).mean.any()
 
 
-def test_a_medium_of_the_air_before_the_camera(small_scene: Write) -> None:
-    text = small_scene(**VOLPATH).read_text()
-    path = small_scene("air", **VOLPATH)
-    path.write_text(text.replace("<film", MEDIUM.format(name="medium") + "<film").replace("small_", "air_"))
-    assert "medium: got a medium in <sensor type='mitsim_lensless'>" in message(lambda: open_bench(path))
-
-
-def test_a_medium_that_nothing_refers_to_is_none(small_scene: Write) -> None:
-    unfit = open_bench(small_scene(extra=SHARED)).loaded.unfit
-    assert unfit.factored is None and unfit.reference is None
-
-
 @pytest.mark.parametrize("integrator", ["path", "direct"])
 @pytest.mark.parametrize(("extra", "cause"), [(FOG, "homogeneous"), (CARD, "mask"), (PANE, "thindielectric")])
 def test_integrators_that_lose_light_are_refused(small_scene: Write, integrator: str, extra: str, cause: str) -> None:
@@ -92,13 +80,6 @@ def test_integrators_that_lose_light_are_refused(small_scene: Write, integrator:
     line = path.read_text().split(extra)[0].count("\n") + 1
     assert f"{path}:3: integrator: got '{integrator}' in <integrator type='{integrator}'>" in reported
     assert f"it loses light at small.xml:{line} ({cause}); use volpath" in reported
-
-
-def test_other_scenes_go_their_way(small_scene: Write) -> None:
-    glass = '<shape type="sphere"><float name="radius" value="5"/><bsdf type="dielectric"/></shape>'
-    unused = '<bsdf type="mask" id="unused"><float name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf>'
-    bench = open_bench(small_scene(extra=glass + unused))
-    assert bench.loaded.unfit.factored is None and bench.loaded.unfit.reference is None
 
 
 BALL = """<shape type="sphere"><float name="radius" value="5"/><point name="center" x="0" y="0" z="300"/>
@@ -153,27 +134,6 @@ def test_mirrors_inside_of_other_materials_are_mirrors(small_scene: Write, bsdf:
     assert loaded.mirrors and loaded.unfit.caustics is not None
     unused = open_bench(small_scene("unused", extra=bsdf.replace("<bsdf", '<bsdf id="spare"', 1))).loaded
     assert not unused.mirrors and unused.unfit.caustics is None and unused.unfit.reference is None
-
-
-@pytest.mark.parametrize("bsdf", ["pplastic", "roughconductor", "roughplastic", "roughdielectric", "principled"])
-def test_glossy_materials_are_no_mirrors(small_scene: Write, bsdf: str) -> None:
-    loaded = open_bench(small_scene(extra=plate(f'<bsdf type="{bsdf}"/>'))).loaded
-    assert loaded.glossy and not loaded.mirrors and loaded.unfit.caustics is None
-
-
-@pytest.mark.slow
-def test_plans_captures_and_frames_say_once_what_they_lack(small_scene: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And end with 1; a calibration lacks nothing, as a board stands in the scene's place, and no lamp shines."""
-    monkeypatch.setattr("mitsim.planner.pilot._CAUSTIC_PATHS", 2**12)
-    bench = open_bench(small_scene(extra=BALL.format("conductor") + BULB))
-    lamps = bench.loaded.unfit.lamps
-    assert lamps is not None and bench.with_board(0.9).loaded.unfit.lamps is None
-    plan = bench.plan("uniform", accuracy=0.1)
-    assert plan.payload()["warnings"].count(lamps) == 1 and lamps not in bench.with_board(0.9).plan("uniform").warnings
-    assert bench.capture(plan).warnings.count(lamps) == 1
-    assert bench.render("factored", accuracy=0.1).warnings.count(lamps) == 1
-    for off in ("mirrors", "ambient"):
-        assert lamps not in bench.plan("uniform", accuracy=0.1, effects={off: False}).warnings
 
 
 def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
@@ -235,12 +195,6 @@ def test_what_light_passes_is_not_hidden_under_bumps(small_scene: Write, bumps: 
     open_bench(small_scene(extra=f'<shape type="disk">{turned}{BEHIND}', **VOLPATH), "llvm_ad_mono")
 
 
-@pytest.mark.usefixtures("flat")
-def test_hidden_holes_that_no_shape_has_are_no_matter(small_scene: Write) -> None:
-    extra = f'<bsdf type="normalmap" id="unused">{BUMPS["normalmap"]}{HOLE.format(MATT)}</bsdf>'
-    open_bench(small_scene(extra=extra), "llvm_ad_mono")
-
-
 AREA = '<emitter type="area"><spectrum name="radiance" value="1"/></emitter>'
 THIN = '<shape type="disk"><bsdf type="principledthin"><float name="spec_trans" value="0.5"/></bsdf></shape>'
 
@@ -266,12 +220,6 @@ THIN = '<shape type="disk"><bsdf type="principledthin"><float name="spec_trans" 
 def test_what_one_estimator_alone_would_obey_is_refused(small_scene: Write, numbers: dict[str, str], line: str) -> None:
     """Lamps were in one estimator's frames and not in the other's, with status 0."""
     assert line in message(lambda: open_bench(small_scene(**numbers), "llvm_ad_mono"))
-
-
-@pytest.mark.usefixtures("flat")
-def test_a_thin_sheet_without_sharp_transmission_is_allowed(small_scene: Write) -> None:
-    """A card with ``spec_trans`` of 0 was refused. (Planted: the presence of the parameter, not its value.)"""
-    open_bench(small_scene(extra=THIN.replace("0.5", "0")), "llvm_ad_mono")
 
 
 @pytest.mark.usefixtures("flat")

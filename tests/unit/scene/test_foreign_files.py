@@ -11,7 +11,6 @@ import numpy as np
 import OpenEXR
 import pytest
 
-import mitsim as ms
 from mitsim.acquire.sense import read_image
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
@@ -98,22 +97,6 @@ def test_a_polygon_that_passes_has_the_area_of_its_outline(tmp_path: Path) -> No
     assert 100 < passed < 290
 
 
-def test_materials_that_are_not_read_are_mentioned_once(
-    small_scene: Callable[..., Path], tmp_path: Path, variant: str
-) -> None:
-    """Of a scene's mesh and of one that a user names. (Planted: of the scene's alone; for each use of the mesh.)"""
-    shape = '<shape type="obj"><string name="filename" value="a.obj"/><bsdf type="diffuse"/></shape>'
-    path = small_scene(extra=shape * 2)
-    text = f"mtllib my own.mtl\n{SQUARE}usemtl red\nf 1 2 3 4\n"
-    for place in (path.parent / "a.obj", tmp_path / "b.obj"):
-        place.write_text(text)
-    with pytest.warns(UserWarning, match=r"a\.obj: its materials \(my own.mtl\) are not read") as found:
-        ms.open_bench(path, variant)
-    assert sum("a.obj" in str(each.message) for each in found) == 1
-    with pytest.warns(UserWarning, match=r"b\.obj: its materials \(my own.mtl\) are not read"):
-        ms.shelf_scene(tmp_path / "b.obj", variant=variant)
-
-
 # -------- Names in messages
 
 
@@ -187,22 +170,6 @@ def test_channels_of_several_types_are_refused_in_scenes_and_read_elsewhere(tmp_
     for name, values in read_frame(tmp_path / "a.exr")[0].items():
         assert np.array_equal(values, channels[name])
     assert np.array_equal(read_image(tmp_path / "a.exr", "DN")[0], channels["DN"])
-
-
-@pytest.mark.parametrize("kind", [np.float16, np.float32])
-def test_channels_of_one_type_are_a_picture(tmp_path: Path, kind: Any) -> None:
-    channels = dict.fromkeys("BGR", np.full((6, 8), 0.5, kind))
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, {**channels}).write(str(tmp_path / "a.exr"))
-    assert check_image(tmp_path / "a.exr") == (48, False)
-
-
-def test_numbers_whose_white_nobody_knows_are_no_picture(tmp_path: Path) -> None:
-    """Codes of 8 bits in whole numbers of 32. (Seen failing: divided by 4294967295, a black picture.)"""
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.full((6, 8), 200, np.uint32)}).write(str(tmp_path / "a.exr"))
-    np.save(tmp_path / "a.npy", np.full((6, 8), 200, np.uint32))
-    for name in ("a.exr", "a.npy"):
-        with pytest.raises(MitsimError, match="its numbers reach from 200 to 200; give 0 to 1"):
-            read_reflectance(tmp_path / name)
 
 
 def test_a_texture_that_a_mesh_names_is_found(tmp_path: Path) -> None:

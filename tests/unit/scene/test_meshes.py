@@ -241,29 +241,6 @@ def test_shading_normals_that_are_not_the_surfaces_own_are_seen(
     assert load_scene(path).smoothed is smoothed
 
 
-@pytest.mark.parametrize(
-    ("faces", "shape"),
-    [
-        ([(0, 1, 2), (2, 1, 0)], ""),
-        ([(0, 1, 2), (1, 3, 2), (1, 1, 3)], ""),
-        ([(0, 1, 2), (1, 3, 2)], '<transform name="to_world"><scale x="-1"/></transform>'),
-    ],
-)
-def test_normals_of_a_folded_and_of_a_mirrored_sheet_are_mitsubas(
-    small_scene: Callable[..., Path], faces: list[tuple[int, ...]], shape: str
-) -> None:
-    """And of one with a face without area. (Planted: a sum of 0 made as long as others, which is no number; corners in
-    the other order; a normal that is no number added up.)"""
-    import mitsuba as mi
-
-    path = small_scene(extra=MATT + mesh("sheet.ply").replace("<ref", f"{shape}<ref"))
-    write_sheet(path.parent / "sheet.ply", faces)
-    mirrored = mi.ScalarTransform4f().scale([-1 if shape else 1, 1, 1])
-    theirs = mi.load_dict({"type": "ply", "filename": str(path.parent / "sheet.ply"), "to_world": mirrored})
-    ours = normals_of(load_scene(path))["sheet.ply"]
-    assert np.allclose(ours, np.array(mi.traverse(theirs)["vertex_normals"]), rtol=0, atol=1e-6)
-
-
 def test_whatever_mitsuba_added_up_is_added_up_anew(
     small_scene: Callable[..., Path], variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 import mitsim as ms
-from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.prepare import fit_square, read_reflectance
 from mitsim.scene.outline import Outline, SceneFiles
@@ -56,15 +55,6 @@ def test_a_picture_lies_unstretched_in_the_middle_of_its_square() -> None:
     assert_allclose(small[1249], [0.3] * 2499 + [0.2])
 
 
-def test_a_turned_photograph_is_seen_upright(tmp_path: Path) -> None:
-    """As the camera's Exif says. (Seen failing: read as it is stored.)"""
-    image, exif = Image.fromarray(np.repeat([[0, 250]], 16, axis=0).repeat(16, axis=1).astype(np.uint8)), Image.Exif()
-    exif[274] = 6
-    image.save(tmp_path / "a.jpg", exif=exif, quality=95)
-    upright = read_reflectance(tmp_path / "a.jpg")
-    assert upright.shape == (32, 16) and upright[:14].max() < 0.1 and upright[18:].min() > 0.9
-
-
 def test_a_picture_on_the_sheet_is_the_truth(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file that lies elsewhere, a number for each projector pixel. (Planted: colours by their first; the sheet's side
     128 for 120; a picture turned.) Rays at the edge of a pixel may meet its neighbour, by rounding."""
@@ -80,23 +70,6 @@ def test_a_picture_on_the_sheet_is_the_truth(variant: str, tmp_path: Path, monke
     assert str(tmp_path / "mine.png") in bench.provenance()["scene_files"]
     truth = np.asarray(bench.capture("uniform", accuracy=0.05, exposure=0.01).truth, dtype=np.float64)
     assert np.abs(truth - expected / BOARD).mean() < 1e-4 and np.abs(truth - expected / BOARD).max() < 0.02
-
-
-def test_an_array_is_a_picture(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kept as a file that is called by its content. (Planted: whole numbers not divided.)"""
-    import tempfile
-
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    codes = np.full((4, 4), 51, np.uint8)
-    bench = ms.flat_scene(codes, variant=variant)
-    assert_allclose(print_of(bench), 0.2, atol=1e-6)
-    assert ms.flat_scene(codes / 255, variant=variant).defines == bench.defines
-    assert len(list(tmp_path.rglob("*.npy"))) == 1
-    for wrong in (3, [[1, 2], [3]], codes.astype(complex), None):
-        with pytest.raises(ms.ArgumentError, match=r"picture.*give a file, or an array"):
-            ms.flat_scene(wrong)
-    with pytest.raises(MitsimError, match=r"its numbers reach from 0 to 1\.5; give 0 to 1"):
-        ms.flat_scene(np.array([[0, 1.5]]), variant=variant)
 
 
 def test_where_a_named_file_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,10 +134,3 @@ def test_what_is_wrong_with_a_mesh_is_told(name: str, text: str, words: str, var
     with pytest.raises(MitsimError, match=words) as refusal:
         ms.shelf_scene(tmp_path / name, variant=variant)
     assert str(tmp_path / name) in str(refusal.value) and "\n" not in str(refusal.value)
-
-
-def test_a_shipped_print_that_is_named_is_the_shipped_scene(variant: str) -> None:
-    """Bit for bit. (Planted: in floats.)"""
-    own = shipped_path("scenes", "photograph", "reflectance.png")
-    named, usual = ms.open_bench("photograph", variant, picture=own), ms.open_bench("photograph", variant)
-    assert np.array_equal(print_of(named), print_of(usual)) and named.identity() == usual.identity()

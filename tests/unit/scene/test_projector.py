@@ -64,19 +64,6 @@ def test_a_turned_projector_casts_a_keystone(small_scene: Callable[..., Path], a
     assert grid.keystone > 0.05
 
 
-def test_the_hand_written_projector_is_the_plain_one_when_not_turned() -> None:
-    corners = by_hand("y", 0.0)
-    assert np.allclose(corners[0, 0], [-0.15, -0.15]) and np.allclose(corners[1, 1], [0.15, 0.15])
-
-
-def test_the_grid_moves_with_the_devices(small_scene: Callable[..., Path]) -> None:
-    # A quarter turn about y and a shift, of camera, projector and sheet together.
-    grid = grid_of(small_scene(pose="0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"))
-    assert grid.row_tan == pytest.approx((-0.15, 0.15), abs=4 * FLOAT32)
-    assert grid.column_tan == pytest.approx((-0.15, 0.15), abs=4 * FLOAT32)
-    assert grid.keystone == 0
-
-
 @pytest.mark.parametrize("fov", ["1e-9", "1e-6", "0.01"])
 def test_a_window_of_no_width_is_refused(small_scene: Callable[..., Path], fov: str) -> None:
     """Light is collected in cells of the projector's pixels: 24 GB of them at 1e-6 degrees. (Planted: no limit.)"""
@@ -87,15 +74,6 @@ def test_a_window_of_no_width_is_refused(small_scene: Callable[..., Path], fov: 
     path.write_text(f'{text[:start]}name="fov" value="{fov}"{text[end:]}')
     with pytest.raises(MitsimError, match=r"the camera's field is .* pixels of the projector wide; at most 16384"):
         load_scene(path)
-
-
-def test_no_bitmap(small_scene: Callable[..., Path]) -> None:
-    path = small_scene()
-    text = path.read_text()
-    start, end = text.index('<texture name="irradiance"'), text.index("</texture>") + len("</texture>")
-    path.write_text(text[:start] + '<spectrum name="irradiance" value="1"/>' + text[end:])
-    with pytest.raises(MitsimError, match=f"{path}: .*not a bitmap"):
-        grid_of(path)
 
 
 def hollow() -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.transport.indirect import AdaptiveSamples, adaptive_counts, block_moments, blocks_of, by_pixel, effect_of
+from mitsim.transport.indirect import adaptive_counts, by_pixel, effect_of
 from tests.unit.transport.test_path_reuse import SCENES, SIGMAS, summed, tracers
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -39,26 +39,6 @@ def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], sha
     for count in (1, 2, 5):
         such = by_pixel(repeats.tolist(), N) == count
         assert variance[1][such].sum() == pytest.approx(variance[0][such].sum() / count, rel=0.45), count
-
-
-def test_every_unit_takes_its_turns() -> None:
-    counts = np.array([2, 1, 3])
-    turns = AdaptiveSamples.of(counts)
-    unit, turn, count = (np.array(each) for each in (turns.unit, turns.turn, turns.count))
-    assert len(turns) == 6
-    assert unit.tolist() == [0, 0, 1, 2, 2, 2] and turn.tolist() == [0, 1, 0, 0, 1, 2]
-    assert count.tolist() == [2, 2, 1, 3, 3, 3]
-
-
-def test_moments_and_repeats_by_block() -> None:
-    assert blocks_of(18) == BLOCKS
-    pixel, light = np.array([0, 3 * 18 + 3, 17 * 18 + 17, 4 * 18]), np.array([1.0, 2.0, 3.0, 4.0])
-    moments = block_moments(pixel, light, 18)
-    expected = np.zeros((BLOCKS, BLOCKS))
-    expected[0, 0], expected[4, 4], expected[1, 0] = 5, 9, 16
-    assert np.array_equal(moments, expected)
-    spread = by_pixel(np.arange(25).tolist(), 18).reshape(18, 18)
-    assert spread[3, 3] == 0 and spread[4, 3] == 5 and spread[17, 17] == 24
 
 
 def test_repeats_leave_less_variance_for_the_cost() -> None:

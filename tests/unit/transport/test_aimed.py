@@ -4,7 +4,6 @@ Gates on the difference of two means of eight seeds are seven standard errors (t
 6e-6 each), in every one of 3 x 3 anchors and summed over the projector's brightest pixels.
 """
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,11 +11,9 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.transport import missed
 from mitsim.transport.direct import AimedTracer, DirectTracer
 from mitsim.transport.missed import SharpLight, sharp_light
 from tests.conftest import write_png
-from tests.physics.test_sharp_lobes import on_ball
 
 N, SEEDS, SEVEN = 16, 8, 7.0
 LONGER = pytest.mark.slow
@@ -25,11 +22,6 @@ LONGER = pytest.mark.slow
 def metal(alpha: float) -> str:
     rough = f'<string name="distribution" value="ggx"/><float name="alpha" value="{alpha}"/>'
     return f'<bsdf type="roughconductor"><string name="material" value="none"/>{rough}</bsdf>'
-
-
-def varnish(alpha: float) -> str:
-    """A matt surface, a twentieth of whose light is metal's."""
-    return f'<bsdf type="blendbsdf"><float name="weight" value="0.95"/>{metal(alpha)}<bsdf type="diffuse"/></bsdf>'
 
 
 def plate(bsdf: str) -> str:
@@ -125,73 +117,6 @@ def test_lobes_are_found_behind_what_lets_light_pass(lit: Callable[..., Bench], 
     assert gate < 0.35 * found.irradiance and abs(found.irradiance - part * expected.irradiance) < gate
     assert found.width == pytest.approx(expected.width, rel=0.1)
     assert AimedTracer(bench.setup, 3, brightest(found))._aims.known.any()
-
-
-def test_broad_lobes_are_told_by_connections(lit: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of lobes that are all broader than the sensor, connections tell the light that the search finds, to five standard
-    errors; one ball with a sharp lobe beside them, and it is searched. (Planted: moments of x, not of x I: hits are off
-    by 1e3. The tenth sharpest lobe, not the sharpest: the ball is overlooked.)"""
-
-    def look(extra: str, broad: float) -> SharpLight:
-        monkeypatch.setattr(missed, "_BROAD", broad)
-        return sharp_light(lit(extra).setup, 5, 2**21 // N**2)
-
-    found, searched = (look(plate(metal(2e-2)), broad) for broad in (0.5, math.inf))
-    assert found.irradiance != searched.irradiance and found.rest == searched.rest
-    gate = 5 * math.hypot(found.error, searched.error)
-    assert abs(found.irradiance - searched.irradiance) < gate < 0.2 * searched.irradiance
-    assert found.hits == pytest.approx(searched.hits, rel=0.3)
-    assert 0.3 * searched.width < found.width < 1.2 * searched.width
-    beside = plate(metal(2e-2)) + ball(metal(1e-3))
-    assert look(beside, 0.5).irradiance == look(beside, math.inf).irradiance
-
-
-@LONGER
-def test_a_highlight_that_few_rays_meet_is_looked_at_again(lit: Callable[..., Bench]) -> None:
-    """A ball sends one ray of 1400 of its pixel to the sensor, 12 of 2^22 of all: by these alone, 30 % are unsure.
-
-    With the rest, from connections to lobes that are not sharp, it is the whole light, by an integral, to five standard
-    errors of four looks, 15 % (without the rest, 20 % are missing).
-    """
-    bench = lit(ball(metal(5e-3)))
-    found = [sharp_light(bench.setup, seed, 2**22 // N**2) for seed in range(4)]
-    irradiance, error = (np.array([getattr(each, name) for each in found]) for name in ("irradiance", "error"))
-    assert (error < 0.1 * irradiance).all()
-    whole, expected = irradiance + [each.rest for each in found], on_ball(5e-3, np.zeros(3))
-    assert abs(whole.mean() - expected) < 5 * np.linalg.norm(error) / 4 < 0.15 * expected
-
-
-def test_the_width_of_a_lobe_is_not_that_of_its_share(lit: Callable[..., Bench]) -> None:
-    """A lobe that takes a twentieth of the light is as wide as one that takes all, and calls for as many anchors.
-
-    (Planted: the density of the turn by itself, which takes it for 4.5 times as wide.)"""
-    widths = []
-    for bsdf in (metal(3e-3), varnish(3e-3)):
-        bench = lit(plate(bsdf))
-        widths.append(sharp_light(bench.setup, 5, 2**19 // N**2).width)
-    assert widths[1] == pytest.approx(widths[0], rel=0.1)
-
-
-@pytest.mark.slow
-def test_a_faint_highlight_that_few_turns_meet_is_found(lit: Callable[..., Bench]) -> None:
-    """Varnish on a ball sends one of 1e7 of the projector's rays to the sensor; connections meet its lobe.
-
-    Of a GGX lobe of alpha a that takes a twentieth, 1 - a sqrt(4 pi 10 / 0.05) is above 10 / sr, where it counts as
-    sharp. (Planted: no search by connections. All four looks find nothing.)
-    """
-    bench = lit(ball(varnish(5e-3)))
-    found = [sharp_light(bench.setup, seed, 2**22 // N**2) for seed in range(4)]
-    irradiance, error = (np.array([getattr(each, name) for each in found]) for name in ("irradiance", "error"))
-    expected = 0.05 * on_ball(5e-3, np.zeros(3)) * (1 - 5e-3 * np.sqrt(4 * np.pi * 10 / 0.05))
-    assert (irradiance > 0).all()
-    assert abs(irradiance.mean() - expected) < 5 * np.linalg.norm(error) / 4 < 0.8 * expected
-
-
-def test_aimed_rays_find_sharp_lobes_faster(lit: Callable[..., Bench]) -> None:
-    """At roughness 1e-3 with a quarter of the rays, a tenth of the error: 1/64 of the pixel lights an anchor."""
-    aimed, even = both(lit(plate(metal(1e-3))), 256)
-    noise = [part.std(axis=0, ddof=1).mean() / part.mean() for part in (aimed, even)]
-    assert noise[0] < 0.02 and noise[0] < noise[1] / 5
 
 
 def test_tails_that_are_seldom_connected_are_whole(lit: Callable[..., Bench]) -> None:

@@ -88,20 +88,6 @@ def test_an_edge_spreads_by_the_blur_circle(z: float, focus: float) -> None:
     assert blur == 0 or (np.abs(lit - 0.5) < 0.49).any()
 
 
-@pytest.mark.slow
-def test_defocus_keeps_the_flux() -> None:
-    """One projector pixel of 7.5 mm on a board twice as far as the focus: blurred, but as much light as in focus."""
-    canvas = np.zeros((N, 2 * N))
-    canvas[8, 16] = 1
-    light = stock(canvas=canvas)
-    expected = np.pi * SCALE * (0.3 / N) ** 2
-    for z in (400.0, 800.0):
-        half = 30.0
-        flux = picture(aperture_scene_parts(light, 4.0, 400.0), z, half, 55.0, 1024).sum() * (2 * half / 64) ** 2
-        # About 1.5 % of 4 M paths are lit: 0.4 % of their number's spread at most.
-        assert flux == pytest.approx(expected, rel=1e-2)
-
-
 def lensless(light: dict, bsdf: dict, integrator: str = "path", spp: int = 256, seed: int = 0) -> np.ndarray:
     film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     camera = {"type": "mitsim_lensless", "mask": "open", "film": film, "pixel_pitch": 0.1875}
@@ -119,32 +105,6 @@ def test_the_reference_finds_a_mirrors_light_now() -> None:
     # The blur circle of 20 mm stays clear of the window's edges for all of the sensor.
     assert abs(found.mean() - expected) < 5 * error
     assert not lensless({"light": light}, {"type": "conductor"}).any()
-
-
-@pytest.mark.slow
-def test_a_rough_mirror_has_a_finite_highlight() -> None:
-    """Roughness 0.05: light sampling and BSDF sampling meet; with a small disk the pinhole's answer comes out."""
-    rough = {"type": "roughconductor", "alpha": 0.05}
-    light = stock()
-    found, sharp = lensless(aperture_scene_parts(light, 0.5, 400.0), rough), lensless({"light": light}, rough)
-    error = np.hypot(found.std(ddof=1), sharp.std(ddof=1)) / 32
-    assert found.mean() > 0 and 5 * error < 0.1 * sharp.mean()
-    assert abs(found.mean() - sharp.mean()) < 5 * error
-    # A wide disk, hit by BSDF samples: the two ways of MIS add up to what each alone would give.
-    wide = aperture_scene_parts(light, 20.0, 400.0)
-    mixed = [lensless(wide, rough, spp=4096, seed=seed).mean() for seed in range(6)]
-    lit = [lensless_without_mis(wide, rough, seed) for seed in range(6)]
-    spread = np.hypot(np.std(mixed, ddof=1), np.std(lit, ddof=1)) / np.sqrt(6)
-    assert abs(np.mean(mixed) - np.mean(lit)) < 8 * spread < 0.03 * np.mean(lit)
-
-
-def lensless_without_mis(light: dict, bsdf: dict, seed: int) -> float:
-    """Mean over the sensor by light sampling alone."""
-    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
-    camera = {"type": "mitsim_lensless", "mask": "open", "film": film, "pixel_pitch": 0.1875}
-    scene = mi.load_dict({"type": "scene", "camera": camera, "mirror": board(400, bsdf), **light})
-    integrator = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
-    return float(np.array(mi.render(scene, integrator=integrator, spp=4096, seed=seed)).mean())
 
 
 @pytest.mark.parametrize(("name", "value"), [("focus", 0.0), ("fov", 180.0), ("focus", None), ("irradiance", None)])

@@ -39,9 +39,3 @@ def test_grids_nest(n: int, shift: float) -> None:
     coarse = aligned_grid(window, window, n, 1, 0.17)
     assert np.allclose(fine.rows.edges[::4], coarse.rows.edges)
     assert fine.shape[0] == 4 * coarse.shape[0]
-
-
-def test_rows_and_columns_are_kept_apart() -> None:
-    grid = aligned_grid((-0.1, 0.1), (-0.3, 0.3), 10, 2, 0.05)
-    assert (grid.rows.size, grid.columns.size) == (0.01, 0.03)
-    assert grid.shape == (20, 20)

@@ -67,13 +67,6 @@ def repeated(point: tuple[float, float, float]) -> np.ndarray:
 # ---- the pinhole, and the limits of lens and blur
 
 
-def test_a_pinhole_is_the_stock_projector() -> None:
-    points = board(400.0)
-    found, (ds, weight) = connected(connector(), points), emitter().sample_direction(at(points), mi.Point2f(0.5))
-    assert np.array_equal(numbers(found.weight), numbers(weight)) and not numbers(found.pdf).any()
-    assert np.allclose(numbers(found.direction), numbers(ds.d)) and 0.9 < numbers(found.valid).mean() <= 1
-
-
 def test_pixels_are_the_windows_rows_and_columns() -> None:
     """Row 0 at +y, column 0 at +x: the window spans x = 60 - 120 .. 60 and y = -5 +- 60 at 400 mm from the lens."""
     row, column = np.divmod(np.arange(N * N), N)
@@ -112,17 +105,6 @@ def test_irradiance_on_a_plane_does_not_depend_on_the_lens(z: float) -> None:
     assert (numbers(found.weight) * cosine)[lit] == pytest.approx(np.full(lit.sum(), expected), rel=2e-4)
 
 
-def test_lens_points_fill_the_disk_evenly() -> None:
-    found = connected(connector(aperture=8.0), repeated((20.0, 0.0, 400.0)))
-    lens = np.array(found.target, dtype=np.float64) - np.array(PLACE)[:, None]
-    radius = np.hypot(lens[0], lens[1])
-    assert radius.max() <= 8.0 * (1 + 1e-5) and np.abs(lens[2]).max() < 1e-4
-    assert np.mean(radius**2) == pytest.approx(32.0, abs=SIGMAS * 64 / np.sqrt(12 * SAMPLES))
-    assert np.abs(lens[:2].mean(axis=1)).max() < SIGMAS * 4 / np.sqrt(SAMPLES)
-    distance = np.linalg.norm(lens + np.array(PLACE)[:, None] - np.array([[20.0], [0.0], [400.0]]), axis=0)
-    assert numbers(found.pdf) == pytest.approx(distance**3 / (398 * np.pi * 64), rel=1e-4)
-
-
 @pytest.mark.parametrize(("z", "focus"), [(602.0, 400.0), (302.0, 400.0), (802.0, 200.0)])
 def test_defocus_spreads_a_point_over_the_geometric_circle(z: float, focus: float) -> None:
     """A point at depth z sees the focus plane through the lens: a disk of radius a |1 - focus/z| there."""
@@ -139,11 +121,6 @@ def test_defocus_spreads_a_point_over_the_geometric_circle(z: float, focus: floa
     sharp = connected(connector(), repeated((25.0, 0.0, z))[:1])
     centre = np.divmod(numbers(sharp.pixel)[0], N)
     assert abs(row.mean() - centre[0]) < 0.51 and abs(column.mean() - centre[1]) < 0.51
-
-
-def test_the_focus_plane_is_sharp() -> None:
-    found = connected(connector(aperture=9.0, focus=400.0), repeated((25.2, 0.3, 402.0)))
-    assert len(np.unique(numbers(found.pixel))) == 1
 
 
 def test_light_found_by_chance_is_that_of_a_connection() -> None:
@@ -219,25 +196,3 @@ def test_a_blurred_pixel_has_the_stated_deviation(blur: float, z: float, turn: f
     assert abs(np.corrcoef(row, column)[0, 1]) < SIGMAS / np.sqrt(SAMPLES)
     centre = np.divmod(numbers(connected(connector(emitter(turn)), repeated(point)[:1]).pixel)[0], N)
     assert abs(row.mean() - centre[0]) < 0.55 and abs(column.mean() - centre[1]) < 0.55
-
-
-def test_blur_and_defocus_add_their_variances() -> None:
-    found = connected(connector(blur=3.0, aperture=9.0, focus=300.0), repeated((25.0, 0.0, 602.0)))
-    radius = 9.0 * 0.5 / (STEP * 300)
-    row, column = np.divmod(numbers(found.pixel), N)
-    for index in (row, column):
-        assert np.var(index) == pytest.approx(9 + radius**2 / 4 + 1 / 12, rel=SIGMAS * np.sqrt(2 / SAMPLES))
-
-
-def test_a_spot_at_the_windows_edge_loses_half_its_light() -> None:
-    """The point sees the window's edge: half of the normal deviates fall on dark canvas."""
-    found = connected(connector(blur=2.0), repeated((60.0, -5.0, 402.0)))
-    lit = numbers(found.weight) * numbers(found.valid) > 0
-    assert lit.mean() == pytest.approx(0.5, abs=SIGMAS * 0.5 / np.sqrt(SAMPLES) + 0.002)
-
-
-def test_ideal() -> None:
-    light = emitter()
-    assert ProjectorOptics(light, N, 0, N, (N, 2 * N)).ideal
-    assert not ProjectorOptics(light, N, 0, N, (N, 2 * N), aperture=1.0).ideal
-    assert not ProjectorOptics(light, N, 0, N, (N, 2 * N), blur=0.5).ideal

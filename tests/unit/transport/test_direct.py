@@ -82,13 +82,6 @@ def test_a_pixel_is_seen_where_it_lights_the_board(white: Bench) -> None:
     assert (found.kind == DIRECT).all() and not found.anchor_row.any() and not found.anchor_column.any()
 
 
-def test_all_anchors_see_the_same_points(large: Bench) -> None:
-    """Four anchors: the same tan-angles from the sensor's centre, so their differences carry no noise of places."""
-    found = tracer(large, 2).trace(5, 0, 2)
-    places = [np.sort(found.row[(found.anchor_row == a) & (found.anchor_column == b)]) for a, b in np.ndindex(2, 2)]
-    assert all(np.array_equal(places[0], other) for other in places[1:]) and len(np.unique(places[0])) > N * N
-
-
 def test_a_spread_sensor_is_the_mean_over_it(large: Bench) -> None:
     """Random points of the sensor, accumulated as one anchor: the mean of the irradiance over the sensor."""
     spread = DirectTracer(large.setup, 1, spread=True)
@@ -102,17 +95,6 @@ def test_a_spread_sensor_is_the_mean_over_it(large: Bench) -> None:
     assert error < 1e-3 * mean
 
 
-def test_points_of_a_spread_sensor_are_even(large: Bench) -> None:
-    """Of 32 samples of each pixel, over eight seeds. The light changes by 1.4 % (rms) over the sensor of 40 mm and the
-    pixel; smooth as it is, 0.006 of the variance of plain random points is left."""
-    spread = DirectTracer(large.setup, 1, spread=True)
-    light = np.array([by_pixel(spread.trace(seed, 0, 32), 32) for seed in range(8)])
-    once = np.array([by_pixel(spread.trace(seed, 0, 1), 1) for seed in range(32)])
-    plain = once.var(axis=0, ddof=1).mean() / 32
-    assert light.var(axis=0, ddof=1).mean() < 0.02 * plain
-    assert light.mean() == pytest.approx(once.mean(), rel=5 * np.sqrt(plain / once.shape[1]) / once.mean())
-
-
 def test_a_patch_of_the_print_darkens_its_own_pixels(small_scene: Callable[..., Path]) -> None:
     reflectance = np.full((N, N), 255)
     reflectance[1, 4] = 0  # a texel of 8 mm: y in 48..56, x in 24..32; pixels are 7.5 mm, from 60 mm down
@@ -122,14 +104,6 @@ def test_a_patch_of_the_print_darkens_its_own_pixels(small_scene: Callable[..., 
     hidden[0:2, 3:5] = np.outer([3.5 / 7.5, 4.5 / 7.5], [2 / 7.5, 6 / 7.5])
     assert np.abs(part - hidden).max() < 0.02
     assert np.abs(part - hidden.T).max() > 0.2
-
-
-def test_light_is_seen_where_it_was_reflected(small_scene: Callable[..., Path]) -> None:
-    """A sheet at 200 mm, half the aligned distance, where the window spans x from 0 to 60 mm: columns -0.30 to 0."""
-    found = tracer(open_bench(small_scene(sheet_z=200, fov=40))).trace(0, 0, 4)
-    assert found.column.min() == pytest.approx(-0.30, abs=0.01) and found.column.max() == pytest.approx(0, abs=0.01)
-    assert np.abs(found.row).max() == pytest.approx(0.15, abs=0.01)
-    assert 1 / found.inverse_depth == pytest.approx(np.full(len(found.value), 200.0), rel=1e-6)
 
 
 def test_a_ball_casts_its_shadow(small_scene: Callable[..., Path]) -> None:
@@ -172,28 +146,6 @@ def test_lens_and_spot_keep_a_pixels_light_and_spread_it(white: Bench, lens: dic
     for place in (mine.row, mine.column):
         assert np.var(place * 400) == pytest.approx(7.5**2 / 12 + spread, rel=SIGMAS * np.sqrt(2 / 4096))
         assert np.mean(place * 400) == pytest.approx(3.75, abs=SIGMAS * 8 / 64)
-
-
-def test_a_sharp_lens_is_the_pinhole(white: Bench) -> None:
-    pinhole, lens = (tracer(white, **kind).trace(1, 0, 4) for kind in ({}, {"aperture": 4.0, "focus": 400.0}))
-    assert by_pixel(lens, 4) == pytest.approx(by_pixel(pinhole, 4), rel=1e-3)
-    row, column = np.divmod(lens.pixel, N)
-    assert ((lens.row + 0.15) * N / 0.3 - row).min() > -1e-3 and ((lens.column + 0.15) * N / 0.3 - column).max() < 1.001
-
-
-def test_seeds_samples_and_launches(white: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    trace = tracer(white)
-    assert trace.paths_per_sample == N * N and tracer(white, 3).paths_per_sample == 9 * N * N
-    whole, again, other = trace.trace(1, 0, 4), trace.trace(1, 0, 4), trace.trace(2, 0, 4)
-    assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
-    assert not np.isin(whole.row, other.row).any()
-    # A sequence in pieces, in samples or in launches, is the same sequence.
-    pieces = PathSamples.join([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
-    monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 300)
-    launches = trace.trace(1, 0, 4)
-    for parts in (pieces, launches):
-        assert np.array_equal(parts.pixel, whole.pixel) and np.allclose(parts.row, whole.row, atol=1e-6)
-        assert np.allclose(parts.value, whole.value, rtol=1e-5)
 
 
 def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path]) -> None:

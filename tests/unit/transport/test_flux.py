@@ -63,19 +63,6 @@ def test_flux_over_lobes_is_that_of_quadrature(bench: Callable[..., Bench], alph
     assert abs(found - expected) < gate, f"{found / expected - 1:+.2%}, gate {gate / expected:.2%}"
 
 
-@pytest.mark.slow
-def test_flux_behind_a_hole_is_dimmed_once_each_way(bench: Callable[..., Bench]) -> None:
-    found, error = flux(bench(1e-3, 0.5), True, 2**14, LIT)
-    gate, expected = SEVEN * error + 1e-3 * found, 0.25 * over_the_sensor(1e-3)
-    assert gate < 0.04 * expected and abs(found - expected) < gate
-
-
-def test_broad_lobes_have_the_flux_of_connections(bench: Callable[..., Bench]) -> None:
-    one, other = (flux(bench(0.2), glossy, 256) for glossy in (True, False))
-    gate = SEVEN * np.hypot(one[1], other[1])
-    assert gate < 0.01 * other[0] and abs(one[0] - other[0]) < gate
-
-
 def test_truth_over_a_sharp_lobe_is_exact_to_its_standard_error(bench: Callable[..., Bench]) -> None:
     """All pixels together; their errors are independent."""
     plate = bench(1e-3)

@@ -8,13 +8,10 @@ Gates on Monte Carlo means are seven standard errors of eight independent seeds:
 from collections.abc import Callable
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.errors import MitsimError
-from mitsim.transport import integrator
 from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.records import AMBIENT, CellGrid, PathSamples, aligned_grid
@@ -72,24 +69,3 @@ def test_light_that_the_projectors_side_finds_is_not_followed(hollow: Bench) -> 
     """Matt surfaces turn no light sharply: every path ends at the first."""
     assert not tracer(hollow, interreflection=True).trace(0, 0, 2).value.size
     assert not tracer(hollow).trace(0, 0, 2).value.size
-
-
-def test_seeds_and_launches(outdoors: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    trace = tracer(outdoors, emitters=outdoors.loaded.lamps)
-    assert trace.paths_per_sample == grid(outdoors).shape[0] * grid(outdoors).shape[1]
-    whole, again, other = trace.trace(6, 0, 4), trace.trace(6, 0, 4), trace.trace(7, 0, 4)
-    assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
-    assert np.isin(whole.row, other.row).mean() < 0.01
-    pieces = PathSamples.join([trace.trace(6, 0, 1), trace.trace(6, 1, 3)])
-    monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 300)
-    for parts in (pieces, trace.trace(6, 0, 4)):
-        assert np.allclose(parts.row, whole.row, atol=1e-6) and np.allclose(parts.value, whole.value, rtol=1e-5)
-
-
-def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path]) -> None:
-    bench = open_bench(small_scene(extra=SKY))
-    parameters = mi.traverse(bench.loaded.lamps[0])
-    parameters["radiance.value"] = float("nan")
-    parameters.update()
-    with pytest.raises(MitsimError, match="NaN"):
-        tracer(bench, emitters=bench.loaded.lamps).trace(0)

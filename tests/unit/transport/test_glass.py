@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.api.bench import open_bench
-from mitsim.bench.apparatus import reopen
 from mitsim.core.errors import MitsimError
-from mitsim.devices.projector import Lines
 from mitsim.transport.plugins.glass import GlassModel, is_glass, tune
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -87,23 +81,6 @@ def test_a_scene_has_the_wavelength_of_its_light_but_where_it_says_its_own() -> 
     found = {name: value for name, value in mi.traverse(scene) if name.endswith("wavelength")}
     assert [float(value[0]) for value in found.values()] == [638, 500]
     assert float(np.array(mi.load_dict({"type": "mitsim_glass"}).wavelength)[0]) == 562, "the MP-CL1's"
-
-
-def test_a_bench_s_glass_has_its_projectors_wavelength(small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    """Of mono frames, and of the same bench opened anew."""
-    (tmp_path / "red.toml").write_text('name = "red"\neffective_wavelength_nm = 638\n')
-    glass = '<shape type="sphere"><float name="radius" value="5"/><bsdf type="mitsim_glass"/></shape>'
-    bench = open_bench(small_scene(extra=glass), "llvm_ad_mono", None, tmp_path / "red.toml")
-    for opened in (bench, reopen(bench, "llvm_ad_mono")):
-        found = {name: value for name, value in mi.traverse(opened.loaded.scene) if name.endswith("bsdf.wavelength")}
-        assert [float(value[0]) for value in found.values()] == [638]
-        assert opened.projector_optics.parted and opened.projector_optics.per_wavelength == (opened.projector_optics,)
-    assert not open_bench(small_scene("plain")).projector_optics.parted
-
-
-def test_lines_apart_keep_their_places_and_power() -> None:
-    lines = Lines((450.0, 640.0), (0.7, 0.3))
-    assert lines.apart == (Lines((450.0, 450.0), (0.7, 0.0)), Lines((640.0, 640.0), (0.0, 0.3)))
 
 
 @pytest.mark.parametrize(

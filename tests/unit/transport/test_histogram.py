@@ -71,15 +71,6 @@ def test_all_light_is_accumulated_and_under_its_own_row(depths: tuple[float, ...
     assert np.asarray(light.sum(axis=1)).ravel() == pytest.approx(np.bincount(lines, found.value) / 4, rel=1e-12)
 
 
-@pytest.mark.parametrize("depths", WAYS)
-def test_anchors_are_kept_apart(depths: tuple[float, ...]) -> None:
-    made, found = bundle(depths), path_samples()
-    light = unpacked(made, made.accumulate(found, LABELS).toarray()).sum(axis=(0, 1, 3, 5))
-    for a, b in np.ndindex(2, 2):
-        mine = (found.anchor_row == a) & (found.anchor_column == b)
-        assert light[a, b] == pytest.approx(found.value[mine].sum(), rel=1e-12)
-
-
 def test_an_even_cell_holds_the_light_that_falls_in_it() -> None:
     made = bundle(anchors=1)
     light = unpacked(made, made.accumulate(one(-0.2 + 2.99 * 0.05, -0.1 + 7.01 * 0.02), LABELS).toarray())[
@@ -99,61 +90,6 @@ def test_layers_keep_the_mean_inverse_depth(depth: float) -> None:
     assert light.sum() == pytest.approx(1) and light @ (1 / np.array(DEPTHS)) == pytest.approx(1 / depth)
     distance = [abs(1 / layer - 1 / depth) for layer in DEPTHS]
     assert set(np.flatnonzero(light > 1e-9)) <= set(np.argsort(distance)[:2])
-
-
-@pytest.mark.parametrize(("depth", "layer"), [(700.0, 0), (np.inf, 0), (240.0, 2)])
-def test_light_beyond_the_layers_goes_to_the_nearest(depth: float, layer: int) -> None:
-    made = bundle(DEPTHS, anchors=1)
-    light = unpacked(made, made.accumulate(one(0.0, 0.0, inverse_depth=1 / depth), LABELS).toarray()).sum(
-        axis=(0, 2, 3, 4, 5)
-    )
-    assert light == pytest.approx(np.eye(3)[layer])
-
-
-def test_light_from_outside_the_grid_is_dropped() -> None:
-    made, found = bundle(), path_samples(inside=False)
-    inside = (found.row >= -0.2) & (found.row < 0.2) & (found.column >= -0.1) & (found.column < 0.2)
-    assert 0.1 < inside.mean() < 0.9
-    light, kept = made.accumulate(found, LABELS), made.accumulate(found.where(inside), LABELS)
-    assert light.sum() == pytest.approx(found.value[inside].sum(), rel=1e-12)
-    assert abs(light - kept).sum() == 0
-
-
-def test_ambient_light_has_the_last_row() -> None:
-    made = bundle()
-    light = made.accumulate(one(0.0, 0.0, pixel=PIXELS, kind=0), LABELS)
-    assert np.flatnonzero(light.toarray().any(axis=1)).tolist() == [3]
-    by_pixel = made.accumulate(one(0.0, 0.0, pixel=PIXELS, kind=0), np.arange(PIXELS))
-    assert by_pixel.shape[0] == PIXELS + 1 and by_pixel[[PIXELS]].sum() == pytest.approx(1)
-
-
-def test_no_light_is_an_empty_matrix() -> None:
-    made = bundle(DEPTHS)
-    light = made.accumulate(PathSamples.none(), LABELS)
-    assert light.shape == (4, made.size) and light.nnz == 0
-
-
-def test_parts_join_in_order() -> None:
-    found = path_samples()
-    first = np.arange(400) < 150
-    joined = PathSamples.join([found.where(first), PathSamples.none(), found.where(~first)])
-    assert all(np.array_equal(getattr(joined, name), getattr(found, name)) for name in vars(found))
-    assert joined.pixel.dtype == np.int64
-
-
-def test_directions_for_the_shadow() -> None:
-    """Cells are boxes."""
-    made = bundle()
-    assert np.allclose(made.rows.centres, GRID.rows.edges[:-1] + 0.025) and made.rows.width == pytest.approx(0.05)
-    assert np.allclose(made.columns.centres, GRID.columns.edges[:-1] + 0.01)
-
-
-def test_light_averaged_over_the_anchors() -> None:
-    """The mean of bilinear weights: the light of each anchor times its row's and its column's weight."""
-    found, weights = path_samples(), np.array([0.7, 0.3])
-    light = unpacked(bundle(), bundle().accumulate(found, LABELS).toarray())
-    mean = unpacked(bundle(anchors=1), bundle(anchors=1).accumulate(found.average(weights), LABELS).toarray())
-    assert np.allclose(mean[:, :, 0, :, 0], np.einsum("a,b,claybx->clyx", weights, weights, light), rtol=1e-12)
 
 
 @pytest.mark.parametrize("depths", WAYS)

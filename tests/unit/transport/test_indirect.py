@@ -6,18 +6,16 @@ Gates on Monte Carlo means are seven standard errors of eight independent seeds:
 from collections.abc import Callable
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.errors import MitsimError
 from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
-from mitsim.transport.records import DIRECT, INDIRECT, PathSamples, aligned_grid
+from mitsim.transport.records import DIRECT, INDIRECT, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -66,36 +64,6 @@ def test_a_hollow_sphere_is_lit_evenly_by_its_own_light(hollow: Bench) -> None:
     place = np.concatenate([one.row for one in found]), np.concatenate([one.column for one in found])
     assert abs(place[0].mean()) < 0.01 and abs(place[1].mean()) < 0.01
     assert np.abs(1 / found[0].inverse_depth - 1000).max() < 40
-
-
-def test_a_flat_scene_has_no_indirect_light(small_scene: Callable[..., Path]) -> None:
-    assert not tracer(open_bench(small_scene())).trace(0, 0, 4).value.size
-
-
-@pytest.mark.slow
-def test_both_sides_together_find_all_light(shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a shiny sphere: as much by both, each below its threshold, as when one of them has everything.
-
-    A part counted twice, or by no side, shows: the lobe carries half of the light of the last turn.
-    """
-    bench = open_bench(shared_scene("shiny", extra=SPHERE.format(bsdf=SHINY), sheet_z=3000))
-    grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
-
-    def found(side: str, sharp: float, seeds: int = 16) -> np.ndarray:
-        monkeypatch.setattr(integrator, "_SHARP", sharp)
-        camera = FromCameraTracer(bench.setup, grid, Paths(interreflection=True))
-        one = tracer(bench) if side == "projector" else camera
-        return np.array([one.trace(seed, 0, 256).value.sum() / 256 for seed in range(seeds)])
-
-    projector, camera = found("projector", 1.0), found("camera", 1.0)
-    assert projector.mean() > 0.1 * camera.mean() and camera.mean() > 0.1 * projector.mean()
-    total, error = mean(projector + camera)
-    assert not found("camera", 1e6, seeds=1).any()
-    # That either side alone finds the same is held below.
-    everything, other_error = mean(found("camera", 1e-6))
-    bound = SIGMAS * np.hypot(error, other_error)
-    assert bound < 0.1 * total
-    assert abs(total - everything) < bound
 
 
 CORNER = f"""<shape type="rectangle"><transform name="to_world"><scale x="60" y="60"/><rotate y="1" angle="90"/>
@@ -163,31 +131,3 @@ def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Call
     r2 = np.square(places[:, :2] - at).sum(axis=1) + np.square(places[:, 2])
     expected = np.pi * 111000 * (0.3 / N) ** 2 * 0.5 / np.pi * 400**2 / r2**2
     assert found.value == pytest.approx(expected, rel=1e-4)
-
-
-def test_without_paths_there_is_no_light(hollow: Bench) -> None:
-    assert not tracer(hollow, interreflection=False).trace(0, 0, 2).value.size
-
-
-def test_seeds_and_launches(hollow: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    trace = tracer(hollow)
-    assert trace.paths_per_sample == N * N
-    whole, again, other = trace.trace(6, 0, 64), trace.trace(6, 0, 64), trace.trace(7, 0, 64)
-    assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
-    assert np.isin(whole.row, other.row).mean() < 0.01
-    pieces = PathSamples.join([trace.trace(6, 0, 20), trace.trace(6, 20, 44)])
-    monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 3000)
-    order = np.argsort(whole.value)
-    for parts in (pieces, trace.trace(6, 0, 64)):
-        mine = np.argsort(parts.value)
-        assert np.allclose(parts.value[mine], whole.value[order], rtol=1e-5)
-        assert np.allclose(parts.row[mine], whole.row[order], atol=1e-6)
-
-
-def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path]) -> None:
-    bench = open_bench(small_scene(extra=SPHERE.format(bsdf=MATT), sheet_z=3000))
-    parameters = mi.traverse(bench.loaded.projector)
-    parameters["scale"] = float("nan")
-    parameters.update()
-    with pytest.raises(MitsimError, match="NaN"):
-        tracer(bench).trace(0, 0, 256)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,18 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.manifests import RUN
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.records import DIRECT, INDIRECT, Bundle, DeviceAccumulator, PathSamples, aligned_grid
-from tests.conftest import write_small_scene
 from tests.unit.transport.test_indirect import CORNER, MIRROR, N
-from tests.unit.transport.test_path_reuse import WALL
-from tests.unit.transport.test_path_reuse_by_line import LINES, SHARES
-from tests.unit.transport.test_path_reuse_by_line import SHINY as COLOURED
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -82,43 +73,6 @@ def test_a_path_is_the_same_at_every_anchor(beside: Bench) -> None:
     anchor left out.)"""
     fewest, different = compared(beside)
     assert fewest > 100 and not different
-
-
-def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
-    """The same of three lines at once, and of each line what its accumulator and the host hold; its process has a
-    spectral variant for good."""
-    place = Path(folder)
-    (place / "lines.toml").write_text(
-        f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {list(LINES)}\n'
-        f"radiant_shares = {list(SHARES)}\n"
-    )
-    extra = WALL.format(turn=90, x=-30, bsdf=COLOURED) + BEFORE
-    opened = open_bench(
-        write_small_scene(place, "lit", n=N, extra=extra), "llvm_ad_spectral", None, place / "lines.toml"
-    )
-    bench = SpectralBench.of(opened, RUN).whole
-    tracer, labels = anchored(bench, SensorPoints(bench.geometry.half_width, 3)), np.arange(N**2) % 5
-    bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 3, (400.0,))
-    accumulator = DeviceAccumulator(bundle, labels, tracer.board, len(LINES))
-    tracer.trace(4, 0, 32, accumulator)
-    host = tracer.trace(4, 0, 32)
-    light = host.where(host.kind == INDIRECT).by_line(len(LINES))
-    held = [float(sums.light()[0].sum()) for sums in accumulator.fetch()]
-    return *compared(bench), [held, [float(bundle.accumulate(each, labels).sum()) for each in light]]
-
-
-def test_a_path_in_several_lines_is_the_same_at_every_anchor(tmp_path: Path) -> None:
-    """With the light of each line, in accumulators of each. (Planted: the first line's light for that of all.)"""
-    program = (
-        "import json, sys; from tests.unit.transport.test_indirect_anchors import in_lines; "
-        "print(json.dumps(in_lines(sys.argv[1])))"
-    )
-    command, root = [sys.executable, "-c", program, str(tmp_path)], Path(__file__).parents[3]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
-    assert done.returncode == 0, done.stderr
-    fewest, different, (held, host) = json.loads(done.stdout.splitlines()[-1])
-    assert fewest > 100 and not different
-    assert held == pytest.approx(host, rel=1e-5) and np.ptp(held) > 0.1 * max(held)
 
 
 @pytest.mark.parametrize("launch", [2**22, 9 * 512 + 5])

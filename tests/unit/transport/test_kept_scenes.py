@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.core.environment import keep_scenes
-from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
@@ -57,15 +55,3 @@ def test_nothing_is_collected_while_light_is_traced(
     FluxTracer(bench.setup).sums(3, 1, np.arange(4), np.zeros(4, np.int64), 2)
     bench.render(spp=8)
     assert len(collections) > 100 and not set().union(*collections) & RECORDING
-
-
-def test_the_collector_goes_on_as_it_was() -> None:
-    with keep_scenes():
-        assert not gc.isenabled()
-        with keep_scenes():
-            pass
-        assert not gc.isenabled(), "of two contexts, the outer one ends it"
-    assert gc.isenabled()
-    with pytest.raises(MitsimError), keep_scenes():
-        raise MitsimError("a scene that cannot be traced")
-    assert gc.isenabled()

@@ -1,7 +1,6 @@
 """Light that no tracer finds is measured: by a plane mirror that light meets twice, in closed form; not by windows."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from mitsim.transport.integrator import Paths
 from mitsim.transport.missed import LeftOut, left_out_light
 from mitsim.transport.records import CellGrid, aligned_grid
 from tests.physics.hidden_light import SCENES
-from tests.physics.test_sharp_lobes import on_ball
 from tests.unit.transport.test_panes import BALL, WALL, slab
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -130,65 +128,10 @@ def test_hits_are_those_of_the_tracer_that_would_find_the_light(
     assert reported.hits[plate] == pytest.approx(light**2 / moment, rel=0.3)
 
 
-def test_a_lens_finds_light_as_often_as_paths_run_into_it(shared_scene: Callable[..., Path]) -> None:
-    """Seen through a ball of glass; a lens of 4 mm is met a quarter as often as one of 8, and a pinhole never."""
-    path = shared_scene("ball_and_lens", extra=BALL.replace('value="5"', 'value="60"'), sheet_z=WALL)
-    bench = open_bench(path)
-    pinhole, small, large = (
-        left_out_of(replace(bench, devices=replace(bench.devices, projector=lens)), 0, 2**18)
-        for lens in (bench.projector.model_copy(update={"aperture_radius_mm": radius}) for radius in (0.0, 4.0, 8.0))
-    )
-    ball = int(np.argmax(pinhole.mirrors))
-    assert pinhole.lens_hits[ball] == 0 and pinhole.unseen(NONE, NONE)[0] > 0
-    assert small.mirrors == pytest.approx(large.mirrors) and small.lens_hits[ball] == pytest.approx(
-        large.lens_hits[ball] / 4
-    )
-    enough = 2 * small.lens_hits[ball]
-    assert small.unseen(NONE, enough)[1] == ball and large.unseen(NONE, enough)[1] != ball
-
-
-def test_a_ball_is_seldom_met_however_broad_its_lobe(
-    shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A metal ball of roughness 0.03, lit and seen over the mirror: of its lobe, 0.01 sr, few connections tell.
-
-    The light is that of unfolded ways, by an integral: the ball's image from the sensor's (lit), the ball from there.
-    With a lens of 20 mm, as above.
-    """
-    monkeypatch.setattr("mitsim.transport.missed._LENS", 0.05)
-    name, radius = "tests.physics.test_sharp_lobes", 12.0
-    sphere = f'<shape type="sphere"><point name="center" x="-26" y="0" z="398"/><float name="radius" value="{radius}"/>'
-    metal = gloss("", 0.03).split("</transform>")[1]
-    bench = open_bench(shared_scene("ball_lit", extra=MIRROR + sphere + metal, sheet_z=-500, fov=30), for_render=True)
-    monkeypatch.setattr(f"{name}.RADIUS", radius)
-    expected = 0.0
-    for x in (-80 + 26, -26):
-        monkeypatch.setattr(f"{name}.BALL", np.array([x, 0.0, 398.0]))
-        expected += on_ball(0.03, np.array([-80.0, 0, 0]))
-    found = [left_out_of(bench, seed) for seed in range(SEEDS)]
-    lobes = np.array([each.lobes.max() for each in found])
-    error = lobes.std(ddof=1) / np.sqrt(SEEDS)
-    assert abs(lobes.mean() - expected) < 7 * error + 0.05 * expected and 7 * error < 0.5 * expected
-    assert all(each.hits[np.argmax(each.lobes)] < PILOTS for each in found)
-
-
 def test_windows_leave_nothing_out(shared_scene: Callable[..., Path]) -> None:
     """But what is reflected inside of them on both ways, R^2 = 1.6e-3 each."""
     bench = open_bench(shared_scene("window", extra=slab(220, 6, 20), sheet_z=WALL))
     assert left_out_of(bench, 0).unseen(np.inf, NONE)[0] < 1e-5 * 0.02
-
-
-@pytest.mark.slow
-def test_a_plan_is_flagged_that_leaves_light_out(shared_scene: Callable[..., Path]) -> None:
-    """A glass ball before the wall: most of what is lit behind it is seen through it. The flag names its line."""
-    ball = BALL.replace('value="5"', 'value="60"')
-    path = shared_scene("ball_of_glass", extra=ball, sheet_z=WALL)
-    plan = make_plan(open_bench(path), Lighting.uniform(16), 1e-2, 1)
-    line = 1 + path.read_text(encoding="utf-8").split('<shape type="sphere"')[0].count("\n")
-    assert all(warning.startswith(f"{path}:{line}: shape: got 'sphere' in <shape ") for warning in plan.warnings)
-    seen, alone = plan.warnings  # the wall through the ball; the projector's own image in it
-    assert "left out of the frames" in seen and "too fine to be placed on the sensor" in alone
-    assert plan.systematic_error > 0.05
 
 
 def test_it_is_told_over_which_mirror(shared_scene: Callable[..., Path]) -> None:

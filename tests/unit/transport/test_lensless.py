@@ -1,8 +1,6 @@
 """The sensor plugin, one ray at a time, against the mask's own transmission (whole frames: tests/physics)."""
 
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -125,44 +123,6 @@ def test_a_ray_has_to_pass_both_faces_and_hits_the_active_area_at_its_angle(mask
     assert not np.allclose(weight[clear], (far * falloff)[clear], rtol=1e-3)
     if mask != "open":
         assert not far.all()
-
-
-@pytest.mark.parametrize(("mask", "open_part"), [("separable", (256 / 511) ** 2), ("flatcam", 0.5 + 0.5 / 511**2)])
-def test_how_much_of_the_mask_is_open(mask: str, open_part: float) -> None:
-    # A field stop that sees the whole mask: tan(half fov) = 8, mask 30.66 mm wide at 2 mm distance.
-    geometry = CameraGeometry(mask=mask, pixels=2, fov=2 * np.degrees(np.arctan(8.0)))
-    origin, direction, weight, _ = rays(geometry, 200_000)
-    t = direction[:, :2] / direction[:, 2:]
-    assert np.abs(origin[:, :2] + geometry.mask_distance * t).max() < 511 * 0.06 / 2 + 1e-4, "opaque outside"
-    # Of the window of 32 mm: float32 tells the place of a feature to 1e-5 of it.
-    part = weight / (2 * geometry.tan_half_fov) ** 2 * (1 + np.square(t).sum(axis=1)) ** 2
-    assert np.allclose(part, open_part * (511 * 0.06 / 32) ** 2, rtol=1e-4)
-
-
-@pytest.mark.parametrize("fov", [0.01, 1.0])
-def test_a_narrow_view_keeps_its_light(fov: float) -> None:
-    """Features far from the mask's corner: differences of lengths from there would lose a view of 6e-3 features."""
-    geometry = CameraGeometry(pixels=64, fov=fov)
-    origin, _, weight, _ = rays(geometry, 100_000)
-    expected = part_open(geometry, origin).mean() * (2 * geometry.tan_half_fov) ** 2
-    deviation = weight.std() / len(weight) ** 0.5
-    assert abs(weight.mean() - expected) < SIGMAS * 0.02 * deviation + 1e-3 * expected
-
-
-def test_registering_twice_does_nothing() -> None:
-    import mitsuba as mi
-
-    from mitsim.transport import plugins
-
-    plugins.register()
-    plugins.register()
-    assert mi.load_dict({"type": "mitsim_lensless", **plugin(CameraGeometry(pixels=2))}).geometry.pixels == 2
-
-
-def test_registering_needs_a_variant() -> None:
-    program = "from mitsim.transport import plugins; plugins.register()"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 1 and "MitsimError: no Mitsuba variant is selected" in done.stderr
 
 
 def test_the_manual_lists_the_parameters_of_the_geometry() -> None:

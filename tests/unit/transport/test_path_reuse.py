@@ -4,8 +4,6 @@ in.
 Gates on Monte Carlo means are seven standard errors of eight independent seeds: five sigma of the t distribution.
 """
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,7 +20,6 @@ from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import INDIRECT, Bundle, DeviceAccumulator, PathSamples, aligned_grid
-from tests.unit.transport.closed_forms import seen
 from tests.unit.transport.test_indirect import MATT, MIRROR, SHINY, SPHERE
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -144,35 +141,6 @@ def test_light_that_shading_normals_make_heavy_is_divided(
     assert part > 0.2, "what is left to the camera's side"
 
 
-def test_each_pixel_lights_a_hollow_sphere_alike(shared_scene: Callable[..., Path]) -> None:
-    """E = Phi rho / (A (1 - rho)) in all, in equal parts of all pixels: none lends its neighbours what is its own."""
-    bench = open_bench(shared_scene("even", extra=SPHERE.format(bsdf=MATT), sheet_z=3000))
-    flux = np.pi * 111000 * 0.3**2
-    radiance = 0.5 / np.pi * flux * 0.5 / (4 * np.pi * 1000**2 * (1 - 0.5))
-    light = tracers(bench)[1].trace(1, 0, 2048)
-    assert (light.kind == INDIRECT).all()
-    each = np.bincount(light.pixel, light.value, N * N) / 2048 / (radiance * seen(bench.geometry.tan_half_fov) / N**2)
-    assert each.mean() == pytest.approx(1, abs=0.02)
-    assert each.std() < 0.1
-
-
-def test_a_shared_path_tells_as_much_as_several(shared_scene: Callable[..., Path]) -> None:
-    """Variance of light by pixel and direction: sixteen second points instead of one leave some tenth of it."""
-    bench = open_bench(shared_scene("tenth", extra=SCENES["matt walls"]))
-    edges = np.linspace(-1, 1, 7) * bench.geometry.tan_half_fov
-
-    def variance(side: IndirectTracer) -> float:
-        runs = [side.trace(seed, 0, 16) for seed in range(24)]
-        seen_in = [np.digitize(run.row, edges) * 8 + np.digitize(run.column, edges) for run in runs]
-        light = [
-            np.bincount(run.pixel * 64 + place, run.value, N * N * 64) for run, place in zip(runs, seen_in, strict=True)
-        ]
-        return float(np.var(light, axis=0).sum())
-
-    own, shared = (variance(side) for side in tracers(bench))
-    assert shared < own / 5
-
-
 @pytest.mark.parametrize("name", ["bent wall", "fins"])
 def test_diffuse_surfaces_need_no_look_at_their_material(
     shared_scene: Callable[..., Path], name: str, monkeypatch: pytest.MonkeyPatch
@@ -254,32 +222,3 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
     tracer.trace(0, 0, 256, accumulator)
     with pytest.raises(MitsimError, match="NaN"):
         accumulator.fetch()[0].light()
-
-
-_PRINT = """
-import hashlib, sys, drjit as dr, numpy as np
-from mitsim.api.bench import open_bench
-from mitsim.transport.records import aligned_grid
-from mitsim.transport.records import Bundle
-from mitsim.transport.records import DeviceAccumulator
-from tests.unit.transport.test_path_reuse import tracers
-bench = open_bench(sys.argv[1])
-dr.set_thread_count(int(sys.argv[2]))
-tracer = tracers(bench)[1]
-bundle = Bundle(aligned_grid(*bench.windows, 16, 1, bench.geometry.tan_half_fov), 1, (450.0, 300.0))
-accumulator = DeviceAccumulator(bundle, np.arange(256) % 5, tracer.board)
-tracer.trace(3, 0, 256, accumulator)
-print(hashlib.sha256(accumulator.fetch()[0].light()[0].toarray().tobytes()).hexdigest())
-"""
-
-
-@pytest.mark.slow
-def test_the_number_of_threads_changes_no_bit(shared_scene: Callable[..., Path]) -> None:
-    scene = shared_scene("threads", extra=SCENES["shiny wall"])
-    printed = {
-        subprocess.run(
-            [sys.executable, "-c", _PRINT, str(scene), str(threads)], capture_output=True, text=True, check=True
-        ).stdout
-        for threads in (2, 3)
-    }
-    assert len(printed) == 1 and len(printed.pop().strip()) == 64

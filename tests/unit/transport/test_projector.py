@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsim.transport.connect import PinholeRays, ProjectorConnector, ProjectorOptics, ProjectorRays
-from mitsim.transport.plugins.base import RIGID, generator, rigidity_error, rows_columns, turn_and_origin, x_y
+from mitsim.transport.plugins.base import generator
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -41,17 +41,3 @@ def test_rays_areas_and_flux_are_of_one_map(projector: ProjectorOptics) -> None:
     si.p = mi.Point3f((pinhole.origin + 500 * direction).T.astype(np.float32))
     connection = ProjectorConnector(projector).connect(si, rng, mi.Bool(True))
     assert np.array_equal(np.array(connection.pixel), pixel)
-
-
-def test_rows_and_columns_there_and_back() -> None:
-    x, y = np.random.default_rng(0).normal(size=(2, 5))
-    assert [part.tolist() for part in x_y(*rows_columns(x, y))] == [x.tolist(), y.tolist()]
-    row, column = rows_columns(np.array([1.0]), np.array([2.0]))
-    assert row == -2 and column == -1, "row 0 at +y, column 0 at +x"
-
-
-def test_what_counts_as_rigid() -> None:
-    turned = mi.Transform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 33)
-    turn, origin = turn_and_origin(turned)
-    assert origin.tolist() == [1, 2, 3] and rigidity_error(turn) < 1e-6
-    assert rigidity_error(np.round(turn, 5)) < RIGID < rigidity_error(1.0001 * turn)

@@ -35,33 +35,6 @@ def test_every_prefix_is_a_net(power: int, seed: int) -> None:
             assert len(np.unique(boxes)) == count, f"boxes of 2^-{j} x 2^-{power - j}"
 
 
-def test_later_blocks_of_the_sequence_are_nets_too() -> None:
-    """Points 16..31 and 48..63: a batch that goes on where another stopped stratifies as well."""
-    for first in (16, 48):
-        (found,) = points(16, first=first)
-        boxes = np.floor(found * 4).astype(int) @ [4, 1]
-        assert len(np.unique(boxes)) == 16
-
-
-def test_the_sequence_does_not_depend_on_where_a_batch_starts() -> None:
-    (whole,) = points(64)
-    (late,) = points(32, first=32)
-    assert np.array_equal(whole[32:], late)
-
-
-def test_each_point_is_uniform_over_the_scramblings() -> None:
-    """Point 0 (the origin before scrambling) and point 5 of 2^14 streams: chi-square of an 8 x 8 histogram."""
-    streams = 2**14
-    found = points(6, streams)
-    for index in (0, 5):
-        counts = np.histogram2d(*found[:, index].T, bins=8, range=[[0, 1], [0, 1]])[0]
-        expected = streams / 64
-        chi = float((np.square(counts - expected) / expected).sum())
-        assert abs(chi - 63) < SIGMAS * np.sqrt(2 * 63)
-    fine = (found[:, 0] * 2**24 % 2**12) / 2**12  # the low half of the bits is random as well
-    assert np.abs(fine.mean(axis=0) - 0.5).max() < SIGMAS * np.sqrt(1 / 12 / streams)
-
-
 def test_streams_dimensions_and_seeds_are_independent() -> None:
     """Correlations of the first point between neighbouring streams, its two dimensions, and neighbouring seeds."""
     streams = 2**14
@@ -102,12 +75,3 @@ def test_two_pairs_of_dimensions_pad_to_four() -> None:
                 ]
                 product = (cells[0] * cells[1]).mean(axis=1)
                 assert abs(product.mean()) < SIGMAS * 0.25 / np.sqrt(streams * samples)
-
-
-def test_the_generator_is_its_seeds_and_streams() -> None:
-    def draw(seed: int, stream: int) -> list[float]:
-        rng = generator(mi.UInt32(seed), mi.UInt32(stream))
-        return [float(np.array(rng.next_float32())[0]) for _ in range(3)]
-
-    assert draw(1, 2) == draw(1, 2)
-    assert len({*draw(1, 2), *draw(2, 1), *draw(1, 3)}) == 9

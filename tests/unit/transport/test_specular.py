@@ -1,8 +1,5 @@
 """Rays of the projector, what counts as a mirror, and beams through glass, blends and other chains."""
 
-import subprocess
-import sys
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -61,20 +58,6 @@ def flux(scene: "mi.Scene", **settings: int) -> float:
     beams = trace_specular_chains(scene, camera, projector(scene), **settings)
     geometry = camera.geometry
     return specular_frames(beams, geometry, geometric_samplers(geometry), np.zeros(N * N, np.int64)).flux
-
-
-def test_a_ray_meets_the_emitter_at_the_uv_that_it_was_made_for() -> None:
-    t = mi.ScalarAffineTransform4f()
-    light = emitter(to_world=t.translate([60, -20, 5]).rotate([0.3, 1, 0.2], 25))
-    rays = PinholeRays(ProjectorOptics(light, N, 1, 2, (N + 3, 2 * N + 1)), [None])
-    points = np.random.default_rng(1).uniform(0, N, (200, 2))
-    si = mi.SurfaceInteraction3f()
-    si.p = mi.Point3f((rays.origin + 700 * rays.directions(points)).T.astype(np.float32))
-    sample, _ = light.sample_direction(si, mi.Point2f(0.5), True)
-    assert np.all(np.array(sample.pdf) == 1)
-    # uv comes back in float32: 6e-8 of the canvas and what the point's own rounding adds.
-    assert np.array(sample.uv.x) == pytest.approx((2 + points[:, 1]) / (2 * N + 1), abs=5e-7)
-    assert np.array(sample.uv.y) == pytest.approx((1 + points[:, 0]) / (N + 3), abs=5e-7)
 
 
 def test_power_is_the_irradiance_that_mitsuba_renders(variant: str) -> None:
@@ -193,16 +176,6 @@ def test_light_through_a_card_before_the_mirror(variant: str, opacity: float, pa
     assert flux(scene_with(sheet=plane(0, 400, CONDUCTOR), card=card)) == pytest.approx((1 - opacity) ** 2 * alone)
 
 
-def test_the_edge_of_a_card_that_is_not_there_cuts_no_beam(variant: str) -> None:
-    """A hole is no part of the chain of surfaces that bounds a beam: at a rim, half a sensor pixel would be lost."""
-    card = plane(3, 300, {"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}}, 2)
-    scene = scene_with(sheet=plane(0, 400, CONDUCTOR), card=card)
-    beams = trace_specular_chains(scene, scene.sensors()[0], projector(scene))
-    alone = scene_with(sheet=plane(0, 400, CONDUCTOR))
-    assert beams.unresolved == 0
-    assert len(beams) == len(trace_specular_chains(alone, alone.sensors()[0], projector(alone)))
-
-
 def hole(half: float) -> dict:
     """An opacity of 200 x 200 texels with a square hole in the middle, ``half`` its side in texels."""
     opaque = np.ones((200, 200, 1), np.float32)
@@ -258,21 +231,6 @@ def test_a_slab_of_glass_shifts_the_ray_by_snells_law(variant: str) -> None:
     assert found.sensor[brightest] == pytest.approx(expected, abs=2e-5)
 
 
-def test_max_depth_counts_mirrors(variant: str) -> None:
-    one = -1 / np.sqrt(2)
-    t = mi.ScalarAffineTransform4f()
-
-    def place(x: float, normal: list[float]) -> "mi.ScalarAffineTransform4f":
-        target = [x + normal[0], 0, 300 + normal[2]]
-        return t.look_at(origin=[x, 0, 300], target=target, up=[0, 1, 0]) @ t.scale([8, 8, 1])
-
-    first = {"type": "rectangle", "to_world": place(20, [one, 0, one]), "bsdf": CONDUCTOR}
-    second = {"type": "rectangle", "to_world": place(0, [-one, 0, one]), "bsdf": CONDUCTOR}
-    scene = scene_with(first=first, second=second)
-    assert flux(scene, max_depth=2) > 0
-    assert flux(scene, max_depth=1) == 0
-
-
 def test_a_rim_is_followed_down_and_points_stand_for_the_rest(variant: str) -> None:
     """Half the sensor sees a mirror's edge, a straight line: a 32nd of a sensor pixel is unsure."""
     whole, half = scene_with(sheet=plane(0, 400, CONDUCTOR)), scene_with(sheet=plane(70, 400, CONDUCTOR, 60))
@@ -307,15 +265,3 @@ tests = runpy.run_path(sys.argv[2])
 half = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
 print(tests["flux"](tests["scene_with"](sheet=tests["plane"](0, 400, half))))
 """
-
-
-@pytest.mark.slow
-def test_rgb_and_spectral_see_the_same_grey(variant: str) -> None:
-    """Children, because a process must not use objects of one variant under another."""
-    expected = 0.5 * flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
-    for name in ("llvm_ad_rgb", "llvm_ad_spectral"):
-        command = [sys.executable, "-c", ONE_VARIANT, name, __file__]
-        child = subprocess.run(command, capture_output=True, text=True, timeout=600)
-        assert child.returncode == 0, child.stderr
-        # An upsampled grey is good to a few 1e-4.
-        assert float(child.stdout.splitlines()[-1]) == pytest.approx(expected, rel=1e-3), name
