@@ -50,7 +50,13 @@ def _projector_pixels(name: str) -> np.ndarray:
     return share @ sheet @ share.T
 
 
-@pytest.mark.parametrize("name", sorted({**generate.TEXTURES, **generate.MESHES, **generate.TEXTS}))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name == "colour_chart/reflectance.png" else ())
+        for name in sorted({**generate.TEXTURES, **generate.MESHES, **generate.TEXTS})
+    ],
+)
 def test_shipped_file_is_what_its_recipe_makes(name: str) -> None:
     assert generate.difference(SCENES, name) is None
 

@@ -176,7 +176,8 @@ def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
     A pitch within :data:`PITCH_TOLERANCE` stays. Raises MitsimError for a camera without a film whose size can be
     set.
     """
-    nodes, words = checked.state.nodes, ""
+    nodes, changed = checked.state.nodes, False
+    (own_row, own_column), shape = sensor.pitches_mm, sensor.frame_shape
     for node in nodes:
         if node.props.plugin_name() != "mitsim_lensless":
             continue
@@ -184,32 +185,22 @@ def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
         if not films:
             tag = checked.outline.tag(mi.parser.SceneNode(node))
             raise tag.refusal("film", "none", "the camera file's rows and columns are its size; give it a <film>")
-        before = _sensor_words(node.props, films[0])
         column = float(node.props.get("pixel_pitch", _PITCH))
         row = float(node.props.get("row_pitch", column))
-        own_row, own_column = sensor.pitches_mm
         if abs(own_column - column) > PITCH_TOLERANCE * column or abs(own_row - row) > PITCH_TOLERANCE * row:
-            node.props["pixel_pitch"] = own_column
+            changed, node.props["pixel_pitch"] = True, own_column
             if "row_pitch" in node.props:
                 del node.props["row_pitch"]
             if own_row != own_column:
                 node.props["row_pitch"] = own_row
-        if sensor.frame_shape is not None:
-            films[0]["height"], films[0]["width"] = sensor.frame_shape
-            for name in _WINDOW:
-                if name in films[0]:
-                    del films[0][name]
-        after = _sensor_words(node.props, films[0])
-        if after != before:
-            words = f"sensor {sensor.name!r}: {after}, as its camera file says; the scene's own, {before},"
-            words = f"{words} stand where no camera is named"
-    return words
-
-
-def _sensor_words(camera: mi.Properties, film: mi.Properties) -> str:
-    column = float(camera.get("pixel_pitch", _PITCH))
-    row = float(camera.get("row_pitch", column))
-    rows, columns = (int(film.get(name, default)) for name, default in (("height", 576), ("width", 768)))
-    pitch = f"{column * 1e3:g}" if row == column else f"{row * 1e3:g} x {column * 1e3:g}"
-    window = f", of which a window of {film['crop_height']} x {film['crop_width']}" if _WINDOW[-1] in film else ""
-    return f"{rows} x {columns} pixels of {pitch} um ({rows * row:.3g} x {columns * column:.3g} mm){window}"
+        if shape is not None:
+            window = [name for name in _WINDOW if name in films[0]]
+            changed |= bool(window) or (films[0].get("height", 576), films[0].get("width", 768)) != tuple(shape)
+            films[0]["height"], films[0]["width"] = shape
+            for name in window:
+                del films[0][name]
+    if not changed:
+        return ""
+    size = "" if shape is None else f"{shape[0]} x {shape[1]} "
+    pitch = f"{own_row * 1e3:g} x {own_column * 1e3:g} um"
+    return f"sensor {sensor.name!r}: {size}pixels of {pitch}, as its camera file says, in place of the scene's own"

@@ -33,11 +33,8 @@ class IndirectTracer(integrator.FollowingTracer):
     adaptive: AdaptiveSamples | None = None
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
-        return self._with_counts(by_pixel(repeats, self.projector.n))
-
-    def _with_counts(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
         again = copy(self)
-        again.adaptive = AdaptiveSamples.of(repeats)
+        again.adaptive = AdaptiveSamples.of(by_pixel(repeats, self.projector.n))
         return again
 
     @property
@@ -53,7 +50,7 @@ class IndirectTracer(integrator.FollowingTracer):
         return self.setup.board
 
     def _launch(self, flight: integrator.InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        return self._paths(self._emission(flight)).path_samples(accumulator)
+        return ProjectorPaths(self, self._emission(flight)).path_samples(accumulator)
 
     def _emission(self, flight: integrator.InFlight) -> Emission:
         index, sample, weight = flight.index, flight.sample, 1.0
@@ -63,9 +60,6 @@ class IndirectTracer(integrator.FollowingTracer):
         # The first turn is stratified, because a pixel is small but its light leaves the surface in all directions.
         shared, rng = streams(flight.seed, pixel, sample)
         return Emission(pixel, (row, column), rng, sobol_point(sample, shared), weight)
-
-    def _paths(self, emission: Emission) -> ProjectorPaths:
-        return ProjectorPaths(self, emission)
 
 
 @dataclass

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property, reduce
 from itertools import cycle
@@ -31,7 +32,15 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.transport.connect import Way
-from mitsim.transport.indirect import MEMBERS, SIDE, Emission, IndirectTracer, ProjectorPaths, blocks_of
+from mitsim.transport.indirect import (
+    MEMBERS,
+    SIDE,
+    AdaptiveSamples,
+    Emission,
+    IndirectTracer,
+    ProjectorPaths,
+    blocks_of,
+)
 from mitsim.transport.integrator import InFlight, camera_part, matt_part, projector_part, shading_correction, tilt
 from mitsim.transport.plugins.base import generator, sobol_point, split_by_line
 from mitsim.transport.records import INDIRECT, DeviceAccumulator, PathSamples, Sightings, check_finite
@@ -57,7 +66,9 @@ class PathReuseTracer(IndirectTracer):
         return MEMBERS * (len(self.adaptive) if self.adaptive else blocks_of(self.projector.n) ** 2)
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
-        return self._with_counts(np.asarray(repeats, dtype=np.int64))
+        again = copy(self)
+        again.adaptive = AdaptiveSamples.of(np.asarray(repeats, dtype=np.int64))
+        return again
 
     def shares(self) -> bool:
         lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
@@ -71,8 +82,10 @@ class PathReuseTracer(IndirectTracer):
 
     @cached_property
     def diffuse(self) -> frozenset[int]:
-        shapes = enumerate(self.setup.scene.shapes())
-        return frozenset(place for place, shape in shapes if _is_diffuse(shape.bsdf()))
+        bsdfs = [shape.bsdf() for shape in self.setup.scene.shapes()]
+        plain = [bsdf is not None and bsdf.class_name() in ("SmoothDiffuse", "TwoSidedBRDF") for bsdf in bsdfs]
+        names = [mi.traverse(bsdf).keys() if some else () for bsdf, some in zip(bsdfs, plain, strict=True)]
+        return frozenset(at for at, some in enumerate(plain) if some and all(map(_REFLECTANCE.match, names[at])))
 
     @property
     def all_diffuse(self) -> bool:
@@ -93,14 +106,9 @@ class PathReuseTracer(IndirectTracer):
         first_turn = sobol_point(sample * MEMBERS + place, generator(seed, block))
         return Emission(pixel, (none, none), rng, first_turn, dr.select(inside, mi.Float(weight), 0))
 
-    def _paths(self, emission: Emission) -> ReusedPaths:
-        return (DiffuseReusedPaths if self.all_diffuse else ReusedPaths)(self, emission)
-
-
-def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
-    if bsdf is None or bsdf.class_name() not in ("SmoothDiffuse", "TwoSidedBRDF"):
-        return False
-    return all(_REFLECTANCE.match(name) for name in mi.traverse(bsdf).keys())  # noqa: SIM118 - no dictionary
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        kind = DiffuseReusedPaths if self.all_diffuse else ReusedPaths
+        return kind(self, self._emission(flight)).path_samples(accumulator)
 
 
 class ReusedPaths(ProjectorPaths):
@@ -112,9 +120,17 @@ class ReusedPaths(ProjectorPaths):
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
     def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        own, count = self._own(), dr.width(self.lit) * MEMBERS
+        own, count, way = self._own(), dr.width(self.lit) * MEMBERS, self.to_sensor_way
         if accumulator is not None:
-            self._accumulate(accumulator)
+            seen = Sightings(way.geometric, self.pixel, way.row, way.column, way.inverse_depth)
+            places = [accumulator.place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
+            dr.eval(places)
+
+            def add(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
+                for each, by_line in zip(places, light, strict=True):
+                    accumulator.add(by_line, self.pixel, dr.gather(mi.UInt32, each, at, active), active)
+
+            self._pair_light(*self._weights(), add)
             return own
         values = [[dr.zeros(mi.Float, count) for _ in range(self.tracer.lines)] for _ in range(2)]
 
@@ -125,19 +141,7 @@ class ReusedPaths(ProjectorPaths):
 
         self._pair_light(*self._weights(), store)
         dr.eval(values)
-        return [*own, self._pair_samples(values[0], self.to_sensor_way), self._pair_samples(values[1], self.further)]
-
-    def _accumulate(self, accumulator: DeviceAccumulator) -> None:
-        way = self.to_sensor_way
-        seen = Sightings(way.geometric, self.pixel, way.row, way.column, way.inverse_depth)
-        places = [accumulator.place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
-        dr.eval(places)
-
-        def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
-            for each, by_line in zip(places, light, strict=True):
-                accumulator.add(by_line, self.pixel, dr.gather(mi.UInt32, each, at, active), active)
-
-        self._pair_light(*self._weights(), store)
+        return [*own, self._pair_samples(values[0], way), self._pair_samples(values[1], self.further)]
 
     # ---- the paths themselves ---------------------------------------------------------------------------------------
 

@@ -271,68 +271,20 @@ class _Aim:
 
 
 def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> RefractedWay:
-    search = _Search(passage, si, target, dr.normalize(target - si.p))
-    nothing = mi.Float(0)
-    start = _Aim(
-        mi.Bool(active), search.facing, mi.UInt32(0), mi.Float(dr.inf), search.facing, nothing, nothing, mi.Spectrum(0),
-        mi.Float(1),
-    )  # fmt: skip
-    (aim,) = dr.while_loop((start,), lambda aim: aim.active, lambda aim: (search.correct(aim),))
-    seen = active & (aim.miss < _MET) & (dr.max(aim.part) > 0)
-    apparent = target - aim.arriving * dr.sqrt(aim.squared)
-    return RefractedWay(aim.direction, apparent, aim.length, aim.part, aim.eta, seen)
+    """Find the way through flat glass from a surface to a target."""
+    facing, zero, none = dr.normalize(target - si.p), mi.Vector3f(0), mi.Float(0)
 
+    def reach(ray: _Ray) -> mi.Float:
+        return dr.dot(target - ray.place, facing) / dr.dot(ray.direction, facing)
 
-@dataclass
-class _Search:
-    passage: Passage
-    si: mi.SurfaceInteraction3f
-    target: mi.Point3f
-    facing: mi.Vector3f
-
-    def correct(self, aim: _Aim) -> _Aim:
-        facing, (a, b) = self.facing, mi.coordinate_system(aim.direction)
-        zero, clear = mi.Vector3f(0), self.passage.clear(self.si, aim.direction)
-        ray = _Ray(
-            mi.Bool(aim.active), self.si.p, aim.direction, clear, zero, zero, a, b, mi.Float(0), mi.Spectrum(1),
-            mi.Float(1),
-        )  # fmt: skip
-        (ray,) = dr.while_loop((ray,), lambda ray: ray.active, lambda ray: (self.advance(ray),))
-        distance = self.reach(ray)
-        error = self.target - (ray.place + ray.direction * distance)
-        u, v = mi.coordinate_system(facing)
-        (au, av), (bu, bv), (eu, ev) = (
-            (dr.dot(move, u), dr.dot(move, v)) for move in (*ray.move_crossing(distance, facing), error)
-        )
-        area = au * bv - av * bu
-        step = a * ((eu * bv - ev * bu) / area) + b * ((au * ev - av * eu) / area)
-        step *= dr.minimum(1, _LARGEST_STEP * dr.rsqrt(dr.squared_norm(step)))
-        miss = dr.sqrt(dr.square(eu) + dr.square(ev))
-        arrived = aim.active & (distance > 0) & dr.isfinite(miss)
-        more = arrived & (miss > _CLOSE) & (aim.step + 1 < _STEPS) & dr.isfinite(dr.squared_norm(step))
-        return _Aim(
-            more,
-            dr.select(more, dr.normalize(aim.direction + step), aim.direction),
-            aim.step + 1,
-            dr.select(arrived, miss, dr.inf),
-            ray.direction,
-            dr.abs(area * dr.dot(ray.direction, facing)),
-            ray.length + distance,
-            ray.part,
-            ray.eta,
-        )
-
-    def reach(self, ray: _Ray) -> mi.Float:
-        return dr.dot(self.target - ray.place, self.facing) / dr.dot(ray.direction, self.facing)
-
-    def advance(self, ray: _Ray) -> _Ray:
+    def advance(ray: _Ray) -> tuple[_Ray]:
+        """Follow a ray and its differentials through the next face before the target's plane."""
         origin = ray.place + ray.direction * ray.clear
-        onward = mi.Ray3f(origin, ray.direction, self.si.time, self.si.wavelengths)
-        met = self.passage.next_surface(onward, ray.active)
+        met = passage.next_surface(mi.Ray3f(origin, ray.direction, si.time, si.wavelengths), ray.active)
         distance = met.t + ray.clear
-        before = ray.active & met.is_valid() & (distance < self.reach(ray))
-        place_a, place_b = ray.move_crossing(distance, met.n)
-        passed = self.passage.through(met, ray.direction, before)
+        before = ray.active & met.is_valid() & (distance < reach(ray))
+        moves = ray.move_crossing(distance, met.n)
+        passed = passage.through(met, ray.direction, before)
         # Snell: d' = d / eta + (c / eta - c') n, c and c' the cosines to the normal that faces the ray.
         normal = met.n * -dr.sign(dr.dot(met.n, ray.direction))
         cosine, inside = -dr.dot(normal, ray.direction), -dr.dot(normal, passed.direction)
@@ -343,12 +295,44 @@ class _Search:
             return direction * ratio + normal * (ratio * change - dr.square(ratio) * cosine * change / inside)
 
         refracted = _Ray(
-            before, met.p, passed.direction, self.passage.clear(met, passed.direction), place_a, place_b,
-            turn(ray.direction_a), turn(ray.direction_b), ray.length + distance, ray.part * passed.part,
-            ray.eta * passed.eta,
+            before, met.p, passed.direction, passage.clear(met, passed.direction), *moves, turn(ray.direction_a),
+            turn(ray.direction_b), ray.length + distance, ray.part * passed.part, ray.eta * passed.eta,
         )  # fmt: skip
         chosen = {name: dr.select(before, getattr(refracted, name), getattr(ray, name)) for name in vars(ray)}
-        return _Ray(**{**chosen, "active": before})
+        return (_Ray(**{**chosen, "active": before}),)
+
+    def correct(aim: _Aim) -> tuple[_Aim]:
+        """Trace the ray of a direction, and turn it by Newton's step toward the target."""
+        a, b = mi.coordinate_system(aim.direction)
+        clear = passage.clear(si, aim.direction)
+        start = _Ray(
+            mi.Bool(aim.active), si.p, aim.direction, clear, zero, zero, a, b, none, mi.Spectrum(1), mi.Float(1)
+        )
+        (ray,) = dr.while_loop((start,), lambda ray: ray.active, advance)
+        distance = reach(ray)
+        error = target - (ray.place + ray.direction * distance)
+        u, v = mi.coordinate_system(facing)
+        (au, av), (bu, bv), (eu, ev) = (
+            (dr.dot(move, u), dr.dot(move, v)) for move in (*ray.move_crossing(distance, facing), error)
+        )
+        area = au * bv - av * bu
+        step = a * ((eu * bv - ev * bu) / area) + b * ((au * ev - av * eu) / area)
+        step *= dr.minimum(1, _LARGEST_STEP * dr.rsqrt(dr.squared_norm(step)))
+        miss = dr.sqrt(dr.square(eu) + dr.square(ev))
+        arrived = aim.active & (distance > 0) & dr.isfinite(miss)
+        more = arrived & (miss > _CLOSE) & (aim.step + 1 < _STEPS) & dr.isfinite(dr.squared_norm(step))
+        direction = dr.select(more, dr.normalize(aim.direction + step), aim.direction)
+        squared = dr.abs(area * dr.dot(ray.direction, facing))
+        miss, length = dr.select(arrived, miss, dr.inf), ray.length + distance
+        return (_Aim(more, direction, aim.step + 1, miss, ray.direction, squared, length, ray.part, ray.eta),)
+
+    begun = _Aim(
+        mi.Bool(active), facing, mi.UInt32(0), mi.Float(dr.inf), facing, none, none, mi.Spectrum(0), mi.Float(1)
+    )
+    (aim,) = dr.while_loop((begun,), lambda aim: aim.active, correct)
+    seen = active & (aim.miss < _MET) & (dr.max(aim.part) > 0)
+    apparent = target - aim.arriving * dr.sqrt(aim.squared)
+    return RefractedWay(aim.direction, apparent, aim.length, aim.part, aim.eta, seen)
 
 
 # -------- Surfaces in contact with transmitting surfaces

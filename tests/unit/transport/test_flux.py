@@ -54,7 +54,7 @@ def over_the_sensor(alpha: float) -> float:
     return float(weight @ np.array([[lobe(alpha, row, column) for column in node] for row in node]) @ weight)
 
 
-@pytest.mark.parametrize("alpha", [3e-2, pytest.param(1e-3, marks=pytest.mark.slow), 1e-4])
+@pytest.mark.parametrize("alpha", [pytest.param(3e-2, marks=pytest.mark.slow), 1e-4])
 def test_flux_over_lobes_is_that_of_quadrature(bench: Callable[..., Bench], alpha: float) -> None:
     """Connections alone are off by more than the gate, or noisier (seen failing without sampled turns)."""
     found, error = flux(bench(alpha), True, 512) if alpha > 1e-3 else flux(bench(alpha), True, 2**14, LIT)

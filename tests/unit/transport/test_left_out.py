@@ -61,7 +61,7 @@ def test_a_wall_that_is_lit_and_seen_by_a_mirror(
     assert abs(found - expected) < 7 * error + 0.05 * expected
 
 
-@pytest.mark.parametrize("name", ["own mirror", "another mirror"])
+@pytest.mark.parametrize("name", ["own mirror", pytest.param("another mirror", marks=pytest.mark.slow)])
 def test_light_that_no_tracer_finds_is_known_at_every_seed(tmp_path: Path, name: str) -> None:
     """By a judge of its own in float64; a wall turned by 30 degrees fills its cubes to 0.94.
 
@@ -84,7 +84,9 @@ SEEN = '<scale x="20" y="60"/><rotate y="1" angle="180"/><translate x="-10" z="4
 LIT = '<scale x="8" y="30"/><rotate y="1" angle="186.23"/><translate x="-25" z="400"/>'
 
 
-@pytest.mark.parametrize(("place", "cosine", "way"), [(SEEN, 1.0, 800.0), (LIT, 0.961, 817.0)])
+@pytest.mark.parametrize(
+    ("place", "cosine", "way"), [(SEEN, 1.0, 800.0), pytest.param(LIT, 0.961, 817.0, marks=pytest.mark.slow)]
+)
 def test_a_sharp_lobe_over_a_mirror_is_left_out(
     shared_scene: Callable[..., Path], place: str, cosine: float, way: float
 ) -> None:
@@ -134,6 +136,7 @@ def test_windows_leave_nothing_out(shared_scene: Callable[..., Path]) -> None:
     assert left_out_of(bench, 0).unseen(np.inf, NONE)[0] < 1e-5 * 0.02
 
 
+@pytest.mark.slow
 def test_it_is_told_over_which_mirror(shared_scene: Callable[..., Path]) -> None:
     """A ball of glass, not a mirror out of the way before it, nor the pane behind it that all light passes; 2^18 paths,
     seed 0."""

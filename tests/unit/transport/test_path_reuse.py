@@ -141,7 +141,7 @@ def test_light_that_shading_normals_make_heavy_is_divided(
     assert part > 0.2, "what is left to the camera's side"
 
 
-@pytest.mark.parametrize("name", ["bent wall", "fins"])
+@pytest.mark.parametrize("name", [pytest.param("bent wall", marks=pytest.mark.slow), "fins"])
 def test_diffuse_surfaces_need_no_look_at_their_material(
     shared_scene: Callable[..., Path], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -141,8 +141,6 @@ def test_a_choice_samples_each_part_by_its_share(variant: str, bsdf: dict, glass
 NESTED = (
     ("blendbsdf", "normalmap", "mirror", True),
     ("mask", "bumpmap", "glass", False),
-    ("twosided", "blendbsdf", "glass", True),
-    ("normalmap", "blendbsdf", "mirror", False),
 )
 
 
@@ -198,7 +196,8 @@ STRANDS = "".join(
 )
 
 
-@pytest.mark.parametrize("own", [IndirectTracer, pytest.param(PathReuseTracer, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("own", [IndirectTracer, PathReuseTracer])
 def test_light_over_hair_is_followed_from_the_camera(
     shared_scene: Callable[..., Path], own: type[IndirectTracer]
 ) -> None:
