@@ -6,14 +6,7 @@ from scipy import sparse
 from scipy.linalg import hadamard
 
 from mitsim.optics import frames as frames_module
-from mitsim.optics.frames import (
-    AccumulatedLight,
-    ClassFrames,
-    ExpectedFrames,
-    _product,
-    formed_frames,
-    pair_shots,
-)
+from mitsim.optics.frames import AccumulatedLight, ClassFrames, ExpectedFrames, _product, formed_frames, pair_shots
 from mitsim.optics.image_formation import FrameOptics
 from tests.unit.optics.small_camera import (
     BESIDE,

@@ -12,14 +12,7 @@ from mitsim.optics.frames import (
     monte_carlo_error,
     probe_vectors,
 )
-from tests.unit.optics.small_camera import (
-    BESIDE,
-    PIXELS,
-    ambient_groups,
-    expected_frames,
-    random_groups,
-    small_optics,
-)
+from tests.unit.optics.small_camera import BESIDE, PIXELS, ambient_groups, expected_frames, random_groups, small_optics
 
 SEEDS = 300
 

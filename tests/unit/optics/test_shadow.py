@@ -68,10 +68,7 @@ def test_wide_and_far_off_cells_equal_quadrature():
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.lists(st.integers(0, 1), min_size=1, max_size=40),
-    st.floats(0.01, 1.0),
-    st.floats(0.1, 3.0),
-    st.floats(3.5, 1e6),
+    st.lists(st.integers(0, 1), min_size=1, max_size=40), st.floats(0.01, 1.0), st.floats(0.1, 3.0), st.floats(3.5, 1e6)
 )
 def test_energy_and_bounds(bits, feature, distance, depth):
     # Over pixels that see the whole mask, the mean transmission adds up to the open area's share, whatever

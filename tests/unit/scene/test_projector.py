@@ -91,11 +91,7 @@ def oblong() -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("canvas", "fragment"),
-    [
-        (np.zeros((N, 2 * N)), "all black"),
-        (oblong(), "8x16 and must fill a square"),
-        (hollow(), "must fill a square"),
-    ],
+    [(np.zeros((N, 2 * N)), "all black"), (oblong(), "8x16 and must fill a square"), (hollow(), "must fill a square")],
     ids=["black", "oblong", "hollow"],
 )
 def test_a_window_that_is_no_filled_square_is_refused(

@@ -138,10 +138,7 @@ def test_a_choice_samples_each_part_by_its_share(variant: str, bsdf: dict, glass
         assert abs(each.mean() - expected) < 5 * each.std() / np.sqrt(count) + 1e-5, which
 
 
-NESTED = (
-    ("blendbsdf", "normalmap", "mirror", True),
-    ("mask", "bumpmap", "glass", False),
-)
+NESTED = (("blendbsdf", "normalmap", "mirror", True), ("mask", "bumpmap", "glass", False))
 
 
 @pytest.mark.parametrize("case", NESTED, ids=map(str, NESTED))
