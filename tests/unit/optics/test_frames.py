@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.devices.mask import Mask
-from mitsim.optics.image_formation import FrameOptics, anchor_positions
+from mitsim.optics.image_formation import anchor_positions
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from tests.unit.optics.small_camera import CAMERA, WINDOW, Z, cell_optics
@@ -128,27 +128,3 @@ def test_both_orders_of_the_product_agree_with_the_dense_one(lit: str) -> None:
 
 
 # ---- layers
-
-
-def test_probes_see_the_frames_of_all_layers() -> None:
-    rng, rows = np.random.default_rng(6), Directions.cells(np.linspace(-0.2, 0.2, 11))
-    columns = Directions.cells(np.linspace(-0.1, 0.3, 9))
-    optics = FrameOptics(CAMERA, rows, columns, (60.0, 20.0), 2)
-    flat = np.sort(rng.choice(640, 150, replace=False))
-    lights, vectors = rng.random((3, 150)), rng.standard_normal((96, 5))
-    found = optics.probe([(flat, light) for light in lights], vectors)
-    expected = np.concatenate([optics.frame(flat, light) @ vectors for light in lights], axis=1)
-    assert np.allclose(found, expected, rtol=1e-10)
-
-
-def test_estimates_that_light_different_places_are_seen_as_each_is() -> None:
-    """The frame is their mean's, a product each one's own, though neither holds all places of the other."""
-    rng, edges = np.random.default_rng(8), np.linspace(-0.2, 0.2, 11)
-    optics = FrameOptics(CAMERA, Directions.cells(edges), Directions.cells(edges), (60.0, 20.0), 2)
-    estimates = [(np.sort(rng.choice(800, 60, replace=False)), rng.random(60)) for _ in range(3)]
-    vectors = rng.standard_normal((96, 4))
-    frame, probed = optics.frame_and_products(estimates, vectors)
-    alone = [optics.frame(*estimate) for estimate in estimates]
-    assert np.allclose(frame, sum(alone) / 3, rtol=1e-12)
-    assert np.allclose(probed, np.concatenate([one @ vectors for one in alone], axis=1), rtol=1e-10)
-    assert np.array_equal(probed, optics.probe(estimates, vectors))

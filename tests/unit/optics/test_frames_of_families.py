@@ -6,7 +6,7 @@ from scipy import sparse
 from scipy.linalg import hadamard
 
 from mitsim.optics import frames as frames_module
-from mitsim.optics.frames import AccumulatedLight, ClassFrames, ExpectedFrames, _product, formed_frames, pair_shots
+from mitsim.optics.frames import AccumulatedLight, ExpectedFrames, _product, formed_frames, pair_shots
 from mitsim.optics.image_formation import FrameOptics
 from tests.unit.optics.small_camera import (
     BESIDE,
@@ -162,23 +162,6 @@ def test_more_light_adds_to_the_light_of_its_rows(family: str) -> None:
     alike(apart, expected_frames(optics, [a + b for a, b in zip(groups, more, strict=True)], labels, weights, 5))
 
 
-@pytest.mark.parametrize("family", [*BESIDE, "identity", "many"])
-def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
-    """Classes 1 and 3 bring frames of their own, without error, in families of either kind and over several blocks."""
-    families = {**BESIDE, "identity": (LABELS, np.eye(4)), "many": (SPLIT, np.random.default_rng(2).random((70, 80)))}
-    labels, weights = families[family]
-    optics, groups = small_optics(8), random_groups(2, 7, 0.2)
-    brought = np.random.default_rng(3).random((2, 8, 8))
-    exact = ClassFrames(np.array([1, 3]), brought)
-    with_it = list(expected_frames(optics, groups, labels, weights, 0, specular=exact))
-    without = list(expected_frames(optics, groups, labels, weights, 0))
-    assert len(with_it) == len(weights)
-    for found, plain, row in zip(with_it, without, weights, strict=True):
-        expected = plain.irradiance + row[1] * brought[0] + row[3] * brought[1]
-        assert np.allclose(found.irradiance, expected, rtol=1e-10)
-        assert found.variance == pytest.approx(plain.variance, rel=1e-12)
-
-
 # ---- shots that leave one another of the light of all pixels
 
 
@@ -198,25 +181,6 @@ def test_shots_of_signed_patterns_are_pairs(low: float) -> None:
     for start, stop in ((0, 16), (5, 9)):
         shots = np.stack(mixture.shots(pairs, start, stop))
         assert np.abs(shots - np.tensordot(weights[start:stop], basis, axes=1)).max() < 1e-14
-
-
-def test_frames_of_pairs_are_those_of_classes() -> None:
-    """Signed patterns through a camera, asked for twice; the probes of another family are left as they were. (Planted:
-    probes mixed in place.)"""
-    signs = hadamard(16)
-    weights = np.stack([signs > 0, signs < 0], axis=1).reshape(32, 16).astype(float)
-    optics, groups = small_optics(), random_groups(3, 7, spread=0.1)
-    labels = np.arange(PIXELS)
-    paired = expected_frames(optics, groups, labels, weights, 5)
-    probed = np.array(paired.probed)
-    first, again = list(paired), list(paired)
-    mean = sum(groups[1:], groups[0]) / 3
-    for one, other, row in zip(first, again, weights, strict=True):
-        plain = optics.frame(np.arange(CELLS**2), np.asarray(row @ mean.toarray()))
-        assert np.abs(one.irradiance - plain).max() < 1e-12 * max(np.abs(plain).max(), 1e-9)
-        assert np.array_equal(one.irradiance, other.irradiance) and one.variance == other.variance
-    assert np.array_equal(paired.probed, probed)
-    assert paired._pairs is not None
 
 
 # ---- what frames are, besides their light

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import sparse
 
 from mitsim.optics.frames import (
     AccumulatedLight,
@@ -62,33 +61,6 @@ def test_the_sampling_error_is_told_without_frames(family: str) -> None:
     for without in ({"specular": exact}, {"ambient": [AccumulatedLight(optics, lamps)]}):
         other, _ = expected_frames(optics, groups, labels, weights, 0, **without).sampling_error()
         assert other != pytest.approx(monte_carlo_error(frames), rel=0.02)
-
-
-@pytest.mark.parametrize("family", BESIDE)
-def test_noise_is_told_by_light(family: str) -> None:
-    """Of each light as of it alone, on one scale; what all shots are lit by counts in each of them.
-
-    (Planted: ambient light counted once, classes weighed by their share and not its square.)
-    """
-    labels, weights = BESIDE[family]
-    optics, lamps = small_optics(), AccumulatedLight(small_optics(), ambient_groups(4))
-    lights = [random_groups(4, seed, spread) for seed, spread in ((7, 0.3), (8, 0.1))]
-    more = [AccumulatedLight(optics, tuple(lights[1]))]
-    by_light, by_ambient = expected_frames(optics, lights[0], labels, weights, 0, more, ambient=[lamps]).noise
-
-    # Where shots are mixed, classes are formed, whose noise is taken for independent.
-    formed, scale = (np.eye(4), np.square(weights).sum(axis=0)) if family == "mixed" else (weights, np.ones(3))
-
-    def alone(groups: list[sparse.csr_array]) -> np.ndarray:
-        frames = expected_frames(optics, groups, labels, formed, 0)
-        return np.sum([times * f.by_group for f, times in zip(frames, scale, strict=True)], axis=0)
-
-    dark = [sparse.csr_array(lights[0][0].shape)] * 4
-    (first, *_) = expected_frames(optics, dark, labels, weights, 0, ambient=[lamps])
-    apart = np.array([*(alone(groups) for groups in lights), len(weights) * first.by_group])
-    found = np.concatenate([by_light, by_ambient])
-    found, apart = (each / np.einsum("lgg->", each) for each in (found, apart))
-    assert found == pytest.approx(apart, rel=1e-9)
 
 
 def test_probes_see_every_matrix_with_its_norm_and_what_columns_share_exactly() -> None:

@@ -6,7 +6,7 @@ import pytest
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import geometric_samplers, wave_samplers
-from mitsim.optics.mirror_frames import Beams, SpecularLight, _cuts, specular_frames
+from mitsim.optics.mirror_frames import Beams, _cuts, specular_frames
 
 PITCH = 0.05
 LABELS = np.arange(9) % 3
@@ -65,12 +65,6 @@ def test_a_part_of_a_sensor_and_tall_pixels_see_what_the_sensor_does() -> None:
     np.testing.assert_allclose(frame(part), frame(whole)[4:14, 2:11], rtol=0, atol=1e-9)
     every, tall = frame(geometry()), frame(geometry(rows=6, columns=16, row_pitch=2 * PITCH))
     np.testing.assert_allclose(tall, (every[2:14:2] + every[3:14:2]) / 2, rtol=0, atol=1e-9)
-
-
-def test_a_turned_beam_lights_its_inside_evenly() -> None:
-    frame = specular_frames(beams(turned(0.3, 0.5)), geometry(), geometric_samplers(geometry()), LABELS).irradiance[0]
-    assert frame[6:10, 6:10] == pytest.approx(2.0 / 0.25, rel=2e-3)
-    assert not frame[0].any() and not frame[:, 0].any()
 
 
 def test_the_field_stop_and_a_response_weigh_directions() -> None:
@@ -164,15 +158,3 @@ def test_classes_are_told_apart_and_add_up() -> None:
 
 
 ORDER = ("pixel", "flux", "sensor", "tangent", "throughput")
-
-
-def test_parallel_light_has_waves_of_a_far_source() -> None:
-    """(Planted: a depth of one over nothing.)"""
-    spectrum, camera = Spectrum(np.array([550.0]), np.array([1.0])), geometry("separable", mask_order=8)
-    corners = square((-0.4, -0.4), (0.4, 0.4))
-    parallel, far = (
-        SpecularLight(one).frames(LABELS, camera, spectrum).irradiance
-        for one in (beams(corners, tangent=np.zeros((1, 2, 2, 2))), beams(corners, depth=1e9))
-    )
-    np.testing.assert_allclose(parallel, far, rtol=0, atol=1e-6 * far.max())
-    assert far.std() > 0.1 * far.mean()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from mitsim.optics.terms import best_term, centre_terms, lacking
+from mitsim.optics.terms import best_term, lacking
 from mitsim.reconstruct.factors import estimate_factors
 
 Terms = list[tuple[np.ndarray, np.ndarray]]
@@ -33,16 +33,6 @@ def test_the_best_term_is_the_first_singular_pair_of_the_dense_operator(count: i
     assert best.residual == pytest.approx(error, rel=1e-10)
 
 
-def test_centred_factors_give_centred_frames() -> None:
-    """Whatever the scene, frames lose the means of their rows and columns, and nothing else."""
-    terms = random_terms(3, 6)
-    scene = np.random.default_rng(7).normal(size=(4, 5))
-    frame = sum(left @ scene @ right.T for left, right in terms)
-    frame -= frame.mean(axis=0)
-    frame -= frame.mean(axis=1, keepdims=True)
-    assert np.allclose(sum(left @ scene @ right.T for left, right in centre_terms(terms)), frame)
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_what_factors_of_stripes_lack_is_the_rest_of_the_operator(count: int) -> None:
     """Pixels of a brightness of their own, which only their factors tell: the calibration's own estimate of the dense
@@ -65,22 +55,3 @@ def test_what_factors_of_stripes_lack_is_the_rest_of_the_operator(count: int) ->
     assert lacks.residual == pytest.approx(np.linalg.norm(rest) / np.linalg.norm(whole), rel=0.02, abs=1e-12)
     made = sum((np.einsum("ir,jc->irjc", *term) for term in lacks.terms), 0 * rest)
     assert np.linalg.norm(made - rest) <= 0.06 * np.linalg.norm(rest) + 1e-12 * np.linalg.norm(whole)
-
-
-def test_what_factors_lack_is_told_but_for_three_percent() -> None:
-    """Orthogonal terms of 1, 0.1 and parts of that; the factors are those that stripes of even pixels give. Of what
-    they lack, the term of 4.5 % counts, that of 2 % does not. (Planted: a bound of 6 %.)"""
-    random = np.random.default_rng(0)
-    lefts, rights = (np.linalg.qr(random.normal(size=(size, 4)))[0].T for size in (28, 30))
-    terms = [
-        (part * left.reshape(7, 4), right.reshape(6, 5))
-        for part, left, right in zip((1, 0.1, 0.0045, 0.002), lefts, rights, strict=True)
-    ]
-    # Factors of stripes in the mean over pixels: sums of terms, each by what its other side gives of uniform light.
-    uniform = best_term([(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True)) for a, b in terms])
-    u, v = uniform.left[:, 0], uniform.right[:, 0]
-    left = sum(a * (b.sum(axis=1) @ v) / (v @ v) for a, b in terms)
-    right = sum(b * (a.sum(axis=1) @ u) / (u @ u) for a, b in terms)
-    lacks, rest = lacking(terms, left, right), dense(terms) - dense([(left, right)])
-    assert lacks.residual == pytest.approx(np.linalg.norm(rest) / np.linalg.norm(dense(terms)), rel=1e-9)
-    assert 0.01 < np.linalg.norm(dense(lacks.terms) - rest) / np.linalg.norm(rest) < 0.03

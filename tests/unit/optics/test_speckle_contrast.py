@@ -85,27 +85,6 @@ def test_it_is_that_of_fields_added_up(mask: str, beam: float | None, dots: int)
     assert found * np.sqrt(2) == pytest.approx(expected, abs=4 * error + 0.03 * expected)
 
 
-def test_a_scanned_beam_has_as_many_modes_as_its_area_fits() -> None:
-    """M = lit area / (pi r^2) for a beam far smaller than the picture and a pixel far smaller than its grain; dots have
-    their part of that."""
-    radius, white = 0.05, np.ones((N, N))
-    found = contrast_of(devices(pitch=1e-3, beam_radius_mm=radius, polarisation=1.0), (SIDE, SIDE), white)
-    assert found**-2 == pytest.approx((N * SIDE) ** 2 / (np.pi * radius**2), rel=0.05)
-    dots = np.zeros((N, N))
-    dots[::4, ::4] = 1
-    few = contrast_of(devices(pitch=1e-3, beam_radius_mm=radius, polarisation=1.0), (SIDE, SIDE), dots)
-    assert (few / found) ** 2 == pytest.approx(16, rel=0.15), "edges of dots have less of the beam's neighbours"
-
-
-def test_polarisations_and_lines_speckle_apart() -> None:
-    tiny = {"pitch": 1e-6}
-    single = contrast_of(devices(**tiny, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
-    assert single == pytest.approx(1, rel=1e-6), "a point of polarised light of one line: fully developed"
-    assert contrast_of(devices(**tiny), (SIDE, SIDE), np.ones((N, N))) == pytest.approx(1 / np.sqrt(2), rel=1e-6)
-    three = contrast_of(devices(**tiny, lines=LINES, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
-    assert three == pytest.approx(1 / np.sqrt(3), rel=1e-6), "equal shares of photons"
-
-
 @pytest.mark.parametrize(("roughness_um", "linewidth_nm"), [(0.15, 0.0), (20.0, 2.0)])
 def test_lines_are_as_coherent_as_the_surface_is_smooth(roughness_um: float, linewidth_nm: float) -> None:
     """Fields of 60 points of random height, at each of 8 wavelengths of every line; light falls and leaves upright."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.prepare import read_reflectance
 from mitsim.scene.headers import check_image, check_obj, check_ply
-from mitsim.scene.load import load_scene
 
 # -------- Wavefront meshes
 
@@ -71,58 +69,7 @@ def test_a_wavefront_mesh_is_read_right_or_refused(tmp_path: Path, variant: str,
     assert float(np.array(mesh.surface_area()).ravel()[0]) == pytest.approx(right, rel=1e-3)
 
 
-def test_a_polygon_that_passes_has_the_area_of_its_outline(tmp_path: Path) -> None:
-    """300 of random radii: the triangles of its fan add up to the area by the shoelace formula, within 0.3 %. Convex
-    ones pass. (Planted: a tolerance of 0.1; signs of two components of the triangles alone.)"""
-    rng, passed = np.random.default_rng(5), 0
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    for number in range(300):
-        angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(4, 9)))
-        radii = 1.0 if number % 3 == 0 else rng.uniform(0.6, 1, len(angles))
-        flat = np.stack([radii * np.cos(angles), radii * np.sin(angles), 0 * angles], axis=1)
-        x, y, _ = flat.T
-        area = abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
-        spokes = flat[1:] - flat[0]
-        fan = np.linalg.norm(np.cross(spokes[:-1], spokes[1:]), axis=1).sum() / 2
-        lines = [f"v {a:.9f} {b:.9f} {c:.9f}" for a, b, c in flat @ turn.T]
-        path = tmp_path / "a.obj"
-        path.write_text("\n".join([*lines, "f " + " ".join(map(str, range(1, len(flat) + 1)))]) + "\n")
-        try:
-            check_obj(path)
-        except ValueError:
-            assert fan > area * (1 + 1e-9) and number % 3, number
-        else:
-            passed += 1
-            assert fan == pytest.approx(area, rel=3e-3), number
-    assert 100 < passed < 290
-
-
 # -------- Names in messages
-
-
-def test_a_wrong_number_is_named_by_its_file(small_scene: Callable[..., Path]) -> None:
-    """Not by the number that Mitsuba gives to an object. (Seen failing: "mesh object_94553190854256".)"""
-    names = ("x", "y", "z", "r", "g", "b")
-    header = ["ply", "format binary_little_endian 1.0", "element vertex 3", *(f"property float {n}" for n in names)]
-    header += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
-    rows = [(0, 0, 0, 1, 1, 1), (1, 0, 0, 1, np.nan, 1), (0, 1, 0, 1, 1, 1)]
-    body = b"".join(struct.pack("<6f", *row) for row in rows) + struct.pack("<B3i", 3, 0, 1, 2)
-    image = np.full((4, 4), 0.5, np.float32)
-    image[1, 2] = 2
-    bitmap = '<texture type="bitmap" id="t"><string name="filename" value="p.exr"/></texture>'
-    matt = '<bsdf type="diffuse"><ref name="reflectance" id="t"/></bsdf>'
-    colours = '<texture type="mesh_attribute" name="reflectance"><string name="name" value="vertex_color"/></texture>'
-    shape = f'<shape type="ply"><string name="filename" value="c.ply"/><bsdf type="diffuse">{colours}</bsdf></shape>'
-    for extra, words in (
-        (shape, r"mesh c\.ply: number 4 of its vertex_color is nan"),
-        (f'{bitmap}<shape type="rectangle">{matt}</shape>', r"bitmap p\.exr: the texel in row 1, column 2 is 2"),
-    ):
-        path = small_scene(extra=extra)
-        (path.parent / "c.ply").write_bytes("\n".join(header).encode() + body)
-        OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": image}).write(str(path.parent / "p.exr"))
-        with pytest.raises(MitsimError, match=words) as refusal:
-            load_scene(path)
-        assert "object_" not in str(refusal.value)
 
 
 # -------- OpenEXR pictures

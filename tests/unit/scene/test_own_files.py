@@ -11,7 +11,7 @@ from PIL import Image
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
-from mitsim.core.prepare import fit_square, read_reflectance
+from mitsim.core.prepare import read_reflectance
 from mitsim.scene.outline import Outline, SceneFiles
 
 TETRAHEDRON = "v 0 0 0\nv 10 0 0\nv 5 20 3\nv 4 2 9\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
@@ -43,16 +43,6 @@ def test_numbers_are_reflectances_whichever_file_holds_them(kind: str, tmp_path:
     else:
         Image.fromarray(codes).save(path)
     assert_allclose(read_reflectance(path), codes / 255, atol=1e-7)
-
-
-def test_a_picture_lies_unstretched_in_the_middle_of_its_square() -> None:
-    """(Planted: stretched; laid at the top.) Of many pixels blocks become their mean, the last one what is left."""
-    wide = np.arange(1, 9).reshape(2, 4) / 10
-    assert_allclose(fit_square(wide), [[0] * 4, [0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8], [0] * 4])
-    long = np.tile([0.2, 0.4], (1, 2500))[:, :4999]
-    small = fit_square(long)
-    assert small.shape == (2500, 2500)
-    assert_allclose(small[1249], [0.3] * 2499 + [0.2])
 
 
 def test_a_picture_on_the_sheet_is_the_truth(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

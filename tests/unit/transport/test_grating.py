@@ -274,36 +274,6 @@ def test_drawn_directions_follow_the_density(settings: dict[str, Any]) -> None:
         assert abs(valid.mean() - kept) < 5 * np.sqrt(max(kept * (1 - kept), 0) / count) + 1e-5
 
 
-def test_the_furnace_in_a_render() -> None:
-    """A disc under uniform light of radiance 1, seen by a distant camera: `path` finds the reflected part, 512 pixels.
-
-    The weights of all samples are equal, so the only noise is which of them leave the hemisphere.
-    """
-    import mitsuba as mi
-
-    for angle in 0.0, 60.0, 80.0:
-        settings = {"grooves": "linear", "diffuse": 0.1, "efficiencies": "0.3, 0.2", "sigma_groove": 0.06}
-        view = mi.ScalarAffineTransform4f().look_at(
-            [4 * np.sin(np.radians(angle)), 0, 4 * np.cos(np.radians(angle))], [0, 0, 0], [0, 1, 0]
-        )
-        film = {"type": "hdrfilm", "width": 16, "height": 32, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
-        size = mi.ScalarAffineTransform4f().scale([0.1, 0.1, 1])
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": "path", "max_depth": 4},
-                "camera": {"type": "orthographic", "to_world": view @ size, "film": film},
-                "disc": {"type": "disk", "bsdf": {"type": "mitsim_grating", **settings}},
-                "light": {"type": "constant"},
-            }
-        )
-        image = np.array(mi.render(scene, spp=256, seed=9), dtype=np.float64)
-        expected = reflected_part(grating(**settings), cosines(angle, 0))
-        assert expected < 0.8 + 1e-9
-        # Half a sample's range of 0.8 bounds its deviation; 131 072 samples, 5 standard errors.
-        assert abs(image.mean() - expected) < 5 * 0.4 / np.sqrt(image.size * 256) + 1e-5
-
-
 # ---- parameters
 
 

@@ -52,13 +52,3 @@ def test_what_is_hidden_counts_for_nothing(variant: str) -> None:
     hidden, open_ = found(0.01, 0.4, card=card).irradiance, found(0.01, 0.4).irradiance
     assert hidden[0] == 0 and hidden[1:] == pytest.approx(open_[1:])
     assert not found(0.3, 0.4).irradiance.any()
-
-
-def test_few_meetings_are_none() -> None:
-    """Of one large ball and many small ones: rays meet the former, and so the latter together where they are many."""
-    pixels = np.arange(31)
-    irradiance, hits = np.append(1.0, np.full(30, 0.01)), np.append(100.0, np.full(30, 0.01))
-    every = Highlights(pixels, irradiance, np.square(irradiance) / hits)
-    assert every.unmet(1.0).pixels.tolist() == list(range(1, 31))
-    assert not len(every.unmet(11.0).pixels), "more than three of all, if less than one of each"
-    assert not len(every.unmet(200.0).pixels)

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
-from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
-from mitsim.transport.records import DIRECT, INDIRECT, aligned_grid
+from mitsim.transport.records import DIRECT, INDIRECT
 from tests.unit.transport.closed_forms import mean, seen
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -68,40 +66,6 @@ def test_a_hollow_sphere_is_lit_evenly_by_its_own_light(hollow: Bench) -> None:
 
 CORNER = f"""<shape type="rectangle"><transform name="to_world"><scale x="60" y="60"/><rotate y="1" angle="90"/>
     <translate x="-30" z="360"/></transform>{SHINY.replace("0.05", "0.2")}</shape>"""
-
-
-@pytest.mark.slow
-def test_both_sides_find_the_same_light_at_every_anchor(
-    shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Beside a shiny wall, on a sensor of 24 mm: how much, and in which mean direction and depth the centre files it.
-
-    (Planted: the camera's paths accumulated as their start sees them.)
-    """
-    bench = open_bench(shared_scene("wall", extra=CORNER, pitch=0.375, mask_feature=0.3), for_render=True)
-    geometry = bench.geometry
-    points = SensorPoints(geometry.half_width, 2, distance=geometry.scene_distance)
-    grid = aligned_grid(*bench.windows, 2 * N, 1, geometry.reach(geometry.scene_distance))
-    sides = (
-        (IndirectTracer(bench.setup, Paths(False, True), points=points), 1e6),
-        (FromCameraTracer(bench.setup, grid, Paths(interreflection=True), points=points), 1e-6),
-    )
-    found = np.zeros((2, SEEDS, 4, 4))
-    for side, (tracer_, sharp) in enumerate(sides):
-        monkeypatch.setattr(integrator, "_SHARP", sharp)
-        for seed in range(SEEDS):
-            light = tracer_.trace(seed, 0, 256)
-            anchor = 2 * light.anchor_row + light.anchor_column
-            for index, weight in enumerate((1.0, light.row, light.column, light.inverse_depth)):
-                found[side, seed, index] = np.bincount(anchor, light.value * weight / 256, 4)
-    found[:, :, 1:] /= found[:, :, :1]
-    means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
-    bound = SIGMAS * np.hypot(*errors)
-    assert (np.abs(means[0] - means[1]) < bound).all()
-    total, *places = bound
-    assert (total < 0.1 * means[0, 0]).all(), "of all light"
-    assert np.max(places[:2]) < 0.1 * np.ptp(means[0, 1:3]) and (places[2] < 0.05 * means[0, 3]).all()
-    assert np.ptp(means[0, 0]) > 0.05 * means[0, 0].mean(), "the anchors see different light"
 
 
 @pytest.mark.parametrize("anchors", [1, 3])

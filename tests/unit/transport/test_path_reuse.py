@@ -141,23 +141,6 @@ def test_light_that_shading_normals_make_heavy_is_divided(
     assert part > 0.2, "what is left to the camera's side"
 
 
-@pytest.mark.parametrize("name", [pytest.param("bent wall", marks=pytest.mark.slow), "fins"])
-def test_diffuse_surfaces_need_no_look_at_their_material(
-    shared_scene: Callable[..., Path], name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two cosines give what the BSDF does, pair by pair; a scene with gloss takes the longer way."""
-    bench = opened(shared_scene(f"diffuse {name}", extra=SCENES[name]))
-    tracer = tracers(bench, spread=True)[1]
-    assert tracer.all_diffuse and not tracers(opened(shared_scene("gloss", extra=SCENES["shiny wall"])))[1].all_diffuse
-    short = tracer.trace(3, 0, 64)
-    monkeypatch.setattr(PathReuseTracer, "all_diffuse", False)
-    long = tracer.trace(3, 0, 64)
-    whole = [np.bincount(light.pixel, light.value, N * N) for light in (short, long)]
-    np.testing.assert_allclose(*whole, rtol=2e-3)
-    assert short.value.sum() == pytest.approx(long.value.sum(), rel=1e-5)
-    assert abs(len(short.value) - len(long.value)) < 1e-3 * len(long.value)
-
-
 # ---- the accumulator
 
 

@@ -150,32 +150,6 @@ def test_each_material_sends_on_its_part(bsdf: dict, part: float) -> None:
     assert flux(scene_with(sheet=plane(0, 400, bsdf))) == pytest.approx(part * full, rel=1e-3)
 
 
-def test_light_through_a_pane_before_the_mirror(variant: str) -> None:
-    """A pane passes T on the way out and T on the way back; its own reflections land elsewhere or are faint."""
-    pane = {"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}
-    passed = 1 - 2 * GLASS / (1 + GLASS)
-    mirror = scene_with(sheet=plane(0, 400, CONDUCTOR))
-    scene = scene_with(sheet=plane(0, 400, CONDUCTOR), pane=plane(0, 300, {**pane}, 60))
-    tracer = SpecularRays(scene, scene.sensors()[0], projector(scene), 3)
-    found = tracer.follow(np.array([[4.5, 7.3]]))
-    expected = SpecularRays(mirror, mirror.sensors()[0], projector(mirror), 3).follow(np.array([[4.5, 7.3]]))
-    straight = np.argmin(np.abs(found.sensor - expected.sensor).sum(axis=1))
-    assert len(found.ray) == 2 and len(set(found.chain.tolist())) == 2
-    assert found.throughput[straight] == pytest.approx(passed**2, rel=1e-2)
-    assert found.sensor[straight] == pytest.approx(expected.sensor[0], abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("opacity", "paint"),
-    [(0.0, {"type": "diffuse"}), (0.0, CONDUCTOR), (0.25, {"type": "diffuse"}), (1.0, {"type": "diffuse"})],
-)
-def test_light_through_a_card_before_the_mirror(variant: str, opacity: float, paint: dict) -> None:
-    """It crosses the card twice."""
-    card = plane(0, 300, {"type": "mask", "opacity": opacity, "bsdf": paint}, 60)
-    alone = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
-    assert flux(scene_with(sheet=plane(0, 400, CONDUCTOR), card=card)) == pytest.approx((1 - opacity) ** 2 * alone)
-
-
 def hole(half: float) -> dict:
     """An opacity of 200 x 200 texels with a square hole in the middle, ``half`` its side in texels."""
     opaque = np.ones((200, 200, 1), np.float32)

@@ -158,34 +158,6 @@ WALL = """<shape type="rectangle"><transform name="to_world"><scale x="60" y="60
     <translate x="-30" z="360"/></transform>{}</shape>"""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "bsdf",
-    [NORMALS.format("normalmap", "normals", MATT), HAIR, THIN.replace('<float name="spec_trans" value="0.5"/>', "")],
-    ids=["bumps", "hair", "thin"],
-)
-def test_directed_materials_bring_the_same_light_from_either_side(
-    shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, bsdf: str
-) -> None:
-    """Followed from the projector, and from the camera alone, for which Mitsuba's values are defined."""
-    path = shared_scene("directed", extra=WALL.format(bsdf))
-    write_maps(path.parent)
-    bench = open_bench(path)
-    grid = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov)
-    points = SensorPoints(bench.geometry.half_width)
-    sides = (
-        (IndirectTracer(bench.setup, Paths(interreflection=True), points), 1e6),
-        (FromCameraTracer(bench.setup, grid, Paths(interreflection=True), points), 1e-6),
-    )
-    found = []
-    for tracer, sharp in sides:
-        monkeypatch.setattr(integrator, "_SHARP", sharp)
-        found.append([tracer.trace(seed, 0, 2048).value.sum() / 2048 for seed in range(8)])
-    (one, other), errors = np.mean(found, axis=1), np.std(found, axis=1, ddof=1) / np.sqrt(8)
-    assert np.hypot(*errors) < 1.5e-2 * other
-    assert abs(one - other) < 7 * np.hypot(*errors)
-
-
 STRANDS = "".join(
     f'<shape type="cylinder"><point name="p0" x="{x}" y="-60" z="370"/><point name="p1" x="{x + 3}" y="60" z="380"/>'
     f'<float name="radius" value="2"/>{HAIR}</shape>'
