@@ -53,7 +53,10 @@ def _projector_pixels(name: str) -> np.ndarray:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if name == "colour_chart/reflectance.png" else ())
+        pytest.param(
+            name,
+            marks=pytest.mark.slow if name in ("colour_chart/reflectance.png", "colour_checker/patches.xml") else (),
+        )
         for name in sorted({**generate.TEXTURES, **generate.MESHES, **generate.TEXTS})
     ],
 )

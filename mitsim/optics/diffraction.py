@@ -239,30 +239,24 @@ def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: 
 
     Behind a tilted mask they are interpolated between those of a few distances.
     """
-    growth, beyond = shadow.tilt[0]
-    if not growth:
-        return _thin_means_at(beyond, shadow, profiles, directions, nm)
-    even = shadow.crossings(directions)
-    nodes, total = nodes_between(even, _DISTANCES), np.zeros(())
-    for weight, node in zip(lagrange_weights(even, nodes), nodes, strict=True):
-        at_node = beyond + growth * float(node)
-        total = total + weight * _thin_means_at(at_node, shadow, profiles, directions, nm)
-    return total
-
-
-def _thin_means_at(
-    beyond: float, shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
-) -> FloatArray:
+    (growth, beyond), even = shadow.tilt[0], shadow.crossings(directions)
+    nodes, total = nodes_between(even, _DISTANCES) if growth else np.zeros(1), np.zeros(())
     met, half_cell = shadow.on_tilted_mask(directions), shadow.half_cell(directions)
     reach = shadow.half_pixel + half_cell
-    low, high = float(met.min() - reach), float(met.max() + reach)
-    light = _Propagation.of(replace(shadow, distance_mm=shadow.distance_mm + beyond), wavelength_nm)
-    kept = len(profiles) ** 2 * (high - low) <= _LARGEST_KEPT * light.step_mm
-    if kept:
-        part = 2.0 ** math.floor(math.log2(_PART_OF_RANGE * (high - low)))
-        low, high = part * math.floor(low / part), part * math.ceil(high / part)
-    integrated = (_keep_integrated if kept else _integrate)(tuple(shadow.clear(profiles, 0.0)), light, low, high)
-    return integrated.smooth_means(met, shadow.half_pixel, half_cell)
+    for weight, node in zip(lagrange_weights(even, nodes), nodes, strict=True):
+        low, high = float(met.min() - reach), float(met.max() + reach)
+        at_node = replace(shadow, distance_mm=shadow.distance_mm + beyond + growth * float(node))
+        light = _Propagation.of(at_node, nm)
+        kept = len(profiles) ** 2 * (high - low) <= _LARGEST_KEPT * light.step_mm
+        if kept:
+            part = 2.0 ** math.floor(math.log2(_PART_OF_RANGE * (high - low)))
+            low, high = part * math.floor(low / part), part * math.ceil(high / part)
+        integrated = (_keep_integrated if kept else _integrate)(tuple(shadow.clear(profiles, 0.0)), light, low, high)
+        means = integrated.smooth_means(met, shadow.half_pixel, half_cell)
+        if not growth:
+            return means
+        total = total + weight * means
+    return total
 
 
 def _thick_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, nm: float) -> FloatArray:

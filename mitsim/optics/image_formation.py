@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise, product, starmap
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -179,7 +178,9 @@ class FrameOptics:
                 shadow = geometry, rows, columns, depth, spectrum
                 summed = largest_terms(*shadow, places) if geometry.is_drawn(spectrum is not None) else None
                 return _Raster(shadow, weights, places, None if summed is None else _Terms(summed, weights))
-            return _Terms(_shadow(geometry, rows, columns, depth, spectrum, places), weights)
+            many = geometry.mask_terms > FEW or geometry.mask_motion is not None
+            form = shadow_terms if many else _keep_shadow
+            return _Terms(form(geometry, rows, columns, depth, spectrum, places), weights)
 
         self._prepare([layer(depth) for depth in depths], (len(rows.centres), len(columns.centres)))
 
@@ -260,11 +261,6 @@ class FrameOptics:
         starts = np.arange(len(self._layers) + 1, dtype=flat.dtype) * flat.dtype.type(self.shape[0] * self.shape[1])
         parts = starmap(slice, pairwise(np.searchsorted(flat, starts)))
         return [(flat[part] - start, light[part]) for start, part in zip(starts, parts, strict=False)]
-
-
-def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
-    many = geometry.mask_terms > FEW or geometry.mask_motion is not None
-    return (shadow_terms if many else _keep_shadow)(geometry, *directions)
 
 
 def raster_error(

@@ -119,18 +119,6 @@ class ProjectorOptics:
         )
         return mi.UInt32(row * n + column)
 
-    def pixel_size(self) -> tuple[float, float]:
-        """Return the size (x, y) of a pixel on the plane at unit distance [mm], by the emitter's own float32.
-
-        :class:`CanvasMap` is 1e-4 more exact, but frames of a blurred spot would not stay bit-equal.
-        """
-        probe = dr.zeros(mi.SurfaceInteraction3f, 2)
-        probe.p = self.emitter.world_transform() @ mi.Point3f([0.0, _PROBE_STEP], [0.0, _PROBE_STEP], [1.0, 1.0])
-        sample, _ = self.emitter.sample_direction(probe, mi.Point2f(0.5))
-        u, v = host_values(sample.uv.x, 2), host_values(sample.uv.y, 2)
-        rows, columns = self.canvas
-        return _PROBE_STEP / (abs(u[1] - u[0]) * columns), _PROBE_STEP / (abs(v[1] - v[0]) * rows)
-
 
 @dataclass(frozen=True, eq=False)
 class CanvasMap:
@@ -250,7 +238,12 @@ class PinholeRays:
         self.origin = self._map.origin
         self.area = self._map.pixel_area(projector.canvas)
         centre = np.stack(np.divmod(np.arange(n * n), n), axis=1) + 0.5
-        self.power = np.concatenate([self._irradiance(centre, chosen) for chosen in wavelengths], axis=1)
+        parts, local = [], self._local(centre)
+        for chosen in wavelengths:
+            place = self._map.turn, self.origin, local, chosen
+            _, emitted, depth, cosine = _direction_samples(projector.emitter, *place)
+            parts.append(channels(mi.unpolarized_spectrum(emitted), len(centre)) * (cosine * depth**2)[:, None])
+        self.power = np.concatenate(parts, axis=1)
         if mi.is_spectral and projector.lines is not None:
             self.power *= line_wavelengths(projector.lines)[1]
 
@@ -269,12 +262,6 @@ class PinholeRays:
     def _local(self, points: FloatArray) -> FloatArray:
         tangents = self._map.tangents(*self._projector.canvas_point(points[:, 0], points[:, 1]))
         return np.stack([*tangents, np.ones(len(points))], axis=1)
-
-    def _irradiance(self, points: FloatArray, wavelengths: mi.Color0f | None) -> FloatArray:
-        _, emitted, depth, cosine = _direction_samples(
-            self._projector.emitter, self._map.turn, self.origin, self._local(points), wavelengths
-        )
-        return channels(mi.unpolarized_spectrum(emitted), len(points)) * (cosine * depth**2)[:, None]
 
 
 def _direction_samples(
@@ -519,7 +506,17 @@ class ProjectorConnector:
         self.projector, self.emitter = projector, projector.emitter
         if not projector.ideal:
             self._to_world = self.emitter.world_transform()
-            self._pixel_at_unit = projector.pixel_size()
+            # Size of a pixel on the plane at unit distance [mm], by the emitter's own float32: the canvas's map is 1e-4
+            # more exact, but frames of a blurred spot would not stay bit-equal.
+            probe = dr.zeros(mi.SurfaceInteraction3f, 2)
+            probe.p = self._to_world @ mi.Point3f([0.0, _PROBE_STEP], [0.0, _PROBE_STEP], [1.0, 1.0])
+            sample, _ = self.emitter.sample_direction(probe, mi.Point2f(0.5))
+            u, v = host_values(sample.uv.x, 2), host_values(sample.uv.y, 2)
+            rows, columns = projector.canvas
+            self._pixel_at_unit = (
+                _PROBE_STEP / (abs(u[1] - u[0]) * columns),
+                _PROBE_STEP / (abs(v[1] - v[0]) * rows),
+            )
 
     def lens_point(self, rng: mi.PCG32) -> mi.Point3f:
         if self.projector.aperture == 0:

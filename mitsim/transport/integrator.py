@@ -111,8 +111,9 @@ class Tracer(ABC):
             before = 0
             for flight in tracer._flights(seeds, first, most):
                 for launched in tracer._launch(flight):
-                    for own, part in zip(found, launched.by_lane(ranges - before), strict=True):
-                        own.append(part)
+                    assert launched.lane is not None, "as it was fetched"
+                    for own, part in zip(found, np.searchsorted(launched.lane, ranges - before).tolist(), strict=True):
+                        own.append(launched.where(slice(*part)))
                 before += dr.width(flight.index) * self.connections_per_path
         compiled_kernels()
         joined = list(map(PathSamples.join, found))

@@ -184,7 +184,12 @@ class ReusedPaths(ProjectorPaths):
         self.to_sensor_way = self._way(paths, si, self.connections.sensor(number))
         own = replace(self.to_sensor_way, open=self.to_sensor_way.open & ~self.shared)
         self._keep_light(paths, si, own, self._draw_numbers(paths), (paths.sightings, number))
-        self.follows = self.shared & self._diffuse(si)
+        # Shapes that are diffuse, or all but those that are not; no comparison where both are many.
+        shapes, diffuse, found = self.scene.shapes(), self.tracer.diffuse, mi.Bool(False)
+        few = min(diffuse, frozenset(range(len(shapes))) - diffuse, key=len)
+        for place in few if len(few) <= _MOST_COMPARED else ():
+            found |= si.shape == mi.ShapePtr(shapes[place])
+        self.follows = self.shared & (found if few is diffuse or len(few) > _MOST_COMPARED else ~found)
         self.shading = mi.Normal3f(si.sh_frame.n)
         self.side = dr.sign(dr.dot(self.shading, -self.second_ray.d))
         paths.throughput = dr.select(self.follows, 1, paths.throughput)
@@ -192,17 +197,6 @@ class ReusedPaths(ProjectorPaths):
         self.scatter(paths, si, False)
         self.own_turn = self._turn_on(si, -self.second_ray.d, paths.ray.d, paths.active & self.follows)
         self.onward = mi.Vector3f(paths.ray.d)
-
-    def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
-        shapes, diffuse = self.scene.shapes(), self.tracer.diffuse
-        others = frozenset(range(len(shapes))) - diffuse
-        few = min(diffuse, others, key=len)
-        if len(few) > _MOST_COMPARED:
-            return mi.Bool(False)
-        found = mi.Bool(False)
-        for place in few:
-            found |= si.shape == mi.ShapePtr(shapes[place])
-        return found if few is diffuse else ~found
 
     def _factors(self, spectrum: mi.UnpolarizedSpectrum) -> ByLine:
         return [spectrum[line] for line in range(self.tracer.lines)]

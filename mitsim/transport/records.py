@@ -152,10 +152,6 @@ class PathSamples:
         value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
         return replace(self, anchor_row=first, anchor_column=first, value=value)
 
-    def by_lane(self, ranges: IntArray) -> list[PathSamples]:
-        assert self.lane is not None, "as it was fetched"
-        return [self.where(slice(*part)) for part in np.searchsorted(self.lane, ranges).tolist()]
-
     def where(self, chosen: npt.NDArray[np.bool_] | slice) -> PathSamples:
         lines = None if self.lines is None else self.lines[:, chosen]
         return PathSamples(**{name: getattr(self, name)[chosen] for name in _ARRAYS}, lines=lines)

@@ -159,9 +159,9 @@ def test_an_even_drawings_waves_are_those_of_its_part(monkeypatch: pytest.Monkey
 
 
 def test_waves_of_large_drawings_are_refused_before_they_are_drawn() -> None:
-    """2048 features a side would take minutes for each line; their geometric shadow is drawn. (Planted: no check.)"""
-    values = np.random.default_rng(0).integers(0, 2, (2048, 2048)).astype(np.float64)
-    camera = CameraGeometry(mask="plate", mask_plate=Plate(0.006, values, "drawing noise.png"))
+    """4096 features a side would take minutes for each line; their geometric shadow is drawn. (Planted: no check.)"""
+    values = np.random.default_rng(0).integers(0, 2, (4096, 4096)).astype(np.float64)
+    camera = CameraGeometry(mask="plate", mask_plate=Plate(0.003, values, "drawing noise.png"))
     with pytest.raises(MitsimError, match=r"drawing noise\.png: .* use --effects=-diffraction"):
         rasters.check_waves(camera, Spectrum(np.array([500.0]), np.ones(1)))
     assert camera.is_drawn(waves=False) and camera.mask_terms == 1

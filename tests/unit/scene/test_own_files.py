@@ -52,7 +52,7 @@ def test_a_picture_on_the_sheet_is_the_truth(variant: str, tmp_path: Path, monke
     Image.fromarray(np.stack([values, values // 2, values], axis=2)).save(tmp_path / "mine.png")
     monkeypatch.chdir(tmp_path)
     Path("small.toml").write_text('base = "imx249"\nrows = 64\ncolumns = 64\n')
-    with pytest.warns(UserWarning, match="32 x 32 pixels of 11.72 um"):
+    with pytest.warns(UserWarning, match="32 x 32 pixels of 11.72 x 11.72 um"):
         bench = ms.open_bench("photograph", variant, "small.toml", picture="mine.png", sheet_mm=120)
     expected = (2 * values.astype(float) + values // 2) / 3 / 255
     assert_allclose(print_of(bench), expected, atol=1e-6)
