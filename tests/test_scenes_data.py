@@ -91,27 +91,6 @@ def test_reflectances_are_physical_and_no_symmetry_hides_a_flip(name: str) -> No
     assert min(float(np.sqrt(np.mean((view - pixels) ** 2))) for view in views) > 0.05
 
 
-def test_the_coloured_chart_lies_where_the_grey_one_does() -> None:
-    """A ray to each texel of colour_chart meets the patch, frame or paper of colour_checker that this texel shows."""
-    import drjit as dr
-
-    mi, loaded = opened("colour_checker")
-    sheet = np.full((512, 512), "paper", dtype=object)
-    sheet[103:409, 29:483] = "frame"
-    names = [shape.id() for shape in loaded.shapes() if shape.id() not in ("paper", "frame")]
-    assert names[0] == "dark_skin" and names[18:] == ["white_9_5", "neutral_8", *names[20:23], "black_2"]
-    for index, name in enumerate(names):
-        row, column = 113 + 74 * (index // 6), 39 + 74 * (index % 6)
-        sheet[row : row + 64, column : column + 64] = name
-    rows, columns = (axis.ravel() for axis in np.indices(sheet.shape))
-    x, y = 64 - (columns + 0.5) / 4, 64 - (rows + 0.5) / 4
-    hit = loaded.ray_intersect(mi.Ray3f(mi.Point3f(0.0), dr.normalize(mi.Vector3f(mi.Float(x), mi.Float(y), 400.0))))
-    of = dr.reinterpret_array(mi.UInt32, hit.shape)
-    order = {int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]): shape.id() for shape in loaded.shapes()}
-    assert np.array_equal([order.get(int(index)) for index in np.array(of)], sheet.ravel())
-    assert np.all(np.array(hit.wi)[2] > 0), "every face faces the camera"
-
-
 @pytest.fixture(params=NAMES)
 def scene(request: pytest.FixtureRequest) -> tuple[str, Any, Any]:
     return request.param, *opened(request.param)
@@ -169,13 +148,3 @@ def test_print_is_upright_and_not_mirrored(scene: tuple[str, Any, Any]) -> None:
     assert np.all(np.array(hit.wi)[2] > 0), "the sheet's front faces the camera"
     seen = np.array(hit.bsdf().eval_diffuse_reflectance(hit)[0])
     assert np.allclose(seen, sheet[row, column], atol=1e-6)
-
-
-def test_the_charts_place_is_inside_its_patches() -> None:
-    """Two projector pixels from their edges, which print and camera blur; a pixel is 3.75 texels from texel 16 on."""
-    from mitsim.devices.framelist import load_chart
-
-    for box, (row, column) in zip(load_chart("colour_checker").patches, generate.chart_patches(), strict=True):
-        for first, end, start in ((*box[:2], row), (*box[2:], column)):
-            inside = (start - 16) / 3.75, (start + generate.CHART_PATCH - 16) / 3.75
-            assert 2 <= first - inside[0] < 3 and 2 <= inside[1] - end < 3

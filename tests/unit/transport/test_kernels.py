@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.job import Clock, compiled_kernels
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.transport import integrator
@@ -78,17 +77,6 @@ def test_light_over_several_surfaces_is_one_kernel_to_a_point_and_one_to_anchors
     assert len(set().union(*to_anchors)) == 2
 
 
-def test_light_from_the_camera_is_one_kernel(
-    small_scene: Callable[..., Path], kernels: Callable[[Tracer, int], set[str]]
-) -> None:
-    bench, found = open_scene(small_scene, "one", n=6), set()
-    grid = Simulation(bench, Settings(bench.geometry.scene_distance)).aim
-    paths = Paths(interreflection=True, emitters=tuple(bench.loaded.scene.emitters())[1:])
-    for points, samples in zip(points_of(bench, (1, False), (1, True), (2, False)), (1, 2, 3), strict=True):
-        found |= kernels(FromCameraTracer(bench.setup, grid, paths, points), samples)
-    assert len(found) == 1
-
-
 def test_another_projector_is_no_other_kernel(
     small_scene: Callable[..., Path], kernels: Callable[[Tracer, int], set[str]]
 ) -> None:
@@ -101,14 +89,3 @@ def test_another_projector_is_no_other_kernel(
         direct |= kernels(DirectTracer(setup, 1), 1)
         camera |= kernels(FromCameraTracer(setup, grid, PATHS), 1)
     assert len(direct) == len(camera) == 1
-
-
-def test_a_clock_counts_the_kernels_that_no_cache_held(variant: str) -> None:
-    from mitsuba import Float
-
-    clock, earlier = Clock(), compiled_kernels()
-    dr.eval(dr.arange(Float, 9) * float(np.random.default_rng().uniform()))
-    found = clock.kernels()
-    assert found["number"] == 1 and found["seconds"] > 0
-    assert compiled_kernels() == {name: value + found[name] for name, value in earlier.items()}
-    assert Clock().kernels() == {"number": 0, "seconds": 0.0}
