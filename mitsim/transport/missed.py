@@ -402,9 +402,9 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     hits = total**2 / moment if moment else 0.0
     rest = 0.0
     if total:
-        others = _Connections(setup, 1, spread=True).over(least, sharp=False)
+        apart = _Connections(setup, 1, spread=True).over(least, sharp=False)
         count = max(1, _CONNECTIONS // paths_per_sample)
-        rest = float(others.trace(seed, 0, count).value.sum()) / count
+        rest = float(apart.trace(seed, 0, count).value.sum()) / count
     width = math.inf
     if found.widths.size:
         order = np.argsort(found.widths)

@@ -180,7 +180,8 @@ def plugin_class() -> type:
             return dr.select(length > 0, flat / length, mi.Vector2f(1, 0))
 
         def _lobes(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.Float, mi.UnpolarizedSpectrum]]:
-            lines = zip(self._shares, map(mi.UnpolarizedSpectrum, self.model.wavelengths), strict=True)
+            each = map(mi.UnpolarizedSpectrum, self.model.wavelengths)
+            lines = list(zip(self._shares, each, strict=True))
             if mi.is_spectral:
                 lines = [(1.0, mi.UnpolarizedSpectrum(si.wavelengths))]
             elif mi.is_rgb:

@@ -304,9 +304,9 @@ class Openings:
         for index, ((rows, columns), area) in enumerate(zip(grids, areas, strict=True)):
             if index:
                 further, left = left >= areas[index - 1], left - areas[index - 1]
-            place = rows.draw(number.x), columns.draw(dr.select(area > 0, left / area, 0))
+            place = [rows.draw(number.x), columns.draw(dr.select(area > 0, left / area, 0))]
             if index:
                 place = [dr.select(further, new, old) for new, old in zip(place, chosen, strict=True)]
-            chosen = list(place)
+            chosen = place
         row, column = (dr.clip(place, 0, width) for place in chosen)
         return row, column, total / width**2
