@@ -565,7 +565,7 @@ SIZES = {
     "sensor": (5, 1193),
     "sessions": (4, 816),
     "studies": (22, 5574),
-    "transport": (20, 4212),
+    "transport": (20, 4213),
     "verbs": (1, 303),
     "version": (1, 1),
 }
