@@ -564,7 +564,7 @@ SIZES = {
     "scene": (6, 1407),
     "sensor": (5, 1193),
     "sessions": (4, 816),
-    "studies": (22, 5574),
+    "studies": (22, 5366),
     "transport": (20, 4213),
     "verbs": (1, 303),
     "version": (1, 1),
