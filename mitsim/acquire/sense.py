@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.bench.request import Exposure, Irradiance, check_ending, check_image
-from mitsim.core.arrays import FloatArray, Npy
+from mitsim.core.arrays import FloatArray, npy_header
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
@@ -176,13 +176,13 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
             raise MitsimError(f"image {path}: an array has no channel {channel!r}; name none")
         try:
             with open(path, "rb") as file:
-                array = Npy.of(file, path.stat().st_size)
-                if array.dtype.kind not in "buif":
-                    raise ValueError(f"{array.dtype} are no real numbers")
-                if not fits_a_frame(array.shape):
-                    raise ValueError(f"its shape is {array.shape}; {FRAME_LIMITS} are allowed")
-                Cost(memory_bytes=_PIXEL_BYTES * math.prod(array.shape)).check(f"image {path}", Limits())
-                return np.asarray(array.part(file), dtype=np.float64), ()
+                shape, dtype = npy_header(file, path.stat().st_size)
+                if dtype.kind not in "buif":
+                    raise ValueError(f"{dtype} are no real numbers")
+                if not fits_a_frame(shape):
+                    raise ValueError(f"its shape is {shape}; {FRAME_LIMITS} are allowed")
+                Cost(memory_bytes=_PIXEL_BYTES * math.prod(shape)).check(f"image {path}", Limits())
+                return np.asarray(np.load(file, allow_pickle=False), dtype=np.float64), ()
         except (OSError, ValueError) as error:
             raise MitsimError(f"image {path}: not an array of numbers ({error}); save one by numpy.save") from error
     channels = {name: values for name, values in read_frame(path)[0].items() if not name.startswith("error.")}

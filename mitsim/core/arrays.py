@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import io
 import math
-import os
-import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -78,45 +76,25 @@ _AGAIN = 2
 """Bytes of memory for each byte of an NPZ: the unpacked data and the array."""
 
 
-@dataclass(frozen=True)
-class Npy:
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    fortran: bool
-    start: int
+def npy_header(file: BinaryIO, size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type of an NPY file of ``size`` bytes, and go back to its beginning, for :func:`numpy.load`.
 
-    @classmethod
-    def of(cls, file: BinaryIO, size: int) -> Npy:
-        """Read a header; ValueError if it is invalid, or claims Python objects or more than ``size`` bytes."""
-        read = _HEADERS.get(np.lib.format.read_magic(file))
-        if read is None:
-            raise ValueError("it is no array of numbers")
-        try:
-            shape, fortran, dtype = read(file)
-        except Exception as error:  # of a damaged header NumPy raises whatever Python does on reading it as a literal
-            raise error if isinstance(error, ValueError) else ValueError("its header is damaged") from None
-        found = cls(shape, dtype, fortran, file.tell())
-        if dtype.hasobject:
-            raise ValueError("it holds objects of Python, which are code")
-        if found.bytes != size - found.start:
-            raise ValueError(f"its header claims {found.bytes} bytes of numbers, and {size - found.start} follow it")
-        return found
-
-    @property
-    def bytes(self) -> int:
-        return math.prod(self.shape) * self.dtype.itemsize
-
-    def part(self, file: BinaryIO, index: int | None = None) -> npt.NDArray[Any]:
-        """Return all numbers, or those at ``index`` of the first axis; ValueError if the file ends before."""
-        several = index is not None and not self.fortran
-        shape = self.shape[1:] if several else self.shape
-        count = math.prod(shape)
-        file.seek(self.start + (count * self.dtype.itemsize * index if several and index else 0))
-        data = bytearray(count * self.dtype.itemsize)
-        if file.readinto(data) != len(data):  # type: ignore[attr-defined]
-            raise ValueError("it ended while it was read")
-        values = np.frombuffer(data, self.dtype).reshape(shape, order="F" if self.fortran else "C")
-        return np.array(values[index]) if index is not None and self.fortran else values
+    ValueError if the header is invalid, or claims Python objects or another number of bytes than follow.
+    """
+    read = _HEADERS.get(np.lib.format.read_magic(file))
+    if read is None:
+        raise ValueError("it is no array of numbers")
+    try:
+        shape, _, dtype = read(file)
+    except Exception as error:  # of a damaged header NumPy raises whatever Python does on reading it as a literal
+        raise error if isinstance(error, ValueError) else ValueError("its header is damaged") from None
+    claimed, there = math.prod(shape) * dtype.itemsize, size - file.tell()
+    if dtype.hasobject:
+        raise ValueError("it holds objects of Python, which are code")
+    if claimed != there:
+        raise ValueError(f"its header claims {claimed} bytes of numbers, and {there} follow it")
+    file.seek(0)
+    return shape, dtype
 
 
 def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
@@ -133,7 +111,8 @@ def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
             arrays = {}
             for part in parts:
                 data = io.BytesIO(packed.read(part))
-                arrays[part.filename.removesuffix(".npy")] = Npy.of(data, part.file_size).part(data)
+                npy_header(data, part.file_size)
+                arrays[part.filename.removesuffix(".npy")] = np.load(data, allow_pickle=False)
             return arrays
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OverflowError) as error:
         raise ValueError(reason_of(error)) from error
@@ -271,15 +250,20 @@ class _FirstErrorFile:
 
 LARGEST_VARIABLE = (1 << 31) - 1
 """Largest array in a MATLAB file of version 5 [bytes]."""
-_HEAD = 128
-_HDF5, _HDF5_MARK = 2, b"\x89HDF\r\n\x1a\n"
-_MATRIX, _COMPRESSED = 14, 15
-_COMPLEX = 0x08
-_BYTES_OF = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
-_BEGINNING = 4096
-"""Bytes of a variable in which its flags, shape and name lie; names have at most 63 letters."""
-_PADDING = 16
-"""Bytes for a tag and for padding to multiples of 8."""
+_NUMBERS = [
+    "double",
+    "single",
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+    "logical",
+    "char",
+]
 _MOST_VARIABLES = 10_000
 _COPIES = 3
 """Arrays of a variable's size held at once: as stored, in its class, and as used here."""
@@ -303,85 +287,26 @@ def write_variables(path: Path, variables: Mapping[str, Any]) -> None:
 def read_variables(path: Path) -> dict[str, Any]:
     """Return the real arrays and texts of a MATLAB file of version 5; other classes are skipped.
 
-    MitsimError for a file that is missing, damaged, of version 7.3 or 4, or does not fit into memory.
+    MitsimError for a file that is missing, damaged, of version 7.3, or does not fit into memory.
     """
-    from scipy.io import loadmat
+    from scipy.io import loadmat, whosmat
 
     check_plain(path)
     try:
         with open(path, "rb") as file:
-            arrays = _arrays_in(file)
-            Cost(memory_bytes=_COPIES * sum(arrays.values())).check(f"{path}", Limits())
+            listed = whosmat(file)  # by headers alone, because SciPy allocates whatever a file claims
+            known = {name: math.prod(shape or ()) for name, shape, kind in listed if kind in _NUMBERS}
+            if len(listed) > _MOST_VARIABLES or len({name for name, *_ in listed}) < len(listed):
+                raise ValueError(f"it holds a variable twice, or over {_MOST_VARIABLES}")
+            if max(known.values(), default=0) > LARGEST_VARIABLE:
+                raise ValueError("a variable claims more than 2 GiB")
+            Cost(memory_bytes=_COPIES * 8 * sum(known.values())).check(f"{path}", Limits())
             file.seek(0)
-            return dict(loadmat(file, variable_names=[*arrays]))
+            found = loadmat(file, variable_names=[*known])
+        return {name: values for name, values in found.items() if getattr(values, "dtype", np.dtype("U")).kind != "c"}
     except MitsimError:
         raise
     except NotImplementedError:
         raise MitsimError(f"{path}: is HDF5, or of version 7.3; save it in MATLAB with -v7") from None
     except Exception as error:  # SciPy's reader raises of all kinds
         raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason_of(error)}); write or copy it again") from error
-
-
-def _arrays_in(file: BinaryIO) -> dict[str, int]:
-    """Return the bytes that each real array and text of a MATLAB ``file`` needs.
-
-    SciPy allocates whatever a file claims and recurses into nested cells until the process ends. Therefore only the
-    beginning of each variable is unpacked here, after "MAT-File Format" (MathWorks).
-    """
-    head = file.read(_HEAD)
-    mark = head[_HEAD - 2 :]
-    if head.startswith(_HDF5_MARK):
-        raise NotImplementedError
-    if len(head) < _HEAD or mark not in (b"IM", b"MI"):
-        raise ValueError("it does not begin as one of version 5")
-    order = "<" if mark == b"IM" else ">"
-    if struct.unpack(f"{order}H", head[_HEAD - 4 : _HEAD - 2])[0] >> 8 == _HDF5:
-        raise NotImplementedError
-    two, found = f"{order}2I", dict[str, int]()
-    end = file.seek(0, os.SEEK_END)
-    place = _HEAD
-    while place + 8 <= end:
-        file.seek(place)
-        kind, length = struct.unpack(two, file.read(8))
-        place += 8 + length
-        if place > end:
-            raise ValueError("it ends within a variable")
-        beginning = file.read(min(length, _BEGINNING))
-        if kind == _COMPRESSED:
-            beginning = zlib.decompressobj().decompress(beginning, _BEGINNING)
-            kind, length = struct.unpack_from(two, beginning)
-            beginning = beginning[8:]
-        if kind != _MATRIX:
-            raise ValueError(f"it holds an element of the kind {kind}")
-        flags, at = _element(beginning, 0, order)
-        (flag,) = struct.unpack_from(f"{order}I", flags)
-        size = _BYTES_OF.get(flag & 0xFF)
-        if size is None or flag >> 8 & _COMPLEX:
-            continue  # no array of real numbers, and no text
-        dimensions, at = _element(beginning, at, order)
-        name, at = _element(beginning, at, order)
-        sides = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
-        count = math.prod(sides)
-        if len(sides) < 2 or min(sides) < 0 or count * size > LARGEST_VARIABLE:
-            raise ValueError(f"its variable {name[:80]!r} claims a shape of {sides[:8]}")
-        # Numbers are stored as the smallest type that holds them, and never as a larger one than they are of.
-        stored, _ = _tag(beginning, at, order)
-        if stored > count * size or length > at + count * size + _PADDING:
-            raise ValueError(f"its variable {name[:80]!r} claims more bytes than its shape has")
-        if (text := name.decode("ascii")) in found or len(found) == _MOST_VARIABLES:
-            raise ValueError(f"it holds {text!r} twice, or over {_MOST_VARIABLES} variables")
-        found[text] = count * size
-    return found
-
-
-def _tag(data: bytes, place: int, order: str) -> tuple[int, int]:
-    kind, length = struct.unpack_from(f"{order}2I", data, place)
-    return (kind >> 16, place + 4) if kind >> 16 else (length, place + 8)
-
-
-def _element(data: bytes, place: int, order: str) -> tuple[bytes, int]:
-    """Return the content of an element, and the offset of the next one."""
-    length, start = _tag(data, place, order)
-    if start + length > len(data):
-        raise ValueError(f"a name or shape in it takes {length} bytes")
-    return data[start : start + length], place + 8 if start == place + 4 else start + -(-length // 8) * 8

@@ -170,7 +170,7 @@ class Wanted:
 
     what: str = "frame"
     most: int = MOST_SIDE
-    bits: Sequence[int] = (8, 12, 16, 32)
+    bits: Sequence[int] = (8, 16, 32)
     colour: bool = False
     raw: Raw | None = None
     orientation: Literal["file", 1, 2, 3, 4, 5, 6, 7, 8] | None = None

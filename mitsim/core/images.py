@@ -1,7 +1,7 @@
 """Numbers of pictures (PNG, TIFF, NPY, OpenEXR, DNG and bare numbers), and PNG and HTML for people.
 
 Nothing is scaled, inverted or converted to grey, and a picture is turned only on request; a file whose numbers the
-library would change is refused. Files are copied, not mapped, because a mapped file that is cut short ends the process.
+library would change is refused. Files are never mapped, because a mapped file that is cut short ends the process.
 """
 
 from __future__ import annotations
@@ -16,19 +16,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, BinaryIO, Literal, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import Npy
+from mitsim.core.arrays import npy_header
 from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.files import FRAME_LIMITS, check_plain, fits_a_frame, stderr_silenced
 from mitsim.core.imagelist import BARE, FORMATS, FRAME, TO_FILE, Wanted
 from mitsim.core.job import Cost, Limits
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 # -------- Pictures of other programs
 
@@ -38,21 +35,10 @@ _PNG_BITS = {"1": 1, "L;2": 2, "L;4": 4, "L": 8, "I;16B": 16}
 """Bits of a grey PNG by Pillow's mode."""
 _COLOURS_A_PIXEL = 3, 4
 _COLOURS = "RGB", "RGBA"
-_BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLES = 258, 259, 262, 339
-"""TIFF 6.0: BitsPerSample, Compression, PhotometricInterpretation, SampleFormat."""
-_BIG = 43
-"""Version number of BigTIFF."""
-_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
-"""Magic numbers of TIFF and BigTIFF."""
-_DNG_VERSION = 50706
-"""Tag in the first page of every DNG (Digital Negative Specification 1.4)."""
-_PLAIN = 1
-_LOSSY = (6, 7)
-"""JPEG compressions of TIFF (TIFF 6.0, technical note 2)."""
-_PAGE_KIND, _ORIENTATION, _TILES, _PARTS = 254, 274, (322, 323), 330
-"""NewSubfileType, Orientation, TileWidth and TileLength, and SubIFDs of TIFF/EP, where raw files keep the picture."""
+_ORIENTATION = 274
+"""Tag of TIFF and Exif."""
 _NO_PAGE = 0b101
-"""Bits of NewSubfileType: reduced picture, transparency mask."""
+"""Bits of TIFF's NewSubfileType: reduced picture, transparency mask."""
 _TILE_MARGIN = 1024
 """Readers allocate whole tiles, so a tile may not exceed its picture by more pixels; usual tiles have 64 to 512."""
 _UPRIGHT = 1
@@ -60,16 +46,12 @@ _TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (-1, True
 _TURNS[8] = (1, False)
 """Counter-clockwise quarter turns, and whether left and right are swapped afterwards (TIFF 6.0, tag 274)."""
 _MOST_PAGES = 1 << 16
-_MOST_ENTRIES = 512
-_WIDTHS = {1: 1, 3: 2, 4: 4}
 _PIXEL_BYTES = 24
 """Memory of a pixel while a page is read and checked; measured: at most 21, for a PNG of 16 bits."""
 _BLACK_IS_ZERO, _RGB = 1, 2
-"""PhotometricInterpretation; 0 (refused) stores black as the largest number."""
+"""PhotometricInterpretation of TIFF; 0 (refused) stores black as the largest number."""
 _FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}
 """TIFF orientations by LibRaw's flip."""
-_UNSIGNED = 1
-"""Also the default without the tag."""
 _CHANNEL = "DN"
 
 
@@ -139,24 +121,22 @@ def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
 
 
 def _png(path: Path, wanted: Wanted) -> _Reader:
-    from PIL.PngImagePlugin import PngImageFile
+    from PIL.PngImagePlugin import PngImageFile  # not Image.open, for which the size that it states may be too large
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with open(path, "rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on metadata that is damaged; where pixels are, reading them raises
         try:
-            with PngImageFile(path) as picture:  # not by Image.open, for which the size that it states may be too large
-                stored, (columns, rows) = str(picture.tile[0][3]) if picture.tile else "", picture.size
-                animated = picture.custom_mimetype is not None
+            picture = PngImageFile(file)
         except SyntaxError:
             raise ValueError("it does not begin as a PNG") from None
-    if animated:
-        raise wanted.refusal(path, f"is an animated PNG of several; give each {wanted.what} a file of its own")
-    bits = _PNG_BITS.get(stored, 0)
-    if bits not in wanted.bits and not (wanted.colour and stored in _COLOURS):
-        known = (count for count in wanted.bits if count in _PNG_BITS.values())
-        raise wanted.refusal(path, f"is no {_allowed_kinds('PNG', known, wanted)}")
-    yield 1, (rows, columns), _PIXEL_BYTES
-    with _open_picture(path, "PNG") as picture:
+        if picture.custom_mimetype is not None:
+            raise wanted.refusal(path, f"is an animated PNG of several; give each {wanted.what} a file of its own")
+        stored = str(picture.tile[0][3]) if picture.tile else ""
+        bits = _PNG_BITS.get(stored, 0)
+        if bits not in wanted.bits and not (wanted.colour and stored in _COLOURS):
+            known = (count for count in wanted.bits if count in _PNG_BITS.values())
+            raise wanted.refusal(path, f"is no {_allowed_kinds('PNG', known, wanted)}")
+        yield 1, picture.size[::-1], _PIXEL_BYTES
         if "transparency" in picture.info:
             raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
         # Some versions of Pillow give 16 bits of a PNG as 32.
@@ -188,98 +168,52 @@ def orient(values: Numbers, orientation: int) -> Numbers:
 
 
 def _tiff(path: Path, wanted: Wanted) -> _Reader:
-    pages, places = _pages_of(path)
-    if not pages:
-        raise wanted.refusal(path, "is no TIFF, or has no page; write it again")
-    if pages > _MOST_PAGES:
-        raise wanted.refusal(path, f"has over {_MOST_PAGES} pages; give fewer")
-    with _open_picture(path, "TIFF", places=places) as picture:
-        _check_tags(path, picture, wanted)
-        size = picture.height, picture.width
-        packed = picture.tag_v2.get(_COMPRESSION, _PLAIN) != _PLAIN  # type: ignore[attr-defined]
-    first = places[0][0] if places.get(0) else _UPRIGHT
-    if wanted.orientation is None:
-        _upright(path, np.empty((0, 0)), first, wanted)
-    if wanted.orientation == TO_FILE and abs(_TURNS.get(first, (0, False))[0]) == 1:
-        size = size[::-1]
-    held = path.stat().st_size / max(math.prod(size), 1) if packed or places else 0.0
-    yield pages, size, held + _PIXEL_BYTES
-    with _open_picture(path, "TIFF", packed, places) as picture:
-        for page in range(pages):
-            picture.seek(page)
-            unsigned = _check_tags(path, picture, wanted)
-            _check_size(path, wanted, picture.height, picture.width)
-            with stderr_silenced():
-                values = np.array(picture)
-            # Pillow holds 32 bits as if they had a sign.
-            values = values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
-            yield _upright(path, values, places[page][0] if page in places else _UPRIGHT, wanted)
+    import tifffile  # most work reads no picture of this kind
 
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what matters is raised
 
-def _pages_of(path: Path) -> tuple[int, dict[int, tuple[int, int, bytes]]]:
-    """Return the number of pages of a TIFF, and value, offset and replacement of each orientation that is not upright.
+    def check(page: Any) -> int:
+        """Return the orientation of a page that is as wanted."""
+        bits, kind = page.bitspersample, page.photometric
+        grey = kind == _BLACK_IS_ZERO and page.samplesperpixel == 1 and page.ndim == 2 and bits in wanted.bits
+        colour = wanted.colour and kind == _RGB and page.ndim == 3 and bits == 8
+        if page.dtype is None or page.dtype.kind not in "buif" or not (grey or colour):
+            raise wanted.refusal(path, f"is no {_allowed_kinds('TIFF', wanted.bits, wanted)}")
+        if int(page.subfiletype) & _NO_PAGE or page.subifds:
+            raise wanted.refusal(path, "holds previews, masks or parts beside the picture; save the picture alone")
+        if page.is_tiled and max(page.tilewidth, page.tilelength) > max(page.shape[:2]) + _TILE_MARGIN:
+            raise wanted.refusal(path, "is of tiles larger than the picture; save it in strips")
+        _check_size(path, wanted, *page.shape[:2])
+        return int(page.tags[_ORIENTATION].value) if _ORIENTATION in page.tags else _UPRIGHT
 
-    Pillow is given a copy in which all pages are upright, because it turns some pictures as it loads them, depending on
-    compression and version.
-    """
-    found: dict[int, tuple[int, int, bytes]] = {}
-    with open(path, "rb") as file:
-        order: Literal["little", "big"] = "little" if file.read(2) == b"II" else "big"
-        big = int.from_bytes(file.read(2), order) == _BIG
-        file.seek(8 if big else 4)
-        counted, entry, place = (8, 20, 8) if big else (2, 12, 4)
-        following, pages = int.from_bytes(file.read(place), order), 0
-        while following and pages <= _MOST_PAGES:
-            file.seek(following)
-            count = int.from_bytes(file.read(counted), order)
-            entries = file.read(min(count, _MOST_ENTRIES) * entry)
-            for start in range(0, len(entries) - entry + 1, entry):
-                tag, kind = (int.from_bytes(entries[start + at : start + at + 2], order) for at in (0, 2))
-                width = _WIDTHS.get(kind, 0) if tag == _ORIENTATION else 0
-                value = int.from_bytes(entries[start + entry - place :][:width], order)
-                if width and value != _UPRIGHT:
-                    at = following + counted + start + entry - place
-                    found[pages] = value, at, _UPRIGHT.to_bytes(width, order)
-            file.seek(following + counted + count * entry)
-            following, pages = int.from_bytes(file.read(place), order), pages + 1
-    return pages, found
-
-
-def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
-    tags: Any = picture.tag_v2  # type: ignore[attr-defined]
-    bits, photometric, samples = tags.get(_BITS, (1,)), tags.get(_PHOTOMETRIC), tags.get(_SAMPLES, (_UNSIGNED,))
-    grey = photometric == _BLACK_IS_ZERO and len(bits) == 1 and bits[0] in wanted.bits
-    if not grey and not (wanted.colour and photometric == _RGB and set(bits) == {8}):
-        raise wanted.refusal(path, f"is no {_allowed_kinds('TIFF', wanted.bits, wanted)}")
-    if grey and tags.get(_COMPRESSION, _PLAIN) in _LOSSY:
-        raise wanted.refusal(path, "is compressed by JPEG, which changes numbers; save it without, or by deflate")
-    if tags.get(_PAGE_KIND, 0) & _NO_PAGE or _PARTS in tags:
-        raise wanted.refusal(path, "holds previews, masks or parts beside the picture; save the picture alone")
-    if tags.get(_ORIENTATION, _UPRIGHT) != _UPRIGHT:
-        raise wanted.refusal(path, "states an orientation in no usual way; save it upright")
-    if any(tags.get(tag, 0) > max(picture.size) + _TILE_MARGIN for tag in _TILES):
-        raise wanted.refusal(path, "is of tiles larger than the picture; save it in strips")
-    return bool(samples[0] == _UNSIGNED)
+    # Given a file and no name, tifffile cannot map it.
+    with open(path, "rb") as file, tifffile.TiffFile(file) as tiff:
+        pages = tiff.pages
+        if not 0 < len(pages) <= _MOST_PAGES:
+            raise wanted.refusal(path, f"has {len(pages)} pages; give 1 to {_MOST_PAGES}")
+        stated, size = check(pages[0]), pages[0].shape[:2]
+        _upright(path, np.empty((0, 0)), stated, wanted)
+        turned = wanted.orientation == TO_FILE and abs(_TURNS[stated][0]) == 1
+        yield len(pages), size[::-1] if turned else size, _PIXEL_BYTES
+        for page in pages:
+            stated = check(page)
+            yield _upright(path, page.asarray(), stated, wanted)
 
 
 def _npy(path: Path, wanted: Wanted) -> _Reader:
     with open(path, "rb") as file:
-        array = Npy.of(file, path.stat().st_size)
-    kinds, sides = "buif" if 1 in wanted.bits else "uif", array.shape[-2:]
-    if len(array.shape) not in (2, 3) or array.dtype.kind not in kinds:
-        payload = f"{array.dtype} of shape {array.shape}"
-        raise wanted.refusal(path, f"holds {payload}; rows x columns of numbers are needed, or pages of them")
-    if len(array.shape) == 3 and sides[1] in _COLOURS_A_PIXEL:
-        rows, columns, colours = array.shape
-        kind = f"{rows} x {columns} pixels of {colours} numbers, as of red, green and blue"
-        raise wanted.refusal(path, f"holds {kind}; save one number a pixel, raw and not demosaiced")
-    pages = range(array.shape[0]) if len(array.shape) == 3 else [None]
-    # Columns first, a page is scattered over the whole file.
-    at_once = array.bytes / max(math.prod(sides), 1) if array.fortran else float(array.dtype.itemsize)
-    yield len(pages), (sides[0], sides[1]), at_once + _PIXEL_BYTES
-    with open(path, "rb") as file:
-        for page in pages:
-            yield array.part(file, page)
+        shape, dtype = npy_header(file, path.stat().st_size)
+        kinds, sides = "buif" if 1 in wanted.bits else "uif", shape[-2:]
+        if len(shape) not in (2, 3) or dtype.kind not in kinds:
+            payload = f"{dtype} of shape {shape}"
+            raise wanted.refusal(path, f"holds {payload}; rows x columns of numbers are needed, or pages of them")
+        if len(shape) == 3 and sides[1] in _COLOURS_A_PIXEL:
+            kind = f"{shape[0]} x {shape[1]} pixels of {shape[2]} numbers, as of red, green and blue"
+            raise wanted.refusal(path, f"holds {kind}; save one number a pixel, raw and not demosaiced")
+        pages = shape[0] if len(shape) == 3 else 1
+        yield pages, sides, pages * dtype.itemsize + _PIXEL_BYTES
+        values = np.load(file, allow_pickle=False)
+        yield from values if len(shape) == 3 else [values]
 
 
 def _exr(path: Path, wanted: Wanted) -> _Reader:
@@ -301,27 +235,20 @@ def _dng(path: Path, wanted: Wanted) -> _Reader:
     except ImportError:
         raise wanted.refusal(path, "rawpy is not installed; pip install 'mitsim[raw]', or save it as TIFF") from None
 
-    with open(path, "rb") as file:
-        order: Literal["little", "big"] = "little" if file.read(2) == b"II" else "big"
-        file.seek(4)
-        file.seek(int.from_bytes(file.read(4), order))
-        entries = file.read(2 + 12 * _MOST_ENTRIES)
-    if _DNG_VERSION.to_bytes(2, order) not in (entries[start : start + 2] for start in range(2, len(entries), 12)):
-        raise ValueError("its header is none of a DNG")
-    with stderr_silenced(), rawpy.imread(str(path)) as raw:
-        sizes = raw.sizes
-        colours = raw.color_desc.decode("ascii", "replace")
+    with stderr_silenced():
+        raw = rawpy.imread(str(path))
+    with raw:
+        sizes, colours = raw.sizes, raw.color_desc.decode("ascii", "replace")
         corner = [(sizes.top_margin + row, sizes.left_margin + column) for row in (0, 1) for column in (0, 1)]
         mosaic = "".join(colours[raw.raw_color(*place)] for place in corner) if raw.num_colors > 1 else None
-    if mosaic is not None and mosaic != (wanted.mosaic or mosaic):
-        raise wanted.refusal(path, f"its mosaic is {cut(mosaic)}, and {wanted.mosaic} is stated; correct that")
-    yield 1, (sizes.height, sizes.width), _PIXEL_BYTES
-    with stderr_silenced(), rawpy.imread(str(path)) as raw:
-        flat = raw.raw_type == rawpy.RawType.Flat
-        values = raw.raw_image_visible.copy() if flat else np.empty(0)
-    if values.ndim != 2:
-        raise wanted.refusal(path, "holds colours, and no number a pixel; save the raw numbers")
-    yield _upright(path, values, _FLIPS.get(sizes.flip, 0), wanted)
+        if mosaic is not None and mosaic != (wanted.mosaic or mosaic):
+            raise wanted.refusal(path, f"its mosaic is {cut(mosaic)}, and {wanted.mosaic} is stated; correct that")
+        yield 1, (sizes.height, sizes.width), _PIXEL_BYTES
+        if raw.raw_type != rawpy.RawType.Flat:
+            raise wanted.refusal(path, "holds colours, and no number a pixel; save the raw numbers")
+        with stderr_silenced():
+            values = raw.raw_image_visible.copy()
+        yield _upright(path, values, _FLIPS.get(sizes.flip, 0), wanted)
 
 
 def _bare(path: Path, wanted: Wanted) -> _Reader:
@@ -351,48 +278,6 @@ def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
     zero = " whose zero is black" if kind == "TIFF" else ""
     raw = "" if wanted.colour else ", raw and not demosaiced"
     return f"grey {kind} of {', '.join(most)} or {last} bits{zero}{colours}; save one number a pixel{raw}"
-
-
-@contextmanager
-def _open_picture(
-    path: Path, kind: str, whole: bool = False, places: Mapping[int, tuple[int, int, bytes]] | None = None
-) -> Iterator[Image]:
-    """Open a picture file without reading its pixels.
-
-    ``whole`` opens a copy in memory, because libtiff maps the file or reads all of it for each page.
-    """
-    from PIL import Image, UnidentifiedImageError  # most work reads no picture
-
-    logs = logging.getLogger("PIL")
-    if not logs.handlers:  # where nobody listens, Python writes errors in a log to stderr
-        logs.addHandler(logging.NullHandler())
-    with open(path, "rb") as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # on metadata that is damaged; where pixels are, reading them raises
-        warnings.simplefilter("error", Image.DecompressionBombWarning)
-        source = io.BytesIO(file.read()) if whole or places else cast("IO[bytes]", _Copied(file))
-        for _, place, upright in (places or {}).values():
-            source.seek(place)
-            source.write(upright)
-        source.seek(0)
-        try:
-            opened = Image.open(source, formats=(kind,))
-        except UnidentifiedImageError:
-            file.seek(0)
-            if file.read(4) not in _BEGINNINGS:
-                raise ValueError(f"its header is none of a {kind}") from None
-            unread = "such as real numbers of 16 or 64 bits, transparency, or a mosaic by its tags"
-            raise MitsimError(
-                f"file {path}: its pixels are of a kind that is not read, {unread}; save it anew"
-            ) from None
-        with opened as picture:
-            yield picture
-
-
-class _Copied:
-    """File without name and descriptor, which Pillow can read but not map."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.read, self.seek, self.tell = file.read, file.seek, file.tell
 
 
 @contextmanager

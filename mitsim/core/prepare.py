@@ -164,13 +164,9 @@ class Preparer:
             corners = np.array([[row, column] for row in (first[0], end[0] - 1) for column in (first[1], end[1] - 1)])
             seen = corners @ matrix.T + offset
             if (seen < -_EDGE).any() or (seen > last + _EDGE).any():
-                whole = np.array([[row, column] for row in (0, last[0]) for column in (0, last[1])])
-                margin = np.ceil(np.abs(whole @ matrix.T + offset - whole).max(axis=0) - _EDGE).astype(int)
-                rows, columns = last + 1 - 2 * margin
-                inside = f", such as {margin[0]},{margin[1]},{rows},{columns}" if min(rows, columns) > 0 else ""
                 raise MitsimError(
                     f"{path}: turned by {self.how.turn_deg:g} degrees about its {self.how.turn_about}, a part of it "
-                    f"lies beyond its {_size(values)} pixels; give a smaller crop{inside}"
+                    f"lies beyond its {_size(values)} pixels; give a smaller crop"
                 )
             values = affine_transform(values, matrix, offset, order=1, mode="nearest")
         return values[first[0] : end[0], first[1] : end[1]]

@@ -30,16 +30,6 @@ def saved(values: np.ndarray, **options: object) -> Write:
     return lambda path: Image.fromarray(values).save(path, **options)
 
 
-def twelve_bits(path: Path) -> None:
-    """A TIFF of 12 bits, rows of whole bytes (TIFF 6.0), which no library here writes."""
-    bits = ["".join(f"{number:012b}" for number in row) for row in NUMBERS % 4096]
-    packed = b"".join(int(row.ljust(88, "0"), 2).to_bytes(11, "big") for row in bits)
-    tags = {256: 7, 257: 5, 258: 12, 259: 1, 262: 1, 273: 8, 277: 1, 278: 5, 279: len(packed)}
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
-    head = b"II*\0" + struct.pack("<I", 8 + len(packed))
-    path.write_bytes(head + packed + struct.pack("<H", len(tags)) + entries + b"\0" * 4)
-
-
 @pytest.mark.parametrize(
     ("name", "write", "expected"),
     [
@@ -47,9 +37,8 @@ def twelve_bits(path: Path) -> None:
         ("a.PNG", saved((NUMBERS // 113).astype(np.uint8)), (NUMBERS // 113).astype(np.uint8)),
         ("a.tif", saved(NUMBERS), NUMBERS),
         ("a.tif", saved((NUMBERS // 113).astype(np.uint8)), (NUMBERS // 113).astype(np.uint8)),
-        ("a.tiff", saved(NUMBERS, compression="tiff_lzw"), NUMBERS),
+        ("a.tiff", saved(NUMBERS, compression="packbits"), NUMBERS),
         ("a.tif", lambda path: tifffile.imwrite(path, NUMBERS, byteorder=">"), NUMBERS),
-        ("a.tif", twelve_bits, NUMBERS % 4096),
         ("a.tif", saved(NUMBERS.astype(np.float32) / 7), NUMBERS.astype(np.float32) / 7),
         ("a.tif", saved(NUMBERS.astype(np.int32) * -1000), NUMBERS.astype(np.int32) * -1000),
         ("a.tif", lambda path: tifffile.imwrite(path, LARGE), LARGE),
@@ -113,7 +102,7 @@ def cut_short(path: Path) -> None:
         ("a.png", cut_short, "damaged"),
         ("a.png", saved(NUMBERS, format="tiff"), "does not begin as a PNG"),
         ("a.png", lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n cut"), "cannot be read"),
-        ("a.tif", saved(np.zeros((5, 7, 3), np.uint8)), "is no grey TIFF of 8, 12, 16 or 32 bits whose zero is black"),
+        ("a.tif", saved(np.zeros((5, 7, 3), np.uint8)), "is no grey TIFF of 8, 16 or 32 bits whose zero is black"),
         ("a.tif", saved(np.zeros((5, 7), bool)), "is no grey TIFF"),
         ("a.tif", saved(NUMBERS, save_all=True, append_images=[Image.fromarray(NUMBERS)]), "has 2 pages"),
         ("a.tif", lambda path: tifffile.imwrite(path, NUMBERS, photometric="miniswhite"), "whose zero is black"),
@@ -275,7 +264,7 @@ def test_a_picture_to_be_shown_turned_is_refused(tmp_path: Path, name: str, numb
         ("a.tif", lambda path: tifffile.imwrite(path, NUMBERS, subfiletype=1), "previews"),
         ("a.tif", raw_photograph, "previews"),
         ("a.tif", lambda path: tifffile.imwrite(path, NUMBERS, tile=(2048, 2048), compression="zlib"), "tiles larger"),
-        ("a.tif", pages(2**16 + 1), "over 65536 pages"),
+        ("a.tif", pages(2**16 + 1), "give 1 to 65536"),
         (
             "a.npy",
             lambda path: (np.save(path, NUMBERS), os.truncate(path, 1 << 40)),
@@ -297,16 +286,10 @@ def test_a_picture_that_holds_another_is_refused(tmp_path: Path, name: str, writ
         ("a.npy", lambda path: np.save(path, np.zeros((3, 500, 500)))),
         ("a.npy", lambda path: np.save(path, np.asfortranarray(np.zeros((3, 500, 500))))),
         ("a.tif", lambda path: tifffile.imwrite(path, np.zeros((3, 500, 500), np.uint16), photometric="minisblack")),
-        (
-            "a.tif",
-            lambda path: tifffile.imwrite(
-                path, np.zeros((3, 500, 500), np.uint16), photometric="minisblack", compression="zlib"
-            ),
-        ),
         ("a.raw", lambda path: np.zeros((500, 500), np.uint16).tofile(path)),
         ("a.png", lambda path: Image.effect_noise((500, 500), 50).save(path)),
     ],
-    ids=["npy", "npy columns first", "tif", "tif packed", "raw", "png"],
+    ids=["npy", "npy columns first", "tif", "raw", "png"],
 )
 def test_a_file_that_is_cut_while_it_is_read_is_refused(tmp_path: Path, name: str, write: Write) -> None:
     """Between header and pixels: a map of the file would end the process. (Planted: NPY mapped, which it did.)"""
