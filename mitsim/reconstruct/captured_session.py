@@ -80,12 +80,23 @@ def calibrate_frames(
     """
     job = job or Job()
     session = folder if isinstance(folder, SessionFrames) else load_frames(folder)
-    doubts: tuple[str, ...] = ()
+    doubts = list[str]()
     if camera is not None:
-        session, doubts = _with_camera(session, camera)
+        sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
+        stated, own = session.listed.digital, digital_of(sensor, session.listed.digital.exposure_s)
+        for name, (part, least) in _COMPARED.items():
+            ours, theirs = getattr(stated, name), getattr(own, name)
+            if ours is not None and theirs is not None and abs(ours - theirs) > max(part * theirs, least):
+                doubts.append(
+                    f"camera {sensor.name}: digital.{name} is {ours:g} in the list, and {theirs:g} by the camera's "
+                    "file; correct the wrong one, or leave --camera out"
+                )
+        absent = {name: getattr(own, name) for name in _FILLED if getattr(stated, name) is None}
+        digital = stated.model_copy(update=absent)
+        session = replace(session, listed=session.listed.model_copy(update={"digital": digital}))
     session, doubt = _checked(session)
     with nullcontext() if output is None else output_folder(output) as place:
-        factors = _calibrate(session, job, doubts + doubt)
+        factors = _calibrate(session, job, (*doubts, *doubt))
         if place is not None:
             factors.write(place)
     return factors
@@ -102,22 +113,6 @@ def calibrate_planes(
         }
         write_colours(place, colours)
     return found
-
-
-def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFrames, tuple[str, ...]]:
-    sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
-    stated, own = session.listed.digital, digital_of(sensor, session.listed.digital.exposure_s)
-    absent = {name: getattr(own, name) for name in _FILLED if getattr(stated, name) is None}
-    doubts = []
-    for name, (part, least) in _COMPARED.items():
-        ours, theirs = getattr(stated, name), getattr(own, name)
-        if ours is not None and theirs is not None and abs(ours - theirs) > max(part * theirs, least):
-            doubts.append(
-                f"camera {sensor.name}: digital.{name} is {ours:g} in the list, and {theirs:g} by the camera's file; "
-                "correct the wrong one, or leave --camera out"
-            )
-    listed = session.listed.model_copy(update={"digital": stated.model_copy(update=absent)})
-    return replace(session, listed=listed), tuple(doubts)
 
 
 def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]]) -> Iterator[tuple[FloatArray, float]]:

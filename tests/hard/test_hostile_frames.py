@@ -52,20 +52,13 @@ def text_attribute(name: str, value: bytes) -> bytes:
 
 
 FRAMES = {
-    "empty": (b"", "not an OpenEXR file"),
     "text": (b"hello", "not an OpenEXR file"),
     "magic alone": (exr_file()[:4], "not an OpenEXR file"),
     "cut in the header": (exr_file()[:100], "cut short"),
-    "cut in the length of an attribute": (exr_file()[: exr_file().index(b"chlist") + 9], "cut short"),
-    "cut in the table": (exr_file()[:-350], "damaged"),
     "cut in the last line": (exr_file()[:-1], "damaged"),
     "2^31 pixels": (exr_file((0, 0, 65535, 32767)), "65536x32768"),
-    "2^62 pixels": (exr_file((-(2**31), -(2**31), 2**31 - 1, 2**31 - 1)), "damaged"),
-    "2^31 pixels, compressed": (exr_file((0, 0, 16383, 16383), compression=3), "16384x16384"),
     "window turned round": (exr_file((7, 7, 0, 0)), "damaged"),
-    "window of another type": (exr_file(box="box2f"), "damaged"),
     "tiled": (exr_file(flags=2 | 0x200), "damaged"),
-    "deep": (exr_file(flags=2 | 0x800), "damaged"),
     "of several parts": (exr_file(flags=2 | 0x1000), "damaged"),
     "version 77": (exr_file(flags=77), "damaged"),
     "compression 99": (exr_file(compression=99), "damaged"),
@@ -73,9 +66,7 @@ FRAMES = {
     "sampling 0": (exr_file(sampling=(0, 0)), "damaged"),
     "sampling 2": (exr_file(sampling=(2, 2)), "leave out pixels"),
     "no channels": (exr_file(channel=b""), "damaged"),
-    "1000 channels": (exr_file(times=1000), "damaged"),
     "attribute of -1 bytes": (exr_file(length=-1), "damaged"),
-    "attribute of 2 GB": (exr_file(length=2**31 - 1), "damaged"),
     "attribute twice": (exr_file(more=text_attribute("a", b"1") * 2), "damaged"),
     "header without end": (exr_file()[:60] + b"x" * 5000, "cut short"),
     "100000 channels": (
@@ -83,13 +74,10 @@ FRAMES = {
         "over 256 KiB",
     ),
     "chunks of -1 bytes": (exr_file(size=-1), "damaged"),
-    "chunks of 2 GB": (exr_file(size=2**31 - 1), "damaged"),
     "metadata that is no JSON": (exr_file(more=text_attribute("mitsim.run", b"{")), "damaged"),
     "metadata deeply nested": (exr_file(more=text_attribute("mitsim.run", b"[" * 100_000)), "nested too deep"),
     "metadata that is a list": (exr_file(more=text_attribute("mitsim.run", b"[1]")), "no text or number"),
-    "metadata that is no text": (exr_file(more=b"mitsim.run\0int\0\x04\0\0\0\1\0\0\0"), "damaged"),
     "metadata of no UTF-8": (exr_file(more=text_attribute("mitsim.run", b"\xff\xfe")), "damaged"),
-    "zeros after the magic": (exr_file()[:8] + bytes(4096), "damaged"),
 }
 
 
@@ -132,7 +120,7 @@ def test_frames_of_another_make(folders: tuple[Path, Path], parts: int, header: 
     assert words in refusal(lambda: solved(*folders))
 
 
-@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"])
+@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIP", "PIZ", "PXR24", "B44", "DWAB"])
 def test_compressed_frames_of_other_programs_are_read(tmp_path: Path, compression: str) -> None:
     """A constant picture of 1024 x 1024 shrinks most: the guard against bombs must let it pass."""
     pixels = {"DN": np.full((1024, 1024), 7, np.float32)}

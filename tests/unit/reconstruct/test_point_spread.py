@@ -5,8 +5,6 @@ A camera's matrix is made here from its definition, pixel by pixel, without a tr
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -139,35 +137,22 @@ def test_half_the_size_sees_half_the_frame() -> None:
     np.testing.assert_array_equal(reduce_frame(np.arange(12.0).reshape(3, 4), 2), [[2.5, 4.5]])
 
 
-def lenses(rng: np.random.Generator) -> np.ndarray:
-    psf = np.zeros((70, 72))
-    psf[rng.integers(8, 62, 40), rng.integers(8, 62, 40)] = 1 / 40
-    return psf
-
-
-def speckle(rng: np.random.Generator) -> np.ndarray:
-    psf = np.maximum(gaussian_filter(rng.normal(size=(70, 72)), 1.0), 0) ** 2
-    return np.asarray(psf / psf.sum())
-
-
 @pytest.mark.parametrize(
-    ("drawn", "noise", "method", "times", "above"),
+    ("noise", "method", "times", "above"),
     [
-        (lenses, 0.05, "nonnegative", 1, 0.01),
-        (speckle, 0.02, "nonnegative", 0.03, 0.02),
-        (lenses, 0.05, "tv", 10, 0.04),
-        pytest.param(lenses, 0.05, "tv", 100, 0.02, marks=pytest.mark.slow),
-        (lenses, 0.01, "tv", 1, 0.07),
+        (0.05, "nonnegative", 1, 0.01),
+        (0.05, "tv", 10, 0.04),
+        (0.01, "tv", 1, 0.07),
     ],
 )
-def test_converged_is_said_near_the_minimum_alone(
-    drawn: Callable[[np.random.Generator], np.ndarray], noise: float, method: str, times: float, above: float
-) -> None:
+def test_converged_is_said_near_the_minimum_alone(noise: float, method: str, times: float, above: float) -> None:
     """Of blocks, whose light is halved once: where the rule holds the objective is that near to what 1500 steps find,
     and a pass sooner it does not. (Planted: only the last pass's fall;
     no heed of what was promised; slopes that no pass sharpens; a rule from the first pass on.)"""
     rng = np.random.default_rng(4)
-    light = ShiftedLight(drawn(rng), (70, 72), precision=np.float32)
+    psf = np.zeros((70, 72))
+    psf[rng.integers(8, 62, 40), rng.integers(8, 62, 40)] = 1 / 40
+    light = ShiftedLight(psf, (70, 72), precision=np.float32)
     scene = 200.0 * np.kron(rng.random((14, 13)) > 0.6, np.ones((10, 11)))[:139, :143]
     frame = light.image_of(scene)
     frame = (frame + noise * frame.mean() * rng.normal(size=frame.shape)).astype(np.float32)
@@ -196,9 +181,9 @@ def test_noise_is_told_and_weights_follow_it() -> None:
     assert lam > 0 and automatic(7 * frame) == pytest.approx([lam, 7 * weight])
 
 
-def point_and_frame(noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def point_and_frame(noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Light of twenty lenses, and the frame (1, 48, 56) of blocks by it, of mean 1."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     light = np.zeros((48, 56))
     light[rng.integers(8, 40, 20), rng.integers(8, 48, 20)] = 0.3 + rng.random(20)
     light = gaussian_filter(light, 0.7)
@@ -208,17 +193,16 @@ def point_and_frame(noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray
     return light / light.sum(), frame + noise * rng.normal(size=frame.shape)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
-def test_light_that_is_turned_or_random_is_flagged(seed: int) -> None:
+def test_light_that_is_turned_or_random_is_flagged() -> None:
     """Right light is not flagged at a noise of 0.5 and of 5 %. With 5 % frames may not decide how the light lies.
     (Planted: no total variation.)"""
     for noise in (0.005, 0.05):
-        light, frames = point_and_frame(noise, seed)
+        light, frames = point_and_frame(noise)
         wrong = {
             "turned by 180 degrees": light[::-1, ::-1],
             "mirrored upside down": light[::-1],
             "mirrored left to right": light[:, ::-1],
-            "random numbers": np.random.default_rng(seed).random(light.shape),
+            "random numbers": np.random.default_rng(0).random(light.shape),
         }
         right = find_fit(ShiftedLight(light, (48, 56), precision=np.float32), frames.astype(np.float32), None)
         assert right.fault == ("", "") and right.gain is not None and right.gain > 1

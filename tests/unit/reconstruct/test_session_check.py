@@ -181,7 +181,7 @@ def test_a_uniform_frame_that_shows_something_else_is_refused_and_named() -> Non
     assert shown_frames(str(refusal.value)) == {("vertical", 0)}
 
 
-@pytest.mark.parametrize("indices", [[0], [6], [1], [16], [3, 9, 30], range(N)])
+@pytest.mark.parametrize("indices", [[0], [1], [3, 9, 30], range(N)])
 @pytest.mark.parametrize("side", SIDES)
 def test_the_signs_of_exchanged_pairs_are_turned(side: str, indices: list[int]) -> None:
     """The light decides on pattern 0, the moving shadow on all others. (Planted: pattern 0 is turned by the shadow,
