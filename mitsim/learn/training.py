@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -138,26 +139,26 @@ class Trainer:
         self.model = Diagonal.of(self.prepared, self._like)
         self.teaching, self.choosing, self.judging = part_photographs(self.sums.photographs, self.request.seed)
 
-    def is_over(self) -> bool:
-        psnr = [value for _, value in self.curve]
-        gone = max(psnr[:-_PATIENCE], default=-math.inf) > max(psnr[-_PATIENCE:]) - _GAIN_DB
-        return self.taken >= self.request.steps or gone
-
-    def go_on(self, job: Job) -> None:
-        """Take the steps up to the next judgement; raise MitsimError if the loss is not finite."""
+    def run(self, job: Job, keep: Callable[[], object] = lambda: None) -> None:
+        """Take all steps, with a judgement and ``keep`` after each twentieth; MitsimError if the loss is not finite."""
         steps = self.request.steps
-        for number in range(self.taken, min(self.taken + max(steps // _LOOKS, 1), steps)):
-            if not math.isfinite(self.step(number)):
-                raise MitsimError(f"training: its numbers ran away at step {number}; give a smaller rate")
-            self.taken = number + 1
-            job.progress("train", self.taken / steps)
-        self.choose()
-        job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.taken / steps)
-
-    def choose(self) -> None:
-        self.curve.append((self.taken, self.judge(self.choosing)))
-        if self.curve[-1][1] >= max(value for _, value in self.curve):
-            self.best = weights_of(self.network)
+        while True:
+            if not self.curve or self.curve[-1][0] < self.taken:
+                self.curve.append((self.taken, self.judge(self.choosing)))
+                if self.curve[-1][1] >= max(value for _, value in self.curve):
+                    self.best = weights_of(self.network)
+            if self.taken:
+                job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.taken / steps)
+                keep()
+            psnr = [value for _, value in self.curve]
+            gone = max(psnr[:-_PATIENCE], default=-math.inf) > max(psnr[-_PATIENCE:]) - _GAIN_DB
+            if self.taken >= steps or gone:
+                return
+            for number in range(self.taken, min(self.taken + max(steps // _LOOKS, 1), steps)):
+                if not math.isfinite(self.step(number)):
+                    raise MitsimError(f"training: its numbers ran away at step {number}; give a smaller rate")
+                self.taken = number + 1
+                job.progress("train", self.taken / steps)
 
     def save(self, path: Path, digest: str) -> None:
         state = {"step": self.taken, "curve": self.curve, "best": self.best, "network": weights_of(self.network)}
@@ -314,14 +315,10 @@ def train_network(
     unfinished = Path(f"{output}{_UNFINISHED}")
     if resume and unfinished.is_file():
         trainer.load(unfinished, digest)
-    else:
-        trainer.choose()
     with job.clock.stage("train"):
         predicted = time.perf_counter() - started + trainer.seconds_a_step() * (request.steps - trainer.taken)
         Cost(predicted).check(f"{store.folder}: training {request.method}", job.limits)
-        while not trainer.is_over():
-            trainer.go_on(job)
-            trainer.save(unfinished, digest)
+        trainer.run(job, lambda: trainer.save(unfinished, digest))
     network.load_state_dict(first)
     before = trainer.judge(trainer.judging)
     network.load_state_dict(trainer.best)

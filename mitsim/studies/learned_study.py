@@ -210,9 +210,7 @@ def transfer(data: str, held_out: str, seed: int) -> Found:
     shape = taught.left.scene_size, taught.right.scene_size
     sums = twin_sums(taught, (least, max(least, most)), truths, seed)
     trainer, started = Trainer(request, taught, sums, first_network(request, shape)), time.process_time()
-    trainer.choose()
-    while not trainer.is_over():
-        trainer.go_on(Job())
+    trainer.run(Job())
     trainer.network.load_state_dict(trainer.best)
     network, taught_s = trainer.network.eval(), time.process_time() - started
     like, rows, arrays = next(network.parameters()), [], {AUTHORS: seen[_TAUGHT].scene}

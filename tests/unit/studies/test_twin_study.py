@@ -23,28 +23,19 @@ from mitsim.studies.framework.experiment import Point, Results, Scope, Setup
 from mitsim.studies.framework.panels import flag_warnings
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.twin_study import (
-    BLURS,
     CAUSES,
-    FREQUENCIES,
-    HAZES,
-    SPREAD_MM,
     STUDY,
     Learned,
     Measured,
     column_of,
     compare,
-    fit,
-    land,
-    lit_square,
     noise_of,
     preparation,
-    radial_power,
     read_captures,
     read_spread,
     render,
     statistics,
 )
-from mitsim.transport.plugins.diffuser import random_relief
 
 SCALES, SCENE, SENSOR = (0.6, 0.7), 40, (80, 90)
 GAIN, LIGHT = 0.1, 600.0
@@ -254,44 +245,27 @@ def test_files_are_found_or_a_line_says_where_they_are_from(tmp_path: Path) -> N
 
 
 def test_a_spread_of_light_by_hand() -> None:
-    """Of one bright pixel in 400: contrast sqrt(399), all light in the brightest twentieth; a wave's power is in its
-    band."""
+    """Of one bright pixel in 400: contrast sqrt(399), all light in the brightest twentieth."""
     point = np.zeros((20, 20))
     point[3, 4] = 1
     assert statistics(point) == pytest.approx((399**0.5, 1))
-    wave = 1 + 0.5 * np.cos(2 * np.pi * 0.1 * np.arange(200))[:, None] * np.ones(200)
-    assert FREQUENCIES[np.argmax(radial_power(wave))] == pytest.approx(0.1, rel=0.2)
-    noise = 1 + np.random.default_rng(0).standard_normal((200, 200))
-    assert radial_power(noise)[9:] == pytest.approx(np.ones(5), rel=0.12)
 
 
-def test_numbers_of_a_spectrum_are_found_again() -> None:
-    """One on the grid, blurred and with an even part, is found as that."""
-    draws = np.random.default_rng(1)
-    grid = np.exp(draws.standard_normal((3, 4, len(FREQUENCIES))))
-    blur, haze = float(BLURS[3]), float(HAZES[4])
-    measured = grid[2, 1] * np.exp(-((2 * np.pi * FREQUENCIES * blur) ** 2)) * (1 - haze) ** 2
-    assert fit(measured, grid) == pytest.approx((2, 1, blur, haze))
-
-
-def test_rays_of_a_weak_relief_fall_as_its_curvature_says() -> None:
-    """Light over its mean is 1 - move (h_xx + h_yy) to first order: correlation of both, noise of rays
-    smoothed."""
-    relief, count, move = random_relief(6.0, 0.8, 0.1, 4), 128, 0.02
-    light = ndimage.gaussian_filter(land(relief, move, count, 0), 3)
-    spread = np.gradient(relief.slope_x, axis=0) + np.gradient(relief.slope_y, axis=1)
-    at = ((np.arange(count) + 0.5 - count / 2) * SPREAD_MM / relief.side_mm + 0.5) * (len(spread) - 1)
-    seen = spread[np.ix_(at.round().astype(int), at.round().astype(int))]
-    assert np.corrcoef(light.ravel(), seen.ravel())[0, 1] < -0.9
-
-
-def test_a_picture_without_a_wide_lit_part_is_refused() -> None:
-    light = np.zeros((300, 400))
-    light[130:170, 180:220] = 1
-    with pytest.raises(MitsimError, match="its lit part is"):
-        lit_square(light)
-    light[40:260, 90:310] = 1
-    assert min(lit_square(light).shape) >= 140 and (lit_square(light) == 1).all()
+def test_a_spread_is_the_lit_square_of_a_grey_picture(tmp_path: Path) -> None:
+    path = tmp_path / "psf.tif"
+    Image.new("RGB", (300, 300)).save(path)
+    with pytest.raises(MitsimError, match=r"psf\.tif: is in colour; give"):
+        read_spread(path)
+    for half, refused in ((80, True), (440, False)):
+        light = np.zeros((1200, 1600), np.uint16)
+        light[600 - half : 600 + half, 800 - half : 800 + half] = 1000
+        Image.fromarray(light).save(path)
+        if refused:
+            with pytest.raises(MitsimError, match="its lit part is"):
+                read_spread(path)
+        else:
+            found = read_spread(path)
+            assert min(found.shape) >= 140 and np.ptp(found) < 1e-12
 
 
 def reduce_captures(patch: pytest.MonkeyPatch) -> None:
@@ -335,18 +309,10 @@ def test_a_diffuser_is_compared_by_its_statistics(monkeypatch: pytest.MonkeyPatc
     """A row for each diffuser; claims compare the measured one with the simulated ones."""
     draws = np.random.default_rng(0)
     lights = [1 + 0.3 * draws.random((160, 160)) for _ in range(7)]
-    monkeypatch.setattr(twin_study, "diffusers_like", lambda *_: (lights[1:], {"blur": 0.6}))
+    monkeypatch.setattr(twin_study, "simulated_spreads", lambda *_: lights[1:])
     point = Point.of(Setup(), data="", capture="diffuser", plane="", seed=0)
     found = twin_study._measure_diffuser(point, lights[0], 0)
-    results = Results(
-        [{**row, "point": point.key} for row in found.rows], {(point.key, n): a for n, a in found.arrays.items()}
-    )
-    assert len(found.rows) == 7 and found.rows[0]["blur"] == 0.6
+    arrays = {(point.key, name): array for name, array in found.arrays.items()}
+    results = Results([{**row, "point": point.key} for row in found.rows], arrays)
+    assert len(found.rows) == 7 and STUDY.draw(results).keys() == {"diffuser.png"}
     assert [claim.verdict for claim in STUDY.judge(results)] == ["confirmed", "confirmed"]
-    assert STUDY.draw(results).keys() == {"diffuser.png"}
-
-
-def test_a_point_spread_function_of_colours_is_refused(tmp_path: Path) -> None:
-    Image.new("RGB", (300, 300)).save(tmp_path / "psf.tif")
-    with pytest.raises(MitsimError, match=r"psf\.tif: is in colour; give"):
-        read_spread(tmp_path / "psf.tif")
