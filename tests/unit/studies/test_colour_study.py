@@ -15,13 +15,10 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.framelist import load_chart
 from mitsim.devices.patterns import parse_patterns
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, JointMosaic, chart, delta_e
-from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.studies.colour_study import (
     D65,
     ONE,
@@ -30,7 +27,6 @@ from mitsim.studies.colour_study import (
     daylight_frame,
     filter_weights,
     judge_colours,
-    serving,
     solve_mosaic,
 )
 from mitsim.studies.framework.campaign import batches
@@ -165,13 +161,3 @@ def test_pixels_see_a_line_as_their_filters_curves_say() -> None:
 def test_a_scene_without_spectra_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match="scene photograph: has no spectra"):
         daylight_frame(Setup("photograph"), tmp_path)
-
-
-def test_a_lent_camera_has_the_gain_of_the_line() -> None:
-    """Its own factors twice and three times as large lend themselves exactly."""
-    manifest = CalibrationManifest(camera={})
-    status = Status(Verdict.CALIBRATED, "Calibrated")
-    own, lent = (Factors(left, left, manifest, status) for left in (shadow(0.0, N), 2 * shadow(0.0, N)))
-    line, other = (SimpleNamespace(factors=each) for each in (own, lent))
-    found = serving(line, other)  # type: ignore[arg-type]
-    assert np.allclose(found.left, own.left) and np.allclose(found.right, own.right)

@@ -125,12 +125,11 @@ def test_every_place_has_noise_of_its_own(lit: dict[str, LitScene]) -> None:
 
 
 def test_exposures_are_the_familys(lit: dict[str, LitScene]) -> None:
-    scene = lit["separable"]
-    mask = MovedMask(scene, IDEALISED, {}, 5)
-    uniform, places = scene.uniform_s(IDEALISED), (PLACES, PLACES)
-    assert mask.seconds(*places, EQUAL_FRAME) == uniform
-    assert mask.seconds(*places, EQUAL_PEAK) <= uniform, "the mask on its axis is one of the places"
-    assert mask.seconds(*places, EQUAL_PEAK) > 0.25 * uniform, "no place lets four times the light pass"
+    """No place lets four times the light of the mask on its axis pass, which is one of the places."""
+    mask = MovedMask(lit["separable"], IDEALISED, {}, 5)
+    uniform = lit["separable"].uniform_s(IDEALISED)
+    assert mask.seconds(PLACES, PLACES, EQUAL_FRAME) == uniform
+    assert 0.25 * uniform < mask.seconds(PLACES, PLACES, EQUAL_PEAK) <= uniform
 
 
 def test_factors_have_the_noise_of_a_session(lit: dict[str, LitScene]) -> None:
@@ -181,9 +180,7 @@ def test_a_gain_within_the_noise_is_none(gain: float, verdict: str) -> None:
             "picture": print_,
         }
         for (name, count), decibels in frames.items()
-        for print_ in ("coins", "page")
-        for model in MODELS
-        for exposure in (EQUAL_PEAK, EQUAL_FRAME)
+        for each, model, exposure in product(("coins", "page"), MODELS, (EQUAL_PEAK, EQUAL_FRAME))
     ]
     *others, moved_or_not = experiment.judge(Results(rows))
     assert moved_or_not.verdict == verdict
