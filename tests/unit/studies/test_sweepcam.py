@@ -177,7 +177,7 @@ def test_a_gain_within_the_noise_is_none(gain: float, verdict: str) -> None:
             "patterns": name,
             "frames": count,
             "psnr_db": decibels,
-            "picture": print_,
+            "picture": each,
         }
         for (name, count), decibels in frames.items()
         for each, model, exposure in product(("coins", "page"), MODELS, (EQUAL_PEAK, EQUAL_FRAME))
