@@ -29,11 +29,10 @@ from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import Digital, FactorNoise, RunManifest
 from mitsim.core.runs import Capture, Measurement
-from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import BYTES_A_NUMBER, TIKHONOV, keeps_frames, slab_numbers
 from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, half_spread
+from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, Side, half_spread
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 
 EDGES = 2.9

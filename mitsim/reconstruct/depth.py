@@ -27,13 +27,12 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
-from mitsim.reconstruct.factorisation import factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, parallax_of, pixels_of_parallax
 from mitsim.reconstruct.misfit import Misfit, weigh
 from mitsim.reconstruct.residuals import CHANCE
 from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare, project_frames
+from mitsim.reconstruct.solver import centre_columns, centre_frame, factorise, group_pixels, prepare, project_frames
 
 RANGE = 0.25
 """Searched part of 1/z on either side: 320 to 533 mm for 400."""

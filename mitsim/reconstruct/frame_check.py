@@ -31,9 +31,8 @@ from scipy.sparse import csr_matrix
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation
-from mitsim.reconstruct.factorisation import IndexArray
 from mitsim.reconstruct.residuals import CHANCE, TINY, Residuals
-from mitsim.reconstruct.solver import robust_scatter
+from mitsim.reconstruct.solver import IndexArray, robust_scatter
 from mitsim.reconstruct.uncertainty import Propagation
 
 # ---- The picture of shifting dots -----------------------------------------------------------------------------------

@@ -27,7 +27,6 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Measurement
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise, print_energy
-from mitsim.reconstruct.factorisation import IndexArray
 from mitsim.reconstruct.factors import decibels
 from mitsim.reconstruct.focus import DerivedCapture
 from mitsim.reconstruct.frame_check import FrameCheck, FrameFault, PictureCheck
@@ -42,6 +41,7 @@ from mitsim.reconstruct.residuals import (
     noise_chance,
 )
 from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import IndexArray
 
 # ---- Defective pixels -----------------------------------------------------------------------------------------------
 

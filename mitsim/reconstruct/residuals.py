@@ -31,8 +31,7 @@ from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
 from mitsim.devices.patterns import shot_orders
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
-from mitsim.reconstruct.factorisation import IndexArray, group_pixels
-from mitsim.reconstruct.solver import Prepared, prepare, robust_scatter
+from mitsim.reconstruct.solver import IndexArray, Prepared, group_pixels, prepare, robust_scatter
 
 # ---- Other readings of the data -------------------------------------------------------------------------------------
 

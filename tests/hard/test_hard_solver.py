@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.factorisation import pattern_blocks
-from mitsim.reconstruct.solver import ROUNDING_LIMIT, prepare
+from mitsim.reconstruct.solver import ROUNDING_LIMIT, pattern_blocks, prepare
 from mitsim.reconstruct.solvers import solve_tv
 from tests.exact_solver import dots
 from tests.hard.hard_models import EPS, LAMBDAS, check_ending, frames_of, shadow, spread, summed

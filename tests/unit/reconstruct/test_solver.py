@@ -15,10 +15,9 @@ from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
-from mitsim.reconstruct.factorisation import pattern_blocks
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, covariance_root, prepare, project_frames
+from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, covariance_root, pattern_blocks, prepare, project_frames
 from tests.ideal_sessions import Bench
 
 
