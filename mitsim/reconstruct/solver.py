@@ -36,7 +36,7 @@ from sensor row to row adds to all numbers of a column of W; halves of the colum
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -175,8 +175,27 @@ def group_pixels(patterns: FloatArray) -> tuple[Group, ...]:
 
 
 def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], centred: bool = False) -> Side:
+    """Return a side from its factor ``phi`` (m, n) and ``patterns`` (n, K), whose pixels fall into ``groups``.
+
+    The SVD is numpy's, because scipy's wheel has a second thread pool (2.5 s instead of 15 ms on a busy machine).
+    """
     sensor, scene = phi.shape
-    parts = [_block_svd(phi[:, group.pixels], group) for group in groups]
+    parts: list[tuple[Sequence[FloatArray], FloatArray, FloatArray]] = []
+    for group in groups:
+        if group.shared is not None:
+            # B = psi (x) Phi diag(w): the SVD of one slab serves all, whatever K.
+            weights, psi = group.shared
+            norm = float(np.linalg.norm(psi))
+            left, values, right = np.linalg.svd(phi[:, group.pixels] * weights, full_matrices=False)
+            # Without the work for 1, and without columns for 0.
+            scaled = [left[:, :0] if k == 0.0 else left if k == 1.0 else left * k for k in psi / (norm or 1.0)]
+            parts.append((scaled, values * norm, right))
+        else:
+            # Phi = Q R once: B = (I (x) Q) [R diag(p_1); R diag(p_2); ...] is then as short as R, and as accurate.
+            q, small = np.linalg.qr(phi[:, group.pixels])
+            stacked = np.concatenate([small * column for column in group.patterns.T])
+            left, values, right = np.linalg.svd(stacked, full_matrices=False)
+            parts.append(([q @ slab for slab in np.split(left, group.patterns.shape[1])], values, right))
     singular = np.concatenate([part[1] for part in parts])
     starts = np.concatenate(([0], np.cumsum([len(part[1]) for part in parts])))
     basis = np.zeros((scene, len(singular)))
@@ -204,28 +223,6 @@ def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], 
         scene_size=scene,
         data_rows=(sensor - centred) * patterns.shape[1],
     )
-
-
-def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray]:
-    """Return the slabs, singular values and right vectors of a group's stacked matrix.
-
-    The SVD is numpy's, because scipy's wheel has a second thread pool (2.5 s instead of 15 ms on a busy machine).
-    """
-    patterns = group.patterns
-    if group.shared is not None:
-        # B = psi (x) Phi diag(w): the SVD of one slab serves all, whatever K.
-        weights, psi = group.shared
-        norm = float(np.linalg.norm(psi))
-        left, singular, right = np.linalg.svd(phi * weights, full_matrices=False)
-        scale = psi / (norm or 1.0)
-        # Without the work for 1, and without columns for 0.
-        scaled = (left[:, :0] if k == 0.0 else left if k == 1.0 else left * k for k in scale)
-        return tuple(scaled), singular * norm, right
-    # Phi = Q R once: B = (I (x) Q) [R diag(p_1); R diag(p_2); ...] is then as short as R, and as accurate.
-    q, small = np.linalg.qr(phi)
-    stacked = np.concatenate([small * column for column in patterns.T])
-    left, singular, right = np.linalg.svd(stacked, full_matrices=False)
-    return tuple(q @ slab for slab in np.split(left, patterns.shape[1])), singular, right
 
 
 def _frozen(array: FloatArray) -> FloatArray:
