@@ -103,18 +103,6 @@ def test_planted_offsets_come_back_within_three_of_their_own_standard_errors(mas
     assert fitted.chi_square == pytest.approx(1, abs=0.25)
 
 
-@pytest.mark.slow
-def test_standard_errors_are_those_that_fits_scatter_by() -> None:
-    """Twelve sessions: their 72 deviations have a mean square of 1 within 0.5, three deviations of chi-square."""
-    model = camera(None)
-    truth = model.built.move(PLANTED)
-    found = [
-        deviations(fit_placement(model, shown(model, truth, 0.1, patterns(6), seed), FITTED), truth)
-        for seed in range(12)
-    ]
-    assert np.mean(np.square(found)) == pytest.approx(1, abs=0.5)
-
-
 def test_numbers_that_act_alike_are_refused() -> None:
     """A small sensor far away sees a larger window as it sees a mask further off."""
     model = camera(None, depth=400.0)
@@ -188,23 +176,6 @@ def test_a_turned_mask_casts_the_shadow_that_rays_through_it_make() -> None:
     assert np.linalg.norm(reported - change) < 0.7 * np.linalg.norm(change)
 
 
-@pytest.mark.parametrize("spectrum", [None, LINE])
-def test_the_model_of_a_part_of_a_sensor_is_the_models_part(spectrum: Spectrum | None) -> None:
-    """Of what factors make of a region; and to 3 % of its turn, whose derivatives hold how the factors' norms change.
-    (Planted: the falloff of rows for columns; mask coordinates of rows for columns.)"""
-    whole, placement = camera(spectrum), Placement(2.01, 0.02, -0.03)
-    geometry = whole.geometry.model_copy(update={"rows": 80, "columns": 96, "roi": (12, 30, 50, 61)})
-    part = replace(whole, geometry=geometry)
-
-    def operators(model: ModelledCamera) -> list[FloatArray]:
-        products = [model.factors(placement)], model.rotation_terms(placement)
-        return [np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in terms)) for terms in products]
-
-    for found, every, most in zip(operators(part), operators(whole), (1e-9, 0.03), strict=True):
-        expected = every[20:70, :, 30:91]
-        assert np.linalg.norm(found - expected) < most * np.linalg.norm(expected)
-
-
 def test_frames_are_chosen_from_coarse_to_fine_and_counted() -> None:
     changes = [0, 5, 1, 3]
     assert Modelling("wave", 2).used_patterns(changes, True, 1) == [("horizontal", 0)]
@@ -230,19 +201,6 @@ def test_words_are_checked() -> None:
             Modelling(**wrong)  # type: ignore[arg-type]
     assert Modelling("wave", fitted=("magnification",)).free == ("magnification", "gain")
     assert tuple(UNITS) == tuple(Placement.__dataclass_fields__)
-
-
-def test_a_turn_acts_where_rays_cross_the_mask() -> None:
-    """From the mask's centre, on the line from a pixel to a point of the board; a factor's part by that coordinate.
-    (Planted: pixels that are seen larger than they are.)"""
-    model, placement = camera(None, depth=8.0), Placement(2.01, 0.02, -0.03, gain=5.0)
-    left, right = model.factors(placement)
-    (_, by_columns), (by_rows, _) = model.rotation_terms(placement)
-    pixels, edges = model.geometry.centres(0)[:, None], np.linspace(-0.15, 0.15, N + 1)
-    board = 8.0 * (edges[:-1] + edges[1:]) / 2
-    crossing = pixels + (board - pixels) * 2.01 / 8.0
-    np.testing.assert_allclose(by_columns, (crossing + 0.03) * right, rtol=0, atol=1e-12 * right.max())
-    np.testing.assert_allclose(by_rows, -(crossing - 0.02) * left, rtol=0, atol=1e-12 * left.max())
 
 
 # ---- Models of simulated sessions ----

@@ -270,16 +270,6 @@ def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.Monke
     assert all(np.array_equal(*pair) for pair in zip(formed, lots, strict=True))
 
 
-@pytest.mark.parametrize("mode", ["pair", "uniform"])
-def test_factors_of_both_kinds_at_once_are_those_of_each_alone(mode: str) -> None:
-    """(Planted: noise-free sums given the noisy response.)"""
-    lit = lit_session(7, mode)
-    for found, noise_free in zip(estimates(lit, Job(), (NOISY, NOISE_FREE))[0], (False, True), strict=True):
-        alone, _ = estimate(lit, Job(), noise_free)
-        assert np.array_equal(found.left, alone.left) and np.array_equal(found.right, alone.right)
-        assert found.separability_residual == alone.separability_residual
-
-
 def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
     """All shots, the uniform one of each side too: 2 x (1 + 16)."""
     monkeypatch.setattr(Exposer, "saturates", lambda *_: True)
@@ -292,36 +282,6 @@ def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: py
 
 
 # ---- differences -----------------------------------------------------------------------------------------------------
-
-
-RATES = [np.array([[value, 7.0]]) for value in (100.0, 60.0, 30.0, 90.0)]
-
-
-def played(pairs: bool, monkeypatch: pytest.MonkeyPatch) -> LitSession:
-    """A session whose noisy frames are given, the uniform one first where it has one; digital numbers are rates."""
-    lit = LitSession(SimpleNamespace(pairs=pairs, filters=None), None, Frame(np.ones((1, 2)), 0, 0, 0), 1.0, 0.0)  # type: ignore[arg-type]
-    monkeypatch.setattr(LitSession, "_both", np.ones((1, 2)))
-    monkeypatch.setattr(LitSession, "_expose", lambda self, light, side, index: (RATES[index], index + 1))
-    return lit
-
-
-SHOWN = Frame(np.ones((1, 2)), 0.0, 0.0, 0.0)
-
-
-def test_a_calibration_pair_is_the_plain_difference_of_its_two_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """(Planted: the -1 frame weighted 0.999.) So what both frames share is gone, to the last bit."""
-    lit = played(True, monkeypatch)
-    responses = [lit.noisy("horizontal", number, SHOWN) for number in (0, 1)]
-    assert [response.rate.tolist() for response in responses] == [[[40.0, 0.0]], [[-60.0, 0.0]]]
-    assert [response.saturated for response in responses] == [1 + 2, 3 + 4]
-
-
-def test_a_calibration_with_a_uniform_shot_takes_it_from_twice_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """2 Y((1 + P)/2) - Y(1) = Y(P): what a +1 and a -1 pixel share is gone. The uniform shot counts once."""
-    lit = played(False, monkeypatch)
-    responses = [lit.noisy("horizontal", number, SHOWN) for number in (0, 1, 2)]
-    assert [response.rate.tolist() for response in responses] == [[[20.0, 7.0]], [[-40.0, 7.0]], [[80.0, 7.0]]]
-    assert [response.saturated for response in responses] == [1 + 2, 3, 4]
 
 
 def test_a_noise_free_response_is_that_of_the_signed_pattern() -> None:
@@ -380,23 +340,6 @@ def test_frames_of_a_session_in_a_folder_give_its_factors_bit_for_bit(
     assert measured.separability_residual == simulated.separability_residual
     # Here the noise is that of the light as it was measured, there the closed form.
     assert measured.unexplained == pytest.approx(simulated.unexplained, abs=0.02)
-
-
-@pytest.mark.parametrize("mode", ["pair", "uniform"])
-def test_repeats_leave_their_numbers_part_of_the_noise(mode: str) -> None:
-    """Residual variance of 4 repeats is a quarter of that of 1, and each is the closed form of its responses.
-
-    16 responses of 24 x 27 numbers tell a variance to 1.4 %; tested at four standard deviations of each. (Planted:
-    every repeat of the same noise; the closed form without repeats.)
-    """
-    noise = {}
-    for repeats in (1, 4):
-        lit = lit_session(mode=mode, repeats=repeats)
-        noise[repeats] = estimate(lit, Job())[0].noise ** 2
-        if mode == "pair":  # responses to a uniform frame share its noise, which the estimate takes up
-            assert noise[repeats] == pytest.approx(lit.response_noise**2, rel=0.06)
-        assert lit.session.shots == (32 if mode == "pair" else 18) * repeats
-    assert noise[4] == pytest.approx(noise[1] / 4, rel=0.08)
 
 
 @pytest.mark.parametrize("mode", ["pair", "uniform"])

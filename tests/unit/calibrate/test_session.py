@@ -169,13 +169,6 @@ def test_the_scale_is_absolute(session: Callable[..., Done]) -> None:
     assert np.linalg.norm(rate - expected) < 0.03 * np.linalg.norm(expected)
 
 
-def test_number_of_frames(session: Callable[..., Done]) -> None:
-    assert session("separable", "pair", 16)[1].manifest.result["frames"] == 2 * 2 * 16
-    assert session("separable", "uniform", 16)[1].manifest.result["frames"] == 2 * (16 + 1)
-    # 13 is no Hadamard order: the patterns are those of 16.
-    assert session("separable", "pair", 13)[1].manifest.result["frames"] == 2 * 2 * 16
-
-
 def test_the_folder(session: Callable[..., Done]) -> None:
     bench, factors, calibration, folder = session("separable", "pair", 16)
     assert sorted(path.name for path in folder.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
@@ -441,22 +434,6 @@ def test_only_the_same_session_is_resumed(
 
 
 @pytest.mark.usefixtures("geometric_sessions")
-def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path], tmp_path: Path) -> None:
-    bench = open_bench(shared_scene("memory16", n=16))
-    bench.calibrate(recipe=recipe("pair"), output=tmp_path / "streamed")
-    bench.calibrate(recipe=recipe("pair")).save(tmp_path / "saved")
-    manifests = []
-    for name in ("streamed", "saved"):
-        manifest = json.loads((tmp_path / name / "manifest.json").read_text())
-        for key in SECONDS:
-            del manifest["result"][key]
-        manifests.append(manifest)
-    assert manifests[0] == manifests[1]
-    with pytest.raises(MitsimError, match="holds files already"):
-        bench.calibrate(recipe=recipe("pair")).save(tmp_path / "saved")
-
-
-@pytest.mark.usefixtures("geometric_sessions")
 def test_what_is_said_of_factors_is_added_up_by_one_thread_of_blas(
     shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -471,12 +448,3 @@ def test_what_is_said_of_factors_is_added_up_by_one_thread_of_blas(
     with threadpool_limits(2):
         open_bench(shared_scene("threads16", n=16)).calibrate(recipe=recipe("uniform"))
     assert asked == [{1}]
-
-
-def test_describing_a_session_traces_nothing(
-    shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("make_plan", "trace_lines"):
-        monkeypatch.setattr(f"mitsim.calibrate.board_session.{name}", lambda *_: pytest.fail("work was done"))
-    session = Session(open_bench(shared_scene("separable16", n=16)), recipe("pair"))
-    assert session.shots == 64 and session.signs.shape == (16, 16)

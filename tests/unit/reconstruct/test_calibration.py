@@ -9,15 +9,11 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.reconstruct.factors import (
     AmbientLight,
-    StripeSums,
     _rank_one_split,
     estimate_factors,
-    factors_of_sums,
     predicted_error,
-    squared_condition,
     stripe_sums,
 )
-from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solver import prepare
 from tests.shadow_factor import scene_factor
 
@@ -86,21 +82,6 @@ def test_error_under_noise_is_the_predicted_one():
     assert np.mean(estimates) == pytest.approx(noise, rel=0.01)
 
 
-def test_residual_rises_when_responses_are_not_separable():
-    left, right = factors()
-    horizontal, vertical = responses(left, right)
-    seen = []
-    for stray in (0.0, 0.01, 0.1, 1.0):
-        shadow = 1 + stray * np.outer(np.linspace(-1, 1, M), np.linspace(-1, 1, M + 5))
-        got = estimate_factors([y * shadow for y in horizontal], [y * shadow for y in vertical], H)
-        seen.append(got.separability_residual)
-    assert (np.diff(seen) > 0).all()
-    # x y over the square has mean square 1/9: a tilt of 0.01 leaves about 0.01 / 3 of a response.
-    assert seen[1] == pytest.approx(0.01 / 3, rel=0.3)
-    assert not got.ok
-    assert str(got.status).startswith("Responses are not separable")
-
-
 def test_twin_pixels_are_reported_as_rank_deficient():
     left, right = factors()
     left[:, 1] = left[:, 0]
@@ -149,34 +130,6 @@ def test_centred_flatcam_is_separable_and_recovers_the_image():
         H,
     )
     assert not plain.ok
-
-
-def test_centring_takes_out_whatever_rows_or_columns_share():
-    """Each response with an offset a row and one a column: the factors are those without, whose columns sum to zero."""
-    rng = np.random.default_rng(5)
-    horizontal, vertical = responses(*factors())
-    offset = [[rng.normal(size=(M, 1)) + rng.normal(size=(1, M + 5)) for _ in side] for side in (horizontal, vertical)]
-    plain = estimate_factors(horizontal, vertical, H, centre=True)
-    got = estimate_factors(
-        *(
-            [y + c for y, c in zip(side, c, strict=True)]
-            for side, c in zip((horizontal, vertical), offset, strict=True)
-        ),
-        H,
-        centre=True,
-    )
-    sign = np.sign(np.vdot(got.left, plain.left))  # of centred factors no sum tells which it is
-    for name in ("left", "right"):
-        estimate, truth = getattr(got, name), getattr(plain, name)
-        assert relative(sign * estimate, truth) < 1e-11
-        assert np.abs(estimate.sum(axis=0)).max() < 1e-11 * np.abs(estimate).sum()
-
-
-def test_a_factor_that_is_singular_to_rounding_has_no_condition():
-    """Rounding is 1e-16 of the largest singular value, not of the next."""
-    assert squared_condition(np.diag([1.0, 1e-8, 1e-17])) == np.inf
-    assert squared_condition(np.diag([1.0, 1e-8, 1e-8])) == pytest.approx(1e16, rel=1e-6)
-    assert squared_condition(np.ones((2, 3))) == np.inf
 
 
 def test_flatcam_leak_where_the_mask_does_not_cover_the_view():
@@ -234,49 +187,6 @@ def test_a_uniform_response_is_split_as_its_svd_would_be(shape, next_one):
     if next_one < 1 or size == 1:
         np.testing.assert_allclose(np.outer(a, v), 3.0 * np.outer(left[:, 0], right[:, 0]), atol=1e-11)
     assert np.linalg.norm(mean @ v) == pytest.approx(3.0 * np.linalg.norm(v), rel=1e-12)
-
-
-@pytest.mark.parametrize("side", ["horizontal", "vertical"])
-def test_a_response_of_several_parts_is_summed_as_a_whole(side):
-    """70 000 numbers, of which 32768 are held at a time. (Planted: the last part left out.)"""
-    rng = np.random.default_rng(3)
-    response = rng.standard_normal((350, 200))
-    common = rng.random(200 if side == "horizontal" else 350)
-    values = response if side == "horizontal" else response.T
-    sums = StripeSums(side, False, common, np.empty((len(values), 2)))
-    sums.add(response)
-    vector = np.linalg.lstsq(common[:, None], values.T, rcond=None)[0][0]
-    np.testing.assert_allclose(sums.vectors[:, 0], vector, rtol=1e-10, atol=1e-12)
-    assert sums.misfit == pytest.approx(np.square(values - np.outer(vector, common)).sum(), rel=1e-12)
-    assert sums.energy == pytest.approx(np.square(values).sum(), rel=1e-12) and sums.done == 1
-
-
-def test_noise_of_either_side_counts() -> None:
-    """Responses to one orientation have noise of 1, those to the other none: half as much in all. (Planted: one side's
-    misfit twice.)"""
-    rng = np.random.default_rng(3)
-    horizontal, vertical = responses(*factors())
-
-    def noisy(frames):
-        return [frame + rng.normal(size=frame.shape) for frame in frames]
-
-    for sides in ((noisy(horizontal), vertical), (horizontal, noisy(vertical))):
-        # 28 800 numbers tell it to half a per cent.
-        assert estimate_factors(*sides, H, uniform=horizontal[0]).noise == pytest.approx(0.5**0.5, rel=0.02)
-
-
-@pytest.mark.parametrize("extra", [(300.0, 0.0), (0.0, 300.0)])
-def test_the_worse_factor_tells_whether_both_can_be_used(extra: tuple[float, float]) -> None:
-    """(Planted: the better one.)"""
-    horizontal, vertical = responses(*(balanced(*factors())))
-    sums = stripe_sums(horizontal[0], vertical[0], N)
-    for side, rest in zip(sums, (horizontal, vertical), strict=True):
-        for response in rest[1:]:
-            side.add(response)
-    assert factors_of_sums(*sums, H).ok
-    found = factors_of_sums(*sums, H, extra=extra)
-    assert max(found.predicted_error) > 0.1 > min(found.predicted_error)
-    assert found.status.verdict is Verdict.MOSTLY_NOISE
 
 
 def test_responses_that_are_missing_are_counted() -> None:

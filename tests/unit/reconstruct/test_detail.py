@@ -12,7 +12,6 @@ from mitsim.reconstruct.accumulation import (
     accumulate,
     disagreement,
     factor_slope,
-    offset_responses,
 )
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare
@@ -38,18 +37,6 @@ def squares(seed: int) -> np.ndarray:
         (y, x), size = rng.integers(0, FINE * N, 2), rng.integers(4, 40)
         print_[y : y + size, x : x + size] = rng.uniform(0.05, 0.95)
     return print_
-
-
-def test_moved_light_is_seen_by_the_difference_of_neighbours() -> None:
-    """A response that grows evenly from pixel to pixel changes by one step everywhere."""
-    rng = np.random.default_rng(4)
-    first, step, patterns = rng.random((12, 1)), rng.random((12, 1)), rng.random((5, 2))
-    factor = first + 0.01 * step * np.arange(5)
-    side = prepare(factor, factor, patterns, patterns).left
-    expected = np.zeros((5, len(side.singular)))
-    for pattern, slab in zip(patterns.T, side.slabs, strict=True):
-        expected[:, slab.columns] += np.outer(pattern, 0.01 * step[:, 0] @ slab.matrix)
-    assert offset_responses(side, factor_slope(factor), patterns).sum(axis=0) == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_single_pixel_has_no_neighbour() -> None:
@@ -102,42 +89,6 @@ def test_disagreement_is_the_energy_of_the_image_error(patterns: str) -> None:
         struck += np.square(prepared.image(gain * problem.projected) - expected).mean()
         reported += disagreement(model, gain, problem.halves, (zero, zero)).mean()
     assert reported == pytest.approx(struck, rel=0.1 if patterns == "uniform" else 0.06)
-
-
-def test_noise_is_taken_off_what_halves_disagree_on() -> None:
-    """White noise in the frames, as much in the image as the dipoles' error: what is told stays that of dipoles.
-
-    40 draws of some 100 numbers, half of their energy signal: good to 2 sqrt(2 / 4000) = 4 %, three of them.
-    (Planted: no noise taken off; its level in the image for that in the difference; G^2
-    multiplied for divided by; columns taken for rows.)
-    """
-    rng, family = np.random.default_rng(6), parse_patterns("dots:3", N, 0)
-    factors, (P_L, P_R) = (shadow(), shadow(0.37)), (family.left.astype(float), family.right.astype(float))
-    model = Model(prepare(*factors, P_L, P_R), factors, (P_L, P_R))
-    propagation, reported = Propagation(model, 1e-6), 0.0
-    white, right = propagation.of_white(1.0), model.prepared.right
-    dipoles = rng.standard_normal((40, N, N))
-    seen = [model.moved[0].sum(axis=0).T @ d @ (right.basis * right.singular) for d in dipoles]
-    errors = [model.prepared.image(propagation.gain * each) for each in seen]
-    struck = float(np.square(errors).mean())
-    deviation = np.sqrt(struck / white.mean())
-    for d in dipoles:
-        sums = model.prepared.accumulator()
-        for i, left in enumerate(P_L.T):
-            for j, right in enumerate(P_R.T):
-                noise = deviation * rng.standard_normal((len(factors[0]), len(factors[1])))
-                sums.add(model.slopes[0] @ (np.outer(left, right) * d) @ factors[1].T + noise, i, j)
-        known = deviation**2 * white
-        halves = model.prepared.problem(sums).halves
-        assert halves
-        reported += disagreement(propagation.model, propagation.gain, halves, (known, known)).mean()
-    assert reported / 40 == pytest.approx(struck, rel=0.12)
-    # Light that moves along the rows is told by halves of the rows, and by what is known of those alone.
-    everything = disagreement(propagation.model, propagation.gain, halves, (known, known))
-    assert disagreement(propagation.model, propagation.gain, halves, (known, 1e6 * known)) == pytest.approx(everything)
-    assert (
-        everything.any() and not disagreement(propagation.model, propagation.gain, halves, (1e6 * known, known)).any()
-    )
 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4"])

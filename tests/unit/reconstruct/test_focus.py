@@ -48,8 +48,6 @@ PARALLAX = Parallax(
     mask_distance_mm=2.0,
 )
 
-LEVEL = PARALLAX.model_copy(update={"row_mm": (0.0, 0.0)})
-"""Of a projector beside the camera alone."""
 
 
 def shadow(depth: float, axis: int, n: int = N, baseline: tuple[float, float] = BASELINE) -> np.ndarray:

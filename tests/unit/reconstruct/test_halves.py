@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mitsim.reconstruct import solver
 from mitsim.reconstruct.solver import coefficient_noise, is_misfit, noise_variance, prepare
 
 M, N = 96, 24
@@ -87,21 +86,3 @@ def test_errors_of_a_factor_are_noise_of_single_columns():
         excess.append(problem.halves.excess[:, 0])
         expected.append(error**2 * np.square(light[:, 0]).sum())
     assert np.median(excess) == pytest.approx(np.mean(expected), rel=0.25)
-
-
-def test_sides_without_spare_rows_tell_nothing_and_harm_nothing():
-    """As many rows as unknowns: both halves fit all that they see. The other side still tells the noise."""
-    rng = np.random.default_rng(3)
-    model = rng.random((N, N)), blurred(rng)
-    problem = summed(model, "uniform", rng.random((N, N)), 1.0, rng)[1]
-    assert problem.halves.typical == pytest.approx(1.0, rel=0.5)  # 576 squares: 10 %, five of them
-    assert np.isfinite(problem.halves.excess).all()
-
-
-def test_medians_of_known_squares() -> None:
-    """Of rows with 5, 4, 1 and no known numbers, against numpy's; 0.4549 is the median of a normal number's square."""
-    squares = np.random.default_rng(0).random((4, 5))
-    squares[1, 2], squares[2, 1:], squares[3] = np.nan, np.nan, np.nan
-    found = solver._medians(squares)
-    assert found[:3] == pytest.approx(np.nanmedian(squares[:3], axis=1) / 0.4549, rel=1e-14)
-    assert np.isnan(found[3])

@@ -12,13 +12,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.core.manifests import Digital
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.misfit import UNEXPLAINED, Cause, Misfit, chi_square_text, defects_of
+from mitsim.reconstruct.misfit import UNEXPLAINED, Cause, Misfit, defects_of
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
-from mitsim.reconstruct.residuals import CHANCE
-from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.solution import Verdict
 from tests.ideal_sessions import BLACK, CODES, PIXELS, Bench, N, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import Frames, with_frames
 
@@ -199,70 +196,6 @@ def test_misfit_has_no_unit() -> None:
         assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6)
 
 
-def test_lambda_is_told_whether_the_frames_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where they do not, or where the calibration says that no factors do, lambda is chosen once more, knowing that.
-
-    In small sessions the frames show it themselves and both choices agree, so what is said is looked at."""
-    reported, solve = [], Prepared.solve
-    monkeypatch.setattr(
-        Prepared,
-        "solve",
-        lambda *given, **named: reported.append(named.get("explained", True)) or solve(*given, **named),
-    )
-    factors = bench().calibrated(0)
-    odd = replace(factors, status=Status(Verdict.NOT_SEPARABLE, "Not separable"))
-    for shift, known, expected in ((0.0, factors, [True]), (SHIFT, factors, [True, False]), (0.0, odd, [True, False])):
-        reported.clear()
-        reconstruct(bench(shift).run("dots:3", picture(), 0), known)
-        assert reported == expected
-
-
-def test_variance_of_digital_numbers() -> None:
-    """Against drawn shots: shot noise of light and dark current, read noise, rounding; of one shot and of a pair.
-
-    200 000 draws tell a variance to 0.3 % (one deviation); five of these.
-    """
-    digital = Digital(
-        exposure_s=0.1, gain_dn_per_e=0.5, black_level_dn=50, dark_current_e_per_s=300, read_noise_e=3.0, step_dn=1.0
-    )
-    rng = np.random.default_rng(3)
-
-    def shot(rate: float) -> np.ndarray:
-        electrons = rng.poisson((rate + 300) * 0.1, 200_000) + 3.0 * rng.standard_normal(200_000)
-        return digital.rate(np.rint(0.5 * electrons + 50))
-
-    one, two = shot(1000.0), shot(200.0)
-    assert digital.variance(one).mean() == pytest.approx(one.var(), rel=0.016)
-    assert digital.variance(one + two, 2).mean() == pytest.approx((one - two).var(), rel=0.016)
-
-
-def test_chance_is_rare() -> None:
-    """The limit on a tile of a single frame: CHANCE deviations of chi-square with as many degrees of freedom."""
-    assert CHANCE * np.sqrt(2 / (DATA / 64)) < 1
-
-
-def test_both_halves_of_a_pair_count_alike() -> None:
-    """To the last bit: a half that weighs 0.999 leaves a thousandth of the uniform light in every measurement, which is
-    less than its noise. (Planted in Capture.pattern_measurements.)"""
-    shots = bench().run("hadamard:4", picture(), 0)
-    rate = {
-        (shot.row, shot.column, shot.sign): shots.manifest.digital.rate(dn)
-        for shot, dn in zip(shots.manifest.patterns.captures, shots.dn, strict=True)
-    }
-    for each in shots.pattern_measurements():
-        positive, negative = rate[each.row, each.column, 1], rate[each.row, each.column, -1]
-        assert np.array_equal(each.frame, positive - negative) and np.array_equal(each.light, positive + negative)
-        assert each.shots == 2 and each.power == pytest.approx(np.sum(positive**2 + negative**2), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("chi_square", "text"), [(1.0042, "1.004"), (9.5, "9.500"), (10.0, "10"), (12_345.0, "1.23e+04")]
-)
-def test_chi_square_as_people_read_it(chi_square: float, text: str) -> None:
-    """The third decimal where fitting images differ, three digits beyond. (Planted: 10 with three decimals.)"""
-    assert chi_square_text(chi_square) == text
-
-
 @pytest.mark.parametrize("unit", [0.01, 1.0])
 def test_a_faulty_frame_is_found_beside_total_variation_in_any_unit(unit: float) -> None:
     """Total variation has no lambda; the picture is that of a lambda in the scale of the factors."""
@@ -324,16 +257,6 @@ def test_a_pixel_that_stands_still(place: tuple[int, int], number: float) -> Non
     assert mended.misfit.defects.places == [place]
 
 
-def test_a_dead_line() -> None:
-    def dead(frames: Frames) -> Frames:
-        return [np.where(np.arange(96)[None, :] == 51, BLACK, frame) for frame in frames]
-
-    shots = bench().run("dots:4", picture(1), 1)
-    mended = reconstruct(with_frames(shots, dead), bench().calibrated(1))
-    assert mended.ok and mended.misfit is not None and mended.misfit.defects is not None
-    assert mended.misfit.defects.places == [(row, 51) for row in range(96)]
-
-
 def test_noise_alone_makes_no_defects() -> None:
     """A chi-square of one degree of freedom has the longest tail."""
     rng = np.random.default_rng(1)
@@ -352,16 +275,3 @@ def test_a_spot_of_light_is_no_defect() -> None:
     assert defects_of(squares, np.full((64, 64), 4.0), 4) is None
     many = np.where(np.random.default_rng(2).random((64, 64)) < 0.05, 400.0, 4.0)
     assert defects_of(many, np.full((64, 64), 4.0), 4) is None
-
-
-def test_light_that_fits_nowhere_is_no_defect() -> None:
-    """Print finer than a scene pixel leaves five times the noise, and more where shadows of two edges cross; a pixel
-    that is dead leaves more by far."""
-    squares = np.full((120, 120), 49 * 5.5)
-    squares[10::30] += 49 * 3
-    squares[:, 20::30] += 49 * 3
-    squares[10::30, 20::30] += 49 * 10
-    assert defects_of(squares, np.full((120, 120), 49.0), 49) is None
-    squares[70, 31] = 49 * 500
-    found = defects_of(squares, np.full((120, 120), 49.0), 49)
-    assert found is not None and found.places == [(70, 31)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,13 +20,11 @@ from mitsim.reconstruct import request
 from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import may_replace, reconstruct
-from mitsim.reconstruct.request import ImageCost, predict_cost
+from mitsim.reconstruct.request import predict_cost
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Tikhonov
 from mitsim.report.reconstruct_run import reconstruct as reconstruct_folders
-from tests import ideal_sessions
-from tests.ideal_sessions import picture
 
 N, PIXELS = 4, 9
 
@@ -140,29 +137,6 @@ def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors
         reconstruct(shots, Factors(factors.left, factors.right, masked, factors.status))
 
 
-@pytest.mark.filterwarnings("error")
-def test_a_lambda_that_leaves_nothing_of_the_data_gives_black(shots: Capture, factors: Factors) -> None:
-    """The largest lambda that a request may have: the squares of its weights are still above 0."""
-    image = reconstruct(shots, factors, lam=1e100)
-    assert 0 < np.abs(image.image).max() < 1e-80
-
-
-def test_the_condition_of_each_side_is_told(shots: Capture, factors: Factors) -> None:
-    """Columns of very different light on the right alone."""
-    worse = Factors(factors.left, factors.right * np.array([1.0, 1.0, 1.0, 1e-3]), factors.manifest, factors.status)
-    result = reconstruct(shots, worse, 1.0)
-    left, right = result.condition_sides
-    assert right > 1e4 > left > 1 and result.condition == right
-    assert left == reconstruct(shots, factors, 1.0).condition_sides[0]
-
-
-def test_the_time_of_both_parts_is_stated(shots: Capture, factors: Factors) -> None:
-    begin = time.perf_counter()
-    result = reconstruct(shots, factors)
-    assert min(result.seconds.values()) > 0 and sum(result.seconds.values()) <= time.perf_counter() - begin
-    assert result.summary()["seconds"]["total"] == pytest.approx(sum(result.seconds.values()))
-
-
 def test_what_an_image_takes_is_predicted_where_that_can_be_told(shots: Capture, factors: Factors) -> None:
     """By the stages that it states; every shot is read, and held against the model. (Planted: half of the shots.)"""
     image = reconstruct(shots, factors)
@@ -172,38 +146,6 @@ def test_what_an_image_takes_is_predicted_where_that_can_be_told(shots: Capture,
     assert summary["predicted_seconds"] == sum(summary["predicted"].values()) > 0
     assert 1e8 < summary["predicted_memory_bytes"] < 2e8
     assert reconstruct(shots, factors, method="tv").summary()["predicted_memory_bytes"] is None
-
-
-def test_large_sensors_are_predicted_to_be_read_twice() -> None:
-    """16 times the pixels take 16 times as long, and once more for frames that are not kept; memory grows with a frame,
-    not with their number. (Planted: one look at frames that are not kept.)"""
-
-    def reported(pixels: int, dots: int) -> ImageCost:
-        family = parse_patterns(f"dots:{dots}", 128)
-        captures = [None] * dots**2
-        shots = SimpleNamespace(
-            patterns=(family.left, family.right), manifest=SimpleNamespace(patterns=SimpleNamespace(captures=captures))
-        )
-        side = np.zeros((pixels, 128))
-        return predict_cost(shots, SimpleNamespace(left=side, right=side))  # type: ignore[arg-type]
-
-    small, large, many = reported(512, 7), reported(2048, 7), reported(2048, 32)
-    assert 10 < large.seconds["accumulate"] / small.seconds["accumulate"] <= 16
-    assert large.seconds["misfit"] > 30 * small.seconds["misfit"]
-    assert large.seconds["misfit"] > large.seconds["accumulate"] / 2
-    assert many.memory_bytes < 1.2 * large.memory_bytes < 2**30
-
-
-def test_dots_may_have_a_period_for_each_axis(tmp_path: Path) -> None:
-    """Rows of period 2, columns of 6: twelve shots and as many blocks; the print comes out of them."""
-    shots, factors = ideal_sessions.bench().run("dots:2x6", picture(), 0), ideal_sessions.bench().calibrated(0)
-    again = load_run(shots.save(tmp_path / "run"))
-    assert len(again.manifest.patterns.captures) == 12 and again.manifest.patterns.family == "dots:2x6"
-    prepared = accumulate(again, factors).prepared
-    for side, period in ((prepared.left, 2), (prepared.right, 6)):  # each coefficient is one pattern's
-        assert len(side.slabs) == period and sum(slab.matrix.shape[1] for slab in side.slabs) == side.rank
-    image = reconstruct(again, factors)
-    assert image.ok and np.abs(image.image - picture()).max() < 0.1  # 0.02 of noise; 0.4 with the periods exchanged
 
 
 def test_the_memory_that_is_asked_for_holds_the_factorised_model(

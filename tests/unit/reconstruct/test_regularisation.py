@@ -15,7 +15,6 @@ from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.solver import (
     RISK_POWER,
     DiagonalProblem,
-    _least,
     automatic_lambda,
     coefficient_noise,
     end_of_range,
@@ -99,24 +98,6 @@ def test_automatic_lambda_is_within_half_a_decibel_of_the_oracle(factor, photogr
     assert psnr(prepared.solve(sums, "auto").image, photograph) > oracle - 0.5
 
 
-def test_noise_estimate_is_the_mean_variance(factor, photograph):
-    # Pure read noise of 3 units over 262144 data: its variance is known to 0.3 %; five of those.
-    prepared = prepare(factor, factor, np.ones((N, 1)), np.ones((N, 1)))
-    sums = prepared.accumulator()
-    noise = 3 * np.random.default_rng(0).normal(size=(512, 512))
-    sums.add(factor @ photograph @ factor.T + noise, 0, 0)
-    assert noise_variance(prepared.problem(sums)) == pytest.approx(9.0, rel=0.015)
-
-
-def test_chosen_lambda_is_the_minimum_of_the_score(factor, photograph):
-    prepared, sums = captured(factor, photograph, 5)
-    problem = prepared.problem(sums)
-    chosen = automatic_lambda(problem)
-    noise = coefficient_noise(problem)
-    others = [risk_score(problem, chosen * step, noise) for step in (0.5, 0.9, 1.1, 2.0)]
-    assert risk_score(problem, chosen, noise) < min(others)
-
-
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_sheet_far_from_its_place_is_seen_and_lambda_follows(factor, photograph, seed):
     """At 380 mm, calibrated at 400: the noise outside the model's range is 1.7 times that within, and white noise alone
@@ -134,29 +115,6 @@ def test_a_sheet_far_from_its_place_is_seen_and_lambda_follows(factor, photograp
     known = (noise_variance(problem) - problem.halves.typical) * spare
     lam = prepared.solve(sums, lack=(np.zeros(problem.sigma.shape), known)).lam
     assert lam < prepared.solve(sums).lam / 100
-
-
-def test_what_the_frames_cannot_say_may_be_told(factor, photograph):
-    """At 395 mm the error lies within the model's range, where it looks like an image: noise alone loses 6 dB and more.
-    Told that the factors do not explain the frames, the steadiest image loses less than 1."""
-    profile = mls_mask().terms[0][1]
-    there = scene_factor(profile, 0.06, centred_edges(512, 0.01172), centred_edges(N, 120 / N), 2.0, 395.0)
-    prepared, sums = under_uniform_light((factor, factor), there, photograph, 0)
-    assert not is_misfit(prepared.problem(sums))
-    assert lost(prepared, sums, photograph)[0] > 3
-    assert lost(prepared, sums, photograph, explained=False)[0] < 1.0
-
-
-def test_noise_of_the_calibration_counts(factor, photograph):
-    """Factors whose errors strike the brightest rows and columns 30 times as hard as the sensor's noise does: lambda
-    still loses less than half a decibel, and the noise that it takes for them is in the first column and row."""
-    rng = np.random.default_rng(5)
-    scale = 0.03 * np.sqrt(np.mean(factor**2))
-    model = tuple(factor + scale * rng.normal(size=factor.shape) for _ in range(2))
-    prepared, sums = under_uniform_light(model, factor, photograph, 5)
-    noise = coefficient_noise(prepared.problem(sums))
-    assert noise[0, 0] > 5 * np.median(noise)
-    assert lost(prepared, sums, photograph)[0] < 0.5
 
 
 @pytest.mark.parametrize("distance", [0.5, 0.75])
@@ -177,26 +135,6 @@ def test_noise_within_the_models_range_counts_where_it_is_more(photograph, dista
     automatic, white = lost(prepared, sums, photograph)
     assert automatic < 4
     assert white > 70
-
-
-@pytest.mark.parametrize(("within", "level"), [(1.5, 1.5), (0.95, 1.0), (0.5, 0.5)])
-def test_the_larger_noise_counts_unless_the_model_fails(within, level):
-    """A thousand numbers of variance 1 outside the range; the halves tell what is within. Outside twice as much is no
-    noise. (Planted: the noise outside alone.)"""
-    halves = SimpleNamespace(typical=within, excess=np.zeros((10, 10)))
-    data = np.random.default_rng(0).normal(size=(10, 10))
-    problem = DiagonalProblem(np.ones((10, 10)), data, float(np.square(data).sum()) + 1000.0, 1100, halves)
-    np.testing.assert_allclose(coefficient_noise(problem), level)
-
-
-def test_noise_is_found_behind_an_octave_without_data():
-    """Singular values of 1 with a faint scene, none in the next octave, then data of 1.9 times the stated noise:
-    as an image they would be brighter than all before, so there is more noise. (Planted: 0 / 0 in the empty octave.)"""
-    sigma = np.concatenate([np.ones(64), np.full(64, 0.15)]).reshape(8, 16)
-    data = np.sqrt(np.where(sigma == 1, 1.1, 1.9))
-    halves = SimpleNamespace(typical=1.0, excess=np.zeros(sigma.shape))
-    problem = DiagonalProblem(sigma, data, float(np.square(data).sum()) + 1000.0, 1128, halves)
-    np.testing.assert_allclose(coefficient_noise(problem), np.where(sigma == 1, 1.0, 1.9))
 
 
 def test_a_faint_octave_before_one_that_is_seen_is_no_noise():
@@ -286,14 +224,6 @@ def test_total_variation_without_weight_is_least_squares():
         solve_tv(prepared, sums, 1.0, iterations=0)
 
 
-def test_the_least_score_is_found_down_to_none_at_all() -> None:
-    """A parabola over lambda in steps of the search: its minimum inside, at the least step, and at no lambda at all."""
-    exponents, scale = np.arange(-4, 1.01, 0.25), 3.0
-    for least in (0.3, 3.0 * 1e-4):
-        assert _least(lambda lam, least=least: (lam - least) ** 2, scale, exponents) == pytest.approx(least, rel=0.02)
-    assert _least(lambda lam: lam**2, scale, exponents) == 0.0
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_dark_print_keeps_its_stars(seed):
     """Forty stars on black, 64 x 64 pixels under random patterns, the light 3 % off over the sensor: an even grey moves
@@ -349,15 +279,6 @@ def test_behind_a_centred_mask_the_steadiest_image_is_not_black(photograph, patt
             light = brightest * shown.sum() + signed @ shown @ signed.T
             sums.add(light * (veil + 0.003 * rng.normal(size=light.shape)), i, j)
     assert lost(prepared, sums, image, explained=False)[0] < 1.5
-
-
-def test_the_steadiest_of_two_is_looked_for():
-    """Most of the data is noise: lambda is 0.55 of the largest sigma^2, and one candidate lies beyond, at 0.70.
-    (Planted: the third last of what two images move.)"""
-    data = np.full((8, 8), np.sqrt(1 + 1 / 0.55))
-    problem = DiagonalProblem(np.ones((8, 8)), data, float(np.square(data).sum()) + 1000.0, 1064)
-    assert automatic_lambda(problem) == pytest.approx(0.55, rel=0.05)
-    assert 0.5 < automatic_lambda(problem, explained=False) <= 1
 
 
 @pytest.mark.parametrize("side", [0, 1])

@@ -6,26 +6,22 @@ Frames that fit only when they are read otherwise: turned, in another order, of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
 from mitsim.core.manifests import Digital, FactorNoise, Patterns
 from mitsim.core.runs import Measurement
 from mitsim.devices.patterns import parse_patterns, shot_orders
-from mitsim.reconstruct import misfit, residuals
 from mitsim.reconstruct.accumulation import FrameNoise, Model, factor_energy
 from mitsim.reconstruct.misfit import Cause, weigh
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.residuals import NoiseTest, Residuals
+from mitsim.reconstruct.residuals import Residuals
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
 from tests.ideal_sessions import Bench, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import Frames, with_frames
-from tests.unit.reconstruct.test_misfit import SHIFT, recovered
 
 
 def test_centring_takes_up_noise_as_well() -> None:
@@ -41,23 +37,6 @@ def test_centring_takes_up_noise_as_well() -> None:
         left.append(problem.energy - float(np.square(problem.projected[problem.sigma > 0]).sum()))
     error = np.std(left) / np.sqrt(len(left))
     assert prepared.spare * 320 == pytest.approx(np.mean(left), abs=4 * error) and error < 1
-
-
-def test_an_image_is_flagged_only_beyond_chance_and_beyond_what_fine_print_leaves(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A sheet beside its place, at thresholds that it does not reach."""
-
-    def flagged() -> bool:
-        found = recovered(bench(SHIFT)).misfit
-        return found is not None and found.flagged
-
-    assert flagged()
-    monkeypatch.setattr(misfit, "UNEXPLAINED", 1.0)
-    assert not flagged(), "it is beyond chance"
-    monkeypatch.undo()
-    monkeypatch.setattr(residuals, "CHANCE", 1e9)
-    assert not flagged(), "it is large"
 
 
 def test_noise_of_a_measurement_is_its_shots_and_that_of_the_ambient_frame_where_one_was_taken_off() -> None:
@@ -136,21 +115,6 @@ def oblong_residuals(frames: list[np.ndarray], lights: list[np.ndarray], shots: 
     return Residuals(data)  # type: ignore[arg-type]
 
 
-def test_expected_energies_add_up() -> None:
-    """Noise of the data that the fit does not take up, the rendering's error, and the factors'."""
-    frame = np.random.default_rng(2).random((16, 24))
-    sums = oblong_residuals([frame], [frame])
-    assert sums.pixels.sum() == 384
-    assert sums.expected_energy(2.0, 7.0).sum() == pytest.approx(2.0 * (384 - 6) + 5 + 7)
-
-
-def test_tiles_of_an_oblong_sensor_have_their_own_pixels() -> None:
-    """2 x 3 pixels each. (Planted: rows cut where columns are.)"""
-    frame = np.random.default_rng(2).random((16, 24))
-    sums = oblong_residuals([frame], [frame])
-    np.testing.assert_allclose(sums.residual, sums.squares.reshape(8, 2, 8, 3).sum(axis=(1, 3)))
-
-
 @pytest.mark.parametrize("shots", [1, 2])
 def test_power_is_that_of_the_shots(shots: int) -> None:
     """For two halves, whose sum and difference are known: (sum^2 + difference^2) / 2. (Planted: the sum's for both.)"""
@@ -208,15 +172,6 @@ def test_measured_noise(gain: float) -> None:
         assert test is not None
         ratios.append(test.ratio)
     assert np.mean(ratios) == pytest.approx(gain, rel=0.14)
-
-
-@pytest.mark.parametrize(("ratio", "off"), [(1.0, False), (0.7, True)])
-def test_an_energy_that_is_stated_too_large_is_no_lack_of_noise(ratio: float, off: bool) -> None:
-    """The error of rendering is known from a few groups only. On one processor it was stated so large that nothing
-    seemed to be left for the sensor's noise. (Planted: second differences are not asked.)"""
-    noise = SimpleNamespace(stated=True, variance=np.ones((1, 1)), light=np.ones((64, 100)))
-    test = NoiseTest(ratio, 0.01, 1.0, 0.01)
-    assert test.off(noise, ratio * 6400.0, 6400.0, 0.4 * 6400.0) == off  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("above", "flagged"), [(0.9, False), (1.1, True)])
@@ -293,20 +248,6 @@ def test_exchanged_halves_of_all_pairs() -> None:
     assert cause is Cause.READING and "halves-exchanged" in words[0]
 
 
-def test_light_of_walls_is_no_other_reading() -> None:
-    """Nearly half of all light spread over the sensor."""
-    walls = bench(optics=lambda light: light + 0.42228 * gaussian_filter(light, 25), peak=4e3)
-    misfit = reconstruct(walls.run("random:2", picture(2), 2), bench().calibrated(2)).misfit
-    assert misfit is not None and misfit.flagged and not misfit.readings
-
-
-def test_another_order_of_dim_light() -> None:
-    shots = replace(CAMERA, peak=10.0).run("dots:4", picture(1), 1)
-    late = with_frames(shots, lambda frames: [frames[-1], *frames[:-1]])
-    misfit = reconstruct(late, CAMERA.calibrated(1)).misfit
-    assert misfit is not None and misfit.flagged and "one step late" in misfit.reason
-
-
 def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
     """Gloss and depth."""
     place = np.linspace(-1, 1, 96)
@@ -314,11 +255,3 @@ def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
     for camera in (glossy, bench(0.3)):
         misfit = reconstruct(camera.run("dots:4", picture(1), 1), bench().calibrated(1)).misfit
         assert misfit is not None and misfit.flagged and not misfit.readings and not misfit.faults
-
-
-def test_noise_of_the_factors_is_no_misfit_of_a_reading() -> None:
-    """Turned frames against factors of a fiftieth's error. (Planted: the factors' noise left out of what is
-    allowed.)"""
-    shots = with_frames(CAMERA.run("dots:4", picture(1), 1), lambda frames: [np.flipud(frame) for frame in frames])
-    misfit = reconstruct(shots, CAMERA.calibrated(1, 0.02)).misfit
-    assert misfit is not None and misfit.cause is Cause.READING

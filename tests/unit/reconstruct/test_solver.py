@@ -17,7 +17,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, covariance_root, pattern_blocks, prepare, project_frames
+from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, pattern_blocks, prepare, project_frames
 from tests.ideal_sessions import Bench
 
 
@@ -157,16 +157,6 @@ def test_values_are_neither_clipped_nor_normalised():
     np.testing.assert_allclose(solve(factor, factor, one, one, frames, 0.0).image, image, rtol=1e-8)
 
 
-def test_single_precision_and_integer_frames_are_summed_in_double():
-    rng = np.random.default_rng(4)
-    factor, P = rng.integers(0, 5, (20, 6)).astype(float), dots(6, 2)
-    exact = frames_of(factor, factor, P, P, rng.integers(0, 9, (6, 6)).astype(float))
-    expected = solve(factor, factor, P, P, exact, 0.0).image
-    for dtype in (np.float32, np.uint32):
-        cast = {key: frame.astype(dtype) for key, frame in exact.items()}
-        np.testing.assert_array_equal(solve(factor, factor, P, P, cast, 0.0).image, expected)
-
-
 def test_solving_changes_nothing_prepared_and_sums_do_not_grow():
     rng = np.random.default_rng(4)
     factor, P = rng.random((20, 6)), dots(6, 2)
@@ -296,54 +286,6 @@ def test_equals_the_dense_solution_with_the_inverse_covariance(patterns: str, la
     assert found.residual == pytest.approx(residual, rel=1e-6)
 
 
-@pytest.mark.parametrize("left", ["five rows of pixels", "rank five"])
-@pytest.mark.parametrize("lam", [0.0, 0.3])
-def test_what_frames_do_not_tell_is_the_likeliest(left: str, lam: float) -> None:
-    """Of fewer data than unknowns C A^T (A C A^T + lambda)^+ y, the image of the least X^T C^-1 X at lambda 0.
-    (Planted: all right vectors; values that are zero but for rounding kept.)"""
-    rng = np.random.default_rng(1)
-    few, right = rng.random((5, ROWS)), rng.random((11, COLUMNS))
-    factor = few if left == "five rows of pixels" else rng.random((13, 5)) @ few
-    lit = [parse_patterns("uniform", size, 0).left.astype(float) for size in (ROWS, COLUMNS)]
-    whole, known = np.kron(factor, right), np.kron(covariance(ROWS), covariance(COLUMNS))
-    data = whole @ rng.random(ROWS * COLUMNS)
-    data += 0.1 * rng.standard_normal(data.shape)
-    inverse = np.linalg.pinv(whole @ known @ whole.T + lam * np.eye(len(whole)), rcond=1e-12)
-    expected = known @ whole.T @ inverse @ data
-    prepared = prepare(factor, right, *lit).with_correlation()
-    found = solved(prepared, data.reshape(1, *factor.shape[:1], 11), (1, 1), lam)
-    assert found.image.ravel() == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
-
-
-def test_a_rank_stays_what_it_is() -> None:
-    """Rounding of a camera of 64 pixels and rank 20 makes values of 1e-14 of the largest. (Planted: kept; cut at
-    eps / n; ones in their place.)"""
-    rng, lit = np.random.default_rng(0), np.ones((64, 1))
-    side = prepare(*(rng.random((128, 20)) @ rng.random((20, 64)) for _ in range(2)), lit, lit).with_correlation().left
-    assert (side.singular == 0).sum() == 44 and side.singular[19] > 1e-4 * side.singular[0]
-
-
-def test_coefficients_see_light_as_the_frames_have_it() -> None:
-    """W = response_L^T X response_R for any image X, and the image of W / sigma is X. (Planted: the basis for its
-    dual.)"""
-    prepared, whole, _ = model("dots:3")
-    image = np.random.default_rng(3).random((ROWS, COLUMNS))
-    sums = prepared.accumulator()
-    for place, frame in zip(np.ndindex(3, 3), (whole @ image.ravel()).reshape(-1, 13, 11), strict=True):
-        sums.add(frame, *place)
-    problem = prepared.problem(sums)
-    assert problem.projected == pytest.approx(prepared.left.response.T @ image @ prepared.right.response, abs=1e-10)
-    assert prepared.image(problem.projected / problem.sigma) == pytest.approx(image, abs=1e-9)
-
-
-def test_the_covariance_is_that_of_a_first_order_markov_field() -> None:
-    """Its inverse is tridiagonal with 1 / (1 - rho^2) at both ends and (1 + rho^2) / (1 - rho^2) between."""
-    root = covariance_root(9)
-    precision = np.linalg.inv(root @ root.T) * (1 - NEIGHBOURS**2)
-    exact = np.diag([1.0, *[1 + NEIGHBOURS**2] * 7, 1.0]) - NEIGHBOURS * (np.eye(9, k=1) + np.eye(9, k=-1))
-    assert precision == pytest.approx(exact, abs=1e-9)
-
-
 def test_equal_sides_are_factorised_once() -> None:
     factor, lit = np.random.default_rng(0).random((9, 5)), np.ones((5, 1))
     found = prepare(factor, factor, lit, lit).with_correlation()
@@ -367,22 +309,6 @@ def noisy() -> tuple[Bench, np.ndarray]:
     scene = np.full((16, 16), 0.2)
     scene[:, 8:] = 0.7
     return Bench(*(rng.random((40, 16)) for _ in range(2)), peak=30.0), scene
-
-
-def test_even_parts_of_a_noisy_image_keep_their_brightness() -> None:
-    """Twelve captures of few photons: Tikhonov's lambda draws the means of both halves to each other by 13 and 32 %,
-    neighbours alike lose 2 and 8 %, and a quarter of the error is left. (Planted: rho of 0.)"""
-    camera, scene = noisy()
-    errors, means = {"tikhonov": [], "markov": []}, {"tikhonov": [], "markov": []}
-    for seed in range(12):
-        shots, factors = camera.run("dots:4", scene, seed), camera.calibrated(seed)
-        for method in errors:
-            image = reconstruct(shots, factors, method=method).image
-            errors[method].append(np.square(image - scene).mean())
-            means[method].append((image[:, 1:7].mean(), image[:, 9:15].mean()))
-    off = {method: np.abs(np.mean(found, axis=0) / (0.2, 0.7) - 1) for method, found in means.items()}
-    assert np.mean(errors["markov"]) < 0.4 * np.mean(errors["tikhonov"])
-    assert (off["markov"] < 0.4 * off["tikhonov"]).all() and off["tikhonov"].min() > 0.1
 
 
 def test_the_truth_lies_within_twice_the_uncertainty() -> None:
