@@ -49,7 +49,6 @@ PARALLAX = Parallax(
 )
 
 
-
 def shadow(depth: float, axis: int, n: int = N, baseline: tuple[float, float] = BASELINE) -> np.ndarray:
     """(PIXELS, n) closed-form factor of a plane at ``depth``."""
     edges = centred_edges(n, WINDOW / n) + baseline[axis] * (1 / depth - 1 / 400)
