@@ -219,7 +219,13 @@ def trace_lines(
         last = lines[0].paths >= MOST_PATHS
         target = plan.sampling_target
         enough = math.inf if last or sampling.excess else target
-        checks = _checks(lines, partial(_parts, groups), lighting, followed, enough, predicted)
+        noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
+        checks = dict[int, _Check]()
+        for line in sorted(range(len(lines)), key=lambda line: -noise[line]):  # until one is not good enough
+            parts = {name: [group.part(name, line) for group in groups] for name in groups[0].done}
+            checks[line] = _check(lines[line], parts, lighting, followed, predicted.get(line, 0.0))
+            if checks[line].bound > enough:
+                break
         lights, near, worst, excess = dict[int, SampledLight](), 1.0, 0, 0.0
         more = sampling.excess([checks[line].light for line in sorted(checks)]) if sampling.excess else 1.0
         for line, check in checks.items():
@@ -285,32 +291,13 @@ class _Check:
     variances: Mapping[str, float]
 
 
-Parts = Mapping[str, Sequence[LightEstimate]]
-"""Groups of each part of a light, by the name of the pass."""
-
-
-def _parts(groups: Sequence[Group], line: int) -> Parts:
-    return {name: [group.part(name, line) for group in groups] for name in groups[0].done}
-
-
-def _checks(
-    lines: Sequence[SampledLight],
-    parts: Callable[[int], Parts],
+def _check(
+    light: SampledLight,
+    parts: Mapping[str, Sequence[LightEstimate]],
     lighting: Lighting,
     followed: bool,
-    enough: float,
-    predicted: Mapping[int, float],
-) -> dict[int, _Check]:
-    noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
-    checks = {}
-    for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
-        checks[line] = _check(lines[line], parts(line), lighting, followed, predicted.get(line, 0.0))
-        if checks[line].bound > enough:
-            break
-    return checks
-
-
-def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool, predicted: float) -> _Check:
+    predicted: float,
+) -> _Check:
     shots, classes = lighting.weights.shape
     whole = tells_all(classes, shots, light.bench.geometry.frame_side)
     seen = lighting if whole else _some(lighting, MOST_CHECKED if followed else CHECKED_SHOTS)

@@ -156,13 +156,6 @@ def test_a_mask_moved_by_a_pixel_casts_the_same_shadow_a_pixel_on() -> None:
     assert np.allclose(frame[1:], before[:-1], rtol=1e-9) and not np.allclose(frame, before, rtol=1e-3)
 
 
-def test_a_mask_moves_along_the_axis_that_its_drift_names() -> None:
-    """(Planted: columns the other way; rows for columns.)"""
-    moved, still = drift_mask(bench(), Drift(mask_rows_um=3.0, mask_columns_um=-5.0)).geometry, bench().geometry
-    assert moved.mask_offset_row - still.mask_offset_row == pytest.approx(3e-3)
-    assert moved.mask_offset_column - still.mask_offset_column == pytest.approx(-5e-3)
-
-
 def test_a_mask_that_tilts_casts_the_shadow_of_one_that_was_made_so() -> None:
     """Of a camera file's mask with that tilt, and with a part of it in the file."""
 
@@ -189,11 +182,6 @@ def test_a_mask_that_tilts_casts_the_shadow_of_one_that_was_made_so() -> None:
         assert np.linalg.norm(frame(moved) - expected) < 1e-3 * np.linalg.norm(expected - even)
     assert Drift().tilt_mrad is None and drift_mask(bench(), Drift()).geometry.identity == bench().geometry.identity
     assert drift_mask(bench(), Drift(mask_tilt_rows_mrad=4.0)).geometry.identity != bench().geometry.identity
-
-
-def test_warmth_moves_the_mask_away() -> None:
-    moved = drift_mask(bench(), Drift(temperature_k=20.0, gap_um_per_k=0.5, mask_axis_um=2.0)).geometry
-    assert moved.mask_distance == pytest.approx(2.012)
 
 
 def test_what_cannot_be_formed_is_refused() -> None:
@@ -243,26 +231,3 @@ def test_a_ripple_is_a_level_of_each_row_by_a_phase_of_each_frame() -> None:
             assert (np.ptp(level[:, 0]) < 1e-9) == (devices is DEVICES)
             seen.append(level[0, 0])
         assert len(set(np.round(seen, 6))) == len(FRAMES)
-
-
-def test_shots_of_an_ambient_frame_ripple_as_well() -> None:
-    """Each by its own phase, frames of a shot the same bit for bit again. (Planted: none in them; the projector's.)"""
-    electrons = np.full((PIXELS, PIXELS), 5e4)
-    camera = rippled(ROLLING, lamp_ripple=0.9, lamp_ripple_hz=37.0)
-    shots = [camera.digital(electrons, "ambient", shot) for shot in range(2)]
-    assert np.array_equal(shots[1], camera.digital(electrons, "ambient", 1))
-    still = [rippled(ROLLING).digital(electrons, "ambient", shot) for shot in range(2)]
-    power = rippled(ROLLING, power_ripple=0.9, power_ripple_hz=37.0)
-    assert np.array_equal(power.digital(electrons, "ambient", 1), still[1])
-    for shot in range(2):
-        phase = stream(SEED, "drift", "lamp ripple", "ambient", shot).uniform(0, 2 * np.pi)
-        level = ripple_level(ripple_response(ROLLING.sensor, SECONDS, 37.0, PIXELS), 0.9, phase)
-        ratio = camera.rate(shots[shot]).sum(axis=1) / camera.rate(still[shot]).sum(axis=1)
-        assert np.allclose(ratio, level[:, 0], rtol=0.02)
-
-
-def test_a_ripple_before_a_rolling_shutter_of_unknown_line_time_is_refused() -> None:
-    unknown = replace(DEVICES, sensor=SENSOR.model_copy(update={"shutter": "rolling"}))
-    assert np.array_equal(frames(rippled(unknown)), frames(exposer()))
-    with pytest.raises(MitsimError, match=r"^sensor [^\n]*line_time_us[^\n]*$"):
-        frames(rippled(unknown, power_ripple=0.1, power_ripple_hz=100.0))

@@ -6,7 +6,6 @@ The sensor has no ADC and no full well, so a frame's numbers are its electrons, 
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -108,14 +107,6 @@ def test_a_signed_measurement_is_the_plain_difference_of_its_two_frames() -> Non
         assert np.array_equal(difference, positive - negative)
 
 
-def test_an_unsigned_measurement_is_its_frame() -> None:
-    family = parse_patterns("dots:2", 4)
-    camera = exposer()
-    frames = [frame(1e-6)] * 4
-    for (rate, *_), shot in zip(camera.measurements(family, frames), family.shots, strict=True):
-        assert np.array_equal(rate, camera.rate(camera.digital(camera.electrons(frames[0]), *shot.names)))
-
-
 # ---- figures ---------------------------------------------------------------------------------------------------------
 
 
@@ -128,19 +119,6 @@ def test_electrons_and_rates_are_each_others_inverse_in_the_mean() -> None:
     assert electrons.max() == pytest.approx(expected, rel=1e-6)
     noiseless = electrons + 40.0 * 0.25 + 20.0
     np.testing.assert_allclose(camera.rate(noiseless), electrons / 0.25, rtol=1e-12)
-
-
-def test_rendering_noise_is_the_light_s_in_electrons() -> None:
-    light = replace(frame(2e-6), variance=(1e-8) ** 2)
-    camera = exposer()
-    assert camera.rendering_noise(light) == pytest.approx(camera.electrons(light).max() * 1e-8 / 2e-6, rel=1e-12)
-
-
-def test_sensor_noise_is_shot_and_read_noise_in_electrons() -> None:
-    """The gain does not show in electrons."""
-    electrons = np.array([[10.0, 30.0]])
-    camera = exposer(gain_dn_per_e=4.0, dark_current_e_per_s=40.0)
-    assert camera.sensor_noise(electrons) == pytest.approx(np.sqrt(20 + 40 * 0.25 + 9), rel=1e-12)
 
 
 def test_what_an_image_does_not_know_of_a_camera_is_said() -> None:

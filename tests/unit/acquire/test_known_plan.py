@@ -118,14 +118,6 @@ def test_other_patterns_of_the_same_classes_or_weights_are_others(bench: Bench, 
         check_plan(plan, SpectralBench(bench), Request.of(patterns=patterns))
 
 
-def test_patterns_that_another_seed_draws_are_others(bench: Bench) -> None:
-    """(Planted: only the family's name is held against the plan's.)"""
-    plan = bench.plan("random:4", accuracy=0.1, seed=1)
-    check_plan(plan, SpectralBench(bench), plan.known_request)
-    with pytest.raises(ArgumentError, match=r"^seed 2: draws other random:4; the plan was made for 1; plan anew"):
-        bench.capture(plan, seed=2)
-
-
 @pytest.mark.usefixtures("no_plans")
 def test_a_scene_that_changed_by_a_number_is_another(
     bench: Bench, file: Path, variant: str, tmp_path: Path, captured: Capture
@@ -170,15 +162,6 @@ def test_other_devices_are_refused_where_they_matter(bench: Bench, file: Path, v
             other.capture(plan)
         with pytest.raises(ArgumentError, match=f"^plan was made of another {sentence}"):
             other.light(plan)
-
-
-@pytest.mark.usefixtures("no_plans")
-def test_light_of_a_plan_is_that_of_its_request(bench: Bench, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = Plan.load(file)
-    first, other = bench.light(plan), bench.light(plan, seed=6)
-    assert first.seed == SEED and other.seed == 6 and (first.flux != other.flux).any()
-    assert first.expose("dots:3").manifest.configuration["seed"] == SEED
-    assert other.expose("dots:3").manifest.configuration["seed"] == 6
 
 
 # ---- light that is traced already

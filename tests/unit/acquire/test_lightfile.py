@@ -97,19 +97,6 @@ def test_a_file_gives_the_frame_of_any_pattern(light: Light, tmp_path: Path) -> 
         assert file["glint"].attrs["shape"].tolist() == [N**2, 64**2] and len(file["glint/data"]) > 100
 
 
-def test_a_file_gives_the_frame_of_a_region(bench: Bench, tmp_path: Path) -> None:
-    """Whose columns do not lie as its rows do, as the layout's number tells. (Planted: rows' anchors for columns'.)"""
-    camera = bench.geometry.model_copy(update={"rows": 40, "roi": (3, 9, 30, 50)})
-    light = some_light(replace(bench, devices=replace(bench.devices, camera=camera)))
-    path, pattern = light.save(tmp_path / "light.h5"), np.random.default_rng(12).random((N, N))
-    (exact,) = light.frames(Lighting(np.arange(N**2), pattern.reshape(1, -1)), 0)
-    frame, _ = frame_of(path, pattern)
-    assert frame.shape == (30, 50) and np.abs(frame - exact.irradiance).max() < 1e-6 * exact.irradiance.max()
-    with h5py.File(path) as file:
-        assert file.attrs["mitsim_transport"] == 2 and "pixels" not in file.attrs
-    assert light.summary()["shape"] == [30, 50]
-
-
 def test_a_scene_without_lamps_and_mirrors_has_none_in_its_file(
     shared_scene: Callable[..., Path], variant: str, tmp_path: Path
 ) -> None:

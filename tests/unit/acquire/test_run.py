@@ -14,7 +14,7 @@ import pytest
 from mitsim.acquire import capture, spectral
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.request import Exposure, Request
+from mitsim.bench.request import Request
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import checksum, read_frame
 from mitsim.core.job import Job, Limits
@@ -85,27 +85,6 @@ def test_the_manifest_says_what_was_done(captured: Capture, bench: Bench) -> Non
     assert {"mitsim", "mitsuba", "drjit", "numpy", "python"} <= set(manifest["versions"])
     assert {"effects", "accuracy", "predicted_seconds", "settings"} <= set(manifest["plan"])
     assert {"anchors", "layers", "subdivision", "effects"} <= set(manifest["plan"]["settings"])
-
-
-def test_the_manifests_patterns_are_the_family(captured: Capture) -> None:
-    block = json.loads((captured.folder / "manifest.json").read_text())["patterns"]
-    family = parse_patterns("dots:3", N)
-    assert block["family"] == "dots:3" and block["n"] == N
-    assert np.array_equal(block["P_L"], family.left) and np.array_equal(block["P_R"], family.right)
-    assert [entry["file"] for entry in block["captures"]] == FILES
-    for entry, shown in zip(block["captures"], family.shots, strict=True):
-        assert (entry["row"], entry["column"], entry["sign"]) == (shown.row, shown.column, 0)
-        _, metadata = read_frame(captured.folder / entry["file"])
-        assert (metadata["row"], metadata["column"], metadata["sign"]) == (shown.row, shown.column, 0)
-        assert metadata["exposure_s"] == captured.exposure_s and metadata["seed"] == 5
-
-
-def test_checksums_are_those_of_the_files(captured: Capture) -> None:
-    folder = captured.folder
-    checksums = json.loads((folder / "manifest.json").read_text())["checksums"]
-    assert set(checksums) == {*FILES, "truth.exr"}
-    for name, value in checksums.items():
-        assert value == hashlib.sha256((folder / name).read_bytes()).hexdigest()
 
 
 def test_the_monte_carlo_error_is_within_the_accuracy(captured: Capture, bench: Bench) -> None:
@@ -271,18 +250,6 @@ def test_resume_of_a_changed_scene_is_refused(small_scene: Callable[..., Path], 
         open_bench(path).capture("uniform", tmp_path / "run", accuracy=2e-2, resume=True)
 
 
-def test_a_folder_in_use_is_refused(bench: Bench, captured: Capture, tmp_path: Path) -> None:
-    with pytest.raises(MitsimError, match="holds files already"):
-        bench.capture("dots:3", captured.folder, accuracy=ACCURACY, seed=5)
-    (tmp_path / "note.txt").write_text("mine")
-    for resume in (False, True):
-        with pytest.raises(MitsimError, match="holds files already"):
-            bench.capture("dots:3", tmp_path, accuracy=ACCURACY, resume=resume)
-    assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
-    with pytest.raises(MitsimError, match="does not exist"):
-        bench.capture("dots:3", tmp_path / "no" / "run", accuracy=ACCURACY)
-
-
 def test_a_folder_in_use_is_refused_before_any_work(
     bench: Bench, captured: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -292,14 +259,6 @@ def test_a_folder_in_use_is_refused_before_any_work(
     monkeypatch.setattr(spectral, "make_plan", work)
     with pytest.raises(MitsimError, match="holds files already"):
         bench.capture("dots:3", captured.folder, accuracy=ACCURACY, seed=5)
-
-
-@pytest.mark.parametrize("changed", [{"patterns": "dots:17"}, {"accuracy": 0.0}, {"seed": -1}])
-def test_what_is_refused_leaves_nothing_behind(bench: Bench, tmp_path: Path, changed: dict[str, object]) -> None:
-    options = {"patterns": "dots:3", "accuracy": ACCURACY, "seed": 0, **changed}
-    with pytest.raises(MitsimError):
-        bench.capture(options.pop("patterns"), tmp_path / "run", **options)
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_signed_family_is_captured_in_halves(bench: Bench, tmp_path: Path) -> None:
@@ -344,30 +303,6 @@ def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> No
     assert all(np.array_equal(rate, noisy[i, j, 1] - noisy[i, j, -1]) for (i, j), rate in measured.items())
 
 
-def test_dark_current_is_taken_off(bench: Bench) -> None:
-    """1e5 dark electrons a second in 0.1 s on a frame without light: 1e4 electrons, a rate of 0 +- 1000 a pixel."""
-    noisy = replace(
-        bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update={"dark_current_e_per_s": 25e3}))
-    )
-    exposer = Exposer(noisy.devices, 0.1, seed=1)
-    rate = exposer.rate(exposer.digital(np.zeros((64, 64)), "dark"))
-    assert abs(rate.mean()) < 5 * 1000 / 64
-    assert rate.std() == pytest.approx(1000, rel=0.06)
-
-
-def test_saturation_is_flagged(bench: Bench, tmp_path: Path) -> None:
-    done = bench.capture("uniform", tmp_path / "run", accuracy=2e-2, exposure=10.0)
-    assert any("full well" in warning for warning in done.warnings)
-
-
-@pytest.mark.parametrize(
-    "settings", [{"seconds": s} for s in (0.0, 1e-13, 1e7, np.inf)] + [{"fraction": f} for f in (0.0, 1e-7, 1.1)]
-)
-def test_exposures_that_make_no_sense(settings: dict[str, float]) -> None:
-    with pytest.raises(MitsimError, match="exposure"):
-        Exposure(**settings)
-
-
 def test_sampling_stops_at_its_target(bench: Bench) -> None:
     lighting = parse_patterns("dots:3", N).lighting
     plan = make_plan(bench, lighting, 1e-2, 0)
@@ -387,26 +322,6 @@ def test_sampling_stops_at_its_target(bench: Bench) -> None:
 # ---- the user's own choices
 
 
-def test_effects_are_switched_by_the_user(bench: Bench, captured: Capture, tmp_path: Path) -> None:
-    """Without diffraction the frames are the geometric ones: 20 % and more away; the plan and the manifest say so."""
-    done = bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, seed=5, effects={"diffraction": False})
-    assert "diffraction" in captured.plan["settings"]["effects"]
-    assert "diffraction" not in done.plan["settings"]["effects"]
-    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
-    assert manifest["configuration"]["effects"] == {"diffraction": False}
-    row = next(effect for effect in manifest["plan"]["effects"] if effect["name"] == "diffraction")
-    assert row["state"] == "off" and "by the user" in row["reason"]
-    assert any("largest: diffraction (off)" in warning for warning in done.warnings)
-    first, second = (
-        np.stack([read_frame(one.folder / name)[0]["electrons"] for name in FILES]) / one.exposure_s
-        for one in (captured, done)
-    )
-    change = np.linalg.norm(first - second) / np.linalg.norm(first)
-    assert change > 0.1
-    # The pilot looks with cells of a whole projector pixel, half a mask feature here: too coarse for the fringes.
-    assert 0.6 < row["error_if_off"] / change < 2
-
-
 @pytest.mark.parametrize(
     "limits", [Limits(seconds=1e-3), Limits(memory_bytes=1e8), Limits(seconds=1e-9, memory_bytes=1e3)]
 )
@@ -417,15 +332,3 @@ def test_what_frames_alone_take_is_looked_at_before_the_plan(
     with pytest.raises(MitsimError, match="dots:3: would take about"):
         bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, job=Job(limits=limits))
     assert not list(tmp_path.iterdir())
-
-
-def test_a_resumed_run_needs_room_for_its_missing_frames_only(
-    captured: Capture, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nine frames take 0.3 MB; with all of them there, 0.06 MB are enough."""
-    monkeypatch.setattr("mitsim.core.job.free_disk", lambda _: 6e4)
-    with pytest.raises(MitsimError, match="would write about"):
-        bench.capture("dots:3", tmp_path / "new", accuracy=ACCURACY, seed=5)
-    folder = Path(shutil.copytree(captured.folder, tmp_path / "run"))
-    bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True)
-    assert pixels(folder) == pixels(captured.folder)

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from mitsim.acquire.sense import irradiance_behind_lens, read_image, sense
-from mitsim.bench.request import Exposure, check_ending
+from mitsim.bench.request import check_ending
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
@@ -34,30 +34,6 @@ def test_an_image_is_exposed_and_read_as_a_capture_s_frame() -> None:
     assert np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=3).digital)
     assert not np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=4).digital)
     assert not frame.warnings and frame.summary()["shape"] == [60, 80]
-
-
-def test_seconds_by_hand_and_saturation_are_as_a_capture_has_them() -> None:
-    auto = sense(IMAGE, CAMERA)
-    longer = sense(IMAGE, CAMERA, Exposure(2 * auto.exposure_s))
-    np.testing.assert_allclose(longer.electrons, 2 * auto.electrons)
-    # Beyond 8000 of 12 800 electrons: the upper 3/8 of the pixels, half of those at the well itself by read noise.
-    assert 0.17 < longer.saturated / IMAGE.size < 0.39
-    assert "saturation" in longer.warnings[0]
-
-
-def test_a_reading_at_the_well_that_light_cannot_have_filled_is_read_noise_as_in_a_capture() -> None:
-    """Light of 0.9 of the well, 9 deviations below it; of 4800 readings with 400 electrons of noise some lie above.
-
-    (Planted: the well in place of the chance that light fills it.) One pixel at twice the light is saturated, and then
-    all readings at the well count.
-    """
-    noisy = CAMERA.model_copy(update={"read_noise_e": 400.0, "bits": 14})
-    even = np.full((60, 80), 1e-6)
-    frame = sense(even, noisy, Exposure(fraction=0.9))
-    assert frame.digital.max() >= math.floor(noisy.full_well_dn) and frame.saturated == 0 and not frame.warnings
-    even[3, 4] = 2e-6
-    bright = sense(even, noisy, Exposure(frame.exposure_s))
-    assert bright.saturated == np.count_nonzero(bright.digital >= math.floor(noisy.full_well_dn)) > 10
 
 
 def test_a_lens_of_f_number_n_images_radiance_l_as_pi_l_over_4_n_squared() -> None:

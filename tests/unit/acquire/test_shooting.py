@@ -13,7 +13,7 @@ from mitsim.core.job import Job
 from mitsim.core.runs import Recorder
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light import cost_model
-from mitsim.light.cost_model import frames_at_once, frames_bytes
+from mitsim.light.cost_model import frames_bytes
 from mitsim.light.settings import GROUPS
 from mitsim.optics import frames as forming
 from tests.unit.acquire.test_exposer import PIXELS, exposer, frame
@@ -27,10 +27,6 @@ def shot(recorder: Recorder) -> Shooting:
     shooting = Shooting(FAMILY, recorder, exposer(), None, np.zeros((PIXELS, PIXELS)))
     shooting.shoot(FRAMES, Job())
     return shooting
-
-
-def test_a_large_sensor_s_frames_are_exposed_a_few_at_a_time() -> None:
-    assert [frames_at_once(pixels**2) for pixels in (8, 512, 1024, 2048, 8192)] == [16, 16, 16, 4, 1]
 
 
 @pytest.mark.parametrize("together", [1, 7, 100])

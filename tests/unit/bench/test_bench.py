@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
-from mitsim.devices.session import load_recipe
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 
@@ -81,15 +79,3 @@ def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[...
     board, known = light(bench.with_board(0.9)), light(sheet)
     assert known.sum() > 0
     assert np.abs(board - known).sum() < 2e-4 * known.sum()
-
-
-def test_recipes_are_checked(tmp_path: Path) -> None:
-    assert load_recipe().signed_capture in ("pair", "uniform")
-    text = shipped_path("calibration", "session.toml").read_text()
-    bad = tmp_path / "session.toml"
-    bad.write_text(text.replace('signed_capture = "pair"', 'signed_capture = "single"'))
-    with pytest.raises(MitsimError, match="signed_capture: got 'single'"):
-        load_recipe(bad)
-    bad.write_text(text.replace("board_reflectance = 0.99", "board_reflectance = 1.2"))
-    with pytest.raises(MitsimError, match=r"board_reflectance: got 1\.2"):
-        load_recipe(bad)

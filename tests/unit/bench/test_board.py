@@ -13,11 +13,10 @@ import pytest
 from pydantic import ValidationError
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.board import CELLS, bowed_surface, missed_pixels, turn_of
+from mitsim.bench.board import missed_pixels
 from mitsim.bench.effects import EFFECTS
-from mitsim.calibrate.board_session import Session
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.session import BoardShape, load_recipe
+from mitsim.devices.session import BoardShape
 from mitsim.light.light import trace_light
 from mitsim.planner.planner import make_plan
 
@@ -90,28 +89,6 @@ def test_light_of_a_board_is_its_closed_form(bench: Bench, shape: BoardShape) ->
     assert np.abs(off.reshape(4, 4, 4, 4).mean(axis=(1, 3))).max() < 5e-4
 
 
-@pytest.mark.parametrize(("row", "column"), [(0.0, 0.0), (20.0, 0.0), (0.0, -40.0), (-35.0, 50.0)])
-def test_slopes_of_a_tilted_board_are_the_tangents_of_its_tilts(row: float, column: float) -> None:
-    """z = tan(row) s_row + tan(column) s_column with s_row = -y, s_column = -x; and it is only turned."""
-    turn = turn_of(BoardShape(tilt_row_deg=row, tilt_column_deg=column))
-    np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-12)
-    assert np.linalg.det(turn) == pytest.approx(1)
-    for x, y in ((1.0, 0.0), (0.3, -2.0)):
-        spot = turn @ [x, y, 0]
-        assert spot[2] == pytest.approx(
-            -np.tan(np.radians(row)) * spot[1] - np.tan(np.radians(column)) * spot[0], abs=1e-12
-        )
-    assert turn[2, 2] > 0
-
-
-def test_a_bow_is_the_height_over_the_middles_of_the_edges() -> None:
-    points, normals = bowed_surface(BoardShape(bow_mm=2.0, size_mm=50.0), 25.0)
-    middle = CELLS // 2
-    assert points[middle, middle] == pytest.approx([0, 0, 0])
-    assert points[0, middle] == pytest.approx([0, -25, 2]) and points[middle, -1] == pytest.approx([25, 0, 2])
-    assert normals[middle, -1] == pytest.approx(np.array([4 / 25, 0, -1]) / np.hypot(4 / 25, 1))
-
-
 @pytest.mark.parametrize(
     ("shape", "missed"),
     [
@@ -135,16 +112,6 @@ def test_a_board_that_turns_its_back_is_missed(bench: Bench) -> None:
     away = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, Z]).scale([100, 100, 1])}
     scene = mi.load_dict({"type": "scene", "board": away})
     assert missed_pixels(replace(bench, loaded=replace(bench.loaded, scene=scene))) == N**2
-
-
-def test_a_board_that_is_too_small_flags_the_session(bench: Bench) -> None:
-    recipe = load_recipe()
-    assert not Session(bench, recipe).board_warnings
-    small = recipe.model_copy(update={"board": BoardShape(size_mm=100.0)})
-    (reported,) = Session(bench, small).warnings
-    assert reported.startswith("board: 112 of 256 projector pixels") and "the window is 120 x 120 mm" in reported
-    large = recipe.model_copy(update={"board": BoardShape(size_mm=140.0)})
-    assert not Session(bench, large).warnings
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ import mitsim
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench import effects
 from mitsim.bench.effects import _TABLE, EFFECTS, Physics, _value
-from mitsim.core.errors import ArgumentError
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, expected_of
@@ -95,21 +94,6 @@ def test_a_bench_has_what_its_devices_and_scene_have(everything: Bench, nothing:
         assert effect.absent or name in ALWAYS, "a plan says why it is left off"
 
 
-@pytest.mark.parametrize("name", EFFECTS)
-def test_neutral_values(everything: Bench, name: str) -> None:
-    """Taken off, an effect has its neutral values, and no other effect has lost any."""
-    physics = Physics.of(everything)
-    without = EFFECTS[name].without(physics)
-    changed = {
-        field
-        for effect in EFFECTS.values()
-        for field in effect.neutral
-        if _value(without, field) != _value(physics, field)
-    }
-    assert changed == set(EFFECTS[name].neutral)
-    assert all(_value(without, field) == value for field, value in EFFECTS[name].neutral.items())
-
-
 def test_a_simulation_has_what_is_on(everything: Bench) -> None:
     for name in EFFECTS:
         physics = Physics.with_effects(everything, {name})
@@ -136,18 +120,6 @@ def test_each_effect_has_a_name_of_its_own_and_the_table_stays() -> None:
     assert list(EFFECTS) == [effect.name for effect in _TABLE]
     with pytest.raises(TypeError):
         EFFECTS["fog"] = EFFECTS["blur"]  # type: ignore[index]
-
-
-def test_switches() -> None:
-    assert effects.parse_switches("") == {}
-    assert effects.parse_switches(" +ambient, -anchors,+ambient") == {"ambient": True, "anchors": False}
-    for text in ("fog", "+fog", "ambient", "+ambient,-ambient", "+", "+-ambient"):
-        with pytest.raises(ArgumentError) as caught:
-            effects.parse_switches(text)
-        assert caught.value.argument == "effects" and repr(text) in str(caught.value)
-    assert effects.check_switches({"blur": False}) == {"blur": False}
-    with pytest.raises(ArgumentError, match="fog"):
-        effects.check_switches({"fog": True})
 
 
 # ---- a new effect ----------------------------------------------------------------------------------------------------

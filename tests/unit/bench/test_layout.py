@@ -97,12 +97,3 @@ def test_a_preview_shows_what_the_camera_sees(
         seen = preview.picture[rows, columns, 0]
         assert seen[0] > 0.8 and (seen[1:] < 0.4).all()
     assert (rows[0] < rows[3]) and (columns[0] < columns[1])
-
-
-@pytest.mark.slow
-def test_a_bench_without_light_can_be_seen(small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the preview's own lamp."""
-    monkeypatch.setattr(module, "_PIXELS", 64)
-    bench = open_bench(small_scene(projector_turn='<rotate y="1" angle="3"/>', sheet_z=300), albedo=0.5)
-    picture = previews(bench, layout_of(bench))[0].picture
-    assert np.isfinite(picture).all() and picture.min() > 0

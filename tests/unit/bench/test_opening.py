@@ -92,28 +92,6 @@ def test_devices_are_camera_and_projector(tmp_path: Path) -> None:
             opening.check_devices(*devices)
 
 
-def test_a_bench_is_what_its_files_say(loader: Loader, scene: Path) -> None:
-    """Parameters as a scene spells them; no file outside unless allowed; a scene to render needs no projector."""
-    bench = open_bench(scene, "llvm_ad_mono", albedo=0.25, mask=True)
-    assert bench.variant == "llvm_ad_mono" and dict(bench.defines) == {"albedo": "0.25", "mask": "true"}
-    assert bench.devices.camera is bench.loaded.camera.geometry and "IMX249" in bench.sensor.name
-    assert (
-        "MP-CL1" in bench.projector.name
-        and bench.devices.camera_file == str(opening.check_devices(None, None)[0])
-        and not loader.worn
-    )
-    open_bench(scene, "llvm_ad_rgb", allow_outside_files=True, for_render=True)
-    assert loader.asked == [
-        ("llvm_ad_mono", scene, dict(bench.defines), {"needs_projector": True, "outside": False}),
-        ("llvm_ad_rgb", scene, {}, {"needs_projector": False, "outside": True}),
-    ]
-    with pytest.raises(MitsimError, match="roughness"):
-        open_bench(scene, roughness=0.1)
-    with pytest.raises(MitsimError, match="nowhere"):
-        open_bench(scene.with_name("nowhere.xml"))
-    assert len(loader.asked) == 2, "neither was loaded"
-
-
 @pytest.mark.parametrize(
     ("pitches", "reported"),
     [

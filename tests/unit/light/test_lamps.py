@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -195,65 +194,6 @@ def test_every_line_sees_the_lamp_as_its_closed_form(light: Mapping[Any, dict[st
         assert abs(runs[:, line].mean() - expected) < 7 * error + 2e-4 * expected, (case, wavelength)
     assert found["together"] in ([], pytest.approx(runs[0], rel=1e-12)), "beside paths over mirrors, which see none"
     assert sum(found["accumulated"]) == pytest.approx(runs[0, 2], rel=1e-6) and found["accumulated"][0] == 0
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_each_band_has_its_light(light: Mapping[Any, dict[str, Any]], case: Any) -> None:
-    """In rows of its own, and as the first look says to some percent; in the look, so many parts of a band."""
-    found = light[case]
-    expected = np.array([counted(*case, *edges) for edges in found["edges"]])
-    bands = np.array(found["bands"])
-    assert bands.mean(axis=0) / bands.mean() / 4 == pytest.approx(expected / expected.sum(), abs=2e-3)
-    assert found["shares"] == pytest.approx(expected / expected.sum(), abs=0.01)
-    for edges, spectrum, weights in zip(found["edges"], found["spectra"], found["weights"], strict=True):
-        assert edges[0] < min(spectrum) and max(spectrum) < edges[1]
-        mean = counted_mean(case, edges)
-        assert np.dot(spectrum, weights) == pytest.approx(mean, abs=3)
-
-
-@pytest.mark.parametrize("lamp", FILTERED)
-def test_pixels_count_the_lamp_each_through_its_filter(light: Mapping[Any, dict[str, Any]], lamp: str) -> None:
-    """And no filter counts for another; lines share a count as their power, each alone as all together.
-
-    Light of several seeds at once is parted as each is traced. (Planted: the red curve for all; red for blue; a line's
-    part of the count as of its photons; a path's bands parted as if they stood band by band.)
-    """
-    (case,) = (each for each in CASES if each[0] == lamp)
-    sheet, found, geometry = "coloured" if lamp == "d65" else "grey", light[case]["filtered"], seen("point")
-    planes = {name: "GBRG".count(name) / 4 for name in FILTERS}
-    # Electrons that all lines make, of an even sheet, for one of their power.
-    power = sum(
-        share * part * at * np.interp(at, list(FILTERS[name]), list(FILTERS[name].values()))
-        for at, share in zip(LINES, SHARES, strict=True)
-        for name, part in planes.items()
-    )
-    traced_runs = np.array(found["lines"]).reshape(SEEDS, len(LINES), len(FILTERS), 4) / SAMPLES
-    every = {name: counted(lamp, sheet, curve, min(curve), max(curve)) for name, curve in FILTERS.items()}
-    whole = sum(planes[name] * every[name] for name in FILTERS)
-    for number, (name, curve) in enumerate(FILTERS.items()):
-        edges = np.linspace(min(curve), max(curve), 5)
-        bands = [counted(lamp, sheet, curve, *ends) for ends in pairwise(edges)]
-        assert np.reshape(found["shares"], (3, 4))[number] == pytest.approx(
-            planes[name] * np.array(bands) / whole, abs=0.01
-        )
-        for line, share in enumerate(SHARES):
-            runs = traced_runs[:, line, number].sum(axis=1) * power / share / planes[name]
-            expected, error = geometry / (ALBEDO * 3e4) * every[name], runs.std(ddof=1) / np.sqrt(SEEDS)
-            assert 7 * error < 0.01 * expected
-            assert abs(runs.mean() - expected) < 7 * error + 2e-4 * expected, (lamp, name, line)
-    assert np.array(found["alone"])[0, 0] == pytest.approx(np.array(found["lines"])[0, 1], rel=1e-6)
-    for name in ("lines", "alone"):
-        together, apart = found[f"replicates {name}"]
-        assert together == pytest.approx(apart, rel=1e-6) and min(apart) > 0
-    beyond = max(1 - every[name] / counted(lamp, sheet, curve) for name, curve in FILTERS.items())
-    assert found["unknown"] == pytest.approx(beyond, abs=0.01) and found["range"] == [420, 650]
-
-
-def counted_mean(case: tuple[str, str, bool], edges: tuple[float, float]) -> float:
-    """Mean wavelength [nm] of what is counted in a band, in steps of a nanometre."""
-    middles = np.arange(edges[0], edges[1], 1.0) + 0.5
-    light = np.array([counted(*case, at - 0.5, at + 0.5) for at in middles])
-    return float((middles * light).sum() / light.sum())
 
 
 def test_light_beyond_a_curve_is_known_to_be_missing(light: Mapping[Any, dict[str, Any]]) -> None:

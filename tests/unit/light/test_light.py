@@ -3,10 +3,8 @@ for."""
 
 import math
 import warnings
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,17 +14,15 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
-from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting, parse_patterns
-from mitsim.light import cost_model
 from mitsim.light import light as module
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, PilotResult, Settings
+from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.simulation import Simulation, TracedPass
-from mitsim.optics.frames import ExpectedFrames, bound_of, monte_carlo_error
-from mitsim.planner import choose, planner
-from mitsim.planner.planner import SceneFacts, make_plan
+from mitsim.optics.frames import ExpectedFrames, bound_of
+from mitsim.planner import planner
+from mitsim.planner.planner import make_plan
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -76,31 +72,6 @@ def test_light_by_class_serves_no_other_family(bench: Bench, plan: Plan, family:
     assert np.allclose(white, stacked(by_class.frames(family, 0)).sum(axis=0), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("classes_tell", "effects", "looked_at"), [(True, (), 16), (False, (), 8), (False, FAR, 16)])
-def test_shots_that_are_looked_at(
-    bench: Bench,
-    plan: Plan,
-    family: Lighting,
-    monkeypatch: pytest.MonkeyPatch,
-    classes_tell: bool,
-    effects: tuple[str, ...],
-    looked_at: int,
-) -> None:
-    """All, where frames of few classes tell of them; else some, here eight, and more of followed light, as a heavy path
-    may strike another; again after each round. (Planted: eight always.)"""
-    target, asked = plan.sampling_target, []
-
-    def reported(frames: ExpectedFrames) -> tuple[float, float]:
-        asked.append(len(frames))
-        return 0.5 * target, 2 * target if len(asked) == 1 else 0.5 * target
-
-    monkeypatch.setattr(ExpectedFrames, "sampling_error", reported)
-    monkeypatch.setattr("mitsim.light.light.tells_all", lambda *_: classes_tell)
-    monkeypatch.setattr("mitsim.light.light.CHECKED_SHOTS", 8)
-    plan = replace(plan, settings=replace(plan.settings, effects=frozenset(effects)))
-    assert trace_light(bench, plan, family, 3).reached and asked == [looked_at] * 2
-
-
 @pytest.mark.parametrize(
     ("error", "bound", "excess"), [(1.9, 2.0, 2.0), (1.9, 4.0, 1.2 * 1.9), (0.9, 2.0, 2.0**0.55), (1.0, 1.1, 1.1)]
 )
@@ -134,28 +105,6 @@ def test_the_next_round_is_for_the_error_where_few_paths_make_the_bound(
     assert trace_light(bench, far, family, 3).reached and asked == [(True, pytest.approx(excess))]
     runs.clear()
     assert trace_light(bench, plan, family, 3).reached and asked[1:] == [(False, pytest.approx(bound))]
-
-
-def test_light_that_needs_less_than_a_sample_takes_one_and_every_round_grows(
-    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """(Planted: two samples for what needs less; rounds in which nothing grows.)"""
-    target, runs = plan.sampling_target, list[ExpectedFrames]()
-
-    def reported(frames: ExpectedFrames) -> tuple[float, float]:
-        runs.append(frames)
-        return (1.1 * target, 1.2 * target) if len(runs) < 3 else (0.0, 0.0)
-
-    monkeypatch.setattr(ExpectedFrames, "sampling_error", reported)
-    samples = {"direct": 0.1, "indirect": 3.0, "indirect_residual": 0.5, "camera_residual": 0.02}
-    samples = {**plan.settings.samples, **samples}
-    settings = replace(plan.settings, effects=frozenset(FAR), followed_anchors=2, samples=samples)
-    wanted, kept = [], module.trace_groups
-    monkeypatch.setattr(module, "trace_groups", lambda *parts: wanted.append(parts[1]) or kept(*parts))
-    assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
-    assert wanted[0] == {"direct": 1, "indirect": 3, "indirect_residual": 1}
-    for before, after in pairwise(wanted):
-        assert after != before and all(after[name] >= count for name, count in before.items())
 
 
 @pytest.mark.parametrize("planned", [0.7, 1.4])
@@ -200,7 +149,8 @@ def test_the_stated_error_holds_where_sampling_stops_by_it(
     monkeypatch.setattr(module, "trace_groups", traced)
     monkeypatch.setattr(module, "_error_growth", lambda *_: (1.0, 1.0))
     monkeypatch.setattr(module, "_line_of", lambda *_: replace(light, sampling_error=math.inf, looked=None))
-    monkeypatch.setattr(module, "_parts", lambda *_: {"direct": light.groups})
+    groups = [SimpleNamespace(done={"direct": 1}, part=lambda *_, own=own: own) for own in light.groups]
+    monkeypatch.setattr(module.Group, "all_of", lambda *_: groups)
     monkeypatch.setattr(module, "expected_of", lambda *_, **__: Seen())
     plan = replace(plan, sampling_target=planned)
     held, kept = list[bool](), list[bool]()
@@ -213,26 +163,6 @@ def test_the_stated_error_holds_where_sampling_stops_by_it(
         held.append(abs(noise.mean()) <= bound)
         kept.append(abs(noise.mean()) <= planned)
     assert 0.93 < np.mean(held) < 0.99 and np.mean(kept) > 0.95
-
-
-def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Lighting) -> None:
-    """Frames of looked-at light state the errors of frames that nobody looked at before; of other light, shots with
-    other classes, or other signs they do not. (Planted: the look's products, times two, and a look for any light.)"""
-    light = trace_light(bench, plan, family, 3)
-    looked = light.looked
-    assert looked is not None
-    pairs, other = Lighting(family.labels // 2, np.eye(8)), light.behind(bench)
-    unlit = Lighting(family.labels, np.hstack([family.weights, np.ones((16, 1))]))  # a class that no pixel has
-    cases = [(light, family, 3), (light, pairs, 3), (light, family, 4), (light.merge(), family, 3), (other, family, 3)]
-    cases.append((light, unlit, 3))
-    for which, shots, seed in cases:
-        plain = replace(which, looked=None).frames(shots, seed)
-        for found, known in zip(which.frames(shots, seed), plain, strict=True):
-            assert np.array_equal(found.irradiance, known.irradiance)
-            assert found.variance == pytest.approx(known.variance, rel=1e-9)
-    assert [
-        looked.at(which, which.rows_of(shots), shots.weights.shape[1]) is not None for which, shots, _ in cases
-    ] == [True, False, True, False, False, False]
 
 
 def test_what_is_made_of_all_lines_meets_the_target(bench: Bench, plan: Plan, family: Lighting) -> None:
@@ -248,29 +178,6 @@ def test_what_is_made_of_all_lines_meets_the_target(bench: Bench, plan: Plan, fa
     assert set(asked) == {1} and found.reached and found.sampling_error <= target / 2
 
 
-def test_a_round_does_not_hold_the_light_of_the_one_before(
-    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of corner in three lines that was 0.4 GB. (Planted: each of the names that are dropped, kept.)"""
-    made, held = list[Any](), list[int]()  # of arrays, which copies of a light share
-    line_of, trace = module._line_of, module.trace_groups
-
-    def watched(*parts: Any) -> SampledLight:
-        light = line_of(*parts)
-        made.append(weakref.ref(light.flux))
-        return light
-
-    def counted(*parts: Any) -> None:
-        held.append(sum(each() is not None for each in made))
-        trace(*parts)
-
-    monkeypatch.setattr(module, "_line_of", watched)
-    monkeypatch.setattr(module, "trace_groups", counted)
-    target = trace_light(bench, plan, family, 3).sampling_error
-    trace_light(bench, replace(plan, sampling_target=target / 2), family, 3)
-    assert len(held) > 2 and not any(held)
-
-
 def test_light_that_is_divided_lies_where_it_lay(bench: Bench, plan: Plan) -> None:
     """Bit for bit SciPy's own quotient. (Planted: copied places; light over the count, which is not SciPy's.)"""
     simulation = Simulation(bench, plan.settings)
@@ -281,45 +188,6 @@ def test_light_that_is_divided_lies_where_it_lay(bench: Bench, plan: Plan) -> No
     assert np.shares_memory(divided["fine"].indices, light["fine"].indices)
     assert np.shares_memory(divided["fine"].indptr, light["fine"].indptr)
     assert divided.received == light.received / 3
-
-
-@pytest.mark.parametrize(
-    ("bounds", "looked"), [([3, 1, 1, 0], [2, 0]), ([1, 2, 1, 0], [2, 0, 1, 3]), ([1, 1, 3, 0], [2])]
-)
-def test_lines_are_looked_at_from_the_noisiest_until_one_is_not_good_enough(
-    monkeypatch: pytest.MonkeyPatch, bounds: list[float], looked: list[int]
-) -> None:
-    """Noise of 2, 1 and 3 in 4 of their light, and a dark line; 2 is enough. (Planted: no end; the quietest first.)"""
-    lines: list[Any] = [SimpleNamespace(flux=np.full(3, 4.0), flux_error=np.full(3, noise)) for noise in (2, 1, 3)]
-    lines.append(SimpleNamespace(flux=np.zeros(3), flux_error=np.zeros(3)))
-    monkeypatch.setattr(module, "_check", lambda light, line, *_: module._Check(light, bounds[line], {}))
-    seen = module._checks(lines, lambda line: line, Lighting.uniform(1), False, 2.0, {})
-    assert list(seen) == looked
-    assert all(seen[line].light is lines[line] and seen[line].bound == bounds[line] for line in looked)
-    assert len(module._checks(lines, lambda line: line, Lighting.uniform(1), False, math.inf, {})) == 4
-
-
-def test_a_plan_of_several_lines_is_priced_for_all(
-    bench: Bench, family: Lighting, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Frames are those of each line, light is held for all; what one line's frames take to form comes once.
-
-    (Planted: lines that the pilot forgets; disk, or light, of one.)
-    """
-    seen: list[int] = []
-
-    class Candidates(choose.Candidates):
-        def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool]) -> None:
-            seen.append(pilot_result.forming.lines)
-            super().__init__(pilot_result, switches)
-
-    monkeypatch.setattr(choose, "Candidates", Candidates)
-    plan = planner.make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False), lines=3)
-    assert seen == [3]
-    monkeypatch.setattr(cost_model, "workers", lambda: 1)  # files one line at a time
-    one, three = (cost_model.frames_cost(bench, plan.settings, family, lines=count) for count in (1, 3))
-    assert three.disk_bytes == 3 * one.disk_bytes
-    assert one.memory_bytes < three.memory_bytes < 2 * one.memory_bytes
 
 
 def test_purposes_share_no_random_numbers(bench: Bench, plan: Plan, family: Lighting) -> None:
@@ -345,33 +213,12 @@ def test_light_for_another_family_says_how_much_worse_its_frames_are(bench: Benc
         assert not lax.expose("uniform").warnings
 
 
-def test_merged_light_has_the_same_frames(bench: Bench, plan: Plan, family: Lighting) -> None:
-    light = trace_light(bench, plan, family, 3)
-    merged = light.merge()
-    assert np.allclose(stacked(merged.frames(family, 0)), stacked(light.frames(family, 0)), rtol=1e-9)
-    assert monte_carlo_error(merged.frames(family, 0)) == 0 < monte_carlo_error(light.frames(family, 0))
-
-
 def test_flux_is_what_each_pixel_casts_on_the_sensor(bench: Bench, plan: Plan) -> None:
     """Over a board: radiance 0.5 scale / z^2 times each pixel's part of the tan-angles, with the falloff."""
     tau = (np.arange(N) - 7.5) * 0.3 / N
     falloff = (1 + np.square(tau)[:, None] + np.square(tau)[None, :]) ** -2
     expected = 0.99 * 111000 / 400**2 * (0.3 / N) ** 2 * falloff.ravel()
     assert trace_light(bench.with_board(0.99), plan, Lighting.uniform(N), 3).flux == pytest.approx(expected, rel=3e-3)
-
-
-def test_facts_name_what_is_there(small_scene: Callable[..., Path], bench: Bench) -> None:
-    sky = '<emitter type="constant"><spectrum name="radiance" value="1"/></emitter>'
-    facts = SceneFacts.of(open_bench(small_scene(extra=sky, fov=12)))
-    assert "1 emitter beside" in facts.notes["ambient"] and "field stop" in facts.warnings[0]
-    assert not SceneFacts.of(bench).warnings
-
-
-def test_a_plan_follows_the_users_choice(plan: Plan, bench: Bench, family: Lighting) -> None:
-    assert not plan.settings.effects
-    assert make_plan(bench, family, 0.3, 0, {"interreflection": True}).settings.effects >= {"interreflection"}
-    with pytest.raises(MitsimError, match=r"^accuracy 0"):
-        make_plan(bench, family, 0.0, 0)
 
 
 def test_sampling_is_checked_without_what_black_pixels_leak(bench: Bench, plan: Plan, family: Lighting) -> None:

@@ -94,16 +94,6 @@ def test_a_new_pass_is_its_row_and_its_integrator(small_scene: Callable[..., Pat
     assert bright.sum() == pytest.approx(1.1 * dim.sum(), rel=5e-3)
 
 
-def test_a_row_predicts_the_samples_that_settings_have() -> None:
-    assert PASSES["direct"].predicted_samples(Settings(400.0)) == 1.0
-    assert PASSES["direct"].predicted_samples(Settings(400.0, samples={"direct": 6.0})) == 6.0
-
-
-def test_a_residual_connects_to_all_anchors_or_to_none() -> None:
-    found = [PASSES["anchor_residual"].connections(Settings(400.0, anchors=count)) for count in (1, 2, 3)]
-    assert found == [0, 4, 9] and PASSES["direct"].connections(Settings(400.0, anchors=3)) == 1
-
-
 def test_rows_are_told_apart() -> None:
     """By name and by stream: two passes of one stream would have the same noise. Grids that they name are there."""
     direct = PASSES["direct"]

@@ -1,20 +1,17 @@
 """The effect plan: settings that keep an accuracy, an honest word on each effect, and the budget that sampling has."""
 
-import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 
 from mitsim.bench.effects import EFFECTS, SWITCHES
 from mitsim.bench.request import check_accuracy
 from mitsim.core.errors import MitsimError
-from mitsim.light.cost_model import Numbers, optics_seconds
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Approximation, Drawn, Estimate
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
-    FACTS,
     ONE_CLASS,
     PILOT_RESULT,
     SIZES,
@@ -54,31 +51,6 @@ def test_every_switch_has_a_row_and_more() -> None:
         assert (effect.reason or effect.state == "exact") and "\n" not in effect.reason
 
 
-@pytest.mark.parametrize("effects", ["", "+mirrors,-diffraction,+anchors,+layers,-interreflection"])
-@pytest.mark.parametrize("accuracy", ACCURACIES)
-def test_seconds_are_never_negative_and_nothing_off_costs_any(accuracy: float, effects: str) -> None:
-    found = plan(accuracy, effects=effects)
-    assert found.predicted_seconds == pytest.approx(sum(found.predicted.values())) and found.predicted_seconds > 0
-    for effect in found.effects:
-        assert 0 <= effect.seconds <= found.predicted_seconds
-        if effect.state == "off":
-            assert effect.seconds == 0
-        assert (effect.state != "off") == on(found, effect.name)
-
-
-def on(found: Plan, name: str) -> bool:
-    """Whether the settings have an effect or discretisation; what is always there counts by its row."""
-    settings = found.settings
-    counts = {"anchors": settings.anchors > 1, "layers": len(settings.depths) > 1, "cells": True, "sensor-noise": True}
-    counts["followed-anchors"] = settings.followed_anchors > 1
-    return counts.get(name, name in settings.effects)
-
-
-def test_what_costs_time_says_so() -> None:
-    found = rows(plan())
-    assert all(found[name].seconds > 0 for name in ("anchors", "layers", "interreflection", "diffraction"))
-
-
 def test_rows_carry_the_measured_errors() -> None:
     found = rows(plan())
     assert found["anchors"].error_if_off == pytest.approx(SIZES[Approximation("anchors", 1)])
@@ -100,20 +72,6 @@ def test_it_shows_itself() -> None:
     shown = found._repr_html_()
     assert all(row.name in shown for row in found.effects) and "0.0e+00" not in shown
     assert repr(found).startswith("Plan(accuracy 0.001: anchors approximate") and "ambient" not in repr(found)
-
-
-def test_a_plan_is_json_with_the_promised_keys() -> None:
-    block = json.loads(json.dumps(asdict(replace(plan(), settings=replace(plan().settings, effects=())))))
-    assert {"effects", "accuracy", "predicted_seconds", "predicted", "settings", "warnings"} <= set(block)
-    assert all(set(effect) == {"name", "state", "reason", "error_if_off", "seconds"} for effect in block["effects"])
-
-
-@pytest.mark.parametrize(
-    ("keystone", "state", "words"), [(0.0, "off", "squarely"), (2.5, "exact", "2.5 of its pixels")]
-)
-def test_a_keystone_is_there_or_not(keystone: float, state: str, words: str) -> None:
-    row = rows(plan(facts=replace(FACTS, keystone=keystone)))["keystone"]
-    assert row.state == state and words in row.reason
 
 
 # ---- the budget
@@ -144,17 +102,6 @@ def test_what_nothing_can_make_up_for_does_not_make_the_rest_finer() -> None:
     with_it, without = plan(1e-3).settings, plan(1e-3, effects="-speckle,-blur").settings
     assert with_it.effects - without.effects == {"speckle", "blur"}
     assert replace(without, effects=with_it.effects) == with_it
-
-
-def test_the_best_there_is_when_nothing_fits() -> None:
-    found = plan(1e-6, ONE_CLASS)
-    assert found.warnings and found.settings.subdivision == 8 and len(found.settings.depths) == 4
-
-
-def test_warnings_of_the_devices_come_first() -> None:
-    facts = replace(FACTS, warnings=("the field stop cuts",))
-    assert plan(1e-6, facts=facts).warnings[0] == "the field stop cuts"
-    assert len(plan(1e-6, facts=facts).warnings) == 2
 
 
 def test_what_a_masks_raster_leaves_is_in_the_budget() -> None:
@@ -201,21 +148,6 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
     row = many.row("mask-shadow")
     assert row.state == "approximate" and "by FFT" in row.reason
     assert many.block()["settings"]["raster"] is True
-
-
-def test_a_shadow_that_the_pilot_has_drawn_is_not_drawn_again() -> None:
-    """In more cells, which take longer without waves, or of several layers, it is. (Planted: drawn again; never; more
-    cells in less time.)"""
-    forming = replace(PILOT_RESULT.forming, correlated=(True, True), phases=36.0)
-
-    def drawing(**numbers: float) -> float:
-        some = replace(Numbers(*[1.0] * 6), **numbers)
-        each = [optics_seconds(replace(forming, drawing=(seconds, seconds)), some) for seconds in (5.0, 0.0)]
-        return float(each[0] - each[1])
-
-    assert drawing() == 0
-    assert drawing(raster_cells=8.0) == pytest.approx(5) and drawing(layers=2.0) == pytest.approx(15)
-    assert drawing(raster_cells=12.0, waves=0.0) == pytest.approx(5 * 144 / 36)
 
 
 @pytest.mark.parametrize("accuracy", [0.0, -1e-3, 1e-7, 0.5, math.nan, math.inf])

@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.light.cost_model import SHARED_COST
-from mitsim.light.light import Group, SampledPass, cheapest_samples, first_samples, next_samples, trace_groups
-from mitsim.light.passes import EVEN, PASSES, even
-from mitsim.transport.path_reuse import PathReuseTracer
+from mitsim.light.light import SampledPass, cheapest_samples, next_samples
+from mitsim.light.passes import EVEN, even
 
 LIGHTS = (
     SampledPass("direct", 24, 0.165, 3.0),
@@ -100,56 +98,6 @@ def of_lanes(paths_per_sample: int) -> Any:
     return SimpleNamespace(paths_per_sample=paths_per_sample)
 
 
-class Counted:
-    """Light of a pass in place of paths': that of sample i is i, and one launch takes four of them."""
-
-    name, row, paths_per_sample = "indirect", SimpleNamespace(stream="own"), 5
-
-    def __init__(self) -> None:
-        self.traced: list[int] = []
-        self.simulation: Any = SimpleNamespace(
-            passes={self.name: SimpleNamespace(tracer=self, row=self.row, trace=self.trace)},
-            paths_at_once=4 * self.paths_per_sample,
-            accumulator=lambda name, labels, lines: None,
-            accumulate=lambda name, found, labels, samples: found / samples,
-        )
-
-    def trace(self, seed: int, first: int, samples: int, accumulator: object) -> Any:
-        assert 0 < samples <= 4
-        numbers = range(first, first + samples)
-        self.traced += numbers
-        return SimpleNamespace(by_line=lambda lines: [float(sum(numbers)) * (line + 1) for line in range(lines)])
-
-
-def test_rounds_go_on_where_the_last_one_ended() -> None:
-    """What groups hold is the mean over their samples, each traced once, after every round; of every line.
-
-    (Planted: the first round's mean not spread over the samples of both; groups not traced.)
-    """
-    lights = [Counted(), Counted()]
-    groups = [Group(each.simulation, np.zeros(4, dtype=np.int64), 3, lines=2) for each in lights]
-    for samples in (3, 10, 10):
-        trace_groups(groups, {"indirect": samples})
-        for each, group in zip(lights, groups, strict=True):
-            assert each.traced == list(range(samples)) and group.done == {"indirect": samples}
-            assert group.paths == 5 * samples
-            mean = (samples - 1) / 2
-            assert (group.light(), group.light(1), group.part("indirect")) == pytest.approx((mean, 2 * mean, mean))
-
-
-def test_sampling_begins_with_what_is_predicted_or_less_where_most_is_followed() -> None:
-    assert first_samples(simulated(direct=(of_lanes(10), 24.0), indirect=(of_lanes(10), 20.0))) == {
-        "direct": 24,
-        "indirect": 20,
-    }
-    assert first_samples(simulated(direct=(of_lanes(10), 24.0), indirect=(of_lanes(10), 40.0))) == {
-        "direct": 24,
-        "indirect": 32,
-    }
-    few = simulated(direct=(of_lanes(1000), 24.0), indirect=(of_lanes(10), 40.0))
-    assert first_samples(few) == {"direct": 24, "indirect": 40}, "paths count, not samples"
-
-
 def test_the_next_round_lowers_the_variance_by_what_is_missing_and_a_twentieth() -> None:
     """At least by a tenth, at most to a sixth. (Planted: each of the three left out.)"""
     simulation, done = simulated(indirect=(of_lanes(10), 100.0)), {"indirect": 1000}
@@ -160,23 +108,3 @@ def test_the_next_round_lowers_the_variance_by_what_is_missing_and_a_twentieth()
     assert grown(1.5) == math.ceil(1000 * 1.05 * 1.5**2)
     assert grown(1.001) == 1100
     assert grown(1e200) == 6000
-
-
-def test_work_is_that_of_paths_at_fixed_unit_costs() -> None:
-    """Shared light counts for several, and light at anchors has a pace of its own: of two lights with the same variance
-    the one of less work grows. (Planted: one pace for all, shared light counted once.)"""
-    shared = PathReuseTracer.__new__(PathReuseTracer)
-    shared.adaptive, shared.projector = None, SimpleNamespace(n=8)  # type: ignore[assignment]
-    cheap, dear = (
-        shared.paths_per_sample * SHARED_COST * PASSES["indirect"].unit_cost,
-        100 * PASSES["from_camera"].unit_cost,
-    )
-    simulation = simulated(indirect=(shared, 1.0), from_camera=(of_lanes(100), 1.0))
-    found = next_samples(
-        simulation, dict.fromkeys(("indirect", "from_camera"), 1000), {"indirect": 1, "from_camera": 1}, 1.5
-    )
-    assert found["indirect"] / found["from_camera"] == pytest.approx(math.sqrt(dear / cheap), rel=2e-3)
-    simulation = simulated(camera_residual=(of_lanes(100), 1.0), from_camera=(of_lanes(100), 1.0))
-    found = next_samples(simulation, dict.fromkeys(simulation.passes, 1000), dict.fromkeys(simulation.passes, 1), 1.5)
-    ratio = math.sqrt(PASSES["from_camera"].unit_cost / PASSES["camera_residual"].unit_cost)
-    assert found["camera_residual"] / found["from_camera"] == pytest.approx(ratio, rel=2e-3)

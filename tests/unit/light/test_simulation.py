@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, expected_of
@@ -83,23 +82,6 @@ def test_every_effect_off_is_the_geometric_model(bench: Bench) -> None:
     assert simulation(bench).physics.geometry == plain
 
 
-def test_neutral_parts(bench: Bench) -> None:
-    off = simulation(bench)
-    assert off.physics.projector.ideal and off.physics.black_level == 0
-    assert off.from_camera is off.indirect is off.anchored is off.glare is None
-    assert (
-        not off.physics.lamps
-        and off.physics.spectrum is None
-        and off.specular_frames(np.zeros(N * N, dtype=np.int64)) is None
-    )
-    assert set(off.passes) == {"direct"}
-
-
-def test_a_plan_says_how_large_the_spots_of_a_lens_are(bench: Bench) -> None:
-    """A cone of radius 3 mm that ends at 300 mm has grown again by 400 mm to a third of it."""
-    assert EFFECTS["aperture"].note(bench) == "a lens of radius 3 mm, sharp at 300 mm: spots of 2 mm at 400 mm"
-
-
 PARTS = (
     *("interreflection", "mirrors", "ambient", "diffraction", "mask-thickness", "pixel-response", "aperture", "blur"),
     *("glare", "black-level"),
@@ -130,25 +112,12 @@ def test_each_effect_changes_its_own_part(bench: Bench, effect: str) -> None:
         assert on.physics.projector.ideal
 
 
-@pytest.mark.parametrize("effect", ["mask-thickness", "pixel-response", "diffraction", "black-level", "ambient"])
-def test_each_effect_changes_the_frame(bench: Bench, effect: str) -> None:
-    """A half-bright capture, so that black light shows; the same paths with and without the effect."""
-    off, on = uniform(simulation(bench), weight=0.5), uniform(simulation(bench, effect), weight=0.5)
-    assert np.linalg.norm(on - off) > 5e-3 * np.linalg.norm(off)
-
-
 def test_black_is_a_part_of_white(bench: Bench) -> None:
     """A dark capture is the black level of a white one, and white is white."""
     made = simulation(bench, "black-level")
     white, dark, plain = uniform(made), uniform(made, weight=0.0), uniform(simulation(bench))
     assert np.allclose(dark, BLACK * white, rtol=1e-9) and np.allclose(white, plain, rtol=1e-9)
     assert not uniform(simulation(bench), weight=0.0).any()
-
-
-def test_ambient_light_is_in_a_dark_capture(bench: Bench) -> None:
-    made = simulation(bench, "ambient")
-    dark, white = uniform(made, weight=0.0), uniform(made)
-    assert dark.any() and np.allclose(white - dark, uniform(simulation(bench)), rtol=1e-9)
 
 
 def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
@@ -208,13 +177,3 @@ def test_flux_counts_each_pixels_direct_light(bench: Bench) -> None:
         and not made.flux(ambient, 2).any()
         and not made.flux(PathSamples.none(), 1).any()
     )
-
-
-def test_cells_are_aligned_with_the_pixels_where_the_light_is(bench: Bench) -> None:
-    """At half the distance the window is seen at other angles, and the cells go with it."""
-    near = Simulation(bench, Settings(depth=200.0))
-    low, high = (60 - np.array([60.0, 0.0]) - 0) / 200  # x from 0 to 60 mm, column tan-angles -0.3 to 0
-    edges = near.aim.columns.edges
-    assert np.abs(edges + high).min() < 1e-5 or np.abs(edges - -0.30).min() < 1e-5
-    assert near.aim.columns.size == pytest.approx(0.3 / N, rel=1e-4) and low == 0
-    assert np.abs(edges).min() < 1e-5

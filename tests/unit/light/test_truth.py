@@ -6,7 +6,6 @@ freedom of four groups.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -146,15 +145,6 @@ def test_a_scene_in_depth_is_exact_to_its_standard_error(shadowed: Bench) -> Non
     assert np.median(np.abs(error)) < 2e-4
 
 
-def test_the_boards_own_error_counts(bench: Bench) -> None:
-    """A board of half the reflectance is the scene: where its flux is as uncertain as the board's, so is the ratio."""
-    board = traced(bench.with_board(0.5), 0, np.inf)
-    alone = module._Flux(bench.with_board(0.5), frozenset(), 0, "board", module.BOARD_SAMPLES)
-    relative = (alone.standard_error / alone.mean).reshape(N, N)
-    assert (board.standard_error > 0.999 * board.reflectance * relative).all()
-    assert board.reflectance == pytest.approx(0.5 / 0.99, rel=2e-3)
-
-
 def test_it_shares_no_error_with_the_frames(bench: Bench, printed: np.ndarray) -> None:
     """Correlation over 256 pixels, with as many samples of each, below 4 / 16. (Planted: the frames' streams.)"""
     lighting = parse_patterns("dots:4", N).lighting
@@ -178,30 +168,6 @@ def test_it_is_refined_as_far_as_the_frames_need(bench: Bench, monkeypatch: pyte
     assert traced(bench, 0, 0.0).rays == pytest.approx(rough.rays, rel=0.05), "exact frames need no exact truth"
 
 
-def test_samples_go_where_a_ray_takes_off_most() -> None:
-    """Numbers double; noisy pixels have more; what is predicted is left, or all samples are spent.
-
-    (Planted: the variance of one sample for that of those taken; the cheapest step last.)
-    """
-    likely = np.array([1e-6, 1.0, 8.0, 64.0, 1.0])
-    samples = np.array([16, 16, 16, 16, 32])
-    wanted = module._allot(likely, samples, 16, 0.05, 10**6)
-    assert (np.log2(wanted / samples) % 1 == 0).all() and wanted[0] == 16
-    assert wanted[1] < wanted[2] < wanted[3] and wanted[4] == max(wanted[1], 32)
-    left = (likely * (wanted / 16) ** -module._RATE).sum() / (likely * (samples / 16) ** -module._RATE).sum()
-    assert 0.025 < left <= 0.05
-    short = module._allot(likely, samples, 16, 0.05, 130)
-    assert (short == [16, 16, 32, 32, 32]).all()
-
-
-def test_rays_end_where_they_would_take_too_long(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The truth then says how good it is, instead of taking an hour."""
-    monkeypatch.setattr(module, "MOST_RAYS", 0)
-    monkeypatch.setattr(module, "MOST_SAMPLES", 64)
-    found = traced(bench, 0, 0.0)
-    assert found.rays <= 2 * 64 * N**2 and found.error > 2e-4
-
-
 def test_pixels_without_light_have_no_truth_and_no_error(bench: Bench, small_scene: Callable[..., Path]) -> None:
     """A field stop of 12 degrees hides the window's edge, board and print alike: 0, not nan."""
     found = traced(open_bench(small_scene(n=N, fov=12)), 0, 0.2)
@@ -209,11 +175,3 @@ def test_pixels_without_light_have_no_truth_and_no_error(bench: Bench, small_sce
     assert 0 < dark.sum() < N**2 / 2
     assert not found.reflectance[dark].any() and not found.standard_error[dark].any()
     assert found.reflectance[4:12, 4:12] == pytest.approx(0.5 / 0.99, rel=5e-3)
-
-
-def test_lens_and_pixels_of_the_plan_shape_it(bench: Bench) -> None:
-    """A blurred spot blurs the truth, as long as the plan simulates it."""
-    devices = replace(bench.devices, projector=bench.projector.model_copy(update={"blur_pixels": 2.0}))
-    blurred = partial(trace_truth, replace(bench, devices=devices), seed=0, flux_error=np.full(N * N, np.inf))
-    sharp, soft = (blurred(Settings(Z, effects=effects)).reflectance for effects in (frozenset(), frozenset({"blur"})))
-    assert soft[4:12, 4:12].std() < 0.7 * sharp[4:12, 4:12].std(), "and noise"

@@ -13,16 +13,13 @@ from mitsim.light.settings import (
     COUNTED,
     GROUPS,
     REPLICATES,
-    WIDE,
     Approximation,
     ErrorCovariance,
     PilotResult,
     SampleCost,
-    Settings,
     SharpPixels,
 )
 from mitsim.planner.choose import Candidates, counts_of, predicted_candidate, value_of_refining
-from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
     APART,
@@ -32,8 +29,6 @@ from tests.unit.planner.invented_pilot_result import (
     changes,
     cheapest,
     plan,
-    rows,
-    stages,
     with_occluded,
     with_sample_costs,
 )
@@ -126,14 +121,6 @@ def test_opposite_errors_are_left_together() -> None:
         assert predicted_candidate(1e-3, pilot_result, bare, {}).fits == fits
 
 
-@pytest.mark.parametrize("accuracy", ACCURACIES)
-def test_work_is_transport_and_optics_at_fixed_unit_costs(accuracy: float) -> None:
-    """Truth is the same for all choices, and none of it."""
-    chosen = cheapest(accuracy, PILOT_RESULT, {})
-    expected = stages(PILOT_RESULT, chosen.settings)
-    assert chosen.work == pytest.approx(expected["transport"] + expected["optics"])
-
-
 def test_light_that_is_missing_leaves_less_for_other_errors_to_be_part_of() -> None:
     """A fifth of the light, and a tenth, come over what no tracer finds: errors are those of the rest."""
     settings = cheapest(1e-2, PILOT_RESULT, {}).settings
@@ -142,13 +129,6 @@ def test_light_that_is_missing_leaves_less_for_other_errors_to_be_part_of() -> N
         predicted_candidate(1e-2, pilot_result, settings, {}).systematic for pilot_result in (PILOT_RESULT, lacking)
     )
     assert before.value > 1e-3 and after == pytest.approx([0.3 + 0.7 * error for error in before])
-
-
-def test_looser_accuracies_are_cheaper() -> None:
-    works = [cheapest(accuracy, PILOT_RESULT, {}).work for accuracy in ACCURACIES]
-    assert works == sorted(works) and len(set(works)) == len(works)
-    seconds = [plan(accuracy).predicted_seconds for accuracy in ACCURACIES]
-    assert seconds == sorted(seconds) and seconds[-1] > 10 * seconds[0]
 
 
 def test_what_the_pilot_cannot_tell_is_on() -> None:
@@ -167,13 +147,6 @@ def test_what_the_pilot_cannot_tell_is_on() -> None:
     assert value_of_refining(1e-3, Candidates(sure, {}))[0] == 0
 
 
-def test_nothing_is_worth_knowing_where_no_luck_would_keep_the_accuracy() -> None:
-    """Every number of cells is known to leave all of the light. (Planted: a second's worth.)"""
-    sizes = {part: 1.0 if part.name == "cells" else size for part, size in SIZES.items()}
-    certain = replace(PILOT_RESULT, changes=changes(sizes), apart={})
-    assert value_of_refining(1e-3, Candidates(certain, {}))[0] == 0.0
-
-
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-4, 1e-6])
 def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
     """Of 49 classes indirect light lies in all cells of each: 2^25 entries a group are 12 GB. (Planted: no limit.)"""
@@ -182,26 +155,6 @@ def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
     samples = {**settings.samples, "indirect": 1e5, "indirect_residual": 1e5}
     finest = replace(settings, anchors=64, followed_anchors=64, samples=samples)
     assert entries(pixels, 49, Numbers.of(finest), finest) > 2**28
-
-
-def test_occluded_pixels_count_with_their_anchors() -> None:
-    """Each of 100 pixels lights four places of its own for each of 16 x 16 anchors, in two layers twice as many; with
-    one anchor it is a pixel like the others."""
-    pixels, few = (
-        PILOT_RESULT.sample_costs["direct"].paths,
-        replace(cheapest(1e-2, PILOT_RESULT, {}).settings, layers=(), coarse_layers=False),
-    )
-    own = replace(few, occluded=tuple(range(100)), occluded_anchors=16, samples={**few.samples, "penumbra": 9.0})
-
-    def more(settings: Settings) -> float:
-        return float(entries(pixels, 49, Numbers.of(settings), settings)) - plain
-
-    plain = float(entries(pixels, 49, Numbers.of(few), few))
-    assert more(own) == pytest.approx(100 * 256 * 4)
-    assert more(replace(own, occluded_anchors=1)) == 0
-    layered = replace(own, layers=(400.0, 300.0), coarse_layers=True)
-    plain = float(entries(pixels, 49, Numbers.of(replace(layered, occluded_anchors=1)), layered))
-    assert more(layered) == pytest.approx(2 * 100 * 256 * 4)
 
 
 @pytest.mark.parametrize("accuracy", ACCURACIES)
@@ -218,33 +171,6 @@ def test_occluded_pixels_have_several_anchors_where_the_others_do(accuracy: floa
     assert chosen.systematic.value == pytest.approx(math.hypot(with_none.systematic.value, left), rel=1e-6)
     off = cheapest(1e-3, pilot_result, {"anchors": False})
     assert off.settings.anchors == off.settings.occluded_anchors == 1 and off.fits, "what the user wants does not count"
-
-
-def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
-    """Ten times the noise takes so many more samples where there are several anchors, and none where there is one.
-    (Planted: the centre's noise for both; spread noise with one anchor.)"""
-    noisy = replace(PILOT_RESULT, spread=SampleCost(2e-2, 16, 16_384))
-    for switches, factor in (({"anchors": False}, 1.0), ({"anchors": True}, 10.0)):
-        quiet, loud = (cheapest(3e-3, pilot_result, switches) for pilot_result in (PILOT_RESULT, noisy))
-        assert (loud.settings.anchors > 1) == (factor > 1)
-        if factor == 1:
-            assert loud == quiet
-        else:
-            assert loud.settings.samples["direct"] > 8 * quiet.settings.samples["direct"]
-            assert 0.3 * loud.target < loud.noise < loud.target
-
-
-def test_what_checks_see_of_all_shots_needs_no_margin() -> None:
-    """Of 64 classes they see all, of 65 some: then the noise has as much margin as what the pilot saw of few frames.
-
-    (Planted: a margin for both in both; none for either.)
-    """
-    for classes, seen in ((64, True), (65, False)):
-        pilot_result = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, shots=100, classes=classes))
-        found = cheapest(1e-3, pilot_result, {})
-        left = found.systematic.bound
-        whole = math.hypot(left / 0.95, found.target) if seen else math.hypot(left, found.target) / 0.95
-        assert found.fits and whole == pytest.approx(1e-3)
 
 
 def test_samples_take_the_least_work_for_the_target() -> None:
@@ -267,31 +193,6 @@ def test_samples_take_the_least_work_for_the_target() -> None:
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) < found.target / 1.1
     ratios = [n / math.sqrt(v / price) for v, n, price in kinds]
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02) and min(counts) > 50
-
-
-def test_wide_cells_hold_light_of_many_anchors() -> None:
-    """8 x 8 anchors of 49 classes are 10^8 places in cells of a pixel, and a sixteenth of that in cells of four.
-    (Planted: as many places as in cells of a pixel; the error of wide cells not counted.)"""
-    many = {
-        Approximation("followed_anchors", count): size for count, size in {1: 7e-3, 2: 3e-3, 5: 6e-4, 8: 2e-5}.items()
-    }
-    followed = SampleCost(2e-2, 2, 36_384)
-    sizes = {part: size for part, size in SIZES.items() if part.name != "followed_anchors"} | many
-    without, found = (
-        with_sample_costs(replace(PILOT_RESULT, changes=changes(each)), indirect_residual=followed)
-        for each in (sizes, sizes | {WIDE: 5e-5})
-    )
-    chosen = cheapest(5e-4, found, {})
-    settings = chosen.settings
-    assert chosen.fits and (settings.followed_anchors, settings.followed_width) == (8, 4)
-    assert entries(PILOT_RESULT.sample_costs["direct"].paths, 49, Numbers.of(settings), settings) <= 2**25
-    narrow = predicted_candidate(5e-4, without, settings, {}).systematic.value
-    assert chosen.systematic.value == pytest.approx(math.hypot(narrow, 5e-5), rel=1e-6)
-    one = cheapest(1e-2, found, {})
-    assert one.settings.followed_width == 1, "one anchor sees nothing beyond its mean"
-    alone = predicted_candidate(1e-2, without, one.settings, {}).systematic.value
-    assert one.systematic.value == pytest.approx(alone, rel=1e-9)
-    assert "8x8 points, in cells of 4x4 pixels, which leaves" in rows(plan(5e-4, found))["followed-anchors"].reason
 
 
 def test_one_hit_of_a_small_target_is_a_quarter_of_the_noise_and_counts_beside_it() -> None:
@@ -318,17 +219,6 @@ def test_doubt_of_the_pilot_is_in_the_bound_alone() -> None:
     left |= {Approximation("interreflection"), Approximation("ambient")}
     found = predicted_candidate(0.1, doubtful, bare, {}).systematic
     assert found == pytest.approx(doubtful.changes.estimate(left)) and found.bound > 1.002 * found.value
-
-
-def test_the_value_of_refining_coarse_cells_names_them() -> None:
-    """Indirect light in coarse cells may be 2e-3 off or not at all: to know it saves fine cells. (Planted: doubt about
-    effects and numbers alone.)"""
-    place = PILOT_RESULT.changes.parts.index(Approximation("indirect cells", 1))
-    products = PILOT_RESULT.changes.products.copy()
-    products[:, :, place, place] = changes({Approximation("indirect cells", 1): 1e-4}, 8e-3).products[:, :, 0, 0]
-    unsure = replace(ONE_CLASS, changes=ErrorCovariance(PILOT_RESULT.changes.parts, products))
-    worth, part = value_of_refining(1e-3, Candidates(unsure, {}))
-    assert worth > 0 and part == Approximation("indirect cells", 1) and run_of(part) == "effects"
 
 
 def test_what_interpolation_leaves_of_sharp_light_counts() -> None:

@@ -14,11 +14,9 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, parse_patterns
-from mitsim.light.settings import Settings, SharpPixels
+from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, expected_of
-from mitsim.planner import pilot
 from mitsim.planner.pilot import occluded_pixels
-from mitsim.planner.pilot_direct import Sample
 from mitsim.planner.planner import make_plan
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -114,37 +112,3 @@ def test_the_plan_gives_them_anchors_and_the_others_few(bench: Bench) -> None:
     assert row.state == "approximate" and row.reason.startswith(f"{len(settings.occluded)} projector pixels are hidden")
     loose = make_plan(bench, Lighting.uniform(N), 0.1, 0)
     assert loose.row("occluded-anchors").state == "off" and loose.settings.with_own_anchors == ()
-
-
-@pytest.mark.parametrize("shows", ["none", pytest.param("nothing else", marks=pytest.mark.slow)])
-def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
-    bench: Bench, shows: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The sample then tells of one kind alone. (Planted: apart all the same; nobody knew of several anchors.)"""
-    monkeypatch.setattr("mitsim.planner.pilot._ROUGH", -1.0)
-    lit = np.zeros(N**2, dtype=bool)
-    lit[: 8 * N] = True  # above the card
-    if shows != "none":
-        lit = np.isin(np.arange(N**2), occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0))
-    lighting = Lighting((~lit).astype(np.int64), np.array([[1.0, 0.0]]))
-    pilot_result = pilot.PilotRuns(bench, lighting, 1e-3, 0).pilot_result
-    assert pilot_result.occluded == () and {1, 2, 3} <= set(pilot_result.ladders["anchors"])
-
-
-@pytest.mark.slow
-def test_pixels_with_a_pass_of_their_own_are_no_occluded_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """(Planted: the look goes by a simulation without them.)"""
-    found = occluded_pixels(Simulation(bench, Settings(depth=Z)), 5e-4, 0)
-    sharp = SharpPixels(found[::2], 2, (-0.1, 0.1, -0.1, 0.1))
-    monkeypatch.setattr("mitsim.planner.pilot.sharp_pixels", lambda *_: sharp)
-    pilot_result = pilot.PilotRuns(bench, parse_patterns("dots:3", N).lighting, 5e-4, 0).pilot_result
-    assert pilot_result.occluded and not set(pilot_result.occluded) & set(sharp.pixels)
-
-
-@pytest.mark.parametrize("pixels", [1, 12, 300])
-def test_a_longer_look_has_an_end(pixels: int) -> None:
-    """Whatever certainty is worth: a look at one pixel grew until 20 GB were full. (Planted: no limit.)"""
-    sample = Sample.of(parse_patterns("dots:3", N).lighting, (64, 64), mirrors=False)
-    counts = [replace(sample, times=4**looks).samples_of_occluded(pixels) for looks in range(12)]
-    assert counts == sorted(counts) and counts[0] >= 4 and counts[-1] == counts[5]
-    assert counts[-1] * pixels <= max(2**11, 4 * pixels)

@@ -7,7 +7,6 @@ against frames of many more samples; the pilot sees a few, so a factor of 1.5 ei
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +19,12 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
-from mitsim.light.settings import REPLICATES, WIDE, Approximation, ErrorCovariance, PilotResult, Settings
+from mitsim.light.settings import REPLICATES, WIDE, PilotResult, Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct, pilot_effects
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
 from mitsim.transport.integrator import FollowingTracer, Tracer
-from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import DIRECT, INDIRECT, PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -190,22 +188,6 @@ def test_wide_cells_of_followed_light_come_true(bench: Bench, pilot_result: Pilo
     assert promised(pilot_result.error(WIDE).value, actual)
 
 
-@pytest.mark.slow
-def test_light_to_many_anchors_is_traced_in_parts(
-    bench: Bench, pilot_result: PilotResult, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
-    (Planted: every part from the first sample on.)"""
-    monkeypatch.setattr(
-        pilot_effects,
-        "_AT_ONCE",
-        2 * 9 * (pilot_result.sample_costs["indirect_residual"].paths + pilot_result.sample_costs["from_camera"].paths),
-    )
-    again = measured(bench, seed=3).ladders["followed_anchors"]
-    for count, error in pilot_result.ladders["followed_anchors"].items():
-        assert again[count] == pytest.approx(error, rel=1e-6)
-
-
 @pytest.fixture(scope="module")
 def direct_part(bench: Bench, pilot_result: PilotResult) -> float:
     """Of all light."""
@@ -222,11 +204,6 @@ def test_cells_come_true(bench: Bench, pilot_result: PilotResult, direct_part: f
         actual = change(frames(bench, replace(base, subdivision=cells), 1024), judge)
         assert actual > 4e-4
         assert promised(pilot_result.ladders["cells"][cells].value, actual * direct_part)
-
-
-def test_a_print_in_the_projectors_pixels_needs_no_finer_cells(small_scene: Callable[..., Path]) -> None:
-    found = measured(open_bench(small_scene()), 0, accuracy=1e-3).ladders["cells"]
-    assert max(found.values()).value < 6e-4, "falloff within a pixel of 7.5 mm"
 
 
 def test_layers_come_true(bench: Bench, pilot_result: PilotResult, direct_part: float) -> None:
@@ -320,42 +297,6 @@ def test_a_ladder_ends_where_its_last_step_leaves_little() -> None:
     assert tried == [1, 2]
 
 
-def test_what_costs_more_to_ask_than_it_saves_is_not_asked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether paths are shared, where indirect light takes little; and no closer look than a part of that light.
-    (Planted: always asked; a closer look whatever it takes.)"""
-    lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
-    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    monkeypatch.setattr(pilot_effects, "_OF_INDIRECT", 1e-12)
-    loose, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
-    tried = list[object]()
-    monkeypatch.setattr(PathReuseTracer, "shares", lambda tracer: bool(tried.append(tracer)))
-    for found, asked in ((loose, False), (close, True)):
-        found.indirect_cost()
-        assert bool(tried) == asked and found._looks[1].samples == sample.followed
-
-
-def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
-    """By looks of their own, whose light and noise are as large as told before. (Planted: samples of the first looks
-    for either, the first looks' seeds, no closer looks at all.)"""
-    lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
-    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    first, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
-    seen = [ErrorCovariance.between(found.changes, found.light**2) for found in (first, close)]
-    open_ = [
-        bound**2 - value**2 for value, bound in (each.estimate([Approximation("indirect cells", 1)]) for each in seen)
-    ]
-    assert open_[1] < open_[0] / 4
-    one, two = (each.estimate([Approximation("indirect layers", 1)]).value for each in seen)
-    assert two == pytest.approx(one, rel=0.3)
-    noises = [found.sample_costs["indirect"] for found in (first, close)]
-    assert [noise.samples for noise in noises] == [sample.followed, 16 * sample.followed]
-    assert 0.5 < noises[1].error * math.sqrt(16) / noises[0].error < 2
-    one, two = (found._looks[1][0][0].value[:50] for found in (first, close))
-    assert not np.array_equal(one, two)
-
-
 def test_the_pilot_is_reproducible(bench: Bench) -> None:
     """Of few shots and at a loose accuracy: all parts of the pilot have their turn."""
     lighting = parse_patterns("dots:2", N).lighting
@@ -363,14 +304,6 @@ def test_the_pilot_is_reproducible(bench: Bench) -> None:
     for name in ("depth", "layers", "effects", "ladders"):
         assert getattr(again, name) == getattr(one, name)
     assert np.array_equal(again.changes.products, one.changes.products)
-
-
-@pytest.mark.slow
-def test_the_pilot_of_a_flat_scene_is_reproducible(small_scene: Callable[..., Path]) -> None:
-    flat = open_bench(small_scene())
-    one, again, other = (measured(flat, seed) for seed in (3, 3, 4))
-    assert again.effects == one.effects and np.array_equal(again.changes.products, one.changes.products)
-    assert other.effects != one.effects and other.ladders["anchors"] != one.ladders["anchors"]
 
 
 def test_a_flat_scene_needs_no_layers(small_scene: Callable[..., Path]) -> None:
@@ -399,22 +332,6 @@ def test_light_is_followed_only_where_surfaces_see_each_other(
         assert bool(followed) == (angle == 181)
 
 
-def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(bench: Bench) -> None:
-    """Where one cell, and one layer, leave little of all light, and anchors see little beyond their mean, neither is.
-    (Planted: the part of the mean, not of what is beyond it.)"""
-    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
-    cells, layers = (Approximation(f"anchor_residual {what}", 1) for what in ("cells", "layers"))
-    enough = 1 / (15 * pilot_direct.norm(runs.anchored._beyond_mean(1, ())))
-    for coarse, looked_at in (
-        ((0.9 * enough, 0.9 * enough), set()),
-        ((1.1 * enough, 0.9 * enough), {cells}),
-        ((0.9 * enough, 1.1 * enough), {cells, layers}),
-    ):
-        runs.anchored.coarse = coarse
-        vars(runs.anchored).pop("changes", None)
-        assert {part for part in runs.anchored.changes if part.name.startswith("anchor_")} == looked_at
-
-
 def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: Bench) -> None:
     """Light whose kind is direct light's, as over mirrors and curved glass, comes by the same paths. (Planted: indirect
     light alone.)"""
@@ -431,58 +348,6 @@ def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: B
     parted = pilot_effects.Bounced.of(halves, seen.samples)
     assert found._noise_of_bounced(parted) == pytest.approx(found._noise_of_bounced(seen), rel=0.1)
     assert pilot_direct.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
-
-
-def test_more_anchors_see_a_faint_camera_part_as_few_do(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Then it is not traced again, and nothing of it is lost. (Planted: frames without it; those of one anchor.)"""
-    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
-    others = runs.samples["followed"], math.inf, 3, runs.fine.judging
-    whole = pilot_effects.FollowedRuns(bench, runs._everything, *others)
-    monkeypatch.setattr(pilot_effects, "_FAINT", 0.0)
-    apart = whole._frames(3)
-    monkeypatch.setattr(pilot_effects, "_FAINT", 0.6)
-    faint = pilot_effects.FollowedRuns(bench, runs._everything, *others)
-    traced = list[str]()
-    replicates = Tracer.replicates
-
-    def count(tracer: Tracer, *arguments: Any, **options: Any) -> list[list[PathSamples]]:
-        traced.append(type(tracer).__name__)
-        return replicates(tracer, *arguments, **options)
-
-    faint._frames(2)
-    monkeypatch.setattr(Tracer, "replicates", count)
-    seen = faint._frames(3)
-    assert len(traced) == 1 and "Camera" not in traced[0]
-    camera = float(np.linalg.norm(whole._form(whole._grids(whole._simulation(2)), whole._few_by_tracer[1])))
-    assert float(np.linalg.norm(seen - apart)) < 0.5 * camera
-    assert camera > 0.1 * float(np.linalg.norm(apart))
-
-
-def test_coarse_cells_of_faint_indirect_light_are_not_looked_at(bench: Bench) -> None:
-    """Where the bound on what they leave, by what they leave of direct light, is below the accuracy. (Planted: the
-    bound of direct light, not of its part.)"""
-    lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
-    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    followed = EffectRuns(bench, everything, sample, 5)
-    direct = sum(float(light.value.sum()) for light in followed.direct) / (REPLICATES * sample.direct)
-    part = followed.received / (direct + followed.received)
-    enough = pilot_direct.GOOD_ENOUGH * 1e-2 / (15 * part)
-    for left, looked_at in ((0.9 * enough, False), (1.1 * enough, True), (0.0, True)):
-        found = EffectRuns(bench, everything, sample, 5, (), 1e-2, partial(tuple, (left / 2, left)))
-        assert bool(found._coarse) == looked_at
-        assert found.sample_costs["indirect"].error
-
-
-def test_noise_over_a_flat_matt_scene_is_that_at_its_centre(small_scene: Callable[..., Path]) -> None:
-    """No ray is traced for what can be no other; nor where the nearest surface is no nearer than all light. Four
-    replicates tell either noise to some 40 %; over gloss they would differ by a factor. (Planted: rays for any scene.)
-    """
-    flat = pilot.PilotRuns(open_bench(small_scene()), parse_patterns("dots:4", N).lighting, 1e-2, 0)
-    assert flat.fine.sample_cost(1.0, spread=True) == flat.fine.sample_cost(1.0) and set(flat.fine._noises) == {False}
-    _, seen = flat.fine._trace(1, spread=True)
-    over = pilot_direct.noise(flat.fine._form(flat.fine._simulation, seen, flat.fine.sample.fine))
-    assert 0.5 < over / flat.fine.sample_cost(1.0).error < 2
 
 
 @pytest.mark.usefixtures("soon_dark")
@@ -512,33 +377,3 @@ def test_applicable(bench: Bench, small_scene: Callable[..., Path], tmp_path: Pa
     )
     found = effects.present(open_bench(small_scene(), projector=projector))
     assert found == ("interreflection", "diffraction", "aperture", "blur", "black-level", "speckle")
-
-
-@pytest.mark.slow
-def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> None:
-    """A mirror brings the light of a few projector pixels to the sensor; shots that do not show them see black pixels
-    alone, and four of 49 have no such shot among them. What black pixels change, against the frames of all shots in
-    closed form, (1 - b) of a class and b of all. (Planted: four shots, as of a print: 6.0e-5 of 8.8e-5.)"""
-    bench = shipped_bench("mirror")
-    lighting = parse_patterns("dots:7", bench.n).lighting
-    found = pilot.PilotRuns(bench, lighting, 1e-3, 1).pilot_result.effects["black-level"]
-    made = Simulation(bench, Settings(depth=400.0, effects=frozenset(effects.present(bench))))
-    specular, black = made.specular_frames(lighting.labels), made.physics.black_level
-    assert specular is not None
-    seen = np.zeros((49, 512, 512))
-    seen[specular.classes] = specular.irradiance
-    everything = black * seen.sum(axis=0)
-    actual = np.linalg.norm(everything - black * seen) / np.linalg.norm(everything + (1 - black) * seen)
-    assert found.value == pytest.approx(actual, rel=0.1)
-
-
-@pytest.mark.slow
-def test_a_refined_run_is_in_what_was_found(bench: Bench) -> None:
-    """More samples of a run tell its changes with half of the standard error. (Planted: the former is kept.)"""
-    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, seed=3)
-    before, cells = runs.pilot_result, Approximation("cells", 1)
-    runs.refine("cells")
-    after = runs.pilot_result
-    spread = [each.bound**2 - each.value**2 for each in (result.error(cells) for result in (before, after))]
-    assert after is not before
-    assert spread[1] != spread[0]

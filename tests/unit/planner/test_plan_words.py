@@ -20,7 +20,6 @@ from tests.unit.planner.invented_pilot_result import (
     plan,
     rows,
     stages,
-    with_occluded,
 )
 
 
@@ -117,13 +116,6 @@ def test_light_that_frames_lack_is_told_with_its_part_and_a_remedy(lacking: dict
     assert "largest: layers (4)" in other, "light that is all resolved is no reason"
 
 
-def test_a_plan_as_json_leaves_out_what_it_was_decided_without() -> None:
-    block = plan().block()
-    assert "request" not in block and "cost" not in block and None not in block.values()
-    assert block["accuracy"] == 1e-3 and block["settings"]["effects"] == sorted(plan().settings.effects)
-    assert set(block) >= {"effects", "predicted_seconds", "settings", "sampling_target", "warnings"}
-
-
 def test_effects_that_are_off_take_no_seconds_and_switches_are_named() -> None:
     found = rows(plan(effects="+ambient,-interreflection"))
     for name, row in found.items():
@@ -132,14 +124,6 @@ def test_effects_that_are_off_take_no_seconds_and_switches_are_named() -> None:
     assert found["diffraction"].reason == "Fresnel number 3.2" and found["diffraction"].seconds > 0
     assert found["blur"].reason == "" and found["blur"].state == "exact"
     assert found["blur"].seconds == 0
-
-
-def test_where_nothing_fits_sampling_still_aims_below_the_accuracy() -> None:
-    """Every number of anchors leaves 5 %: the plan is flagged, and sampling is no finer than it need be."""
-    coarse = {**SIZES, **{Approximation("anchors", count): 0.05 for count in (1, 2, 3, 5)}}
-    found = plan(1e-2, replace(PILOT_RESULT, changes=changes(coarse)))
-    assert found.warnings and found.systematic_bound > 1e-2
-    assert 0.5e-2 < found.sampling_target < 1e-2
 
 
 FOLLOWS = replace(PILOT_RESULT, changes=changes(SIZES | {Approximation("ambient"): 5e-2}))
@@ -175,20 +159,3 @@ def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
             reported[name].seconds == pytest.approx(seconds(settings) - seconds(less)) and reported[name].seconds > 0
         ), name
     assert reported["followed-anchors"].error_if_off == pytest.approx(SIZES[Approximation("followed_anchors", 1)])
-
-
-def test_the_row_of_occluded_pixels_tells_their_number_and_what_they_leave() -> None:
-    """None: few anchors serve all. Some: one anchor's error, and what the chosen ones leave."""
-    none = rows(plan())["occluded-anchors"]
-    assert (none.state, none.error_if_off, none.seconds) == ("off", 0, 0) and "serve all" in none.reason
-    pilot_result = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
-    found = plan(pilot_result=pilot_result)
-    several, count = rows(found)["occluded-anchors"], found.settings.occluded_anchors
-    assert count > 1 and several.state == "approximate" and several.seconds == 0
-    assert several.error_if_off == pytest.approx(6e-3)
-    left = pilot_result.ladders["occluded_anchors"][count].value
-    hidden = "150 projector pixels are hidden from part of the sensor"
-    assert several.reason == f"{hidden}: {count}x{count} anchors, which leaves {left:.1e}"
-    one = rows(plan(0.1, pilot_result, "-anchors"))["occluded-anchors"]
-    assert (one.state, one.seconds) == ("off", 0) and one.error_if_off == pytest.approx(6e-3)
-    assert one.reason == f"{hidden}: 1x1 anchors, which leaves 6.0e-03"
