@@ -17,9 +17,8 @@ import pytest
 import mitsim as ms
 from mitsim.acquire.exposure import Exposer, ambient_shots
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.errors import MitsimError
-from mitsim.core.exr import checksum, read_frame, write_frame
-from mitsim.core.runs import Capture, load_run
+from mitsim.core.exr import checksum, read_frame
+from mitsim.core.runs import Capture
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light.light import SampledLight
 from mitsim.light.simulation import Simulation
@@ -209,35 +208,6 @@ def test_a_resumed_run_is_bit_equal(bench: Bench, tmp_path: Path) -> None:
             assert np.array_equal(values, before[name][channel])
     assert again.fingerprint == whole.fingerprint
     assert again.manifest.checksums.keys() == whole.manifest.checksums.keys() >= set(names)
-
-
-def test_a_real_cameras_dark_frame_is_taken_off(tmp_path: Path) -> None:
-    """The least that such a folder holds: a name, a number of shots, and the channel DN."""
-    rng = np.random.default_rng(0)
-    dark, lit = rng.random((4, 5)) * 50 + 160, rng.random((4, 5)) * 100
-    write_frame(tmp_path / "a.exr", {"DN": (dark + lit).astype(np.float32)}, {})
-    write_frame(tmp_path / "dark.exr", {"DN": dark.astype(np.float32)}, {})
-    manifest = {
-        "kind": "capture", "format": 1, "status": "complete", "camera": {},
-        "digital": {"exposure_s": 0.02, "black_level_dn": 160, "gain_dn_per_e": 0.125, "dark_current_e_per_s": 6},
-        "patterns": {"P_L": [[1]], "P_R": [[1]], "captures": [{"file": "a.exr", "row": 0, "column": 0, "sign": 0}]},
-    }  # fmt: skip
-
-    def rate(**more: object) -> np.ndarray:
-        (tmp_path / "manifest.json").write_text(json.dumps({**manifest, **more}))
-        ((frame, _, _),) = load_run(tmp_path).measurements()
-        return frame
-
-    assert rate() == pytest.approx((dark + lit - 160) / 0.125 / 0.02 - 6, rel=1e-5), "as before"
-    without = load_run(tmp_path).fingerprint
-    assert rate(ambient_frame={"file": "dark.exr", "shots": 8}) == pytest.approx(lit / 0.125 / 0.02, rel=1e-4)
-    shots = load_run(tmp_path)
-    assert shots.fingerprint != without and shots.ambient is not None
-    # What is not stated of the sensor counts as 0: shot noise alone, of lamps and dark current.
-    assert shots.ambient.variance == pytest.approx((shots.ambient.rate + 6) / 0.02 / 8)
-    write_frame(tmp_path / "dark.exr", {"DN": np.zeros((3, 3), np.float32)}, {})
-    with pytest.raises(MitsimError, match=r"ambient frame is 3x3, but the frames are 4x5"):
-        list(load_run(tmp_path).measurements())
 
 
 # ---- what noise and full well allow ----------------------------------------------------------------------------------

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from mitsim.acquire import spectral
-from mitsim.acquire.capture import Light, check_plan
-from mitsim.acquire.spectral import SpectralBench
+from mitsim.acquire.capture import Light
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.request import Request
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.devices.projector import Lines
@@ -104,18 +102,6 @@ def test_a_plan_that_takes_longer_than_is_allowed_is_refused(bench: Bench, file:
     with pytest.raises(MitsimError, match=r"^dots:3: would take about 1e\+09 s; allowed are 8\.64e\+04 s"):
         bench.capture(Plan.load(file).taking(transport=1e9), tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("patterns", ["hadamard:4", "dots:1x16"])
-def test_other_patterns_of_the_same_classes_or_weights_are_others(bench: Bench, file: Path, patterns: str) -> None:
-    """(Planted: classes of pixels compared alone; how they are lit alone.)"""
-    plan = replace(Plan.load(file), request=Request.of(patterns="dots:4", accuracy=ACCURACY))
-    for same in ("dots:4", "dots:4x4"):
-        check_plan(plan, SpectralBench(bench), Request.of(patterns=same))
-    made, asked = (bench.family(name).lighting for name in ("dots:4", patterns))
-    assert np.array_equal(made.labels, asked.labels) != np.array_equal(made.weights, asked.weights)
-    with pytest.raises(ArgumentError, match=f"^patterns '{patterns}': the plan was made for 'dots:4'"):
-        check_plan(plan, SpectralBench(bench), Request.of(patterns=patterns))
 
 
 @pytest.mark.usefixtures("no_plans")

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.acquire import spectral
 from mitsim.acquire.spectral import MosaicFrames, MosaicLight, without_filters
 from mitsim.api.bench import Bench, open_bench
 from mitsim.calibrate.board_session import Session
@@ -87,26 +86,6 @@ def test_lamps_are_in_every_frame_and_alone_in_the_dark_one(apart: bool) -> None
     root = spread.sum() * np.sign(own) * np.sqrt(abs(own)) + np.sign(theirs) * np.sqrt(abs(theirs))
     assert lit.by_group == pytest.approx(dark.by_group + theirs if apart else root * abs(root))
     assert lit.variance == pytest.approx(np.trace(lit.by_group))
-
-
-def test_sampling_looks_at_lamps_behind_each_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Errors of 1, 2 and 3 % beside 1 % of the mean, of pixels that count 4, 2 and 1. (Planted: a mean of errors.)"""
-    responses = [Response(np.ones(2), (400.0, 700.0), planes=planes) for planes in ((0,), (1, 2), (3,))]
-    shares = np.repeat([4 / 9, 2 * 2 / 9, 1 / 9], 4) / 4
-    counted_lamps = CountedLamps(tuple(responses), ((400.0, 700.0),) * 12, shares=shares)
-    errors: dict[int | None, float] = {0: 0.01, 4: 0.02, 8: 0.03, None: 0.01}
-
-    def alone(light: Any, bands: slice, seed: int) -> Any:
-        return SimpleNamespace(sampling_error=lambda: (errors[bands.start], 0.0))
-
-    monkeypatch.setattr(spectral, "_lamps_alone", alone)
-    light: Any = SimpleNamespace(bench=SimpleNamespace(counted_lamps=counted_lamps), seed=0)
-    energy = np.array([16.0, 2 * 4.0, 1.0])
-    expected = np.sqrt(np.dot(energy, [1, 4, 9]) / energy.sum())
-    assert spectral.excess_behind_filters([light, light]) == pytest.approx(expected)
-    errors[None] = 0.05
-    dark: Any = SimpleNamespace(bench=SimpleNamespace(counted_lamps=None))
-    assert spectral.excess_behind_filters([light]) == spectral.excess_behind_filters([dark]) == 1
 
 
 @pytest.fixture(scope="module")

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import tracemalloc
-
 import numpy as np
 import pytest
 
-from mitsim.acquire.exposure import Shooting, Totals
+from mitsim.acquire.exposure import Shooting
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import Recorder
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light import cost_model
-from mitsim.light.cost_model import frames_bytes
-from mitsim.light.settings import GROUPS
-from mitsim.optics import frames as forming
 from tests.unit.acquire.test_exposer import PIXELS, exposer, frame
-from tests.unit.optics.small_camera import LABELS, SPLIT, expected_frames, random_groups, small_optics
 
 FAMILY = parse_patterns("dots:5", 10)
 FRAMES = [frame(1e-6 * (2 + index)) for index in range(25)]
@@ -62,34 +56,3 @@ def test_a_file_that_cannot_be_written_ends_the_shooting(monkeypatch: pytest.Mon
         with pytest.raises(MitsimError, match=f"^file {bad}: cannot be written"):
             shot(recorder)
         assert bad not in recorder.files and len(recorder.files) <= (24 if bad.endswith("24.exr") else 8)
-
-
-@pytest.mark.parametrize("mixed", [True, False])
-def test_frames_take_as_much_memory_as_is_predicted(mixed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Thirty-six shots of 200 x 200 pixels, mixed from classes that are held or formed one by one: half to all of it.
-
-    (Planted: chunks that are kept until all is written; frames formed 36 at a time, where 5 are predicted.)
-    """
-    pixels, shots = 200, 36
-    for room, count in ((forming, 5), (cost_model, 4)):
-        monkeypatch.setattr(room, "_BYTES_AT_ONCE", count * 8 * pixels**2)
-    classes, labels = (4, LABELS) if mixed else (12, SPLIT)
-    if not mixed:
-        monkeypatch.setattr(forming, "_BASIS_BYTES", 1)
-    weights = np.random.default_rng(3).random((shots, classes))
-
-    class Nowhere(Recorder):
-        def write(self, name, channels, metadata) -> None:
-            """Kept by nobody."""
-
-    expected = expected_frames(small_optics(pixels), random_groups(GROUPS, 7), labels, weights, 0)
-    shooting = Shooting(parse_patterns("dots:6", 12), Nowhere(), exposer(), None, np.zeros((pixels, pixels)))
-    tracemalloc.start()
-    try:
-        totals = Totals.of(expected)
-        shooting.shoot(expected, Job())
-        taken = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert totals.peak > 0 and shooting.sensor_noise > 0
-    assert 0.4 < taken / frames_bytes(classes, shots, pixels) < 1

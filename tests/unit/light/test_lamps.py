@@ -13,7 +13,6 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,12 +20,10 @@ import pytest
 
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
-from mitsim.bench.request import Request
 from mitsim.core.manifests import MOSAIC, RUN
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import SPECTRA_NM, CountedLamps, Response, Spectrum
 from mitsim.light.passes import Grid
-from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
@@ -235,36 +232,3 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
         assert np.allclose(found, alone.frame(row.indices, row.data), rtol=1e-12, atol=1e-15 * found.max())
         frames.append(found)
     assert np.linalg.norm(frames[0] - frames[3]) > 0.05 * np.linalg.norm(frames[0])
-
-
-def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever they are planned: `mitsim plan` has not lit them before. The plan is of all lines together, though it is
-    made on one, and for what was asked. (Planted: planned as they are; what one line is made of; what is switched
-    on.)"""
-    planned: list[Any] = []
-    alone, whole = (
-        SimpleNamespace(counted_lamps=object()),
-        SimpleNamespace(
-            family=lambda patterns, seed: SimpleNamespace(lighting=Lighting(np.zeros(4, int), np.ones((1, 1)))),
-            deciding={"colour": "all lines"},
-        ),
-    )
-    lit = SimpleNamespace(roughest=lambda seed, part: alone)
-    colours: Any = SimpleNamespace(
-        manifest=object(),
-        benches=(1, 2, 3),
-        whole=whole,
-        check=lambda request: None,
-        lit_by_lamps=lambda effects, seed: lit,
-        roughest=lambda seed, part: SimpleNamespace(counted_lamps=None),
-    )
-
-    def plan_request(bench: Any, request: Any, lines: int) -> Any:
-        planned.append((bench, dict(request.effects), lines))
-        return Plan(1e-3, (), 1.0, Settings(400.0), 1e-3, 0.0, 0.0, (), request=request, made_of={"colour": "one"})
-
-    monkeypatch.setattr("mitsim.acquire.spectral.plan_request", plan_request)
-    asked = Request.of(patterns="uniform")
-    plan = SpectralBench.plan(colours, asked)
-    assert plan.request == asked and plan.made_of == whole.deciding
-    assert planned == [(alone, {}, 3), (alone, {"ambient": True}, 3)]

@@ -27,7 +27,6 @@ from tests.unit.planner.invented_pilot_result import PILOT_RESULT
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N = 16
-FAR = ("interreflection",)
 
 
 @pytest.fixture(scope="module")
@@ -70,41 +69,6 @@ def test_light_by_class_serves_no_other_family(bench: Bench, plan: Plan, family:
     # Uniform light never splits a class: it is the sum of all of them.
     (white,) = stacked(by_class.frames(uniform, 0))
     assert np.allclose(white, stacked(by_class.frames(family, 0)).sum(axis=0), rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("error", "bound", "excess"), [(1.9, 2.0, 2.0), (1.9, 4.0, 1.2 * 1.9), (0.9, 2.0, 2.0**0.55), (1.0, 1.1, 1.1)]
-)
-def test_the_next_round_is_for_the_error_where_few_paths_make_the_bound(
-    bench: Bench,
-    plan: Plan,
-    family: Lighting,
-    monkeypatch: pytest.MonkeyPatch,
-    error: float,
-    bound: float,
-    excess: float,
-) -> None:
-    """Where many tell it, for the bound; never more than that; and of direct light, whose paths are all alike, for the
-    bound always. (Planted: for the bound always, for the error always, no power of the bound.)"""
-    target, runs = plan.sampling_target, list[ExpectedFrames]()
-    far = replace(plan, settings=replace(plan.settings, effects=frozenset(FAR)))
-
-    def reported(frames: ExpectedFrames) -> tuple[float, float]:
-        runs.append(frames)
-        return (0.0, 0.0) if len(runs) > 1 else (error * target, bound * target)
-
-    monkeypatch.setattr(ExpectedFrames, "sampling_error", reported)
-    monkeypatch.setattr(module, "tells_all", lambda *_: True)
-    asked = []
-
-    def following(_: Simulation, done: Mapping[str, int], variances: Mapping[str, float], by: float) -> dict[str, int]:
-        asked.append(("indirect" in variances, by))
-        return {name: count + 1 for name, count in done.items()}
-
-    monkeypatch.setattr(module, "next_samples", following)
-    assert trace_light(bench, far, family, 3).reached and asked == [(True, pytest.approx(excess))]
-    runs.clear()
-    assert trace_light(bench, plan, family, 3).reached and asked[1:] == [(False, pytest.approx(bound))]
 
 
 @pytest.mark.parametrize("planned", [0.7, 1.4])

@@ -57,37 +57,6 @@ def test_a_heavy_path_makes_its_own_light_grow() -> None:
     assert found == {"direct": 32, "indirect": grown, "penumbra": 6, "from_camera": 9, "indirect_residual": 9}
 
 
-def test_two_lights_share_the_work_whatever_their_sizes() -> None:
-    """Against every number of samples of the first, of variances, samples and work over decades.
-
-    (Planted: a light rests by another power of what the others' next sample gains.)
-    """
-    rng = np.random.default_rng(7)
-    for _ in range(40):
-        variances, works = 10 ** rng.uniform(-2, 0, 2), 10 ** rng.uniform(-3, 1, 2)
-        done = rng.integers(2, 60, 2)
-        lights = [
-            SampledPass(name, int(count), variance, work)
-            for name, count, variance, work in zip(("indirect", "from_camera"), done, variances, works, strict=True)
-        ]
-        allowed = variances.sum() / rng.uniform(1.1, 6)
-        found = cheapest_samples(lights, allowed)
-        assert sum(light.variance_left(found[light.name]) for light in lights) <= allowed * (1 + 1e-9)
-        assert all(found[light.name] >= light.done for light in lights)
-        first = np.arange(done[0], 40 * done[0] + 1)
-        rest = allowed - variances[0] * done[0] / first
-        second = np.maximum(
-            np.divide(variances[1] * done[1], rest, out=np.full(len(rest), np.inf), where=rest > 0), done[1]
-        )
-        least = float((works[0] * first + works[1] * second).min())
-        assert works[0] * found["indirect"] + works[1] * found["from_camera"] <= least + works.sum()
-
-
-def test_where_nothing_is_enough_all_grow_as_far_as_they_may() -> None:
-    lights = [SampledPass("direct", 24, 0.5, 3.0), SampledPass("indirect", 10, 0.5, 2.0)]
-    assert cheapest_samples(lights, 0.0) == {"direct": 192, "indirect": 80}
-
-
 def simulated(**tracers: tuple[Any, float]) -> Any:
     """A simulation of these tracers, with predicted samples."""
     passes = {name: SimpleNamespace(tracer=tracer, predicted=count) for name, (tracer, count) in tracers.items()}

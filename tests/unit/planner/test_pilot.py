@@ -4,11 +4,9 @@ The scene calls for everything at once: a sensor of 24 mm near a ball and a corn
 against frames of many more samples; the pilot sees a few, so a factor of 1.5 either way is its promise here.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +20,9 @@ from mitsim.devices.patterns import parse_patterns
 from mitsim.light.settings import REPLICATES, WIDE, PilotResult, Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_error
-from mitsim.planner import pilot, pilot_direct, pilot_effects
+from mitsim.planner import pilot, pilot_direct
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
-from mitsim.transport.integrator import FollowingTracer, Tracer
-from mitsim.transport.records import DIRECT, INDIRECT, PathSamples
+from mitsim.transport.records import PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
@@ -261,23 +258,6 @@ def test_frames_of_pilot_runs_are_those_that_a_capture_forms(bench: Bench, monke
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
 
 
-@pytest.mark.slow
-def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
-    """At anchors, as a tracer alone would make it; their squares add up. (Planted: one side's for the other's, all
-    light's for one of them.)"""
-    lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
-    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    found = FollowedRuns(bench, everything, sample, 0.0, 5)
-    indirect, camera = found.sample_costs(1.0).values()
-    alone, nothing = FollowedRuns(bench, everything, sample, 0.0, 5), [PathSamples.none()] * REPLICATES
-    vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
-    assert indirect.error == pytest.approx(pilot_direct.noise(alone._beyond_mean(1, ())), rel=1e-9)
-    both = pilot_direct.noise(found._beyond_mean(1, ()))
-    assert math.hypot(indirect.error, camera.error) == pytest.approx(both, rel=0.3)
-    assert (indirect.paths, camera.paths) == tuple(tracer.paths_per_sample for tracer in found._simulation().at_anchors)
-
-
 def test_a_ladder_ends_where_its_last_step_leaves_little() -> None:
     """As far as two steps tell: of changes that fall by a quarter, 1/16 is left after three. One step alone tells what
     the step before it leaves. (Planted: a further step to judge the last one; one step trusted as two are.)"""
@@ -312,44 +292,6 @@ def test_a_flat_scene_needs_no_layers(small_scene: Callable[..., Path]) -> None:
     assert found.effects["interreflection"] == (0, 0) and "ambient" not in found.effects
 
 
-def test_light_is_followed_only_where_surfaces_see_each_other(
-    small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A sheet, and a plate before it that faces as it does: nothing is followed. Turned by a degree, it is."""
-    followed = list[str]()
-    replicates = Tracer.replicates
-
-    def count(tracer: Tracer, *arguments: Any, **options: Any) -> list[list[PathSamples]]:
-        followed.extend([type(tracer).__name__] * isinstance(tracer, FollowingTracer))
-        return replicates(tracer, *arguments, **options)
-
-    monkeypatch.setattr(Tracer, "replicates", count)
-    for angle in (180, 181):
-        place = f'<scale value="20"/><rotate y="1" angle="{angle}"/><translate z="390"/>'
-        bsdf = '<bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf>'
-        plate = f'<shape type="rectangle"><transform name="to_world">{place}</transform>{bsdf}</shape>'
-        assert "interreflection" in measured(open_bench(small_scene(extra=plate)), 0).effects
-        assert bool(followed) == (angle == 181)
-
-
-def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: Bench) -> None:
-    """Light whose kind is direct light's, as over mirrors and curved glass, comes by the same paths. (Planted: indirect
-    light alone.)"""
-    sample = pilot_direct.Sample.of(
-        parse_patterns("dots:4", N).lighting, bench.geometry.frame_shape, bench.loaded.mirrors
-    )
-    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    found = EffectRuns(bench, everything, sample, 5)
-    seen = found._looks[1]
-    halves = [
-        replace(light, kind=np.where(np.arange(light.value.size) % 2, DIRECT, INDIRECT).astype(np.int16))
-        for light in seen.indirect
-    ]
-    parted = pilot_effects.Bounced.of(halves, seen.samples)
-    assert found._noise_of_bounced(parted) == pytest.approx(found._noise_of_bounced(seen), rel=0.1)
-    assert pilot_direct.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
-
-
 @pytest.mark.usefixtures("soon_dark")
 def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> None:
     away = open_bench(small_scene(projector_turn='<rotate y="1" angle="180"/>'))
@@ -364,16 +306,3 @@ def test_a_mask_that_is_closed_before_the_sensor_is_refused(small_scene: Callabl
     """Its features are wider than the sensor sees, and the middle one is closed: it was a division by zero."""
     with pytest.raises(MitsimError, match=r"no light of the projector passes the mask.* features are 40 mm wide"):
         measured(open_bench(small_scene("closed", mask_feature=40)), seed=0)
-
-
-def test_applicable(bench: Bench, small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    assert "ambient" in effects.present(bench) and "mirrors" not in effects.present(bench)
-    projector = tmp_path / "projector.toml"
-    projector.write_text('name = "ideal"\neffective_wavelength_nm = 562.0\n')
-    assert effects.present(open_bench(small_scene(), projector=projector)) == ("interreflection", "diffraction")
-    projector.write_text(
-        'name = "all"\neffective_wavelength_nm = 562.0\ncontrast_ratio = 100.0\naperture_radius_mm = 1.0\n'
-        "blur_pixels = 0.5\nspeckle_contrast = 0.01\n"
-    )
-    found = effects.present(open_bench(small_scene(), projector=projector))
-    assert found == ("interreflection", "diffraction", "aperture", "blur", "black-level", "speckle")

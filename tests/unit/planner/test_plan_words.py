@@ -1,7 +1,6 @@
 """What a plan says: of devices that the model does not cover, of effects, and as JSON; benches are plain numbers."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -80,20 +79,6 @@ def test_devices_are_flagged_where_their_model_ends(
     assert facts.keystone == 2.5 and len(facts.warnings) == len(words)
     for warning, part in zip(facts.warnings, words, strict=True):
         assert part in warning
-
-
-def test_what_grey_frames_leave_of_colours_is_none_where_nothing_differs_by_wavelength(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Where surfaces or the camera may differ, nobody predicted it. (Planted: the camera's curve is read as none.)"""
-    monkeypatch.setattr("mitsim.planner.planner.EFFECTS", {})
-    red = Tag(Path("a.xml"), 7, "rgb", {})
-    grey, camera, surfaces = (
-        SceneFacts.of(each).spectrum for each in (bench(), bench(curve=1), bench(coloured=(red,)))
-    )
-    assert (grey.state, grey.error_if_off, grey.seconds) == ("off", 0, 0) and "camera" not in grey.reason
-    assert (camera.state, camera.error_if_off) == ("off", None) and "but the camera does" in camera.reason
-    assert (surfaces.state, surfaces.error_if_off) == ("off", None) and "the first a.xml:7" in surfaces.reason
 
 
 @pytest.mark.parametrize(
