@@ -26,7 +26,7 @@ from mitsim.light import light
 from mitsim.light.light import trace_light
 from mitsim.light.settings import GROUPS, REPLICATES, Approximation, ErrorCovariance, Settings
 from mitsim.optics import frames as forming
-from mitsim.planner import pilot_direct
+from mitsim.planner import pilot_direct, planner
 from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer
 from tests.physics.judged_scenes import CAMERA_FILE
@@ -203,7 +203,7 @@ def test_the_plan_does_not_depend_on_the_clock(
     for seed in range(2):
         rng = np.random.default_rng(seed)
         times = iter(np.cumsum(rng.exponential(10.0 ** rng.uniform(-6, 3, 1000))))
-        monkeypatch.setattr(pilot_direct.time, "perf_counter", lambda times=times: float(next(times)))
+        monkeypatch.setattr(planner.time, "perf_counter", lambda times=times: float(next(times)))
         plans.append(make_plan(bench, family, 5e-2, 3))
     first, second = plans
     assert first.predicted_seconds != second.predicted_seconds

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.acquire import capture, spectral
+from mitsim.acquire import capture
 from mitsim.core.exr import read_frame
 from mitsim.light import light
 
@@ -207,7 +207,7 @@ def test_lambda_out_of_range(shots: ms.Capture, factors: ms.Factors, lam: Any) -
 def traced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Purposes of all light that was traced since."""
     purposes: list[str] = []
-    original, truth, truths = light.trace_lines, light.trace_truth, spectral.trace_truths
+    original, truth, truths = light.trace_lines, light.trace_truth, capture.trace_truths
 
     def counted(*arguments: Any) -> Any:
         sampling = arguments[5] if len(arguments) > 5 else None
@@ -220,7 +220,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     for module in (light, capture):
         monkeypatch.setattr(module, "trace_lines", counted)
     monkeypatch.setattr(light, "trace_truth", counted_truth(truth))
-    monkeypatch.setattr(spectral, "trace_truths", counted_truth(truths))
+    monkeypatch.setattr(capture, "trace_truths", counted_truth(truths))
     return purposes
 
 
