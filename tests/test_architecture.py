@@ -554,7 +554,7 @@ SIZES = {
     "devices": (10, 2120),
     "exchange": (7, 1411),
     "learn": (7, 1314),
-    "light": (9, 1734),
+    "light": (9, 1728),
     "metrics": (1, 81),
     "mitsim": (1, 26),
     "optics": (8, 1827),
