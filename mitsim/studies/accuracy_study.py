@@ -33,6 +33,7 @@ from mitsim.light.cost_model import frame_seconds
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import COUNTED, Approximation, PilotResult
+from mitsim.light.simulation import Simulation
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner import pilot
@@ -40,7 +41,6 @@ from mitsim.planner.choose import counts_of, predicted_candidate
 from mitsim.planner.planner import SceneFacts, explain_plan
 from mitsim.report.pages import Value
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.studies.causes import reform
 from mitsim.studies.framework.claims import Judged, choose_rows
 from mitsim.studies.framework.experiment import Found, Point, Scope, Study
 from mitsim.studies.framework.panels import Bars, Lines
@@ -191,13 +191,15 @@ def measure_run(judge: Judge, accuracy: float, opening_s: float) -> dict[str, Va
 def measure_reference(judge: Judge) -> list[dict[str, Value]]:
     """Return a row for each number of samples of the reference whose predicted time is short enough."""
     probe, light, shots = judge.probe, judge.light, judge.probe.family.shots
-    absent = names(lambda effect: not effect.in_reference)
-    if any(EFFECTS[name].retraced(Physics.of(probe.bench)) for name in absent & light.plan.settings.effects):
-        settings = light.plan.settings
+    absent, settings = names(lambda effect: not effect.in_reference), light.plan.settings
+    if any(EFFECTS[name].retraced(Physics.of(probe.bench)) for name in absent & settings.effects):
         plain = replace(light.plan, settings=replace(settings, effects=settings.effects - absent))
         light = probe.trace(plain, probe.seed + 1)
-    else:
-        light = reform(light, absent)
+    else:  # frames are formed without the effects
+        formed = light.simulation.settings
+        light = replace(
+            light, simulation=Simulation(light.bench, replace(formed, effects=formed.effects - absent))
+        )  # fmt: skip
     index, rows = len(shots) // 2, list[dict[str, Value]]()
     answer, _ = stack_frames(light.frames(probe.family.lighting.shots([index]), probe.seed + 1))
     with show_pattern(probe.bench, probe.family.light(shots[index])):

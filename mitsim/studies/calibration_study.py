@@ -1,7 +1,6 @@
 """Limits of a calibration session, and of an image that is made with its factors, on one bench.
 
-*entries*: factors of noisy frames against those of expected frames. *causes*: residual of a separable camera without
-one cause. *losses*: cost of each source in one image.
+*entries*: factors of noisy frames against those of expected frames. *losses*: cost of each source in one image.
 
 The squared error E of the image is the sum of parts V. Parts of noise follow from a perturbation of the solver with a
 fixed lambda (:mod:`mitsim.studies.causes`). Parts of the scene's light that the factors lack follow from noiseless
@@ -13,7 +12,7 @@ do not add up. The loss by a drift after the session is measured by :mod:`mitsim
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -24,7 +23,7 @@ import numpy as np
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.board_session import Session
-from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
+from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -34,18 +33,17 @@ from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import digital_of
-from mitsim.devices.session import SIDES, BoardShape, Drift, SessionRecipe, load_recipe
-from mitsim.light.light import SampledLight
+from mitsim.devices.session import SIDES, Drift, SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Estimate, Factors, decibels
 from mitsim.report.lit_scene import SPECKLE, IdealCamera, LitScene
 from mitsim.report.pages import Value
 from mitsim.studies import causes
-from mitsim.studies.causes import Ablation, Noise, Scatter, ablations, reform
+from mitsim.studies.causes import Ablation, Noise, Scatter
 from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, squared_error
 from mitsim.studies.framework.claims import Judged, measured
 from mitsim.studies.framework.experiment import Found, Point, Results, Scope, Study
-from mitsim.studies.framework.panels import Bars, Images, Part
-from mitsim.studies.framework.studio import Studio, single_precision
+from mitsim.studies.framework.panels import Bars, Part
+from mitsim.studies.framework.studio import Studio
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -213,16 +211,12 @@ def entry_variances(lit: LitSession, factors: tuple[FloatArray, FloatArray], sid
 
 # -------- The study
 
-_FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
 _SAID_DB = 0.005
 """Least loss that is drawn."""
-_SHOWN_DEVIATIONS = 4.0
 
 
-def measure_session(
-    bench: Bench, recipe: SessionRecipe, patterns: str, seed: int, accuracy: float
-) -> tuple[list[Row], dict[str, FloatArray]]:
-    """Return the rows of a session and of an image with its factors, and the factors' errors by entry."""
+def measure_session(bench: Bench, recipe: SessionRecipe, patterns: str, seed: int, accuracy: float) -> list[Row]:
+    """Return the rows of a session and of an image with its factors."""
     job, family = Job(), bench.family(patterns, seed)
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), seed)
@@ -238,12 +232,13 @@ def measure_session(
         "exposure_seconds": len(session.order) * lit_s,
         "separability_residual": noisy.separability_residual, "noise_free_residual": clean.separability_residual,
     }]  # fmt: skip
-    entries, maps = judge_factors(lit, noisy, clean)
-    rows += [*entries, *residuals(lit, noisy, clean, job)]
+    rows += judge_factors(lit, noisy, clean)
     scene = LitScene(bench.light(patterns, job, accuracy=accuracy, seed=seed))
     stand = DriftStand(scene, Factors.of(noisy, manifest), recipe, family, seed)
     lost = losses(stand, lit, Factors.of(clean, manifest))
-    rows += [{"kind": "losses", **asdict(row), "name": _name(row)} for row in lost]
+    for row in lost:
+        name = row.source if row.of == UNEXPLAINED else f"{row.of}: {row.source}"
+        rows.append({"kind": "losses", **asdict(row), "name": name})
     left, right = IdealCamera(bench, bench.geometry.mask).calibrated(scene.board_flux)
     geometric = replace(stand, factors=replace(stand.factors, left=left, right=right)).before_db
     explained, unexplained = sum(row.squared_error for row in lost[:-1]), lost[-1]
@@ -253,55 +248,27 @@ def measure_session(
         "exposure_seconds": len(family.shots) * stand.exposure_s, "flagged": unexplained.missing,
         "reason": f"losses: {unexplained.words}" if unexplained.missing else "",
     })  # fmt: skip
-    return rows, maps
-
-
-def _name(row: LossRow) -> str:
-    return row.source if row.of == UNEXPLAINED else f"{row.of}: {row.source}"
+    return rows
 
 
 @single_threaded_blas()
-def judge_factors(lit: LitSession, noisy: Estimate, clean: Estimate) -> tuple[list[Row], dict[str, FloatArray]]:
+def judge_factors(lit: LitSession, noisy: Estimate, clean: Estimate) -> list[Row]:
     """Return errors of each factor beside their prediction, and those of its entries in predicted deviations."""
-    rows, maps = list[Row](), dict[str, FloatArray]()
+    rows = list[Row]()
     pairs = zip(FACTORS, SIDES, (clean.left, clean.right), (noisy.left, noisy.right), strict=True)
     for name, side, exact, found in pairs:
         # Factors are known up to a common scale and sign; this one is not drawn towards zero by the noise.
         found = found * (np.vdot(exact, exact) / np.vdot(found, exact))
         variances = entry_variances(lit, (clean.left, clean.right), side)
         deviation = np.asarray(np.sqrt(sum(variances.values(), np.zeros(1))))
-        off = maps[name] = (found - exact) / deviation
+        off = (found - exact) / deviation
         norm = float(np.linalg.norm(exact))
         rows.append({
             "kind": "entries", "factor": name, "error": float(np.linalg.norm(found - exact)) / norm,
             "predicted_error": float(np.linalg.norm(deviation)) / norm, "largest": float(np.abs(off).max()),
             "chi_square": float(np.square(off).mean()),
         })  # fmt: skip
-    return rows, maps
-
-
-def residuals(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[Row]:
-    """Yield the separability residual without each cause, and the signed root of the difference of its square."""
-    whole, simulation, session = clean.separability_residual, lit.light.simulation, lit.session
-
-    def row(cause: str, residual: float, left: float) -> Row:
-        less = residual**2 - left**2
-        part = float(np.copysign(np.sqrt(abs(less)), less))
-        return {"kind": "causes", "cause": cause, "residual": left, "part": part}
-
-    def without(session: Session, light: SampledLight) -> float:
-        return estimate(LitSession.of(session, light, job), job, noise_free=True)[0].separability_residual
-
-    yield row("noise", noisy.separability_residual, whole)
-    for name, settings in ablations(simulation.settings, simulation.settings.effects):
-        if name in _FORMED:
-            light = reform(lit.light, frozenset({name}))
-        else:
-            light = session.trace(replace(lit.light.plan, settings=settings), job)
-        yield row(name, whole, without(session, light))
-    if session.recipe.board != BoardShape():
-        flat = replace(session, recipe=session.recipe.model_copy(update={"board": BoardShape()}))
-        yield row("board", whole, without(flat, flat.trace(lit.light.plan, job)))
+    return rows
 
 
 def _points(scope: Scope) -> list[Point]:
@@ -318,9 +285,8 @@ def _points(scope: Scope) -> list[Point]:
 def _measure(studio: Studio, point: Point) -> Found:
     recipe = load_recipe(None if point["recipe"] is None else Path(point["recipe"]))
     asked = str(point["patterns"]), int(point["seed"]), point.setup.accuracy
-    rows, maps = measure_session(studio.bench(point.setup), recipe, *asked)
-    shown = {name: 0.5 + off / (2 * _SHOWN_DEVIATIONS) for name, off in maps.items()}
-    return Found(tuple(point.row(**row) for row in rows), single_precision(shown))
+    rows = measure_session(studio.bench(point.setup), recipe, *asked)
+    return Found(tuple(point.row(**row) for row in rows))
 
 
 _TABLES = {
@@ -328,7 +294,6 @@ _TABLES = {
     "session": ("The session", "frames exposure_seconds separability_residual noise_free_residual"),
     "image": ("The image", "psnr_db predicted_psnr_db geometric_psnr_db frames exposure_seconds"),
     "entries": ("Errors of the factors", "factor error predicted_error chi_square largest"),
-    "causes": ("What is not separable", "cause residual part"),
 }
 
 
@@ -370,15 +335,6 @@ STUDY = Study(
             "name", file="losses", x="lost_db", x_label="PSNR lost [dB]", colour="of", ordered=True,
             where={"kind": "losses", "lost_db": lambda lost: measured(lost) and abs(lost) >= _SAID_DB},
             errors={"lost_db": "error_db"},
-        ),
-        Images(
-            {name: (f"{name} factor", "") for name in FACTORS}, file="entries", down=("kind",),
-            where={"kind": "session"},
-            title=f"Errors of the factors' entries, black to white: {_SHOWN_DEVIATIONS:g} predicted deviations",
-        ),
-        Bars(
-            "cause", file="causes", x="part", colour="kind", x_label="part of the separability residual [1]",
-            where={"kind": "causes", "part": lambda part: measured(part) and part > 0},
         ),
     ),
     tables=(_tables,),

@@ -61,7 +61,6 @@ import numpy as np
 from scipy import sparse
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
@@ -352,29 +351,6 @@ def _weigh(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
     scaled = sparse.csr_array(sparse.diags_array(by) @ rows)
     scaled.eliminate_zeros()
     return scaled
-
-
-# -------- Effects that need no light to be traced anew, and settings without one of them
-
-
-def reform(light: SampledLight, absent: frozenset[str]) -> SampledLight:
-    """Return the ``light`` with frames formed without the effects ``absent``."""
-    simulation = light.simulation
-    settings = replace(simulation.settings, effects=simulation.settings.effects - absent)
-    return replace(light, simulation=Simulation(simulation.bench, settings))
-
-
-def ablations(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str, Settings]]:
-    for name in sorted(present & names(lambda effect: effect.in_frames)):
-        yield name, replace(settings, effects=settings.effects - {name})
-    if settings.anchors > 1:
-        yield "anchors", replace(settings, anchors=1, occluded_anchors=1)
-    if settings.followed_anchors > 1:
-        yield "followed-anchors", replace(settings, followed_anchors=1)
-    if len(settings.depths) > 1:
-        yield "layers", replace(settings, layers=())
-    if settings.subdivision > 1:
-        yield "cells", replace(settings, subdivision=1)
 
 
 # -------- The image that is expected of changed frames

@@ -135,14 +135,9 @@ def study_folder(output: Path | str, name: str) -> AbstractContextManager[Path]:
 def _is_earlier(place: Path, name: str) -> bool:
     head = place / f"{name}.json"
     found = read_json(head) if head.is_file() else None
-    if not isinstance(found, dict) or found.get("kind") != name:
-        return False
-    written: tuple[str, ...] = {
-        ALL: (*PAPER, "*.html"),
-        "characterise": ("*.png", "camera.toml", "characterise.html"),
-        "demo": (*DEMO_FOLDERS, DEMO_PAGE),
-    }.get(name, ("*.png", "*.csv", "*.html", POINTS, KEPT))
-    return all(any(fnmatch(item.name, known) for known in (head.name, ".*", *written)) for item in place.iterdir())
+    written = "*.png", "*.csv", "*.html", "camera.toml", POINTS, KEPT, *DEMO_FOLDERS, *PAPER
+    names = [item.name for item in place.iterdir()] if isinstance(found, dict) and found.get("kind") == name else [""]
+    return all(any(fnmatch(each, known) for known in (head.name, ".*", *written)) for each in names)
 
 
 # -------- Points of a study on disk

@@ -219,8 +219,7 @@ class Statement:
             holding = [model for model, holds in by_model.items() if holds]
             rest = [f", {other} {UNDECIDED}" for other, holds in by_model.items() if holds is None]
             decided = f"confirmed only {holding[0]}{''.join(rest)}" if holding else decided
-        words: list[str] = [holds for _, holds in found.values() if isinstance(holds, str)]
-        return Claim(claim, self.paper, figures[both[0]], figures[both[1]], words[0] if words else decided)
+        return Claim(claim, self.paper, figures[both[0]], figures[both[1]], decided)
 
     def _found(self, rows: DataFrame) -> tuple[str, Holds]:
         if not self.every:

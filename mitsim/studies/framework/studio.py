@@ -100,14 +100,10 @@ class Studio:
         place.mkdir(parents=True)
         return place
 
-    def shared_folder(self, kind: str) -> Path:
-        place = self._shared / kind
-        place.mkdir(parents=True, exist_ok=True)
-        return place
-
     def made_once(self, kind: str, name: str, make: Callable[[Path], object]) -> Path:
         """Return a shared file or folder, which ``make`` creates whole or not at all."""
-        place = self.shared_folder(kind) / name
+        place = self._shared / kind / name
+        place.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(place.with_suffix(".lock")):
             if not place.exists():  # a studio may have been ended while it made it
                 part = place.with_suffix(".part")

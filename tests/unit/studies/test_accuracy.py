@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,12 +10,9 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.light.light import trace_light
 from mitsim.planner.choose import counts_of, predicted_candidate
-from mitsim.planner.planner import make_plan
 from mitsim.studies import accuracy_study as accuracy
 from mitsim.studies.accuracy_study import Judge, Probe
-from mitsim.studies.causes import ablations, reform
 from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
 
@@ -114,22 +110,6 @@ def test_a_judge_takes_a_plans_own_numbers_where_its_time_does_not_buy_finer_one
     assert counts_of(finest) != counts_of(plan.settings)
 
 
-def test_without_names_each_effect_once(bench: Bench) -> None:
-    plan = make_plan(bench, bench.family(PATTERNS).lighting, 1e-4, SEED)
-    present = frozenset({"diffraction", "interreflection", "speckle"})
-    settings = replace(plan.settings, anchors=2)
-    switched = dict(ablations(settings, present))
-    assert present - switched.keys() == {"speckle"}, "it is not part of expected frames"
-    assert "anchors" in switched and switched["anchors"] == replace(settings, anchors=1)
-    finest = replace(settings, followed_anchors=2, subdivision=4, layers=(3.0, 2.0))
-    fallen = dict(ablations(finest, frozenset()))
-    assert fallen["followed-anchors"] == replace(finest, followed_anchors=1)
-    assert fallen["cells"] == replace(finest, subdivision=1)
-    assert fallen["layers"] == replace(finest, layers=())
-    for name in present & switched.keys():
-        assert switched[name].effects == settings.effects - {name}
-
-
 THICK = '<float name="mask_thickness" value="0.3"/>'
 
 
@@ -160,17 +140,3 @@ def test_the_judge_of_the_reference_has_what_the_registry_says(
     monkeypatch.setattr(accuracy, "LONGEST_S", math.inf)
     rows: list[dict[str, Any]] = list(accuracy.measure_reference(answer))
     assert len(rows) == 2 and all(0.8 < row["error"] / row["mc_error"] < 1.25 for row in rows)
-
-
-def test_reformed_light_is_that_of_a_plan_without_the_effect(bench: Bench) -> None:
-    lighting = bench.family(PATTERNS).lighting
-    # Sampling in one round, so that both have the same paths.
-    plan = replace(make_plan(bench, lighting, 1e-2, SEED, {"diffraction": True}), sampling_target=math.inf)
-    light = trace_light(bench, plan, lighting, SEED)
-    plain = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects - {"diffraction"}))
-    for ours, theirs in zip(
-        reform(light, frozenset({"diffraction"})).frames(lighting, SEED),
-        trace_light(bench, plain, lighting, SEED).frames(lighting, SEED),
-        strict=True,
-    ):
-        assert np.array_equal(ours.irradiance, theirs.irradiance)

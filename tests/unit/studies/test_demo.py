@@ -11,7 +11,6 @@ import pytest
 from mitsim.acquire import capture
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Request
-from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import load_run
@@ -20,7 +19,6 @@ from mitsim.light.plan import Plan
 from mitsim.metrics import psnr
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.report import label
 from mitsim.studies.demo import demo, scene_line
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
@@ -41,12 +39,6 @@ def test_first_sentence_of_the_opening_comment(tmp_path: Path, text: str, line: 
     path.parent.mkdir()
     path.write_text(text, encoding="utf-8")
     assert scene_line(path) == line
-
-
-@pytest.mark.parametrize("path", sorted(shipped_path("scenes").glob("*/scene.xml")), ids=lambda path: path.parent.name)
-def test_every_shipped_scene_says_what_it_is(path: Path) -> None:
-    line = scene_line(path)
-    assert line.startswith(f"{path.parent.name}: ") and len(line) > 40
 
 
 @pytest.mark.parametrize(("patterns", "planned"), [("dots:2", "dots:5"), ("uniform", "dots:5"), ("dots:7", "dots:7")])
@@ -130,17 +122,3 @@ def test_what_does_not_fit_is_refused_before_an_earlier_demo_is_removed(
     with pytest.raises(MitsimError, match="no full well to fill"):
         demo(bottomless, earlier, Request.of(patterns="dots:2"))
     assert (earlier / "report.html").read_text() == "yesterday's"
-
-
-@pytest.mark.parametrize(
-    ("name", "reported"),
-    [
-        ("uniform", "Uniform"),
-        ("dots:7", "49 dots"),
-        ("dots:7x14", "7 x 14 dots"),
-        ("hadamard:8", "64 Hadamard"),
-        ("random:3", "9 random"),
-    ],
-)
-def test_labels(name: str, reported: str) -> None:
-    assert label(name) == reported

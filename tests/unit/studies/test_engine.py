@@ -11,7 +11,20 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.report.pages import Mean
-from mitsim.studies.framework.claims import Gain, Judged, Level, choose_rows, distinct, mean_of, measured
+from mitsim.studies.framework.claims import (
+    CONFIRMED,
+    NOT_CONFIRMED,
+    UNDECIDED,
+    Gain,
+    Level,
+    choose_rows,
+    distinct,
+    every,
+    mean_of,
+    measured,
+    verdict_at,
+    within,
+)
 from mitsim.studies.framework.experiment import IMAGE, TRUTH, Axes, Results, Scope, Setup
 from mitsim.studies.framework.panels import Bars, Images, Lines
 from mitsim.studies.framework.studio import flags_of
@@ -130,8 +143,74 @@ def test_a_claim_states_its_own_models_and_both_means_apart() -> None:
     (told,) = apart.judge(Results(pairs))
     assert told.verdict == "confirmed"
     assert told.idealised == "1.7 \N{PLUS-MINUS SIGN} 0.6 dB" and told.rendered == "1.5 \N{PLUS-MINUS SIGN} 0.5 dB"
-    (word,) = Judged("Own words", lambda rows: ("", "confirmed only here")).judge(Results(pairs))
-    assert word.verdict == "confirmed only here"
+
+
+PRINTS_DB = (0.0, 7.0, 14.0)
+"""What prints differ by, which would hide any gain of images that are not paired: an interval of 17 dB either way."""
+JITTER = (-0.1, 0.0, 0.1)
+"""Of three prints: a standard error of 0.058, and a 95 % interval of 4.3 of them, 0.25, either way."""
+
+
+@pytest.mark.parametrize("kind", ["level", "gain", "every"])
+def test_claims_are_decided_on_both_sides_of_each_border(kind: str) -> None:
+    """Prints differ by 14 dB, so that only paired differences decide; on a border nothing is. (Planted: any gain above
+    0; the upper border left out; means of all images in place of pairs; the first of the values for every one.)"""
+    levels = Level("", where="a", at_least=20.0, at_most=25.0)
+    gains = Gain("", "b", "a", at_least=-1.0, at_most=3.0, every="depth" if kind == "every" else "")
+    claim, low, high = (levels, 20.0, 25.0) if kind == "level" else (gains, -1.0, 3.0)
+
+    def verdict(value: float) -> str:
+        rows = [
+            {"patterns": name, "picture": picture, "depth": depth,
+             "psnr_db": (value if kind == "level" else offset) + jitter if name == "a" else offset + more}
+            for picture, offset, jitter in zip("abc", PRINTS_DB, JITTER, strict=True)
+            for depth, more in ((1, value), (2, 1.0))
+            for name in "ab"
+        ]  # fmt: skip
+        shown = rows if kind == "every" else [row for row in rows if row["depth"] == 1]
+        return claim.judge(Results(shown))[0].verdict
+
+    for border, inwards in ((low, 0.3), (high, -0.3)):
+        assert verdict(border + inwards) == CONFIRMED and verdict(border) == UNDECIDED
+        assert verdict(border - inwards) == NOT_CONFIRMED
+
+
+def test_an_interval_decides_where_no_border_lies_in_it() -> None:
+    """Student's interval of three values is 4.30 errors either way, of nine 2.31. (Planted: 1.96 for any number.)"""
+    assert within(Mean(1.0, 0.2, 3), low=0.13) is True and within(Mean(1.0, 0.2, 3), low=0.15) is None
+    assert within(Mean(1.0, 0.2, 9), low=0.53) is True and within(Mean(1.0, 0.2, 9), low=0.55) is None
+    assert within(Mean(1.0, 0.2, 3), high=0.13) is False and within(Mean(1.0, 0.2, 3), -9, 9) is True
+    assert within(Mean(1.0, math.nan, 1), low=-99) is None, "a single value has no error"
+
+
+def test_pairs_are_of_prints_or_of_seeds_of_one_print() -> None:
+    """Seeds of one print are averaged first: they share its detail. (Planted: all images as if independent.)"""
+    one = [{"picture": name, "seed": seed, "x": value} for name, seed, value in
+           (("a", 0, 10.0), ("a", 1, 12.0), ("b", 0, 20.0), ("b", 1, 22.0))]  # fmt: skip
+    other = [{**row, "x": float(row["x"]) - 1.0 - (row["picture"] == "b")} for row in one]
+    assert mean_of(Results(one).frame, "x") == Mean(16.0, pytest.approx(5.0), 2)
+    assert mean_of(Results(one).frame, "x", Results(other).frame) == Mean(1.5, pytest.approx(0.5), 2)
+    assert mean_of(Results(one[:2]).frame, "x") == Mean(11.0, pytest.approx(1.0), 2)
+    with pytest.raises(MitsimError, match="nothing was measured of x"):
+        mean_of(Results(one[:2]).frame, "x", Results(other[2:]).frame)
+
+
+def test_a_claim_of_parts_and_of_places() -> None:
+    """(Planted: an undecided part passed over.)"""
+    assert [every(True, True), every(True, None), every(None, False)] == [True, None, False]
+    assert verdict_at({"peak": True, "frame": None}) == f"confirmed only at peak, {UNDECIDED} at frame"
+    assert verdict_at({"peak": True, "frame": False}) == "confirmed only at peak"
+    assert verdict_at({"peak": None, "frame": False}) == UNDECIDED
+    assert verdict_at({"peak": False, "frame": False}) == NOT_CONFIRMED
+
+
+def test_false_verdicts_are_rare() -> None:
+    """Of 2000 draws of eight prints at a border, as many lie outside as the confidence says: 2.5 % on either side,
+    0.35 % one standard deviation. (Planted: one standard error for the interval.)"""
+    draws = np.random.default_rng(1).normal(0.0, 1.0, (2000, 8))
+    holds = [within(Mean.of_numbers(list(draw), "x"), low=0.0) for draw in draws]
+    assert sum(each is True for each in holds) / 2000 == pytest.approx(0.025, abs=4 * 0.0035)
+    assert sum(each is False for each in holds) / 2000 == pytest.approx(0.025, abs=4 * 0.0035)
 
 
 def test_lines_have_a_figure_for_each_value_and_rows_that_begin_every_curve() -> None:
