@@ -103,6 +103,9 @@ _IN_PLACE = 1e-3
 """Tolerated distance from the aligned plane [projector pixels], because float32 leaves 1e-4."""
 
 
+# -------- Light without some of its effects
+
+
 class Ablation:
     """Light from which any of its effects can be removed; retraced light is kept.
 
