@@ -559,7 +559,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (8, 1827),
     "planner": (6, 1673),
-    "reconstruct": (22, 5944),
+    "reconstruct": (22, 5941),
     "report": (9, 2041),
     "scene": (6, 1407),
     "sensor": (5, 1193),
