@@ -575,7 +575,7 @@ LONG = 450
 """Lines of a file that a reader does not scroll without headings; chosen: some six screens."""
 HEADING = re.compile(r"^\s*# -{4,} ?\w", flags=re.M)
 UNNAMED = {"__init__", "__main__"}
-ALIKE: set[str] = {"projector", "request"}
+ALIKE: set[str] = {"request"}
 """Names that files of several rooms have still: a change takes some away, and adds none."""
 TOKENS_WITHOUT_CODE = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
