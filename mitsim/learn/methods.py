@@ -340,7 +340,9 @@ class LearnedSolver(Solver):
         image = found.cpu().numpy().astype(np.float64)
         if not np.isfinite(image).all():
             raise MitsimError(f"model {self.name}: its image of these frames is not finite; train it anew")
-        missed, beyond = beyond_noise(prepared, problem, image)
+        # The frames' energy in the model's range that the image does not reproduce, and its rms part beyond noise.
+        missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
+        beyond = float(np.sqrt(max(missed - variance * prepared.rank, 0.0) / problem.energy))
         outside = max(problem.energy - float(np.square(problem.projected).sum()), 0.0)
         flags = [*(prepared.doubts if isinstance(prepared, _Doubted) else ())]
         relative, (low, high) = relative_noise(problem), self.manifest.noise
@@ -420,13 +422,6 @@ def on_device(network: Method, device: str) -> Method:
 
 def datum_variance(problem: DiagonalProblem) -> float:
     return max(noise_variance(problem), _NO_NOISE * problem.energy / problem.data_count)
-
-
-def beyond_noise(prepared: Prepared, problem: DiagonalProblem, image: FloatArray) -> tuple[float, float]:
-    """Return the frames' energy in the model's range that an image does not reproduce, and the rms unexplained part."""
-    missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
-    beyond = max(missed - datum_variance(problem) * prepared.rank, 0.0)
-    return missed, float(np.sqrt(beyond / problem.energy))
 
 
 def relative_noise(problem: DiagonalProblem) -> float:

@@ -128,10 +128,6 @@ class PairsManifest(BaseModel):
     def family(self) -> PatternFamily:
         return parse_patterns(self.patterns, self.n, self.seed)
 
-    @cached_property
-    def sensor_model(self) -> SensorModel:
-        return SensorModel.model_validate_json(self.sensor)
-
 
 class ModelManifest(Configuration):
     """Manifest of a trained network."""
@@ -353,7 +349,7 @@ class PairStore:
     @check_arguments
     @single_threaded_blas()
     def draw(self, index: int, seed: int) -> Frames:
-        made, sensor = self.manifest, self.manifest.sensor_model
+        made, sensor = self.manifest, SensorModel.model_validate_json(self.manifest.sensor)
         rates, lamps, exposure_s, speckle = self._light_of(index)
         root, digital = integer(seed, "pair", index), digital_of(sensor, exposure_s)
 

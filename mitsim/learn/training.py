@@ -179,25 +179,21 @@ class Trainer:
         self.network.load_state_dict(held["network"])
         self.optimiser.load_state_dict(held["optimiser"])
 
-    def rate(self, number: int) -> float:
-        part, rising = (number + 0.5) / self.request.steps, _RISING
-        if part < rising:
-            return self.request.rate * part / rising
-        return self.request.rate * 0.5 * (1 + math.cos(math.pi * (part - rising) / (1 - rising)))
-
     def step(self, number: int) -> float:
         random = stream(self.request.seed, "step", number)
         chosen = self.teaching[random.integers(len(self.teaching), size=self.request.batch)]
         truths, data = self._turn(*self.batch(chosen), random)
+        part, rate = (number + 0.5) / self.request.steps, self.request.rate
+        falling = 0.5 * (1 + math.cos(math.pi * (part - _RISING) / (1 - _RISING)))
         for group in self.optimiser.param_groups:
-            group["lr"] = self.rate(number)
+            group["lr"] = rate * (part / _RISING if part < _RISING else falling)
         self.network.train()
-        loss = self._gradients(truths, data, integer(self.request.seed, "noise", number))
+        loss = self.gradients(truths, data, integer(self.request.seed, "noise", number))
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), _LONGEST_GRADIENT)
         self.optimiser.step()
         return loss
 
-    def _gradients(self, truths: Tensor, data: Data, seed: int) -> float:
+    def gradients(self, truths: Tensor, data: Data, seed: int) -> float:
         self.optimiser.zero_grad()
         loss = self.network.loss(truths, data, self.model, torch.Generator().manual_seed(seed))
         loss.backward()
@@ -217,17 +213,6 @@ class Trainer:
         moved = data.weights[half:] + sigma * self.model.coefficients(turned - truths[half:])
         weights = torch.cat([data.weights[:half], moved])
         return torch.cat([truths[:half], turned]), Data(weights, data.deviation)
-
-    def seconds_a_step(self) -> float:
-        truths, data = self.batch(self.teaching[: self.request.batch])
-        self.network.train()
-        taken = []
-        for _ in range(2):  # the first fills caches
-            started = time.perf_counter()
-            self._gradients(truths, data, 0)
-            taken.append(time.perf_counter() - started)
-        self.optimiser.zero_grad()
-        return taken[-1] * (1 + _LOOK)
 
     def judge(self, pairs: Labels) -> float:
         found = []
@@ -316,7 +301,13 @@ def train_network(
     if resume and unfinished.is_file():
         trainer.load(unfinished, digest)
     with job.clock.stage("train"):
-        predicted = time.perf_counter() - started + trainer.seconds_a_step() * (request.steps - trainer.taken)
+        truths, data = trainer.batch(trainer.teaching[: request.batch])
+        network.train()
+        for _ in range(2):  # the first fills caches
+            before_step = time.perf_counter()
+            trainer.gradients(truths, data, 0)
+        each = (1 + _LOOK) * (time.perf_counter() - before_step)
+        predicted = time.perf_counter() - started + each * (request.steps - trainer.taken)
         Cost(predicted).check(f"{store.folder}: training {request.method}", job.limits)
         trainer.run(job, lambda: trainer.save(unfinished, digest))
     network.load_state_dict(first)
