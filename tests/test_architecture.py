@@ -553,7 +553,7 @@ SIZES = {
     "core": (16, 3090),
     "devices": (10, 2120),
     "exchange": (7, 1411),
-    "learn": (7, 1314),
+    "learn": (7, 1301),
     "light": (9, 1728),
     "metrics": (1, 81),
     "mitsim": (1, 26),
