@@ -17,16 +17,6 @@ preconditioned by a division by |H|^2 + mu and start from the image at half the 
 and in each pass replaced by the quadratic that touches it. The iterations end where the last half of all steps has
 lowered the objective by at most ``tolerance`` of itself (Strakos and Tichy, ETNA 13, 2002).
 
-**Weight.** Blocks of sensor pixels are held out and predicted from the image of the rest. Where the best lambda asks
-for clearly more noise than the frames have, the weight follows from that model error in place of the noise.
-
-**Fit.** Any point spread function fits a frame with some image, because the scene has more pixels, but a wrong one
-needs a negative or rough image. So the least of
-
-    1/2 ||A X - Y||^2 + w TV(X),    X >= 0
-
-is compared with that of the same light mirrored and turned, which has the same spectrum.
-
 **Dots.** Under dots of period k no pixel is in two frames, so that the normal equations fall into k^2 independent
 systems, one for the n^2/k^2 pixels of each *class* that shines together, as in the paper's equation 8. Where the sensor
 gets all light, the matrix of a class is a section of one convolution with h's autocorrelation at every k-th place,
@@ -41,9 +31,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import product
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -52,7 +42,6 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
-from mitsim.reconstruct.request import TIKHONOV, TV, Bounds
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import check_lambda
 from mitsim.reconstruct.solvers import Prior, lengths, slopes_adjoint, slopes_of
@@ -386,75 +375,14 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
     return total, seen, promised
 
 
-# ---- The weight of the prior, and the misfit -------------------------------------------------------------------------
+# ---- The misfit ------------------------------------------------------------------------------------------------------
 
-_RIDGE, _WEIGHT = 50.0, 1.2
-"""Lambda over the mean square of a pixel's light, by relative error; TV's weight in units of the gradient's error."""
-_CLEARLY = 2.0
-_SIDE, _STEPS = 128, 60
-_BLOCKS, _KEPT = 12, 8
-_HALVES = range(-16, 7)
-_TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
-_MODEL_ERROR, _ROUGH, _LEFT = 0.01, (3.0, 0.3), 4.0
-_ALIKE = 0.9
 _BETTER, _EQUAL = 0.85, 0.98
 """Cost ratios of the best turned copy below which it is recommended, and below which the light is wrong."""
 _LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
 """Least cost ratio of right light: the first times chi-square to the second; noise explains frames below the last."""
 _OFF = 1 / 8
 _GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
-
-
-def frame_noise(frame: Array) -> float:
-    """Return the noise by mixed second differences (Immerkaer, Comput. Vis. Image Underst. 64, 1996)."""
-    if min(frame.shape) < 3:
-        return 0.0
-    bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
-    # The 9 weights have squares of 36 in all; half of normal numbers are below 0.6745 deviations.
-    return float(np.median(np.abs(bent))) / 6 / 0.6745
-
-
-def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, int]:
-    factor = 1 if light.patterns else max(min(*light.sensor, *light.psf.shape) // _SIDE, 1)
-    return light.reduce(factor), np.stack([reduce_frame(frame, factor) for frame in frames]), factor
-
-
-# ---- The weight ----
-
-
-def frame_error(light: ShiftedLight, frames: Array) -> float:
-    """Return the deviation of ``frames`` (K K', m, m') from the light that a model explains.
-
-    It is their noise or, if clearly larger, the noise whose ridge predicts held-out pixels best.
-    """
-    mean = float(frames.mean())
-    if mean <= 0:
-        raise MitsimError(f"frame of mean {mean:g}: lambda cannot be chosen; check exposure and black level")
-    noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
-    if light.patterns is not None:
-        return noise
-    small, seen, _ = _shrink(light, frames)
-    row, column = np.indices(small.sensor) // max(min(small.sensor) // _BLOCKS, 1)
-    counted = (row + 3 * column) % _KEPT > 0
-    part = replace(small, seen=counted.astype(small.precision))
-
-    @cache
-    def error(half: int) -> float:
-        prior = Prior(ridge=10 ** (half / 2) * small.column_power, bounds=(0.0, math.inf))
-        scene = minimise(part, seen * part.seen, prior, _STEPS, 0.02).image
-        return float(np.square((small.image_of(scene) - seen)[:, ~counted]).sum())
-
-    best = 0
-    while best in _HALVES and error(lower := min((best - 1, best + 1), key=error)) < error(best):
-        best = lower
-    before, here, after = (error(half) for half in (best - 1, best, best + 1))
-    # The vertex of the parabola through these three.
-    place = best + (before - after) / 2 / max(before - 2 * here + after, 1e-300)
-    level = mean * 10 ** (place / 2) / _RIDGE
-    return level if level > _CLEARLY * noise else noise
-
-
-# ---- The misfit ----
 
 
 @dataclass(frozen=True)
@@ -523,92 +451,6 @@ class PointSpreadFit:
         if not status.verdict.good:
             return replace(status, flags=(*status.flags, f"{sentence}; {remedy}."))
         return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
-
-
-def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> PointSpreadFit:
-    small, seen, factor = _shrink(light, frames)
-    rows, columns = (max(size // 16, 1) for size in seen.shape[1:])
-    strips = [strip for frame in seen for strip in np.array_split(frame, rows)]
-    tiles = [tile for strip in strips for tile in np.array_split(strip, columns, axis=1)]
-    measured = float(np.mean([frame_noise(tile) ** 2 for tile in tiles])) if variance is None else variance / factor**2
-    noise = max(measured, 1e-300)
-    error = math.hypot(math.sqrt(noise), _MODEL_ERROR * float(seen.mean()))
-
-    def cost(psf: FloatArray, rough: float) -> tuple[float, float]:
-        camera = replace(small, psf=np.ascontiguousarray(psf))
-        prior = Prior(weight=rough * error * math.sqrt(camera.column_power), bounds=(0.0, math.inf))
-        found = minimise(camera, seen, prior, 2 * _STEPS, 0.002)
-        return found.objective, float(np.mean(np.square(camera.image_of(found.image) - seen))) / noise
-
-    rough, fine = _ROUGH
-    (objective, left), (alternative, chi_square) = cost(small.psf, rough), cost(small.psf, fine)
-    rough, objective = (fine, alternative) if left > _LEFT else (rough, objective)
-    others, grid = dict[str, float](), [2 * size for size in small.psf.shape]
-    for name, (down, across) in _TURNED.items():
-        copy = small.psf[::down, ::across]
-        shifted = fft.irfft2(fft.rfft2(small.psf, grid) * fft.rfft2(copy, grid).conj(), grid)
-        if shifted.max() < _ALIKE * math.sqrt(float(np.square(small.psf).sum() * np.square(copy).sum())):
-            others[name] = cost(copy, rough)[0]
-    reading = min(others, key=lambda name: others[name], default="")
-    energy = max(float(np.mean(np.square(seen, dtype=np.float64))), 1e-300)
-    off = [float(np.average(place, weights=np.abs(light.psf))) for place in np.indices(light.psf.shape)]
-    rows, columns = light.psf.shape
-    return PointSpreadFit(
-        chi_square=chi_square,
-        unexplained=math.sqrt(max(chi_square - 1, 0.0) * noise / energy),
-        stated=variance is not None,
-        gain=others[reading] / max(objective, 1e-300) if others else None,
-        reading=reading,
-        off=(off[0] - (rows - 1) / 2, off[1] - (columns - 1) / 2),
-        size=(rows, columns),
-    )
-
-
-# ---- The image, and its weight ---------------------------------------------------------------------------------------
-
-
-def solve_point_spread(
-    light: ShiftedLight,
-    frames: Array,
-    method: str,
-    lam: float | Literal["auto"] = "auto",
-    bounds: Bounds | None = None,
-    iterations: int = 300,
-    tolerance: float = 0.02,
-) -> Solution:
-    """Return the image of all frames (K K', m, m')."""
-    light.check_frames(frames)
-    if iterations < 1:
-        raise MitsimError(f"iterations are {iterations}; give at least 1")
-    prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
-    frames = frames.astype(light.precision)
-    if lam != "auto":
-        known = check_lambda(lam)
-    elif method == TV:
-        known = _WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power)
-    elif light.patterns is None:
-        known = _RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power
-    else:
-        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
-    prior = replace(prior, weight=known) if method == TV else replace(prior, ridge=known)
-    energy = float(np.vdot(frames, frames))
-    found = minimise(light, frames, prior, iterations, tolerance)
-    residual = light.image_of(found.image) - frames
-    figures = f"Objective {found.objective:.4g}."
-    lowered = f"the last half of {found.iterations} iterations lowered the objective by {found.fall:.1%}"
-    if found.fall <= tolerance:
-        status = Status(Verdict.SOLVED, f"Converged: {lowered}", "", figures)
-    else:
-        remedy = "take a larger lambda, or allow more iterations"
-        status = Status(Verdict.NOT_CONVERGED, f"Not converged: {lowered} or more", remedy, figures)
-    return Solution(
-        image=np.asarray(found.image[light.window], np.float64),
-        lam=prior.weight or prior.ridge,
-        residual=math.sqrt(float(np.vdot(residual, residual)) / energy) if energy else 0.0,
-        status=status,
-        iterations=found.iterations,
-        objective=found.objective,
-    )
 
 
 # ---- Least squares of many frames: conjugate gradients, and the classes of dots --------------------------------------
