@@ -559,7 +559,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (8, 1827),
     "planner": (6, 1673),
-    "reconstruct": (21, 5924),
+    "reconstruct": (21, 5929),
     "report": (9, 2041),
     "scene": (6, 1407),
     "sensor": (5, 1193),
