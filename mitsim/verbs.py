@@ -370,8 +370,10 @@ def prepare_study(
 def scope_of(
     name: str, scope: Scope, patterns: str, varied: Sequence[tuple[str, tuple[str, ...]]], measure: str
 ) -> Scope:
-    """Return the ``scope`` of a study with the ``varied`` names and values of a sweep or a drift; other studies vary
-    nothing. MitsimError for options that the study does not have, or that cannot be."""
+    """Return the ``scope`` of a study with the ``varied`` names and values of a sweep or a drift.
+
+    MitsimError for options that the study does not have, or that cannot be.
+    """
     from mitsim.devices.patterns import read_name
     from mitsim.studies.framework.experiment import check_drifts, check_sweep, measures_of
 
@@ -390,8 +392,10 @@ def scope_of(
 
 
 def _check_setup(scope: Scope, scene: str | None) -> None:
-    """Refuse files of a ``scope`` that cannot be used, before the renderer is imported. A study without a ``scene`` of
-    its own may use others."""
+    """Refuse files of a ``scope`` that cannot be used, before the renderer is imported.
+
+    A study without a ``scene`` of its own may use others.
+    """
     from mitsim.bench.apparatus import check_devices, check_scene
     from mitsim.studies.framework.experiment import NO_SCENE, Scope
 

@@ -81,8 +81,10 @@ def open_bench(
 
 
 class Bench(Apparatus):
-    """An apparatus that is ready to plan, capture and calibrate; its attributes are those of
-    :class:`mitsim.bench.apparatus.Apparatus`."""
+    """Apparatus that is ready to plan, capture and calibrate.
+
+    Its attributes are those of :class:`mitsim.bench.apparatus.Apparatus`.
+    """
 
     def __repr__(self) -> str:
         path, (rows, columns) = self.loaded.path, self.geometry.frame_shape
@@ -181,8 +183,10 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Any,
     ) -> dict[str, Capture]:
-        """Take a capture for each spectral line of the projector, by the line's name, as ``638nm``. All lines are
-        traced on the same paths. Each capture has the accuracy that is asked for. Needs a spectral variant.
+        """Take a capture for each spectral line of the projector, by the line's name, as ``638nm``.
+
+        All lines are traced on the same paths. Each capture has the accuracy that is asked for. Needs a spectral
+        variant.
 
         Parameters
         ----------
@@ -208,8 +212,9 @@ class Bench(Apparatus):
 
     @takes(Request, without="patterns")
     def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured:
-        """Choose mono light if it leaves at most half of the accuracy as error of colours, else all lines. The result
-        has the ``plan``, the ``bench`` in the variant that it needs, which is set, and True for ``mono``.
+        """Choose mono light if it leaves at most half of the accuracy as error of colours, else all lines.
+
+        The result has the ``plan``, the ``bench`` in the variant that it needs, which is set, and True for ``mono``.
 
         Parameters
         ----------
@@ -227,8 +232,10 @@ class Bench(Apparatus):
 
     @check_arguments
     def in_variant(self, variant: str) -> Bench:
-        """Load the bench into a ``variant``, which is then the current one; objects of the earlier variant must not be
-        used with it."""
+        """Load the bench into a ``variant``, which is then the current one.
+
+        Objects of the earlier variant must not be used with it.
+        """
         return reopen(self, variant)
 
     @takes(SessionRequest)
@@ -268,8 +275,9 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Any,
     ) -> MosaicCapture:
-        """Take frames of all lines at once by a camera under a mosaic of colour filters: one frame for each shot. Needs
-        a spectral variant, and a camera whose file has a ``mosaic``.
+        """Take frames of all lines at once by a camera under a mosaic of colour filters: one frame for each shot.
+
+        Needs a spectral variant, and a camera whose file has a ``mosaic``.
 
         Parameters
         ----------
@@ -301,10 +309,11 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Any,
     ) -> dict[str, Factors]:
-        """Estimate the factors of a camera under colour filters at each spectral line of the projector, by the line's
-        name. Each line has a session of its own, by the shipped recipe with four shots of each pattern if none is
-        given. Each pixel's number is divided by the stated transmission of its filter, so that the factors are those of
-        pixels without filters, one electron a photon.
+        """Estimate the factors of a camera under colour filters by spectral line of the projector.
+
+        Each line has a session of its own, by the shipped recipe with four shots of each pattern if none is given. Each
+        pixel's number is divided by the stated transmission of its filter, so that the factors are those of pixels
+        without filters, one electron a photon.
 
         Parameters
         ----------
@@ -383,8 +392,10 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Any,
     ) -> Factors:
-        """Calibrate as :meth:`calibrate` does, and write the session's frames as a user of a real camera has them, so
-        that :func:`mitsim.calibrate_frames` makes the same factors of them.
+        """Calibrate as :meth:`calibrate` does, and write the session's frames.
+
+        The frames are written as a user of a real camera has them, so that :func:`mitsim.calibrate_frames` makes the
+        same factors of them.
 
         Parameters
         ----------
@@ -400,8 +411,10 @@ class Bench(Apparatus):
     # ---- The bench to look at, renderings, and the same devices before a board ----
 
     def view(self) -> BenchView:
-        """Draw the bench to scale, with its distances and the camera's view, before any light is simulated. The
-        drawing shows itself in a notebook, and is saved as a picture or as a page."""
+        """Draw the bench to scale, with its distances and the camera's view, before any light is simulated.
+
+        The drawing shows itself in a notebook, and is saved as a picture or as a page.
+        """
         from mitsim.report.bench_view import view
 
         return view(self)
@@ -528,8 +541,7 @@ _ALLOWED = "give a file, or an array of real numbers 0 to 1 or of unsigned ones,
 
 
 def _write_array(picture: object) -> Path:
-    """Write an array to a file that is named by its content, so that another process finds it when it opens the
-    scene."""
+    """Write an array to a file that is named by its content, so that another process finds it."""
     import numpy as np
 
     try:

@@ -35,8 +35,10 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def run() -> None:
-    """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused or failed, 128 + n ended by
-    signal n."""
+    """Serve the command line in this process.
+
+    The exit status is 0 done, 1 done but flagged, 2 refused or failed, or 128 + n ended by signal n.
+    """
     try:
         Path.cwd()
     except FileNotFoundError:

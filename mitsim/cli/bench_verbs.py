@@ -52,7 +52,7 @@ class Showing(DemoRequest, Common):
 
 @command
 def demo(asked: Showing) -> int:
-    """The whole job, from plan to images of five pattern families.
+    """Do the whole job, from plan to images of five pattern families.
 
     Plans, captures, calibrates and reconstructs one scene, and writes report.html.
 
@@ -173,7 +173,7 @@ class Studying(StudyOptions, Common):
 
 @command
 def study(asked: Studying) -> int:
-    """An experiment with figures, CSV and JSON.
+    """Run an experiment with figures, CSV and JSON.
 
     `mitsim list studies` says what each is for; all is those of the paper on one page, and merge joins the parts of
     --shard. One of your own is a file, or a module named with a dot.
@@ -187,7 +187,7 @@ def study(asked: Studying) -> int:
 
 @command
 def doctor(asked: Common) -> int:
-    """What works on this machine, and what mends the rest.
+    """Check what works on this machine, and what mends the rest.
 
     $ mitsim doctor
     $ mitsim doctor --variant llvm_ad_spectral
@@ -217,7 +217,7 @@ class Planning(OfScene, Planned, AnyColour, Opening, Overwritten, Common):
 
 @command
 def plan(asked: Planning) -> int:
-    """What a capture will simulate, why, and what it will cost.
+    """Plan what a capture will simulate, and at what cost.
 
     A short look at the scene finds the cheapest combination of effects whose error is within the accuracy.
 
@@ -454,7 +454,7 @@ _OF_OTHER = {"reference": ("accuracy", "effects"), "factored": ("spp",)}
 
 @command
 def render(asked: Rendering) -> int:
-    """Expected irradiance on the sensor, in the scene's own light.
+    """Render the expected irradiance on the sensor, in the scene's own light.
 
     The reference follows path by path through the mask, without diffraction; factored is what other verbs use.
 

@@ -179,8 +179,10 @@ class Pictured(Common):
         return self.finish({**payload, "picture": made}, [*lines, *said], [*warnings, *failed])
 
     def _attempt(self, make: Callable[[], dict[str, Any]], kept: str) -> tuple[dict[str, Any] | None, list[str]]:
-        """Return the result of ``make``, unless pictures are not wanted. If they cannot be made, return None and a
-        warning that the work is ``kept``."""
+        """Return the result of ``make``, unless pictures are not wanted.
+
+        If they cannot be made, return None and a warning that the work is ``kept``.
+        """
         if self.no_pictures:
             return None, []
         try:
@@ -223,8 +225,10 @@ class KnownPlan(Options):
     plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", metavar="FILE")
 
     def read(self, changes: Mapping[str, Any], same_patterns: bool) -> Plan | None:
-        """Return the plan in the file, None without one; MitsimError for ``changes`` that need another plan, which
-        those of patterns do if ``same_patterns`` are needed."""
+        """Return the plan in the file, None without one.
+
+        MitsimError for ``changes`` that need another plan, which those of patterns do if ``same_patterns`` are needed.
+        """
         if self.plan is None:
             return None
         import mitsim
@@ -422,8 +426,10 @@ def wrap_text(text: str, indent: str = "") -> list[str]:
 
 
 def print_result(as_json: bool, payload: Any, lines: Iterable[str], warnings: Sequence[str]) -> int:
-    """Print a result as one JSON object, the ``payload``, or as ``lines`` of text; return exit status 1 if there are
-    ``warnings``, which go to stderr in either case."""
+    """Print a result as one JSON object, the ``payload``, or as ``lines`` of text.
+
+    Return exit status 1 if there are ``warnings``, which go to stderr in either case.
+    """
     with write_at_end():
         if as_json:
             from mitsim.core.files import plain
@@ -440,8 +446,11 @@ def print_result(as_json: bool, payload: Any, lines: Iterable[str], warnings: Se
 
 @contextmanager
 def write_at_end() -> Iterator[None]:
-    """Write the output of this context at its end. If nobody reads standard output any more, end the program
-    quietly as SIGPIPE does; raise MitsimError if it cannot be written for another reason, such as a full disk."""
+    """Write the output of this context at its end.
+
+    If nobody reads standard output any more, end the program quietly as SIGPIPE does; raise MitsimError if it cannot be
+    written for another reason, such as a full disk.
+    """
     try:
         yield
         sys.stdout.flush()

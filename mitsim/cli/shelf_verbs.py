@@ -139,7 +139,7 @@ class Listing(Common):
 
 @command
 def list_(asked: Listing) -> int:
-    """Scenes, devices, studies, effects, methods: what each is for.
+    """List scenes, devices, studies, effects and methods with their purpose.
 
     $ mitsim list scenes
     $ mitsim list cameras --json
@@ -262,7 +262,7 @@ class Beginning(Common):
 
 @command
 def new(asked: Beginning) -> int:
-    """A file to begin with: commented, whole, valid as it is.
+    """Write a file to begin with: commented, whole, valid as it is.
 
     A mask is a camera file with a table [mask], a recipe is of
     calibrate --recipe, a list is of import --list.

@@ -133,8 +133,10 @@ def session_of(folder: Path | str) -> Repeat:
 
 @dataclass
 class _Found:
-    """Tables of a session that were found in folders; ``warnings`` on changes since; and the folders that the tables of
-    capture and calibration were ``taken`` from."""
+    """Tables of a session that were found in folders, and ``warnings`` on changes since.
+
+    ``taken`` has the folders that the tables of capture and calibration were taken from.
+    """
 
     tables: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -145,8 +147,10 @@ class _Found:
             self.warnings.append(text)
 
     def add_scene(self, manifest: RunManifest | CalibrationManifest, folder: Path, coloured: bool) -> None:
-        """Add the table of the scene that a ``manifest`` describes; raise MitsimError if another scene is there
-        already. Warn of files that differ from those that it describes."""
+        """Add the table of the scene that a ``manifest`` describes; MitsimError if it differs from an earlier one.
+
+        Warn of files that differ from those that it describes.
+        """
         conf, where = manifest.configuration, f"{folder}/{MANIFEST}"
         if "scene" not in conf or "defines" not in conf:
             raise MitsimError(f"{folder}: is not of a simulated scene, so no session file makes it anew")
