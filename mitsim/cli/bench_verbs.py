@@ -454,7 +454,7 @@ _OF_OTHER = {"reference": ("accuracy", "effects"), "factored": ("spp",)}
 
 @command
 def render(asked: Rendering) -> int:
-    """Render the expected irradiance on the sensor, in the scene's own light.
+    """Render the irradiance on the sensor in the scene's own light.
 
     The reference follows path by path through the mask, without diffraction; factored is what other verbs use.
 

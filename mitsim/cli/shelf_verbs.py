@@ -139,7 +139,7 @@ class Listing(Common):
 
 @command
 def list_(asked: Listing) -> int:
-    """List scenes, devices, studies, effects and methods with their purpose.
+    """List scenes, devices, studies, effects and methods.
 
     $ mitsim list scenes
     $ mitsim list cameras --json

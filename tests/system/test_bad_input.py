@@ -181,58 +181,6 @@ _CURVE = "quantum_efficiency_curve = {wavelengths_nm = [600, 700], efficiency = 
 """Of a camera that does not see the projector."""
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "fragments"),
-    [
-        ("read_noise_e = 6.7", "read_noize_e = 6.7", ["read_no"]),
-        ("read_noise_e = 6.7", "read_noise_e = nan", ["read_noise_e", "nan"]),
-        ("read_noise_e = 6.7", "read_noise_e = -6.7", ["read_noise_e", "-6.7"]),
-        ("full_well_e = 32360.0", "full_well_e = nan", ["full_well_e", "nan"]),
-        ("full_well_e = 32360.0", "full_well_e = inf", ["full well"]),
-        ("binning = 2", "binning = 0", ["binning", "0"]),
-        ("gain_dn_per_e = 0.125", "gain_dn_per_e = 0", ["gain_dn_per_e", "0"]),
-        ("bits = 12", "bits = 5", ["black_level_dn"]),
-        ("bits = 12", "bits = 12.5", ["bits", "12.5"]),
-        ("quantum_efficiency = 0.75", "quantum_efficiency = 1.2", ["quantum_efficiency", "1.2"]),
-        ("quantum_efficiency = 0.75", "quantum_efficiency = '75 %'", ["quantum_efficiency", "75 %"]),
-        ("quantum_efficiency = 0.75", _CURVE, ["562 nm", "600 to 700 nm"]),
-        ("bits = 12", "bits = ", ["not valid TOML", "line 11"]),
-        ("bits = 12", "bits = 12\nbits = 10", ["not valid TOML", "line 12"]),
-    ],
-)
-def test_a_camera_file_with_a_mistake(
-    refused: Refused, lab: Any, tmp_path: Path, old: str, new: str, fragments: list[str]
-) -> None:
-    text = lab.camera.read_text()
-    assert old in text
-    (tmp_path / "mine.toml").write_text(text.replace(old, new))
-    for verb in (("capture", "--patterns", "dots:4"), ("calibrate",)):
-        mentions(refused(*verb, *lab.arguments, *NEW, "--camera", "mine.toml"), "mine.toml", *fragments)
-
-
-@pytest.mark.parametrize("value", ["nan", "-562.0", "0", "inf", "'green'"])
-def test_a_projector_file_with_a_mistake(refused: Refused, lab: Any, tmp_path: Path, value: str) -> None:
-    (tmp_path / "mine.toml").write_text(f'name = "mine"\neffective_wavelength_nm = {value}\n')
-    for verb in (("capture", "--patterns", "dots:4"), ("calibrate",)):
-        line = refused(*verb, lab.scene, *NEW, "--projector", "mine.toml")
-        mentions(line, "mine.toml", "effective_wavelength_nm", value)
-
-
-def test_a_projector_file_without_its_wavelength(refused: Refused, lab: Any, tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text('name = "mine"\neffective_wavelenght_nm = 562\n')
-    mentions(refused("plan", lab.scene, "--projector", "mine.toml"), "effective_wavelength_nm", "mine.toml")
-
-
-@pytest.mark.parametrize(
-    "line", ["exposure_fraction = 0", "exposure_fraction = nan", "board_reflectance = 1.5", "signed_capture = 'half'"]
-)
-def test_a_recipe_with_a_mistake(refused: Refused, lab: Any, tmp_path: Path, line: str) -> None:
-    recipe = {"board_reflectance": "0.99", "exposure_fraction": "0.8", "signed_capture": "'pair'", "source": "'me'"}
-    name, value = line.split(" = ")
-    (tmp_path / "mine.toml").write_text("".join(f"{k} = {v}\n" for k, v in {**recipe, name: value}.items()))
-    mentions(refused("calibrate", *lab.arguments, *NEW, "--recipe", "mine.toml"), "mine.toml", name, value)
-
-
 def test_binary_files_where_text_is_expected(refused: Refused, lab: Any, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_bytes(b"\x80\xff\x00name")
     mentions(refused("plan", lab.scene, "--camera", "mine.toml"), "mine.toml")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
-import inspect
 import json
 import math
 import subprocess
@@ -77,13 +75,6 @@ assert ms.reconstruct is importlib.import_module(ms._HOMES['reconstruct']).recon
         assert done.returncode == 0, done.stderr
 
 
-def test_the_function_is_no_room() -> None:
-    room = importlib.import_module("mitsim.reconstruct")
-    assert ms.reconstruct is importlib.import_module("mitsim.reconstruct.reconstruct").reconstruct is not room
-    ms.reconstruct = room  # as Python does when the room is imported
-    assert callable(ms.reconstruct)
-
-
 def test_type_checkers_see_the_same_homes() -> None:
     """(Planted: a name in brackets, which the package overlooks.)"""
     stub = ast.parse(Path(ms.__file__).with_suffix(".pyi").read_text())
@@ -116,15 +107,6 @@ def test_the_lines_that_the_package_opens_with(shared_scene: Callable[..., Path]
     model = operator @ image.image.ravel()
     data = np.concatenate([frame.ravel() for frame, _, _ in shots.measurements()])
     assert np.linalg.norm(data - model) / np.linalg.norm(data) == pytest.approx(image.residual, rel=1e-3)
-
-
-def test_what_a_capture_holds(shots: ms.Capture, bench: ms.Bench) -> None:
-    assert shots.dn.shape == shots.electrons.shape == (9, 64, 64) and shots.dn.dtype == np.uint32
-    assert shots.truth.shape == (16, 16) and shots.truth.mean() == pytest.approx(ALBEDO / 0.99, rel=0.02)
-    assert shots.exposure_s > 0 and shots.warnings == () and shots.folder is None
-    assert shots.plan["accuracy"] == ACCURACY and {"effects", "settings"} <= shots.plan.keys()
-    summary = shots.summary()
-    assert (summary["frames"], summary["shape"], summary["seed"], summary["output"]) == (9, (64, 64), SEED, None)
 
 
 @pytest.mark.usefixtures("other_kernels")
@@ -170,19 +152,6 @@ def assert_equal_files(one: Path, other: Path) -> None:
         assert values.dtype == theirs[name].dtype and np.array_equal(values, theirs[name]), (one, name)
 
 
-def test_a_loaded_capture_is_the_one_in_memory(shots: ms.Capture, tmp_path: Path) -> None:
-    loaded = ms.load_run(shots.save(tmp_path / "run"))
-    for name in ("dn", "electrons", "truth"):
-        ours, theirs = getattr(shots, name), getattr(loaded, name)
-        assert ours.dtype == theirs.dtype and np.array_equal(ours, theirs), name
-    assert (loaded.exposure_s, loaded.warnings, loaded.plan) == (shots.exposure_s, shots.warnings, shots.plan)
-    assert loaded.fingerprint == shots.fingerprint and loaded.truth_board == shots.truth_board
-    again = loaded.save(tmp_path / "again")
-    assert (again / "manifest.json").read_bytes() == (tmp_path / "run" / "manifest.json").read_bytes()
-    with pytest.raises(ms.MitsimError, match="holds files already"):
-        shots.save(tmp_path / "run")
-
-
 def test_images_from_memory_and_from_disk_are_equal(shots: ms.Capture, factors: ms.Factors, tmp_path: Path) -> None:
     capture, cal = ms.load_run(shots.save(tmp_path / "run")), ms.load_calibration(factors.save(tmp_path / "cal"))
     assert np.array_equal(cal.left, factors.left) and np.array_equal(cal.right, factors.right)
@@ -191,13 +160,6 @@ def test_images_from_memory_and_from_disk_are_equal(shots: ms.Capture, factors: 
         first, second = ms.reconstruct(shots, factors, method=method), ms.reconstruct(capture, cal, method=method)
         assert np.array_equal(first.image, second.image) and first.inputs == second.inputs, method
         assert first.save(tmp_path / method) == second.save(tmp_path / method), "the same inputs may be written again"
-
-
-@pytest.mark.parametrize("lam", [-1.0, math.nan, math.inf, "automatic"])
-def test_lambda_out_of_range(shots: ms.Capture, factors: ms.Factors, lam: Any) -> None:
-    with pytest.raises(ms.ArgumentError, match=r"lam .*(at least 0, or auto|a number or 'auto')") as caught:
-        ms.reconstruct(shots, factors, lam)
-    assert caught.value.argument == "lam" and str(lam) in str(caught.value)
 
 
 # ---- light that is traced once ---------------------------------------------------------------------------------------
@@ -229,12 +191,6 @@ def same_light(ours: ms.Capture, theirs: ms.Capture) -> None:
     assert ours.exposure_s == pytest.approx(theirs.exposure_s, rel=1e-6)
     assert np.abs(ours.electrons - theirs.electrons).max() < 1e-6 * theirs.electrons.max()
     assert np.array_equal(ours.truth, theirs.truth)
-
-
-def test_light_is_that_of_a_capture(bench: ms.Bench, shots: ms.Capture, traced: list[str]) -> None:
-    """Of the family that it was traced for: the same plan, and so the same paths."""
-    same_light(bench.light("dots:3", accuracy=ACCURACY, seed=SEED).expose("dots:3"), shots)
-    assert traced == ["scene", "truth"]
 
 
 def test_light_serves_any_family_and_is_traced_once(
@@ -315,29 +271,12 @@ def test_objects_show_themselves(bench: ms.Bench, shots: ms.Capture, factors: ms
 # ---- numbers and names -----------------------------------------------------------------------------------------------
 
 
-def test_numbers_may_be_numbers(bench: ms.Bench) -> None:
-    text = ms.open_bench(bench.loaded.path, albedo=str(ALBEDO))
-    assert text.provenance() == bench.provenance() and bench.defines == {"albedo": "0.4"}
-    with pytest.raises(ms.MitsimError, match=r"albdo.*albedo"):
-        ms.open_bench(bench.loaded.path, albdo=ALBEDO)
-
-
 def test_a_shipped_name_wins_over_a_folder_of_that_name(refused: Callable[..., str], tmp_path: Path) -> None:
     (tmp_path / "photograph").mkdir()
     (tmp_path / "photograph" / "scene.xml").write_text("<scene")
     assert "dots:129" in refused("plan", "photograph", "--patterns", "dots:129")
     for own in ("./photograph", tmp_path / "photograph", "photograph/scene.xml"):
         assert "photograph/scene.xml" in refused("plan", own, "--patterns", "dots:129")
-
-
-def test_devices_by_name(call: Callable[..., Any], refused: Callable[..., str], bench: ms.Bench) -> None:
-    devices = "--camera", "imx249", "--projector", "mp_cl1"
-    options = "--accuracy", 0.1, "--patterns", "uniform", "--json"
-    assert call("plan", bench.loaded.path, *devices, *options).payload["accuracy"] == 0.1
-    line = refused("plan", bench.loaded.path, "--camera", "imx24")
-    assert "imx24:" in line and "did you mean imx249?" in line and "shipped are" in line
-    assert "did you mean mp_cl1?" in refused("plan", bench.loaded.path, "--projector", "mp_cl2")
-    assert "did you mean photograph?" in refused("plan", "fotograph")
 
 
 @pytest.mark.parametrize("name", ["scene", "variant", "camera", "projector", "allow_outside_files", "for_render"])
@@ -406,51 +345,3 @@ for arguments, _ in json.loads(sys.argv[1]):
         assert fragment in message, (arguments, message)
         assert heavy == [], f"{arguments} imported {heavy}"
     assert not list(tmp_path.iterdir())
-
-
-NO_KIND: list[Any] = [object(), b"x", np.array([]), 1j]
-"""What no argument of the face may be."""
-
-
-def needed(bench: ms.Bench, shots: ms.Capture, factors: ms.Factors, called: Callable[..., object]) -> dict[str, Any]:
-    """Right arguments for those parameters of ``called`` that have no default."""
-    given = {"scene": bench.loaded.path, "shots": shots, "factors": factors, "bench": bench, "psnr": 30.0}
-    given |= dict.fromkeys(("image", "truth"), np.ones((2, 2)))
-    given |= dict.fromkeys(("folder", "run", "calibration", "output", "path", "frames", "listed", "psf"), "new")
-    given |= {"modelling": ms.Modelling("wave"), "model": "wave", "patterns": "dots:2", "variant": "llvm_ad_mono"}
-    given |= {"method": "unrolled", "pairs": "new", "source": "new", "format": "mat", "camera": "imx249"}
-    given |= {"reflectance": 0.5, "count": 1, "depth": 400.0, "stages": {}, "name": "x"}
-    given |= {"picture": "new.png", "mesh": "new.obj", "size": 120.0, "distance": 400.0, "session": {}}
-    parameters = inspect.signature(called).parameters.values()
-    return {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}
-
-
-@pytest.mark.parametrize("of", ["ms", "bench", "shots", "factors"])
-def test_every_wrong_argument_is_refused_in_a_line(
-    of: str, bench: ms.Bench, shots: ms.Capture, factors: ms.Factors
-) -> None:
-    """By functions of the package and methods of what they make; of more values, in test_wrong_arguments.py. (Planted:
-    one method that checks nothing.)"""
-    owner: Any = {"ms": ms, "bench": bench, "shots": shots, "factors": factors}[of]
-    names = [name for name in (ms.__all__ if of == "ms" else dir(owner)) if name in FACE[of]]
-    assert sorted(names) == sorted(FACE[of])
-    for name in names:
-        called = getattr(owner, name)
-        right = needed(bench, shots, factors, called)
-        parameters = inspect.signature(called).parameters.values()
-        for parameter in (each for each in parameters if each.kind < 2 and each.annotation != "object"):
-            for value in NO_KIND:
-                with pytest.raises(ms.MitsimError) as refusal:
-                    called(**{**right, parameter.name: value})
-                assert len(str(refusal.value).splitlines()) == 1
-
-
-FACE = {
-    "ms": [name for name in ms.__all__ if not name[0].isupper()] + ["Limits", "Modelling", "Clock", "Job"],
-    "bench": ["plan", "light", "capture", "capture_lines", "choose_colour", "in_variant", "in_bands", "calibrate_lines",
-              "capture_mosaic", "calibrate_mosaic", "calibrate", "calibrate_depths", "write_session", "render",
-              "with_board", "family", "windows_at", "parallax_from"],
-    "shots": ["save"],
-    "factors": ["save", "operator", "check_fit"],
-}  # fmt: skip
-"""Public functions, classes and methods that take arguments."""

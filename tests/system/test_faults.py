@@ -72,21 +72,7 @@ def stopped(call: Callable[..., Any], lab: Any, run: Path, whole: Path, how: sig
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("how", "least"),
-    [
-        (signal.SIGINT, 100),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((signal.SIGTERM, 100), (signal.SIGKILL, 0))),
-    ],
-)
-def test_a_stopped_run_loses_no_frame(
-    call: Callable[..., Any], lab: Any, tmp_path: Path, whole: Path, how: signal.Signals, least: int
-) -> None:
-    stopped(call, lab, tmp_path / "run", whole, how, least)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("least", [0, 1, 17, 64, 200, 333, 490, LAST])
+@pytest.mark.parametrize("least", [0, 64, LAST])
 @pytest.mark.parametrize("how", STOPS, ids=lambda how: how.name)
 def test_no_moment_is_a_bad_one(
     call: Callable[..., Any], lab: Any, tmp_path: Path, whole: Path, how: signal.Signals, least: int
@@ -153,39 +139,7 @@ def test_a_disk_that_fills_up_during_a_run(call: Callable[..., Any], lab: Any, w
     assert_resumed(call, lab, run, whole)
 
 
-def test_a_disk_that_is_too_small_is_refused_before_work(
-    refused: Callable[..., str], lab: Any, small_disk: Path
-) -> None:
-    (small_disk / "filler").write_bytes(bytes(12 << 20))
-    line = refused("capture", *lab.arguments, "-o", small_disk / "run", "--patterns", PATTERNS)
-    assert line.startswith(f"{PATTERNS}: would write about") and f"{small_disk / 'run'} has 12 MiB left" in line
-    assert sorted(path.name for path in small_disk.iterdir()) == ["filler"]
-
-
-def test_a_read_only_disk_is_refused_before_work(refused: Callable[..., str], lab: Any, small_disk: Path) -> None:
-    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
-    for verb in (("capture", "--patterns", "dots:4"), ("calibrate",)):
-        line = refused(*verb, *lab.arguments, "-o", small_disk / "run")
-        assert f"output {small_disk / 'run'}" in line and "Read-only file system" in line
-    assert "Read-only file system" in refused("render", lab.scene, "-o", small_disk / "frame.exr")
-
-
 # ---- the folder ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_two_runs_on_one_folder(call: Callable[..., Any], lab: Any, tmp_path: Path, whole: Path) -> None:
-    """The second is refused while the first writes, whatever its options; the first does not notice."""
-    run = tmp_path / "run"
-    process = running(20, "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS)
-    worker = psutil.Process(process.pid).children()[0]
-    worker.suspend()
-    for options, words in ((), "the folder holds files already"), (("--resume",), "another mitsim is writing there"):
-        line = call("capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, *options).refusal
-        assert line.startswith(f"output {run}: {words}")
-    worker.resume()
-    assert ended(process).returncode == 0
-    assert_equal_runs(run, whole)
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ ENDS: dict[str, Callable[[subprocess.Popen[str]], None]] = {
 
 
 @pytest.mark.parametrize("how", ENDS)
-@pytest.mark.parametrize("frames", [1, 60, 300])
+@pytest.mark.parametrize("frames", [60])
 def test_a_capture_goes_on_to_the_same_frames(lab: Any, whole: Path, tmp_path: Path, how: str, frames: int) -> None:
     command = ("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", PATTERNS, "--quiet")
     process = running(frames, *command, session=True)

@@ -113,36 +113,6 @@ def test_exposure_by_hand(call: Callable[..., Any], lab: Any, tmp_path: Path) ->
     assert np.allclose(peaks[1], 2 * peaks[0], rtol=1e-6)
 
 
-def test_lambda_by_value(recover: Callable[..., Any]) -> None:
-    auto = recover("uniform")
-    assert recover("uniform", "--lambda", auto["lambda"])["psnr"] == pytest.approx(auto["psnr"], abs=1e-6)
-    # Far too much and none at all are both worse than the automatic one.
-    for value in (auto["lambda"] * 1e3, 0):
-        found = recover("uniform", "--lambda", value)
-        assert found["lambda"] == value and found["psnr"] < auto["psnr"] - 3
-
-
-def test_total_variation(recover: Callable[..., Any]) -> None:
-    # Few data and a print of smooth parts.
-    found = recover("uniform", "--method", "tv")
-    assert found["psnr"] > recover("uniform")["psnr"] + 4
-    # One frame's noise keeps the iterations from converging in one of three seeds, which the status tells.
-    assert "total variation" in recover("dots:4", "--method", "tv")["status"]
-
-
-@pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4"])
-def test_a_little_total_variation_changes_a_good_image_little(recover: Callable[..., Any], patterns: str) -> None:
-    # A weight of 1e-9 of the data's scale: the minimum is the least-squares image.
-    plain = recover(patterns, "--lambda", 0)
-    assert recover(patterns, "--method", "tv", "--lambda", 1.0)["psnr"] == pytest.approx(plain["psnr"], abs=1)
-    assert recover(patterns, "--method", "tv")["psnr"] > plain["psnr"] - 3
-
-
-def test_no_total_variation_at_all_is_least_squares(recover: Callable[..., Any]) -> None:
-    plain = recover("dots:4", "--lambda", 0)
-    assert recover("dots:4", "--method", "tv", "--lambda", 0)["psnr"] == pytest.approx(plain["psnr"], abs=0.5)
-
-
 def test_a_second_reconstruction_replaces_the_first_when_it_is_asked_to(
     call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
 ) -> None:

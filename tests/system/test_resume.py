@@ -10,10 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from mitsim.core.exr import read_frame
 from tests.system.interrupted import PATTERNS, RESUME, assert_equal_runs, cut_short
 
 pytestmark = pytest.mark.robustness("Faults")
@@ -32,14 +30,6 @@ def killed(lab: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def interrupted(killed: Path, tmp_path: Path) -> Path:
     """A copy of the killed run."""
     return Path(shutil.copytree(killed, tmp_path / "run"))
-
-
-def test_a_killed_run_has_whole_frames_only(killed: Path, whole: Path) -> None:
-    frames = sorted(killed.glob("frame_*.exr"))
-    assert 100 <= len(frames) < 512, "the signal came in the middle"
-    for path in frames:
-        assert np.array_equal(read_frame(path)[0]["DN"], read_frame(whole / path.name)[0]["DN"])
-    assert json.loads((killed / "manifest.json").read_text())["status"] == "incomplete"
 
 
 def test_a_killed_run_is_no_run(refused: Callable[..., str], lab: Any, interrupted: Path) -> None:
@@ -67,11 +57,6 @@ def test_resume_of_a_finished_run_changes_nothing(call: Callable[..., Any], lab:
     before = {path.name: path.read_bytes() for path in run.glob("*.exr")}
     assert call("capture", *lab.arguments, "-o", run, "--patterns", "dots:4", "--resume").code == 0
     assert {path.name: path.read_bytes() for path in run.glob("*.exr")} == before
-
-
-def test_resume_starts_where_nothing_is(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    assert call("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", "dots:4", "--resume").code == 0
-    assert_equal_runs(tmp_path / "run", lab.run)
 
 
 def test_resume_replaces_a_frame_that_was_changed(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
@@ -113,13 +98,6 @@ def test_resume_refuses_a_corrupted_manifest(refused: Callable[..., str], lab: A
     run = lab.copy("run", tmp_path / "run")
     (run / "manifest.json").write_text(text)
     assert "run/manifest.json" in refused("capture", *lab.arguments, "-o", "run", "--resume", "--patterns", "dots:4")
-
-
-def test_resume_refuses_a_foreign_folder(refused: Callable[..., str], lab: Any, tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "letter.txt").write_text("keep me")
-    line = refused("capture", *lab.arguments, "-o", "mine", "--resume", "--patterns", "dots:4")
-    assert "mine: the folder holds files already" in line
 
 
 # ---- calibrations ----------------------------------------------------------------------------------------------------

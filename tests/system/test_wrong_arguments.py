@@ -11,10 +11,35 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from tests.system.test_face import FACE, NO_KIND, needed
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.slow]
 
+NO_KIND: list[Any] = [object(), b"x", np.array([]), 1j]
+"""What no argument of the face may be."""
+
+
+def needed(bench: ms.Bench, shots: ms.Capture, factors: ms.Factors, called: Callable[..., object]) -> dict[str, Any]:
+    """Right arguments for those parameters of ``called`` that have no default."""
+    given = {"scene": bench.loaded.path, "shots": shots, "factors": factors, "bench": bench, "psnr": 30.0}
+    given |= dict.fromkeys(("image", "truth"), np.ones((2, 2)))
+    given |= dict.fromkeys(("folder", "run", "calibration", "output", "path", "frames", "listed", "psf"), "new")
+    given |= {"modelling": ms.Modelling("wave"), "model": "wave", "patterns": "dots:2", "variant": "llvm_ad_mono"}
+    given |= {"method": "unrolled", "pairs": "new", "source": "new", "format": "mat", "camera": "imx249"}
+    given |= {"reflectance": 0.5, "count": 1, "depth": 400.0, "stages": {}, "name": "x"}
+    given |= {"picture": "new.png", "mesh": "new.obj", "size": 120.0, "distance": 400.0, "session": {}}
+    parameters = inspect.signature(called).parameters.values()
+    return {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}
+
+
+FACE = {
+    "ms": [name for name in ms.__all__ if not name[0].isupper()] + ["Limits", "Modelling", "Clock", "Job"],
+    "bench": ["plan", "light", "capture", "capture_lines", "choose_colour", "in_variant", "in_bands", "calibrate_lines",
+              "capture_mosaic", "calibrate_mosaic", "calibrate", "calibrate_depths", "write_session", "render",
+              "with_board", "family", "windows_at", "parallax_from"],
+    "shots": ["save"],
+    "factors": ["save", "operator", "check_fit"],
+}  # fmt: skip
+"""Public functions, classes and methods that take arguments."""
 WRONG: list[Any] = [
     *NO_KIND,
     *(None, True, False, 0, -1, 3, 10**40, 2**63, 0.5, -1e-300, 1e300, float("nan"), float("inf"), -float("inf")),

@@ -146,14 +146,6 @@ def test_all_of_a_plan_has_every_row() -> None:
     assert all(f"{name} " in text and reason in text for name, _, reason, _ in ROWS) and "nothing calls" not in text
 
 
-def test_names_in_a_plan_are_printable(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """A surface that a scene calls "[/]" was an error of rich. (Planted: printed as it is.)"""
-    made = plan_of(("gloss", "exact", f"of {HOSTILE}", 0.5), notes=("cells are chosen safely",))
-    screen.print_result(False, {}, plan_lines(made), ())
-    out = capsys.readouterr().out
-    assert "\x1b]" not in out and "[/]" in out.replace("\n", "") and made.notes[0] in out
-
-
 def test_lines_are_as_wide_as_the_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """80 characters where there is none; a path is not broken. (Planted: printed as they are.)"""
     monkeypatch.delenv("COLUMNS", raising=False)

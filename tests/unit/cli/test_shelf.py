@@ -106,13 +106,6 @@ def test_a_new_camera_loads(shell_of: Callable[..., str], tmp_path: Path, like: 
     assert "# Distance between centres of pixels in a row, um.\npixel_pitch_um = " in path.read_text(encoding="utf-8")
 
 
-def test_a_camera_that_cannot_capture_is_begun_for_what_it_can(shell_of: Callable[..., str], tmp_path: Path) -> None:
-    """(Planted: a command that is refused.)"""
-    for like, verb in (("imx250", "characterise"), ("imx249", "capture")):
-        found = json.loads(shell_of("new", "camera", "mine", "-o", tmp_path / f"{like}.toml", "--like", like, "--json"))
-        assert found["use"].startswith(f"mitsim {verb} ")
-
-
 def test_new_devices_sessions_and_lists_load(shell_of: Callable[..., str], tmp_path: Path) -> None:
     projector = load_model(begun(shell_of, "projector", tmp_path / "p.toml"), ProjectorModel)
     assert (projector.name, projector.columns) == ("mine", 1920)

@@ -34,12 +34,6 @@ def test_any_metadata_value_comes_back(tmp_path_factory: pytest.TempPathFactory,
     assert read_frame(path)[1] == {"value": value}
 
 
-def test_rows_stay_rows(tmp_path: Path) -> None:
-    tall = np.arange(10, dtype=np.uint32).reshape(5, 2)
-    write_frame(tmp_path / "a.exr", {"DN": tall.T[:, ::-1]}, {})
-    assert np.array_equal(read_frame(tmp_path / "a.exr")[0]["DN"], tall.T[:, ::-1])
-
-
 def test_a_failed_write_leaves_the_old_frame_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.exr"
     write_frame(path, {"DN": DN}, {"version": 1})

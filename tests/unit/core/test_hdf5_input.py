@@ -111,13 +111,6 @@ def test_what_would_not_fit_the_memory_is_refused(tmp_path: Path) -> None:
         pass
 
 
-def test_an_empty_dataset_is_no_fault(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("x", (0, 3), "f8")
-    with checked_hdf5(tmp_path / "a.h5", lambda _: 1.0) as file:
-        assert file["x"].shape == (0, 3)
-
-
 def test_no_other_code_opens_an_hdf5_file() -> None:
     """But ``core/arrays.py``. (Planted: h5py.File in the pairs' store.)"""
     package = Path(__file__).parents[3] / "mitsim"

@@ -4,7 +4,6 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -85,14 +84,6 @@ def test_blas_has_one_thread_until_the_last_context_is_left() -> None:
         left.set()
         other.join()
         assert inside == [{1}] and threads_of_blas() == {2}
-
-
-def test_blas_has_its_threads_again_after_an_error() -> None:
-    """(Planted: nothing is put back then.)"""
-    with threadpool_limits(2):
-        with suppress(MitsimError), single_threaded_blas():
-            raise MitsimError("inside")
-        assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {2}
 
 
 @pytest.mark.parametrize("module", ["scipy.linalg", "scipy.special"])
