@@ -157,17 +157,6 @@ def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledL
     )
 
 
-def keep_light(checkpoint: Checkpoint, light: SampledLight) -> None:
-    (group,) = light.groups
-    own = ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
-    facts = {name: getattr(light, name) for name in own}
-    facts |= {name: getattr(group, name) for name in ("received", "outside")}
-    for name, row in GRIDS.items():
-        matrix = group[name]
-        facts |= {f"{row.key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
-    checkpoint.save("light", facts)
-
-
 # ---- Sessions ----
 
 
@@ -276,7 +265,14 @@ def _run_sessions(
             if light is None:
                 lights = lights or whole.trace_lines([each.board for each in lines], plan, job)
                 light = lights[number]
-                keep_light(checkpoint, light)
+                (group,) = light.groups
+                own = ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
+                facts = {name: getattr(light, name) for name in own}
+                facts |= {name: getattr(group, name) for name in ("received", "outside")}
+                for name, row in GRIDS.items():
+                    parts = ("data", "indices", "indptr", "shape")
+                    facts |= {f"{row.key}_{part}": getattr(group[name], part) for part in parts}
+                checkpoint.save("light", facts)
             lit = LitSession.of(session, light, job)
             lit = replace(lit, kept=KeptFrames(session, frames) if frames else None)
             found.append(_factors(lit, checkpoint, job))

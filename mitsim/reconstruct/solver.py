@@ -835,14 +835,10 @@ NEIGHBOURS = 0.9
 """Correlation rho of neighbouring pixels; 0.8 to 0.98 are within 0.7 dB of each other (docs/decisions.md)."""
 
 
-def covariance_root(size: int) -> FloatArray:
-    """Return the lower triangular F (n, n) with F F^T the covariance rho^|p - p'| of a row of pixels."""
-    place = np.arange(size)
-    return np.asarray(np.linalg.cholesky(NEIGHBOURS ** np.abs(place[:, None] - place)))
-
-
 def correlate_side(side: Side) -> Side:
-    root = covariance_root(side.scene_size)
+    place = np.arange(side.scene_size)
+    # F F^T is the covariance rho^|p - p'| of a row of pixels.
+    root = np.asarray(np.linalg.cholesky(NEIGHBOURS ** np.abs(place[:, None] - place)))
     turned, singular, right = np.linalg.svd(side.response.T @ root, full_matrices=False)
     singular[singular <= singular.max() * side.scene_size * np.finfo(np.float64).eps] = 0.0
     # The dual of F V' is F^-T V': both made with the triangular root, neither with an inverse of C.

@@ -104,7 +104,7 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
     even = np.outer(*(dual.sum(axis=0) for dual in duals))
     bands = [_bands(side.scene_size) for side in sides]
     left, right = (
-        np.add.reduceat(np.square(dual.T @ _cosines(side)), starts, axis=1)
+        np.add.reduceat(np.square(dual.T @ dct(np.eye(side.scene_size), axis=0, norm="ortho").T), starts, axis=1)
         for dual, side, (starts, _, _) in zip(duals, sides, bands, strict=True)
     )
     nodes, step = _nodes(bands[0][1] / len(duals[0]), bands[1][1] / len(duals[1]))
@@ -131,10 +131,6 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
     level_of_detail = np.log(usual * max(brightness**2, variance))
     power, covariance, departure = _likeliest(*groups, level_of_detail, np.asarray(np.linalg.inv(before)))
     return Spectrum(*mean(np.exp(power)), even, power, covariance, shares, departure)
-
-
-def _cosines(side: Side) -> FloatArray:
-    return np.asarray(dct(np.eye(side.scene_size), axis=0, norm="ortho").T)
 
 
 def _bands(size: int) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.intp]]:
@@ -370,7 +366,7 @@ class Propagation:
         told = np.divide(part * detail, self._sigma, out=np.zeros_like(power), where=power > 0)
         squares = self._pixel_variance(np.square(lost) * (np.square(told) + energy * (1 - part)))
         of_mean = (spectrum.mean**2 + spectrum.mean_variance) * np.square(image(lost * spectrum.even))
-        seen = gaussian_filter(np.square(image(lost * told)), _NEAR, mode="nearest")
+        seen = _near(image(lost * told))
         usual = gaussian_filter(self._pixel_variance(np.square(lost) * energy * part), _NEAR, mode="nearest")
         doubt = max(_UNSURE * float(usual.mean()), 1e-300)
         near = (seen + doubt) / (usual + doubt)
@@ -383,10 +379,6 @@ class Propagation:
         rows = _of_factor(left, right, self.model.patterns[0], self.terms, image)
         columns = _of_factor(right, left, self.model.patterns[1], self.terms[::-1], image.T).T
         return noise.left**2 * rows, noise.right**2 * columns
-
-    def of_lack(self, struck: FloatArray) -> FloatArray:
-        off = np.square(self.model.prepared.image(self.gain * struck))
-        return np.asarray(gaussian_filter(off, _NEAR, mode="nearest"))
 
     def of_print(self, image: FloatArray) -> FloatArray:
         left, right = self.model.sides
@@ -437,7 +429,7 @@ def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0)
         "calibration_noise": left + right,
         "print_detail": np.maximum(propagation.of_print(image), told),
         "exposure": np.square(exposure * image),
-        "inseparability": propagation.of_lack(lack.struck) if lack else zero,
+        "inseparability": zero if lack is None else _near(data.prepared.image(propagation.gain * lack.struck)),
         "regularisation_bias": lost,
     }
     return Uncertainty({name: np.sqrt(np.maximum(each, 0.0)) for name, each in variances.items()}, factor)
@@ -450,7 +442,10 @@ def _of_factor(
     # Pixels that the same patterns light are seen alike: coefficients answer to each kind of them once.
     kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
     of_kind = (kind.ravel() == np.arange(len(kinds))[:, None]).astype(np.float64)
-    responses = _responses(own, kinds)
+    stack = np.zeros((len(own.singular), own.pattern_count, own.sensor_size))
+    for index, slab in enumerate(own.slabs):
+        stack[slab.columns, index] = slab.matrix.T
+    responses = ((kinds @ (stack @ stack.transpose(0, 2, 1))) * kinds).sum(axis=2)
     rows, columns = terms
     parts = np.stack([(seen * column) @ other.basis.T for column in columns.T])
     spread = np.zeros((len(own.singular), len(other.basis)))
@@ -462,12 +457,8 @@ def _of_factor(
     return np.asarray(np.square(own.basis) @ np.maximum(spread, 0.0))
 
 
-def _responses(side: Side, kinds: FloatArray) -> FloatArray:
-    stack = np.zeros((len(side.singular), side.pattern_count, side.sensor_size))
-    for index, slab in enumerate(side.slabs):
-        stack[slab.columns, index] = slab.matrix.T
-    products = stack @ stack.transpose(0, 2, 1)
-    return np.asarray(((kinds @ products) * kinds).sum(axis=2))
+def _near(error: FloatArray) -> FloatArray:
+    return np.asarray(gaussian_filter(np.square(error), _NEAR, mode="nearest"))
 
 
 def _together(parts: list[FloatArray]) -> FloatArray:
