@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.reconstruct.factors import LARGEST_ERROR, UNKNOWN_NOISE, Estimate, estimate_factors
+from mitsim.reconstruct.factors import LARGEST_ERROR, Estimate, estimate_factors
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report.reconstruct_run import reconstruct
 from tests.robustness import Recorder
@@ -133,32 +133,6 @@ def test_responses_that_cancel_leave_no_factor() -> None:
     with np.errstate(all="raise"):
         found = estimate_factors([uniform] + [uniform * 0] * (N - 1), [uniform * 0] * N, H, uniform=uniform)
     assert found.predicted_error[1] == np.inf and found.rank[1] == 0 and not found.ok
-
-
-def test_noise_alone_flags_a_well_conditioned_camera(measured: Recorder) -> None:
-    """Every pixel sees one scene row and column, so the rank never suffers: at 0.4 electrons a pixel the error is 20 %.
-
-    Closed form: a factor of ones has error 1 / (8 sqrt(electrons)) here (16 responses, 64 numbers for each scene row).
-    """
-    factor = np.kron(np.eye(N), np.ones((PIXELS // N, 1)))
-    for electrons, ok in ((0.4, False), (40.0, True)):
-        found = Camera(factor, factor).calibrate(electrons)
-        predicted = max(found.predicted_error) * 8 * np.sqrt(electrons)
-        measured(abs(predicted - 1), at_most=0.15, what=f"of the closed form, {electrons} electrons")
-        assert found.rank == (N, N) and found.ok == ok
-        assert str(found.status).startswith("Calibrated" if ok else "Factors are mostly noise")
-
-
-def test_unstated_noise_shows_in_the_residual(measured: Recorder) -> None:
-    """Without the sensor's noise the residual alone must tell: it grows as exposure falls, and flags."""
-    camera = Camera(shadow(), shadow())
-    found = [camera.calibrate(10.0**power, stated=False) for power in (8, 6, 4, 2, 0)]
-    residuals = [calibration.separability_residual for calibration in found]
-    assert (np.diff(residuals) > 0).all()
-    measured(residuals[0], at_most=1e-2, what="residual, 1e8 electrons")
-    measured(residuals[2], what="residual, 1e4 electrons")
-    assert [calibration.ok for calibration in found] == [residual < UNKNOWN_NOISE for residual in residuals]
-    assert all(calibration.unexplained == calibration.separability_residual for calibration in found)
 
 
 def test_full_wells_show_in_the_residual(measured: Recorder) -> None:
@@ -278,21 +252,6 @@ def test_flags_of_folders_reach_the_image(bench: Callable[..., tuple[Path, Path]
     assert json.loads((run / "image" / "result.json").read_text())["status"] == str(found.status)
 
 
-def test_folders_without_flags(bench: Callable[..., tuple[Path, Path]]) -> None:
-    found = image_of(*bench())
-    assert found.ok and "flagged" not in str(found.status)
-
-
-def test_factors_that_do_not_fit_the_memory_are_refused(
-    bench: Callable[..., tuple[Path, Path]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folders = bench()
-    monkeypatch.setattr("mitsim.core.job.free_memory", lambda: 1e4)
-    with pytest.raises(MitsimError, match=r"factorising its patterns: would take about 0\.0625 MiB of memory"):
-        image_of(*folders)
-    assert not (folders[0] / "image").exists()
-
-
 def test_the_command_ends_with_1(
     bench: Callable[..., tuple[Path, Path]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -331,14 +290,6 @@ def test_absurd_factors_are_refused(bench: Callable[..., tuple[Path, Path]], fac
     with pytest.raises(MitsimError, match=words) as caught:
         image_of(run, cal)
     assert "\n" not in str(caught.value) and not (run / "image").exists()
-
-
-def test_twin_columns_are_flagged_by_the_solver(bench: Callable[..., tuple[Path, Path]]) -> None:
-    """A rank-deficient factor from elsewhere, without a word in its manifest: the solver finds it."""
-    factor = 100 * shadow(n=8)
-    factor[:, 1] = factor[:, 0]
-    found = image_of(*bench(factor))
-    assert not found.ok and found.rank == 56 and str(found.status).startswith("Rank deficient: 8 of 64")
 
 
 def test_a_saturated_session_is_flagged(

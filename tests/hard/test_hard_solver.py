@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import numpy as np
@@ -177,13 +176,3 @@ def test_rounding_is_bounded_or_flagged(measured: Recorder, exponent: int) -> No
         advised = float(re.search(r"lambda above (\S+),", str(solution.status))[1])
         again = prepared.solve(sums, 1.05 * advised)
         assert again.ok and again.rounding < ROUNDING_LIMIT
-
-
-def test_the_report_s_numbers_are_json() -> None:
-    """An infinite condition becomes null, as JSON has no infinity; the status still says inf."""
-    from mitsim.core.files import plain
-
-    prepared = prepare(np.eye(3, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
-    solution = prepared.solve(summed(prepared, {(0, 0): np.ones((3, 5))}), 0.1)
-    payload = json.loads(json.dumps(plain({"condition": prepared.condition, "status": str(solution.status)})))
-    assert payload["condition"] is None and "condition inf" in payload["status"]

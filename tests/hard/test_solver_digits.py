@@ -82,43 +82,16 @@ def gate(relative: float) -> float:
 # ---- how many digits -------------------------------------------------------------------------------------------------
 
 
-def digits_table() -> list[tuple[float, float, float]]:
-    """(lambda_rel, error of the solver, of the paper's plain Gram form); n = 8, m = 16, cond(Phi) = 1e4 each side."""
+def test_digits_at_every_lambda(measured: Recorder) -> None:
+    """The default stays below the gate 10 eps / sqrt(lambda_rel); cond(Phi) is 1e4 a side, the judge has 50 digits."""
     one, image = np.ones((8, 1)), np.random.default_rng(3).random((8, 8))
     left, right = (with_spectrum(np.geomspace(1, 1e-4, 8), 16, seed) for seed in (1, 2))
     frames = frames_of(left, right, one, one, image)
     exact = Exact(left, right, one, one, frames)
-    rows = []
     for relative in (*LAMBDAS, 0.0):
-        found = solved(left, right, one, one, frames, relative)
-        answer = exact.image(found.lam)
-        plain = plain_gram(left, right, frames[0, 0], found.lam)
-        rows.append((relative, exact.error(found), float(np.linalg.norm(plain - answer) / np.linalg.norm(answer))))
-    return rows
-
-
-def plain_gram(left: np.ndarray, right: np.ndarray, frame: np.ndarray, lam: float) -> np.ndarray:
-    """The paper's closed form as it stands, in the precision of its arguments: eigenvalues below zero are kept."""
-    (lv, le), (rv, re) = (np.linalg.eigh(phi.T @ phi) for phi in (left, right))
-    rotated = le.T @ (left.T @ frame @ right) @ re
-    return le @ (rotated / (np.outer(lv, rv) + left.dtype.type(lam))) @ re.T
-
-
-def test_digits_at_every_lambda(measured: Recorder) -> None:
-    """The default stays below the gate 10 eps / sqrt(lambda_rel); cond(Phi) is 1e4 a side, the judge has 50 digits."""
-    for relative, svd, _ in digits_table():
+        error = exact.error(solved(left, right, one, one, frames, relative))
         # lambda = 0: the condition of both sides together, 1e4 * 1e4, magnifies eps.
-        measured(svd, at_most=gate(relative) if relative else 10 * EPS * 1e8, what=f"{relative:.0e}")
-
-
-def test_gram_matrices_lose_twice_as_many_digits(measured: Recorder) -> None:
-    """By the paper's plain form, and at lambda = 0 the image; no worse than eps / lambda_rel."""
-    rows = digits_table()
-    measured(rows[-1][2], at_least=1e-3, what="plain at 0")
-    for relative, _, plain in rows[:-1]:
-        assert plain < 10 * EPS / relative, "and no worse than eps / lambda_rel"
-    for _, svd, plain in rows[3:]:  # lambda_rel of 1e-8 and below
-        assert plain > 100 * svd
+        measured(error, at_most=gate(relative) if relative else 10 * EPS * 1e8, what=f"{relative:.0e}")
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -199,64 +172,23 @@ def test_noise_is_magnified_more_than_rounding(measured: Recorder) -> None:
         measured(error / moved, at_most=1e-6, what="of what noise moves")
 
 
-# ---- close masks and Gram matrices -----------------------------------------------------------------------------------
-
-
-def distance_table() -> list[tuple[float, float, list[float]]]:
-    """(distance [mm], cond(Phi), errors over LAMBDAS); 48 pixels, n = 12."""
-    one, image = np.ones((12, 1)), np.random.default_rng(3).random((12, 12))
-    rows = []
-    for distance in DISTANCES_MM:
-        phi = shadow(distance, 48, 12)
-        frames = frames_of(phi, phi, one, one, image)
-        exact = Exact(phi, phi, one, one, frames)
-        solutions = [solved(phi, phi, one, one, frames, relative) for relative in LAMBDAS]
-        assert all(solution.ok and np.isfinite(solution.image).all() for solution in solutions)
-        rows.append((distance, float(np.linalg.cond(phi)), [exact.error(found) for found in solutions]))
-    return rows
+# ---- close masks ----
 
 
 @pytest.mark.slow
 def test_masks_from_2_mm_to_20_um(measured: Recorder) -> None:
     """Uniform light, 48 pixels, n = 12: cond(Phi) grows to 1e15, the error stays below the gate at every lambda."""
-    rows = distance_table()
-    for distance, _, errors in rows:
-        for relative, error in zip(LAMBDAS, errors, strict=True):
-            assert error < gate(relative)
-        measured(errors[-1], at_most=gate(LAMBDAS[-1]), what=f"{distance} mm at 1e-16")
-    assert rows[0][1] < 1e3 and rows[-1][1] > 1e15
-
-
-def test_negative_eigenvalues_of_a_gram_matrix(measured: Recorder) -> None:
-    """At 50 um and k = 1 a quarter of the Gram matrix's eigenvalues are negative; the solver's sigma never is.
-
-    Their products come within a few eps of zero, so sigma^2 + lambda changes sign below lambda_rel 1e-16, and in single
-    precision already at 1e-10.
-    """
-    phi = shadow(0.05)
-    for kind, relative in ((np.float64, 1e-17), (np.float32, 1e-10)):
-        values = np.linalg.eigvalsh(phi.astype(kind).T @ phi.astype(kind))
-        share = (values < 0).mean()
-        measured(100 * share, at_least=20, what=f"negative in {kind.__name__}", unit="%")
-        denominators = np.outer(values, values) / values.max() ** 2 + kind(relative)
-        assert denominators.min() < 0 < denominators.max()
-    one = np.ones((128, 1))
-    side = prepare(phi, phi, one, one).left
-    assert (side.singular >= 0).all() and 10 < side.rank < 128
-
-
-def test_a_plain_gram_solution_breaks_where_the_default_does_not(measured: Recorder) -> None:
-    """50 um, 64 pixels, n = 16: errors of the plain form in both precisions, and of the default, against 50 digits."""
-    phi, one = shadow(0.05, 64, 16), np.ones((16, 1))
-    frames = frames_of(phi, phi, one, one, np.random.default_rng(3).random((16, 16)))
-    exact = Exact(phi, phi, one, one, frames)
-    for relative, kind in ((1e-16, np.float64), (1e-10, np.float32)):
-        solution = solved(phi, phi, one, one, frames, relative)
-        answer = exact.image(solution.lam)
-        plain = plain_gram(phi.astype(kind), phi.astype(kind), frames[0, 0].astype(kind), solution.lam)
-        error = np.linalg.norm(plain - answer) / np.linalg.norm(answer)
-        measured(error, at_least=0.1, what=f"plain in {kind.__name__} at {relative:.0e}")
-        measured(exact.error(solution), at_most=gate(relative), what=f"default at {relative:.0e}")
+    one, image, conditions = np.ones((12, 1)), np.random.default_rng(3).random((12, 12)), []
+    for distance in DISTANCES_MM:
+        phi = shadow(distance, 48, 12)
+        frames = frames_of(phi, phi, one, one, image)
+        exact = Exact(phi, phi, one, one, frames)
+        conditions.append(np.linalg.cond(phi))
+        for relative in LAMBDAS:
+            solution = solved(phi, phi, one, one, frames, relative)
+            assert solution.ok and np.isfinite(solution.image).all()
+            measured(exact.error(solution), at_most=gate(relative), what=f"{distance} mm at {relative:.0e}")
+    assert conditions[0] < 1e3 and conditions[-1] > 1e15
 
 
 @pytest.mark.slow
@@ -277,31 +209,6 @@ def test_full_size_against_exact_integers(measured: Recorder, distance: float) -
 
 
 # ---- frames and columns that are hard --------------------------------------------------------------------------------
-
-
-def test_a_bright_highlight_in_single_precision(measured: Recorder) -> None:
-    """float32 frames of whole DN up to 65535, one scene pixel 5000 times the rest: digits as with double precision.
-
-    Rounding to DN leaves a misfit, so the bound is the one under noise. Products in single precision lose the image.
-    """
-    one, image = np.ones((12, 1)), 0.5 + np.random.default_rng(3).random((12, 12))
-    image[5, 7] = 5000
-    phi = shadow(2.0, 48, 12)
-    frame = phi @ image @ phi.T
-    frame = np.rint(65535 * frame / frame.max())
-    assert frame.max() == 65535 and frame.min() < 2000
-    single = {(0, 0): frame.astype(np.float32)}
-    exact = Exact(phi, phi, one, one, {(0, 0): frame})
-    for relative in (1e-4, 1e-6, 1e-8):
-        solution = solved(phi, phi, one, one, single, relative)
-        assert np.array_equal(solution.image, solved(phi, phi, one, one, {(0, 0): frame}, relative).image)
-        error = exact.error(solution)
-        limit = gate(relative) * (1 + solution.residual / np.sqrt(relative))
-        measured(error, at_most=limit, what=f"{relative:.0e}")
-        answer = exact.image(solution.lam)
-        plain = plain_gram(phi.astype(np.float32), phi.astype(np.float32), single[0, 0], solution.lam)
-        lost = np.linalg.norm(plain - answer) / np.linalg.norm(answer)
-        assert lost > 1e6 * error
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
