@@ -544,6 +544,7 @@ def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArra
     unit.
     """
     coherence, spectrum = devices.projector.speckle or Coherence(), devices.projector.spectrum
+    camera, radius = devices.camera, coherence.beam_radius_mm
     wavelengths = spectrum.wavelengths_nm
     inverse, pairs = 1 / wavelengths, np.eye(len(wavelengths))
     if coherence.roughness_um is not None:
@@ -552,21 +553,8 @@ def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArra
         within = 1 / np.sqrt(1 + np.square(8 * np.pi * height * coherence.linewidth_nm / np.square(wavelengths)))
         np.fill_diagonal(pairs, within)
     pairs *= np.outer(spectrum.weights, spectrum.weights)
-    together = np.unique(2 / (inverse[:, None] + inverse)[pairs > 0])
-    spaces = {wavelength: _space(devices, pixels_mm, lit, wavelength * 1e-6) for wavelength in together}
-    # Two lines use grains at their mean wave number, because coherent lines are close to it.
-    both = np.array([[spaces.get(2 / (k + other), 0.0) for other in inverse] for k in inverse])
-    return float(np.sqrt((1 + coherence.polarisation**2) / 2 * (pairs * both).sum()))
 
-
-def _space(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray, wavelength_mm: float) -> float:
-    """Return the mean over pairs of points for one wavelength, relative to the sum of squares of all pixels' light."""
-    camera, radius = devices.camera, (devices.projector.speckle or Coherence()).beam_radius_mm
-
-    def grains(distance: FloatArray, width: float) -> FloatArray:
-        kernel = np.square(np.sinc(width * distance / (wavelength_mm * camera.scene_distance)))
-        return np.asarray(kernel if radius is None else kernel * np.exp(-np.square(distance / radius)))
-
+    # ---- What light of two points passes the same openings of the mask
     def one_feature(distance: FloatArray) -> FloatArray:
         apart = camera.mask_distance / (camera.scene_distance * camera.mask_feature)
         return np.asarray(np.maximum(1 - np.abs(distance) * apart, 0))
@@ -576,24 +564,33 @@ def _space(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray, wa
         means = [weight * rows.mean() * columns.mean() for weight, rows, columns in camera.build_mask().terms]
         open_part = {"open": 1.0, "flatcam": 0.5}.get(camera.mask) or float(sum(means))
         seen = [(1.0, np.ones_like), (1 / open_part - 1, one_feature)]
+
+    # ---- Means over pairs of points, relative to the sum of squares of all pixels' light
     sizes = [2 * side for side in lit.shape]
-    spectrum = np.square(np.abs(np.fft.rfft2(lit, sizes)))
-    apart = np.fft.irfft2(spectrum, sizes)  # light of pairs of pixels, by how many rows and columns they are apart
+    squared = np.square(np.abs(np.fft.rfft2(lit, sizes)))
+    apart = np.fft.irfft2(squared, sizes)  # light of pairs of pixels, by how many rows and columns they are apart
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    part, share = (nodes + 1) / 2, weights / 2 * (1 - (nodes + 1) / 2)
 
     def mean(kernels: Iterable[Kernel]) -> float:
         total = 0.0
         for weight, through in seen:
-            sides = zip(kernels, pixels_mm, lit.shape, strict=True)
-            rows, columns = (_between_pixels((kernel, through), size, side) for kernel, size, side in sides)
-            total += weight * float(rows @ apart @ columns)
+            axes = []
+            for kernel, size, count in zip(kernels, pixels_mm, lit.shape, strict=True):
+                lags = np.fft.fftfreq(2 * count, 1 / (2 * count))[:, None]
+                places = np.stack([(lags + part) * size, (lags - part) * size])
+                axes.append(np.asarray((share * kernel(places) * through(places)).sum(axis=(0, 2))))
+            total += weight * float(axes[0] @ apart @ axes[1])
         return total
 
-    return mean([partial(grains, width=width) for width in camera.active_sides]) / mean([np.ones_like] * 2)
+    def grains(distance: FloatArray, width: float, wavelength_mm: float) -> FloatArray:
+        kernel = np.square(np.sinc(width * distance / (wavelength_mm * camera.scene_distance)))
+        return np.asarray(kernel if radius is None else kernel * np.exp(-np.square(distance / radius)))
 
-
-def _between_pixels(kernels: tuple[Kernel, Kernel], size: float, count: int) -> FloatArray:
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    part, share = (nodes + 1) / 2, weights / 2 * (1 - (nodes + 1) / 2)
-    lags = np.fft.fftfreq(2 * count, 1 / (2 * count))[:, None]
-    places = np.stack([(lags + part) * size, (lags - part) * size])
-    return np.asarray((share * kernels[0](places) * kernels[1](places)).sum(axis=(0, 2)))
+    spaces, alone = dict[float, float](), mean([np.ones_like] * 2)
+    for each in np.unique(2 / (inverse[:, None] + inverse)[pairs > 0]):
+        sides = camera.active_sides
+        spaces[each] = mean([partial(grains, width=side, wavelength_mm=each * 1e-6) for side in sides]) / alone
+    # Two lines use grains at their mean wave number, because coherent lines are close to it.
+    both = np.array([[spaces.get(2 / (k + other), 0.0) for other in inverse] for k in inverse])
+    return float(np.sqrt((1 + coherence.polarisation**2) / 2 * (pairs * both).sum()))

@@ -97,17 +97,49 @@ def specular_frames(
     frames = np.zeros((len(classes), *shape))
     total, lit = 0.0, np.zeros(len(labels), dtype=bool)
     for cut in _cuts(beams, reached, min(geometry.pitches) / boxes_per_pixel):
-        boxes = _boxes(beams, cut, geometry)
-        pixels = beams.pixel[boxes.beam]
+        # ---- Boxes that the sensor sees within the field stop: place, size and tangent at the middle, and flux
+        corners, tangents = beams.sensor[cut.beams], beams.tangent[cut.beams]
+        place, tangent = _bilinear(corners, cut.a, cut.b), _bilinear(tangents, cut.a, cut.b)
+        along, across = _gradients(corners, cut.a, cut.b)
+        extent = np.hypot(along * cut.size[0], across * cut.size[1])
+        extent = np.maximum(extent, _POINT * min(geometry.pitches))
+        seen = (np.abs(place) < geometry.half_width + extent / 2).all(axis=-1)
+        seen &= (np.abs(tangent) <= geometry.tan_half_fov).all(axis=-1)
+        throughput = _bilinear(beams.throughput[cut.beams][..., None], cut.a, cut.b)[..., 0]
+        light = (beams.flux[cut.beams, None, None] * throughput)[seen] * (cut.size[0] * cut.size[1])
+        owner = np.broadcast_to(np.arange(len(cut.beams))[:, None, None], seen.shape)[seen]
+        place, extent, tangent = place[seen], extent[seen], tangent[seen]
+        squared = np.square(tangent[:, 0]) + np.square(tangent[:, 1])
+        light = light * (geometry.pixel_fill_factor * geometry.angular_response(squared))
+        magnification = (1 + geometry.mask_distance * _slope(corners, tangents))[owner]
+        pixels = beams.pixel[cut.beams[owner]]
         slot, within = np.searchsorted(classes, labels[pixels]), 0.0
-        rows, columns = ([_pieces(boxes, axis, step, geometry) for step in (0, 1)] for axis in (0, 1))
+
+        # ---- By axis, the two pixels that a box meets, its part in each, and its place and width on the mask
+        both: list[list[tuple[IntArray, FloatArray, FloatArray, FloatArray]]] = [[], []]
+        for axis, step in np.ndindex(2, 2):
+            active_part, pitch = math.sqrt(geometry.pixel_fill_factor), geometry.pitches[axis]
+            first = 0 if geometry.roi is None else geometry.roi[axis]
+            middle = place[:, axis] / pitch + geometry.shape[axis] / 2 - first
+            width = extent[:, axis] / pitch
+            low, high = middle - width / 2, middle + width / 2
+            pixel = np.floor(low).astype(np.int64) + step
+            low = np.maximum(low, pixel + (1 - active_part) / 2)
+            high = np.minimum(high, pixel + (1 + active_part) / 2)
+            share = np.maximum(high - low, 0) / width
+            share[(pixel < 0) | (pixel >= geometry.frame_shape[axis])] = 0
+            grown = magnification[:, axis]
+            offset = ((low + high) / 2 - middle) * pitch
+            shadow = place[:, axis] + geometry.mask_distance * tangent[:, axis] + grown * offset
+            both[axis].append((pixel, share, shadow, np.abs(grown) * share * width * pitch))
+        rows, columns = both
         shadows = [
             (weight, [by_row(*piece[2:]) for piece in rows], [by_column(*piece[2:]) for piece in columns])
             for weight, by_row, by_column in terms
         ]
         for i, (row, row_share, *_) in enumerate(rows):
             for j, (column, column_share, *_) in enumerate(columns):
-                flux = boxes.flux * row_share * column_share
+                flux = light * row_share * column_share
                 within += float(flux.sum())
                 met = np.flatnonzero(flux)
                 passed = np.zeros(len(met))
@@ -127,15 +159,6 @@ class _Cut(NamedTuple):
     a: FloatArray
     b: FloatArray
     size: tuple[float, float]
-
-
-class _Boxes(NamedTuple):
-    beam: IntArray
-    flux: FloatArray
-    place: FloatArray
-    extent: FloatArray
-    tangent: FloatArray
-    magnification: FloatArray
 
 
 def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
@@ -162,43 +185,6 @@ def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
             a = (np.arange(first, min(first + strip, rows)) + 0.5) / rows
             for start in range(0, len(alike), step):
                 yield _Cut(alike[start : start + step], a, b, (1 / rows, 1 / columns))
-
-
-def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry) -> _Boxes:
-    corners = beams.sensor[cut.beams]
-    place, tangent = _bilinear(corners, cut.a, cut.b), _bilinear(beams.tangent[cut.beams], cut.a, cut.b)
-    along, across = _gradients(corners, cut.a, cut.b)
-    extent = np.hypot(along * cut.size[0], across * cut.size[1])
-    extent = np.maximum(extent, _POINT * min(geometry.pitches))
-    seen = (np.abs(place) < geometry.half_width + extent / 2).all(axis=-1)
-    seen &= (np.abs(tangent) <= geometry.tan_half_fov).all(axis=-1)
-    throughput = _bilinear(beams.throughput[cut.beams][..., None], cut.a, cut.b)[..., 0]
-    flux = (beams.flux[cut.beams, None, None] * throughput)[seen] * (cut.size[0] * cut.size[1])
-    owner = np.broadcast_to(np.arange(len(cut.beams))[:, None, None], seen.shape)[seen]
-    place, extent, tangent = place[seen], extent[seen], tangent[seen]
-    squared = np.square(tangent[:, 0]) + np.square(tangent[:, 1])
-    response = geometry.pixel_fill_factor * geometry.angular_response(squared)
-    magnification = 1 + geometry.mask_distance * _slope(corners, beams.tangent[cut.beams])
-    return _Boxes(cut.beams[owner], flux * response, place, extent, tangent, magnification[owner])
-
-
-def _pieces(
-    boxes: _Boxes, axis: int, step: int, geometry: CameraGeometry
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    active_part = math.sqrt(geometry.pixel_fill_factor)
-    pitch, first = geometry.pitches[axis], 0 if geometry.roi is None else geometry.roi[axis]
-    place = boxes.place[:, axis] / pitch + geometry.shape[axis] / 2 - first
-    extent = boxes.extent[:, axis] / pitch
-    low, high = place - extent / 2, place + extent / 2
-    pixel = np.floor(low).astype(np.int64) + step
-    low = np.maximum(low, pixel + (1 - active_part) / 2)
-    high = np.minimum(high, pixel + (1 + active_part) / 2)
-    share = np.maximum(high - low, 0) / extent
-    share[(pixel < 0) | (pixel >= geometry.frame_shape[axis])] = 0
-    magnification = boxes.magnification[:, axis]
-    offset = ((low + high) / 2 - place) * pitch
-    shadow = boxes.place[:, axis] + geometry.mask_distance * boxes.tangent[:, axis] + magnification * offset
-    return pixel, share, shadow, np.abs(magnification) * share * extent * pitch
 
 
 def _bilinear(corners: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:

@@ -163,22 +163,6 @@ def _twice(x: FloatArray, blur: float) -> FloatArray:
     return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * scipy.special.ndtr(z) + z * density))
 
 
-def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
-    index = places.astype(np.intp)
-    beyond = places - index
-    result = np.empty((len(nodes), *places.shape))
-    for function, out in zip(nodes, result, strict=True):
-        before, left, right, after = function[:-3], function[1:-2], function[2:-1], function[3:]
-        third = (after - before) / 6 + (left - right) / 2
-        second = (before + right) / 2 - left
-        first = right - left - second - third
-        np.take(third, index, out=out)
-        for coefficient in (second, first, left):
-            out *= beyond
-            out += coefficient[index]
-    return result
-
-
 def _running_sums(parts: FloatArray) -> FloatArray:
     sums = np.zeros((len(parts), parts.shape[1] + 1))
     np.cumsum(parts, axis=1, out=sums[:, 1:])
@@ -214,7 +198,20 @@ class Antiderivative:
         if centres.size < _DENSE * count or half_pixel * half_cell < _WIDE * step**2:
             return self.means(centres, half_pixel, half_cell)
         nodes = self.means(np.asarray(low + step * (np.arange(count) - 1)), half_pixel, half_cell)
-        return _cubic(nodes, (centres - low) / step)
+        # Cubic interpolation between four nodes.
+        places = (centres - low) / step
+        index = places.astype(np.intp)
+        beyond = places - index
+        result = np.empty((len(nodes), *places.shape))
+        for function, out in zip(nodes, result, strict=True):
+            before, left, right, after = function[:-3], function[1:-2], function[2:-1], function[3:]
+            third = (after - before) / 6 + (left - right) / 2
+            second = (before + right) / 2 - left
+            np.take(third, index, out=out)
+            for coefficient in (second, right - left - second - third, left):
+                out *= beyond
+                out += coefficient[index]
+        return result
 
     def _ends(self, points: FloatArray, half: float) -> FloatArray:
         if half == 0:
@@ -383,27 +380,24 @@ def both_axes(
 
 def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions) -> SeparableTerms:
     """Return the separable terms [(left (m, r), right (m, c)), ...], weights folded into left."""
-    means = _thick_means if shadow.thickness_mm else _thin_means
+
+    def means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
+        half_cell = shadow.half_cell(directions)
+        if shadow.thickness_mm:
+            crossings = shadow.crossings(directions)
+            thick = np.empty((len(shadow.weights()), *crossings.shape))
+            for j, tau in enumerate(directions.centres):
+                for term, clear in enumerate(shadow.clear(profiles, float(tau))):
+                    thick[term, :, j] = clear.box_means(crossings[:, j], shadow.half_pixel, half_cell)
+            return thick
+        boxes, feature = (shadow.on_tilted_mask(directions), shadow.half_pixel, half_cell), shadow.mask.feature_mm
+        if not shadow.mask.even or boxes[1] + boxes[2] > _MOST_FEATURES * feature:
+            return np.stack([profile.box_means(*boxes) for profile in shadow.clear(profiles, 0.0)])
+        in_features = [np.asarray(each / feature) for each in boxes]
+        return np.stack([trapezoid_mean(profile, *in_features) for profile in profiles])
+
     left, right = both_axes(shadow, rows, columns, means)
     return [(weight * a, b) for weight, a, b in zip(shadow.weights(), left, right, strict=True)]
-
-
-def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
-    boxes = shadow.on_tilted_mask(directions), shadow.half_pixel, shadow.half_cell(directions)
-    feature = shadow.mask.feature_mm
-    if not shadow.mask.even or boxes[1] + boxes[2] > _MOST_FEATURES * feature:
-        return np.stack([profile.box_means(*boxes) for profile in shadow.clear(profiles, 0.0)])
-    in_features = [np.asarray(each / feature) for each in boxes]
-    return np.stack([trapezoid_mean(profile, *in_features) for profile in profiles])
-
-
-def _thick_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
-    crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
-    means = np.empty((len(shadow.weights()), *crossings.shape))
-    for j, tau in enumerate(directions.centres):
-        for term, clear in enumerate(shadow.clear(profiles, float(tau))):
-            means[term, :, j] = clear.box_means(crossings[:, j], shadow.half_pixel, half_cell)
-    return means
 
 
 def trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:

@@ -308,36 +308,29 @@ def first_squares(
     while len(row):
         small = step < size
         low, high, step = low[small], high[small], step[small]
-        divided = _squares_in_boxes(row // size, column // size, low / size, high / size)
+        divided = np.zeros(len(row), dtype=bool)
+        if len(low):  # squares that one of the boxes meets
+            first, last = (np.floor(ends / size).astype(np.int64) for ends in (low, high))
+            rows, columns = (last - first + 1).T
+            stride = int(max((column // size).max(), last[:, 1].max())) + 2
+            keys = row // size * stride + column // size
+            order, counts = np.argsort(keys), rows * columns
+            ends = np.cumsum(counts)
+            start = np.searchsorted(ends, np.arange(0, ends[-1] + _BOXES_AT_ONCE, _BOXES_AT_ONCE), side="left")
+            for begin, end in pairwise([*np.unique(np.minimum(start, len(counts) - 1)), len(counts)]):
+                chosen = slice(begin, end)
+                box = np.repeat(np.arange(begin, end), counts[chosen])
+                place = np.arange(len(box)) - np.repeat(np.cumsum(counts[chosen]) - counts[chosen], counts[chosen])
+                down, across = np.divmod(place, columns[box])
+                wanted = np.unique((first[box, 0] + down) * stride + first[box, 1] + across)
+                at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+                divided[order[at[keys[order][at] == wanted]]] = True
         yield size, row[~divided], column[~divided]
         size //= 2
         row, column = (
             np.concatenate([axis[divided] + offset * size for offset in offsets])
             for axis, offsets in ((row, (0, 0, 1, 1)), (column, (0, 1, 0, 1)))
         )
-
-
-def _squares_in_boxes(row: IntArray, column: IntArray, low: FloatArray, high: FloatArray) -> Mask:
-    found = np.zeros(len(row), dtype=bool)
-    if not len(low):
-        return found
-    first, last = np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
-    (rows, columns), start = (last - first + 1).T, np.zeros(len(low), np.int64)
-    stride = int(max(column.max(), last[:, 1].max())) + 2
-    keys = row * stride + column
-    order = np.argsort(keys)
-    counts = rows * columns
-    ends = np.cumsum(counts)
-    start = np.searchsorted(ends, np.arange(0, ends[-1] + _BOXES_AT_ONCE, _BOXES_AT_ONCE), side="left")
-    for begin, end in pairwise([*np.unique(np.minimum(start, len(counts) - 1)), len(counts)]):
-        chosen = slice(begin, end)
-        box = np.repeat(np.arange(begin, end), counts[chosen])
-        place = np.arange(len(box)) - np.repeat(np.cumsum(counts[chosen]) - counts[chosen], counts[chosen])
-        down, across = np.divmod(place, columns[box])
-        wanted = np.unique((first[box, 0] + down) * stride + first[box, 1] + across)
-        at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-        found[order[at[keys[order][at] == wanted]]] = True
-    return found
 
 
 def _window_boxes(spots: _Spots, rays: PinholeRays) -> tuple[FloatArray, FloatArray, FloatArray]:

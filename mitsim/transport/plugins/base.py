@@ -75,8 +75,6 @@ def device_vectors(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
 # -------- Coordinates
 
 Numbers: TypeAlias = "mi.Float | FloatArray"
-RIGID = 1e-4
-"""Largest :func:`rigidity_error` of a rigid transform: matrices of five digits pass, a scale of 1.0001 does not."""
 
 
 def rows_columns(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
@@ -90,10 +88,6 @@ def x_y(row: Numbers, column: Numbers) -> tuple[Numbers, Numbers]:
 def turn_and_origin(transform: mi.AffineTransform4f) -> tuple[FloatArray, FloatArray]:
     matrix = np.array(transform.matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
     return matrix[:3, :3], matrix[:3, 3]
-
-
-def rigidity_error(turn: FloatArray) -> float:
-    return float(np.abs(turn.T @ turn - np.eye(3)).max())
 
 
 # -------- Random numbers of the factored estimator

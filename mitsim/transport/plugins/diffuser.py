@@ -120,6 +120,10 @@ def point_spread(
     above = _THICKNESS_MM + 1.0
     # Where light must meet the flat face to reach the relief's middle, and a millimetre before that.
     start = -inner * _THICKNESS_MM - np.array(tilt)
+    along = np.array([*tilt, -1.0])
+    unit = mi.Vector3f(*(along / np.linalg.norm(along)).tolist())
+    # Light instead of radiance, and only its refracted part.
+    context = mi.BSDFContext(mi.TransportMode.Importance, mi.BSDFFlags.DeltaTransmission)
     light = np.zeros(rows * columns)
     band = max(1, _RAYS_AT_ONCE // rays)
     for first in range(0, rays, band):
@@ -128,29 +132,21 @@ def point_spread(
         x = ((np.arange(first, first + count)[:, None] + jitter[0]) / rays - 0.5) * side
         y = ((np.arange(rays)[None, :] + jitter[1]) / rays - 0.5) * side
         places = np.stack([x.ravel() + start[0], y.ravel() + start[1], np.full(x.size, diffuser.distance_mm + above)])
-        place, part = _landing(scene, places, np.array([*tilt, -1.0]))
+        ray, part, active = mi.Ray3f(mi.Point3f(places.astype(np.float32)), unit), mi.Float(1), mi.Bool(True)
+        for _ in range(2):
+            crossing = scene.ray_intersect(ray, active)
+            active &= crossing.is_valid()
+            turned, weight = crossing.bsdf().sample(context, crossing, 0.5, mi.Point2f(0.5), active)
+            part *= weight[0]  # glass without colour
+            # Not Mitsuba's own start, which leaves the ray's line and loses light at the relief's edge.
+            along_ray = crossing.to_world(turned.wo)
+            ray = mi.Ray3f(crossing.p + along_ray * _CLEAR_MM, along_ray)
+        active &= ray.d.z < 0
+        place = vectors(ray(-ray.o.z / ray.d.z), places.shape[1])
+        part = host_values(mi.Float(mi.UInt32(active)) * part, places.shape[1])
         row = np.floor(rows / 2 - place[:, 1] / pitch_mm)
         column = np.floor(columns / 2 - place[:, 0] / pitch_mm)
         seen = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (part > 0)
         index = (row[seen] * columns + column[seen]).astype(np.int64)
         light += np.bincount(index, part[seen], minlength=rows * columns)
     return np.asarray(light.reshape(shape) * (side / rays / pitch_mm) ** 2)
-
-
-def _landing(scene: mi.Scene, places: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-    unit = along / np.linalg.norm(along)
-    ray = mi.Ray3f(mi.Point3f(places.astype(np.float32)), mi.Vector3f(*unit.tolist()))
-    part, active = mi.Float(1), mi.Bool(True)
-    # Light instead of radiance, and only its refracted part.
-    context = mi.BSDFContext(mi.TransportMode.Importance, mi.BSDFFlags.DeltaTransmission)
-    for _ in range(2):
-        crossing = scene.ray_intersect(ray, active)
-        active &= crossing.is_valid()
-        turned, weight = crossing.bsdf().sample(context, crossing, 0.5, mi.Point2f(0.5), active)
-        part *= weight[0]  # glass without colour
-        # Not Mitsuba's own start, which leaves the ray's line and loses light at the relief's edge.
-        along_ray = crossing.to_world(turned.wo)
-        ray = mi.Ray3f(crossing.p + along_ray * _CLEAR_MM, along_ray)
-    active &= ray.d.z < 0
-    landed = ray(-ray.o.z / ray.d.z)
-    return vectors(landed, places.shape[1]), host_values(mi.Float(mi.UInt32(active)) * part, places.shape[1])
