@@ -94,7 +94,7 @@ def test_an_instance_does_not_hide_itself(scene: Callable[..., Bench]) -> None:
             f'<point name="{name}" x="{x * scale}" y="{y * scale}" z="{(depth - z) * scale}"/>'
             for name, x, y, depth in ends
         )
-        return f'<shape type="cylinder">{points}<float name="radius" value="{0.5 * scale}"/>{MATT}</shape>'
+        return f'<shape type="cylinder">{points}<float name="radius" value="{1.5 * scale}"/>{MATT}</shape>'
 
     group = f"""<shape type="shapegroup" id="group">{rods(0.5, 300)}</shape><shape type="instance"><ref id="group"/>
         <transform name="to_world"><scale value="2"/><translate z="300"/></transform></shape>"""

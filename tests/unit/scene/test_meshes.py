@@ -75,25 +75,13 @@ EDGES = ["int vertex1", "int vertex2"]
 DIALECTS = {
     "plain": Dialect(),
     "line ends of Windows": Dialect(line_end="\r\n"),
-    "comments": Dialect(comments=["comment of two  words", "comment"]),
-    "double": Dialect(["double x", "double y", "double z"]),
     "another order": Dialect(["float q", *XYZ], before=(0.5,)),
     "colours of both": Dialect([*XYZ, *COLOUR], after=(255, 0, 0, 255), face_after=COLOUR),
-    "real colours of both": Dialect(
-        [*XYZ, "float r", "float g", "float b"], after=(0.1, 0.2, 0.3), face_after=["float r", "float g", "float b"]
-    ),
     "normals": Dialect([*XYZ, "float nx", "float ny", "float nz"], after=(0, 0, 1)),
-    "texture coordinates u v": Dialect([*XYZ, "float u", "float v"], after=(0.1, 0.2)),
     "texture coordinates s t": Dialect([*XYZ, "float s", "float t"], after=(0.1, 0.2)),
     "flags before the corners": Dialect(face_before=["uchar flags"]),
-    "a face's x": Dialect(face_after=["float x"]),
     "short lists": Dialect(listed="uchar ushort vertex_index"),
-    "long lists": Dialect(listed="int uint vertex_indices"),
-    "bytes": Dialect(listed="char uchar vertex_indices"),
-    "no materials": Dialect(further=[("material", 2, ["uchar ambient_red"], [])]),
-    "edges after": Dialect(further=[("edge", 2, EDGES, [(0, 1)] * 3)]),
     "edges between": Dialect(further=[("edge", 1, EDGES, [(0, 1)] * 3)]),
-    "a camera before": Dialect(further=[("camera", 0, ["float fov", "double roll"], [(1.0, 2.0)])]),
     "faces first": Dialect(faces_first=True),
 }
 

@@ -47,7 +47,7 @@ def rendered(path: Path) -> tuple[float, float]:
 
 @pytest.mark.parametrize("plugin", [glass, grating, lensless], ids=lambda plugin: plugin.PLUGIN)
 def test_the_example_of_a_manual_loads(plugin: ModuleType, small_scene: Callable[..., Path]) -> None:
-    """As written; tests/unit/scene/test_vocabulary.py renders all plugins."""
+    """As written; tests/unit/scene/test_colours_of_scenes.py renders all plugins."""
     xml = example(plugin.__doc__ or "")
     assert f'type="{plugin.PLUGIN}"' in xml
     path = small_scene(extra="" if xml.startswith("<sensor") else BALL.format(xml) if xml.startswith("<bsdf") else xml)
