@@ -1,4 +1,4 @@
-"""A small scene for each plugin that a scene may have, and what a run of all verbs on it gave: for test_colours_of_scenes.
+"""A small scene for each plugin that a scene may have, and what a run of all verbs on it gave.
 
 ``python -m tests.vocabulary VARIANT FOLDER [NAMES]`` runs them all in one variant and prints one JSON object: for each
 plugin, as "tag type", a line for each verb that did not end with a finite frame.
