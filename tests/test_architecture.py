@@ -557,7 +557,7 @@ SIZES = {
     "light": (9, 1728),
     "metrics": (1, 81),
     "mitsim": (1, 26),
-    "optics": (8, 1827),
+    "optics": (8, 1812),
     "planner": (6, 1673),
     "reconstruct": (21, 5921),
     "report": (9, 2041),
@@ -565,7 +565,7 @@ SIZES = {
     "sensor": (5, 1193),
     "sessions": (4, 818),
     "studies": (22, 5256),
-    "transport": (20, 4213),
+    "transport": (20, 4204),
     "verbs": (1, 309),
     "version": (1, 1),
 }
