@@ -28,7 +28,6 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.report import CONVENTIONS, EQUAL_PEAK, label
 from mitsim.report.demo_page import BudgetRow, FamilyResult, Recovery, ReportData, Trust, build_report, verdict
 from mitsim.report.lit_scene import LitScene, Unexposed
-from mitsim.sensor.chain import Digital
 from mitsim.studies.framework.campaign import DEMO_FOLDERS, DEMO_PAGE, study_folder
 
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
@@ -124,7 +123,11 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
     with job.clock.stage("views"):
         view = pinhole_view(bench, load_recipe().board_reflectance, request.seed)
         count = len(shots.manifest.patterns.captures)
-        frames: dict[str, Any] = {f"{label('uniform')}, the only frame": _white(lit, factors)}
+        white = lit.rendered_frames(factors, bench.family("uniform"), light.seed)
+        (shot,), (even,) = white.family.shots, white.expected
+        exposer = white.exposer(white.seconds(EQUAL_PEAK))
+        shown = exposer.digital(exposer.shot_electrons(even, *shot.names), *shot.names)
+        frames: dict[str, Any] = {f"{label('uniform')}, the only frame": shown}
         for index in (0, count // 2):
             caption = f"frame {index + 1} of {count}" if count > 1 else "the only frame"
             frame, _ = read_frame(folder / "run" / frame_name(index))
@@ -183,12 +186,6 @@ def _compare(lit: LitScene, factors: Factors, name: str, shots: Capture | None) 
         rendered=rendered[times[EQUAL_PEAK]],
         by_exposure={convention: rendered[seconds].quality.psnr_db for convention, seconds in times.items()},
     )
-
-
-def _white(lit: LitScene, factors: Factors) -> Digital:
-    frames = lit.rendered_frames(factors, lit.bench.family("uniform"), lit.light.seed)
-    (shot,), (frame,), exposer = frames.family.shots, frames.expected, frames.exposer(frames.seconds(EQUAL_PEAK))
-    return exposer.digital(exposer.shot_electrons(frame, *shot.names), *shot.names)
 
 
 def _page(

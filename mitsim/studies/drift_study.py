@@ -273,8 +273,13 @@ class DriftStand:
         at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
         found = self._shadow(drift_projector(drift_mask(bench, at_rest), drift)) + _minus([best])
         if drift.vibration_um:
-            parts = [(self._shift(place * drift.vibration_um / 1e3), weight) for place, weight in _HERMITE]
-            found += _weigh(parts) + _minus(self._shadow(bench))
+            # The mean shadow of a normal motion along both axes at once.
+            shifted = [self._shift(place * drift.vibration_um / 1e3) for place, _ in _HERMITE]
+            for terms in zip(*shifted, strict=True):
+                sides = zip(*terms, strict=True)
+                left, right = (sum(w * one for (_, w), one in zip(_HERMITE, side, strict=True)) for side in sides)
+                found.append((np.asarray(left), np.asarray(right)))
+            found += _minus(self._shadow(bench))
         if drift.mask_rotation_mrad:
             found += self._turn(drift.mask_rotation_mrad / 1e3)
         rate = electrons_from_irradiance(
@@ -317,14 +322,6 @@ def squared_error(db: float) -> float:
 
 def _minus(terms: SeparableTerms) -> SeparableTerms:
     return [(-left, right) for left, right in terms]
-
-
-def _weigh(parts: list[tuple[SeparableTerms, float]]) -> SeparableTerms:
-    found: SeparableTerms = []
-    for index in range(len(parts[0][0])):
-        left, right = (sum(weight * terms[index][side] for terms, weight in parts) for side in (0, 1))
-        found.append((np.asarray(left), np.asarray(right)))
-    return found
 
 
 # -------- Each kind of drift alone: the decibels that it costs

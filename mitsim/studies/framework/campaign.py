@@ -300,7 +300,10 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
                 f"study merge: {part} is of another study or scope than {parts[0]}, or was measured by other versions "
                 f"than this one ({cut(str(head['versions']))}); run it again"
             )
-    scope = _scope(heads[0]["scope"], parts[0])
+    try:
+        scope = TypeAdapter(Scope).validate_python(heads[0]["scope"])
+    except ValidationError as error:
+        raise MitsimError(f"study merge: {parts[0]}: its scope cannot be read ({error.errors()[0]['msg']})") from error
     if study == ALL:
         for part in parts:
             for name in PAPER:
@@ -388,13 +391,6 @@ def _head(folder: Path) -> dict[str, Any]:
         if whole and (head["study"] == ALL or (folder / POINTS).is_dir()):
             return dict(head)
     raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
-
-
-def _scope(found: Any, part: Path | str) -> Scope:
-    try:
-        return TypeAdapter(Scope).validate_python(found)
-    except ValidationError as error:
-        raise MitsimError(f"study merge: {part}: its scope cannot be read ({error.errors()[0]['msg']})") from error
 
 
 # -------- Batches of points in, measured in processes of their own; findings out as they come

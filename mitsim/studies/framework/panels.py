@@ -89,19 +89,15 @@ class Panel:
 
     def draw(self, results: Results) -> dict[str, Figure]:
         rows = choose_rows(results.frame, self.where)
+        measure = str(getattr(self, "y", getattr(self, "x", ""))).removesuffix("_db") or "images"
         drawn: dict[str, Figure | None] = {}
         for value in distinct(rows, self.each) if self.each else [""]:
             shown = f"exposure {value}" if self.each == "exposure" else self.name(self.each, value)
             one = replace(self, title=", ".join(filter(None, (self.title, shown))))
-            name = "_".join(filter(None, (self.file or self._file, str(value)))).replace(" ", "_").replace(":", "")
+            name = "_".join(filter(None, (self.file or measure, str(value)))).replace(" ", "_").replace(":", "")
             own = choose_rows(rows, {self.each: value} if self.each else {})
             drawn[f"{name}.png"] = one.figure(results, own)
         return {name: figure for name, figure in drawn.items() if figure is not None}
-
-    @property
-    def _file(self) -> str:
-        shown = getattr(self, "y", getattr(self, "x", ""))
-        return str(shown).removesuffix("_db") or "images"
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         raise NotImplementedError
@@ -250,21 +246,19 @@ class Pivot(Panel):
         chosen, found = choose_rows(results.frame, self.where), []
         for value in distinct(chosen, self.each) if self.each else [None]:
             own = choose_rows(chosen, {} if value is None else {self.each: value})
-            heads = list(self.parts(own, self.columns))
-            lines = []
+            heads, lines = list(self.parts(own, self.columns)), []
             for name, (line, _) in self.parts(own, self.rows).items():
-                cells = self.parts(line, self.columns)
-                shown = ((cells[head][0], cells[head][1] or self.value) if head in cells else None for head in heads)
-                lines.append((name, *(_mean_text(*each) if each else DASH for each in shown)))
+                cells, texts = self.parts(line, self.columns), []
+                for head in heads:
+                    rows, column = cells.get(head, (line[:0], ""))
+                    column = column or self.value
+                    known = column in rows and bool(rows[column].notna().any())
+                    unit = "dB" if column.endswith("_db") else ""
+                    texts.append(with_unit(mean_of(rows, column), unit).removesuffix(" dB") if known else DASH)
+                lines.append((name, *texts))
             title = ", ".join(filter(None, (self.title, "" if value is None else self.name(self.each, value))))
             found += [Part(title, "", ("", *heads), tuple(lines))] if lines else []
         return found
-
-
-def _mean_text(rows: DataFrame, column: str) -> str:
-    if column not in rows or rows[column].isna().all():
-        return DASH
-    return with_unit(mean_of(rows, column), "dB" if column.endswith("_db") else "").removesuffix(" dB")
 
 
 _MOST_SHOWN = 6

@@ -97,8 +97,6 @@ def test_claims_for_each_value_and_for_every_value() -> None:
     assert [(claim.claim, claim.verdict) for claim in each] == [
         ("At 390 mm dots are better", "confirmed"), ("At 400 mm dots are better", "not confirmed")
     ]  # fmt: skip
-    (every,) = Gain("Dots are better", "dots:7", "uniform", every="depth").judge(results)
-    assert every.verdict == "not confirmed" and every.idealised == "" and every.rendered.startswith("390: 34.0")
     (level,) = Level("Images are good", where="uniform", at_least=10.0).judge(results)
     assert level.verdict == "confirmed"
 

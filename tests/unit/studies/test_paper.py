@@ -16,7 +16,6 @@ from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, batches, run_experiment
 from mitsim.studies.framework.claims import UNDECIDED, Judged, Statement, stated
 from mitsim.studies.framework.experiment import (
-    IMAGE,
     Claim,
     Point,
     Results,
@@ -26,7 +25,7 @@ from mitsim.studies.framework.experiment import (
     measures_of,
     values_of,
 )
-from mitsim.studies.framework.panels import Images, flag_warnings, section_of, write_page
+from mitsim.studies.framework.panels import flag_warnings, section_of, write_page
 from mitsim.studies.light_studies import ERROR_SOURCES
 
 TIMES = "\N{MULTIPLICATION SIGN}"
@@ -122,20 +121,6 @@ def test_verdicts(peak: str, frame: str, verdict: str) -> None:
              for model, sign in zip(MODELS, two, strict=True)}  # fmt: skip
     claim = Judged("", lambda rows: ("", signs[rows["model"].iloc[0], rows["exposure"].iloc[0]]))
     assert judged(claim, **{f"{model}__{name}": 0.0 for model, name in signs}).verdict == verdict
-
-
-def test_images_are_those_of_their_rows() -> None:
-    """Rows that are alike in all columns but one; a row of the grid with an image missing is left out. (Planted: the
-    first image of the table.)"""
-    rows = [{"point": f"{name}{number}", "kind": name, "number": number} for name in "ab" for number in (1, 2)]
-    arrays = {(str(row["point"]), IMAGE): np.full((2, 2), index) for index, row in enumerate(rows)}
-    del arrays["b1", IMAGE]
-    grid = Images("number", columns=(2, 1), down=("kind",), caption="number {number}")
-    cells = grid.draw(Results(rows, arrays))["images.png"].axes
-    assert [axes.get_ylabel() for axes in cells] == ["a", ""]
-    assert [(float(axes.images[0].get_array()[0, 0]), axes.get_xlabel()) for axes in cells] == [
-        (lightness(np.array(1.0)), "number 2"), (0, "number 1")
-    ]  # fmt: skip
 
 
 def test_a_page_says_how_many_images_are_flagged_and_what_for() -> None:
