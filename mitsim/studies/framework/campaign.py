@@ -287,6 +287,12 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
     started, heads = time.perf_counter(), [_head(Path(part)) for part in parts]
     if not heads:
         raise MitsimError("study merge: give the folders of the parts")
+    for part, head in zip(parts, heads, strict=True):
+        if any(head[key] != heads[0][key] for key in ("study", "scope")) or head["versions"] != versions():
+            raise MitsimError(
+                f"study merge: {part} is of another study or scope than {parts[0]}, or was measured by other versions "
+                f"than this one ({cut(str(head['versions']))}); run it again"
+            )
     study, known = heads[0]["study"], (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)
     if not isinstance(study, str) or study not in known:
         instead = "none that ships" if experiment is None else f"not {experiment}"
@@ -294,12 +300,6 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
             f"study merge: {parts[0]} is of the study {cut(str(study))!r}, {instead}; a study of your own is merged by "
             "its name, --experiment MODULE"
         )
-    for part, head in zip(parts, heads, strict=True):
-        if any(head[key] != heads[0][key] for key in ("study", "scope")) or head["versions"] != versions():
-            raise MitsimError(
-                f"study merge: {part} is of another study or scope than {parts[0]}, or was measured by other versions "
-                f"than this one ({cut(str(head['versions']))}); run it again"
-            )
     try:
         scope = TypeAdapter(Scope).validate_python(heads[0]["scope"])
     except ValidationError as error:
