@@ -373,10 +373,6 @@ def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output
     }
 
 
-def total_of_lines(payload: Mapping[str, Any]) -> str:
-    return f"{len(payload['channels'])} lines in {payload['seconds']['total']:.1f} s: {payload['output']}"
-
-
 def memory_line(payload: Mapping[str, Any]) -> str:
     """Return the line on the memory that a capture or calibration used."""
     taken = f"Memory {payload['memory_bytes'] / 2**30:.2g} GiB"
@@ -396,25 +392,19 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
     def frames(part: Mapping[str, Any]) -> str:
         return f"{part['frames']} frames of {part['shape'][0]}x{part['shape'][1]}"
 
-    def errors(part: Mapping[str, Any], first: str) -> str:
-        bound, seconds = part["total_error_bound"], part["exposure_s"]
-        return f"{first} {part['mc_error']:.1e}, total error up to {bound:.1e}, exposure {seconds:.3g} s a frame"
-
-    taken, lines = payload["seconds"], list[str]()
+    taken = payload["seconds"]
     if payload.get("kind") == RUN:
-        each = (f"{part['name']}: {frames(part)}, {errors(part, 'Monte Carlo error')}" for part in payload["channels"])
-        lines = [total_of_lines(payload), *each, *_kernel_lines(payload["kernels"])]
-    elif "mosaic" in payload:
-        count = len(payload["channels"])
-        lines = [
-            f"{frames(payload)} behind {payload['mosaic']} filters, {count} lines at once, in {taken['total']:.1f} s: "
-            f"{payload['output']}",
-            errors(payload, "Monte Carlo error at most"),
-        ]
+        lines = [f"{len(payload['channels'])} lines in {taken['total']:.1f} s: {payload['output']}"]
+        for part in payload["channels"]:
+            lines.append(
+                f"{part['name']}: {frames(part)}, Monte Carlo error {part['mc_error']:.1e}, total error up to "
+                f"{part['total_error_bound']:.1e}, exposure {part['exposure_s']:.3g} s a frame"
+            )
     else:
         stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in taken.items() if name != "total")
+        behind = f" behind {payload['mosaic']} filters" if "mosaic" in payload else ""
         lines = [
-            f"{frames(payload)} in {taken['total']:.1f} s: {payload['output']}",
+            f"{frames(payload)}{behind} in {taken['total']:.1f} s: {payload['output']}",
             f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
             f"exposure {payload['exposure_s']:.3g} s a frame",
             *common.details(
@@ -422,8 +412,8 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
                 f"Seconds: {stages}",
                 memory_line(payload),
             ),
-            *_kernel_lines(payload["kernels"]),
         ]
+    lines += _kernel_lines(payload["kernels"])
     if ambient := payload.get("ambient_frame"):
         lines.append(
             f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "

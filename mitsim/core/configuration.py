@@ -335,14 +335,9 @@ class Options(BaseModel):
 
     def refuse(self, names: Iterable[str], where: str) -> None:
         """Refuse given options that have no effect under the condition ``where``."""
-        refuse_unused(self.model_fields_set, names, where)
-
-
-def refuse_unused(given: Iterable[str], names: Iterable[str], where: str) -> None:
-    """Raise ArgumentError for the first given option that has no effect under the condition ``where``."""
-    for name in names:
-        if name in given:
-            raise ArgumentError(name, f"has no effect {where}; leave it out")
+        for name in names:
+            if name in self.model_fields_set:
+                raise ArgumentError(name, f"has no effect {where}; leave it out")
 
 
 def limits_of(field: FieldInfo) -> str:

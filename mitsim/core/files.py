@@ -27,8 +27,8 @@ _KINDS = {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFIFO: "a n
 _LONGEST_HEAD = 1 << 20
 FRAMES, PARTS = "frame_*.exr", "*.part.npz"
 """Files that an unfinished capture or calibration has completed."""
-PAIRS, SHARDS = "pairs.json", "pairs_*.h5"
-"""Manifest of a store of pairs, and files that an unfinished store has completed."""
+PAIRS = "pairs.json"
+"""Manifest of a store of pairs."""
 
 
 @contextmanager
@@ -119,8 +119,8 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
         except OSError as error:
             raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
         if occupied and not overwrite:
-            left = _unfinished_work(path) or "; choose a new one or empty it"
-            raise MitsimError(f"output {path}: the folder holds files already{left}")
+            remedy = "go on with resume=True" if _is_unfinished(path) else "choose a new one or empty it"
+            raise MitsimError(f"output {path}: the folder holds files already; {remedy}")
     # Permission bits do not show everything (root, read-only mounts, quotas): only a file that was really written does.
     try:
         with tempfile.TemporaryFile(dir=place) as file:
@@ -248,19 +248,14 @@ def _lock(path: Path, name: Path) -> Iterator[None]:
         lock.release()
 
 
-def _unfinished_work(folder: Path) -> str:
-    """Return the number of files that a killed work finished and how to resume it, or an empty text."""
+def _is_unfinished(folder: Path) -> bool:
+    """Return True if a killed work left its manifest in a ``folder``, so that it can be resumed."""
     try:
-        name = PAIRS if (folder / PAIRS).is_file() else "manifest.json"
-        manifest = json.loads(read_text(folder / name, _LONGEST_HEAD))
+        path = folder / (PAIRS if (folder / PAIRS).is_file() else "manifest.json")
+        manifest = json.loads(read_text(path, _LONGEST_HEAD))
     except (MitsimError, ValueError, RecursionError):
-        return ""
-    if not isinstance(manifest, dict) or manifest.get("status") != "incomplete":
-        return ""
-    kind = manifest.get("kind")
-    finished = {"calibration": ("parts", PARTS), "pairs": ("shards", SHARDS)}
-    name, pattern = finished.get(str(kind), ("frames", FRAMES))
-    return f": an unfinished {kind} with {len([*folder.glob(pattern)])} finished {name}; go on with resume=True"
+        return False
+    return isinstance(manifest, dict) and manifest.get("status") == "incomplete"
 
 
 # -------- JSON files

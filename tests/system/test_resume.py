@@ -35,9 +35,8 @@ def interrupted(killed: Path, tmp_path: Path) -> Path:
 def test_a_killed_run_is_no_run(refused: Callable[..., str], lab: Any, interrupted: Path) -> None:
     line = refused("reconstruct", "run", "--calibration", lab.calibration)
     assert "run: the capture is incomplete" in line and "--resume" in line
-    frames = len(list(interrupted.glob("frame_*.exr")))
     line = refused("capture", *lab.arguments, "-o", "run", "--patterns", PATTERNS)
-    assert "run: the folder holds files already" in line and f"{frames} finished frames" in line
+    assert "run: the folder holds files already" in line
     assert "go on with --resume" in line and "empty" not in line, "emptying it would throw the frames away"
 
 

@@ -110,7 +110,7 @@ def test_an_unfinished_calibration_is_not_to_be_emptied(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text('{"kind": "calibration", "status": "incomplete"}')
     (tmp_path / "left.exr").touch()
     (tmp_path / "responses.part.npz").touch()
-    with pytest.raises(MitsimError, match="an unfinished calibration with 1 finished parts; go on with resume=True"):
+    with pytest.raises(MitsimError, match="holds files already; go on with resume=True"):
         files.prepare_output(tmp_path)
     for text in ("{", "[" * 100_000, "[1]", '{"status": "complete"}'):
         (tmp_path / "manifest.json").write_text(text)

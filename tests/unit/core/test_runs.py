@@ -129,7 +129,7 @@ def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
     with claim_run(run, RunHead.of(CONFIGURATION), resume=True) as again:
         again.begin()
     with (
-        pytest.raises(MitsimError, match="unfinished capture with 8 finished frames; go on with resume=True"),
+        pytest.raises(MitsimError, match="holds files already; go on with resume=True"),
         claim_run(run, RunHead.of(CONFIGURATION), resume=False),
     ):
         pass
