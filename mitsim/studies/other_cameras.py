@@ -87,30 +87,19 @@ def ideal_places(bench: Apparatus, places_mm: Iterable[float], board_flux: float
 def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, accuracy: float = 1e-3) -> Places:
     """Return factors as sessions with the mask at each place estimate them, all in one board's light.
 
-    A mask that has moved along both axes determines the left factor of its row and the right one of its column. The
-    sensor's noise is added to factors in closed form (:func:`mitsim.reconstruct.factors.predicted_error`), because
-    noisy frames take four times as long.
+    A mask that has moved along both axes determines the left factor of its row and the right one of its column.
     """
     recipe, job = load_recipe(), Job()
     session = Session(bench, recipe, seed)
     light = session.trace(session.plan(accuracy, job), job)
 
     def lit(row: float, column: float) -> LitSession:
-        own = Session(move_mask(bench, row, column), recipe, seed)
+        own = Session(move_mask(bench, row, column), recipe, integer(seed, "mask", f"{row:g}", f"{column:g}"))
         return LitSession.of(own, light.behind(own.board), Job())
 
-    def calibrate(place: float) -> Pair:
-        own = lit(place, place)
-        clean, _ = estimate(own, Job(), noise_free=True)
-        count, sides = np.sqrt(session.signs.shape[1]), (clean.left, clean.right)
-        noisy = []
-        for name, side, other in zip(("left", "right"), sides, sides[::-1], strict=True):
-            deviation = own.response_noise / (count * np.linalg.norm(other.sum(axis=1)))
-            noise = stream(seed, "mask", name, f"{place:g}").standard_normal(side.shape)
-            noisy.append(side + deviation * noise)
-        return noisy[0], noisy[1]
-
-    return _consistent({place: calibrate(place) for place in places_mm}, bench, lambda *at: lit(*at).white)
+    found = {place: estimate(lit(place, place), Job())[0] for place in places_mm}
+    sides = {place: (factors.left, factors.right) for place, factors in found.items()}
+    return _consistent(sides, bench, lambda *at: lit(*at).white)
 
 
 def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float], Frame]) -> Places:

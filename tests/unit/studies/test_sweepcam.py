@@ -10,11 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.calibrate.board_session import Session
-from mitsim.calibrate.calibrate import estimate
-from mitsim.calibrate.lit_session import LitSession
-from mitsim.core.job import Job
-from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS
 from mitsim.report.lit_scene import IdealCamera, LitScene
@@ -130,19 +125,6 @@ def test_exposures_are_the_familys(lit: dict[str, LitScene]) -> None:
     uniform = lit["separable"].uniform_s(IDEALISED)
     assert mask.seconds(PLACES, PLACES, EQUAL_FRAME) == uniform
     assert 0.25 * uniform < mask.seconds(PLACES, PLACES, EQUAL_PEAK) <= uniform
-
-
-def test_factors_have_the_noise_of_a_session(lit: dict[str, LitScene]) -> None:
-    """Root mean square over 2 x 64 x 16 numbers, held against a session of noisy frames at the same place: each
-    scatters by 1 / sqrt(4096) = 1.6 %; 10 % for shot noise that follows the light. (Planted: sqrt(N) left out; the
-    factor's own sum for the other's.)"""
-    bench = lit["separable"].bench
-    ((left, right),) = calibrated_places(bench, [0.42], 3).values()
-    session = Session(move_mask(bench, 0.42, 0.42), load_recipe(), 3)
-    frames = LitSession.of(session, session.trace(session.plan(1e-3, Job()), Job()), Job())
-    noisy, clean = (estimate(frames, Job(), noise_free=free)[0] for free in (False, True))
-    for ours, theirs, exact in ((left, noisy.left, clean.left), (right, noisy.right, clean.right)):
-        assert np.std(ours - exact) == pytest.approx(np.std(theirs - exact), rel=0.1)
 
 
 def test_how_a_session_shares_its_product_does_not_matter(lit: dict[str, LitScene]) -> None:
