@@ -252,8 +252,8 @@ def trace_lines(
 
 
 @single_threaded_blas()
-def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "scene") -> SampledLight:
-    groups = Group.all_of(simulation, light.labels, light.seed, purpose)
+def traced_again(light: SampledLight, simulation: Simulation) -> SampledLight:
+    groups = Group.all_of(simulation, light.labels, light.seed, "scene")
     trace_groups(groups, light.samples)
     estimates = tuple(group.light() for group in groups)
     return replace(light, groups=estimates, simulation=simulation, flux=np.mean(_flux(estimates, light.flux), axis=0))

@@ -103,7 +103,7 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[LossRow]:
     sampled = sum((noise for (_, name), noise in noises.items() if name == RENDERING), Noise())
     drawn = sum(noises.values(), Noise()) - sampled
     # Images of the scene's light without noise: whole, and without one cause after another.
-    ablation, off, seen = Ablation.of(light), frozenset[str](), [stand.clear(clear, light)]
+    ablation, off, seen = Ablation(light), frozenset[str](), [stand.clear(clear, light)]
     removed = [name for name in ERROR_SOURCES if name in ablation.effects]
     for name in removed:
         off |= {name}

@@ -107,54 +107,67 @@ _IN_PLACE = 1e-3
 
 
 class Ablation:
-    """Light from which any of its effects can be removed; retraced light is kept.
+    """Light from which any of its effects can be removed; retraced light is kept."""
 
-    Parameters
-    ----------
-    exact, board
-        (n^2,) direct light of each projector pixel on the sensor according to the truth, and over a white board
-        [W m^-2].
-    purpose
-        purpose of the light, which names its random streams.
-    """
-
-    def __init__(self, light: SampledLight, exact: FloatArray, board: FloatArray, purpose: str = "scene") -> None:
-        self.light, self._exact, self._purpose = light, exact, purpose
+    def __init__(self, light: SampledLight) -> None:
+        truth, bench, simulation = light.apparent, light.bench, light.simulation
+        board, settings, physics = truth.board_flux, simulation.settings, simulation.physics
+        self.light, self._exact = light, truth.reflectance.ravel() * board  # direct light by the truth [W m^-2]
         self._even = np.divide(board.mean(), board, out=np.ones_like(board), where=board > 0)
         self._kept: dict[tuple[bool, frozenset[str]], SampledLight] = {}
-        self._simulated = lru_cache(maxsize=_SIMULATIONS)(lambda settings: Simulation(light.bench, settings))
-        self.effects = tuple(name for name, present in _present(light).items() if present)
-
-    @classmethod
-    def of(cls, light: SampledLight) -> Ablation:
-        truth = light.apparent
-        return cls(light, truth.reflectance.ravel() * truth.board_flux, truth.board_flux)
+        self._simulated = lru_cache(maxsize=_SIMULATIONS)(lambda settings: Simulation(bench, settings))
+        samples = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
+        pixel = np.array([(last - first) / bench.n for first, last in bench.windows])
+        aside = np.abs(_Place(bench).parallax(samples)) / pixel[:, None]
+        present = {
+            FALLOFF: True,
+            DIFFRACTION: physics.spectrum is not None,
+            KEYSTONE: bench.loaded.pixels.keystone > 0,
+            DEPTH: bool(aside.size and aside.max() > _IN_PLACE),
+            OCCLUSION: bool(settings.with_own_anchors),
+            DETAIL: settings.subdivision > 1,
+            INTERREFLECTION: physics.interreflection and any(group["indirect"].nnz for group in light.groups),
+            MIRRORS: physics.mirrors,
+            GLOSS: bench.loaded.glossy and (settings.anchors > 1 or settings.sharp is not None),
+            AMBIENT: bool(physics.lamps),
+            BLACK_LEVEL: physics.black_level > 0,
+            DEFOCUS: not physics.projector.ideal,
+            SPECKLE: physics.speckle > 0,
+            RENDER_NOISE: True,
+        }
+        self.effects = tuple(name for name, there in present.items() if there)
 
     def without(self, off: frozenset[str]) -> SampledLight:
         off &= frozenset(self.effects)
         if not off:
             return self.light
         bench, moved = self.light.bench, off & _MOVED
+        brightness = self._even if FALLOFF in off else np.ones_like(self._even)
+        absent = _FURTHER.union(*(REGISTERED.get(name, frozenset()) for name in off))
         # Light over mirrors lies among direct light, and only tracing separates them.
         direct = self._trace(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
         share = self.light.simulation.physics.projector.share  # the truth has no glare
         flux = share * self._exact if RENDER_NOISE in off else self.light.flux
         by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
-        groups = tuple(_scale(group, np.append(by_pixel * self._brightness(off), 0.0)) for group in direct.groups)
+        groups = tuple(_scale(group, np.append(by_pixel * brightness, 0.0)) for group in direct.groups)
         if GLOSS in off:
             sharp = (_even_lobes(group["sharp"], direct.simulation) for group in groups)
             groups = tuple(group.with_light({"sharp": own}) for group, own in zip(groups, sharp, strict=True))
-        simulation = self._simulated(_form_settings(direct.simulation.settings, off, bench.loaded.glossy))
+        settings = direct.simulation.settings
+        formed = replace(
+            settings, effects=settings.effects - absent, occluded=() if OCCLUSION in off else settings.occluded,
+            anchors=1 if (GLOSS if bench.loaded.glossy else FALLOFF) in off else settings.anchors, followed_anchors=1,
+        )  # fmt: skip
         own = {field.name: getattr(self.light, field.name) for field in fields(SampledLight)}
-        own |= {"groups": groups, "simulation": simulation}
-        return AblatedLight(**own, whole=self.light, rest=self._rest(off))
+        own |= {"groups": groups, "simulation": self._simulated(formed)}
+        return AblatedLight(**own, whole=self.light, rest=self._rest(off, brightness))
 
-    def _rest(self, off: frozenset[str]) -> SampledLight | None:
+    def _rest(self, off: frozenset[str], brightness: FloatArray) -> SampledLight | None:
         light, settings = self.light, self.light.simulation.settings
         effects = settings.effects - frozenset[str]().union(*(REGISTERED.get(name, frozenset()) for name in off))
         if not effects & _FURTHER:
             return None
-        brightness = np.append(self._brightness(off), 1.0)
+        brightness = np.append(brightness, 1.0)
         if MIRRORS in self.effects:
             light = self._trace(direct=False, off=off & {MIRRORS})
             groups = tuple(_scale(group, brightness) for group in light.groups)
@@ -165,9 +178,6 @@ class Ablation:
             )
         plain = replace(settings, anchors=1, sharp=None, occluded=(), effects=effects)
         return replace(light, groups=groups, simulation=self._simulated(plain))
-
-    def _brightness(self, off: frozenset[str]) -> FloatArray:
-        return self._even if FALLOFF in off else np.ones_like(self._even)
 
     def _trace(self, direct: bool, off: frozenset[str]) -> SampledLight:
         if (direct, off) not in self._kept:
@@ -182,9 +192,7 @@ class Ablation:
             if DEPTH in off:
                 settings = replace(settings, depth=bench.geometry.scene_distance, layers=())
             settings = replace(settings, effects=settings.effects - absent)
-            self._kept[direct, off] = traced_again(
-                self.light, _AblationSimulation(bench, settings, direct, own), self._purpose
-            )
+            self._kept[direct, off] = traced_again(self.light, _AblationSimulation(bench, settings, direct, own))
         return self._kept[direct, off]
 
 
@@ -288,42 +296,6 @@ class _Place:
 def _project(homography: FloatArray, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
     first, second, scale = homography @ np.stack([row, column, np.ones_like(row)])
     return first / scale, second / scale
-
-
-def _present(light: SampledLight) -> dict[str, bool]:
-    bench, settings, physics = light.bench, light.simulation.settings, light.simulation.physics
-    return {
-        FALLOFF: True,
-        DIFFRACTION: physics.spectrum is not None,
-        KEYSTONE: bench.loaded.pixels.keystone > 0,
-        DEPTH: _off_plane(light),
-        OCCLUSION: bool(settings.with_own_anchors),
-        DETAIL: settings.subdivision > 1,
-        INTERREFLECTION: physics.interreflection and any(group["indirect"].nnz for group in light.groups),
-        MIRRORS: physics.mirrors,
-        GLOSS: bench.loaded.glossy and (settings.anchors > 1 or settings.sharp is not None),
-        AMBIENT: bool(physics.lamps),
-        BLACK_LEVEL: physics.black_level > 0,
-        DEFOCUS: not physics.projector.ideal,
-        SPECKLE: physics.speckle > 0,
-        RENDER_NOISE: True,
-    }
-
-
-def _off_plane(light: SampledLight) -> bool:
-    bench, simulation = light.bench, light.simulation
-    path_samples = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
-    size = [(last - first) / bench.n for first, last in bench.windows]
-    aside = np.abs(_Place(bench).parallax(path_samples)) / np.array(size)[:, None]
-    return bool(aside.size and aside.max() > _IN_PLACE)
-
-
-def _form_settings(settings: Settings, off: frozenset[str], glossy: bool) -> Settings:
-    absent = _FURTHER.union(*(REGISTERED.get(name, frozenset()) for name in off))
-    anchors = 1 if (GLOSS if glossy else FALLOFF) in off else settings.anchors
-    occluded = () if OCCLUSION in off else settings.occluded
-    effects = settings.effects - absent
-    return replace(settings, effects=effects, anchors=anchors, occluded=occluded, followed_anchors=1)
 
 
 def _even(path_samples: PathSamples, pixels: int) -> PathSamples:

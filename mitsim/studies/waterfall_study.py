@@ -47,7 +47,7 @@ class Levels:
     """Images of a scene with any of its effects, by the factors of the idealised camera."""
 
     def __init__(self, lit: LitScene, patterns: str, seed: int) -> None:
-        self.lit, self._patterns, self._seed, self._ablation = lit, patterns, seed, Ablation.of(lit.light)
+        self.lit, self._patterns, self._seed, self._ablation = lit, patterns, seed, Ablation(lit.light)
         bench = lit.bench
         sides = IdealCamera(bench, bench.geometry.mask).calibrated(float(lit.light.apparent.board_flux.mean()))
         manifest = CalibrationManifest(camera=bench.identity(), centre=bench.geometry.centred, parallax=bench.parallax)

@@ -167,7 +167,7 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     errors = {(): 0.1, (causes.DEPTH,): 0.08, (causes.DEPTH, causes.GLOSS): 0.05}
     off = {names: size * RNG.standard_normal((N, N)) for names, size in errors.items()}
     ablation = SimpleNamespace(effects=effects, without=lambda names: tuple(sorted(names)))
-    monkeypatch.setattr(module.Ablation, "of", lambda light: ablation)
+    monkeypatch.setattr(module, "Ablation", lambda light: ablation)
     monkeypatch.setattr(module, "noises_of", lambda *_: noises)
     fixed = {"response": 0.1 * RNG.standard_normal((N, N)), "offsets": 0.1 * RNG.standard_normal((N, N))}
     linear = LinearImage(left, right, parse_patterns("dots:2", N), 0.1)
