@@ -564,7 +564,7 @@ SIZES = {
     "scene": (6, 1407),
     "sensor": (5, 1193),
     "sessions": (4, 818),
-    "studies": (22, 5248),
+    "studies": (22, 5229),
     "transport": (20, 4204),
     "verbs": (1, 309),
     "version": (1, 1),
