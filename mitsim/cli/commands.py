@@ -168,11 +168,15 @@ class Pictured(Common):
         """
 
         def make() -> dict[str, Any]:
-            from mitsim.report.pages import write_beside
+            from mitsim.report.pages import Picture, Scale
 
-            started = time.perf_counter()
-            file, words = write_beside(*frame)
-            return {"file": str(file), "shows": words, "seconds": time.perf_counter() - started}
+            start, (path, values, unit) = time.perf_counter(), frame
+            drawn = Picture.of(path.name, path.name, values, Scale.of(values, unit))
+            return {
+                "file": str(drawn.write(path.parent)),
+                "shows": drawn.caption,
+                "seconds": time.perf_counter() - start,
+            }
 
         made, failed = self._attempt(make, "the frame is kept")
         said = [] if made is None else [f"picture {made['file']}: {made['shows']}"]

@@ -17,12 +17,12 @@ from mitsim.core.files import MOST_SIDE, check_plain
 if TYPE_CHECKING:
     import numpy as np
 
-FORMATS = (".png", ".tif", ".tiff", ".npy", ".exr", ".dng")
+FORMATS = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Formats whose header describes the content."""
 JPEG = (".jpg", ".jpeg")
 """Pictures that are not read as frames."""
-PRINTS = (*FORMATS[:-1], *JPEG)
-"""Formats of pictures for prints: all but raw files of cameras."""
+PRINTS = (*FORMATS, *JPEG)
+"""Formats of pictures for prints."""
 BARE = (".raw", ".bin", ".dat")
 """Formats without a header."""
 _Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
@@ -37,8 +37,6 @@ BGGR = "BGGR"
 """Default mosaic, FlatCam's."""
 CORRECTIONS = "dark", "flat", "flat_dark"
 """Fields of a preparation that are paths of frames."""
-TO_FILE = "file"
-"""The orientation that a file states."""
 _LARGEST_TURN = 45.0
 """Degrees; beyond, no corner of the picture would remain."""
 _LARGEST_FACTOR = 1 << 24
@@ -115,9 +113,8 @@ class Preparation(Configuration):
     """Plane of the mosaic, or `all`; none: the picture is no mosaic."""
     wavelengths_nm: Annotated[tuple[_Wavelength, ...], Field(strict=False, min_length=3, max_length=3)] = WAVELENGTHS_NM
     """Wavelengths of red, green and blue planes in a colour image [nm]."""
-    orientation: Literal["file", 1, 2, 3, 4, 5, 6, 7, 8] | None = None
-    """Rotation of the picture or plane: an orientation of Exif and TIFF, or `file` for the stated one; none: not
-    rotated, and a file that states a rotation is refused."""
+    orientation: Literal[1, 2, 3, 4, 5, 6, 7, 8] | None = None
+    """Rotation of the picture or plane, as Exif and TIFF number it; none: not rotated."""
     turn_deg: float = Field(default=0.0, ge=-_LARGEST_TURN, le=_LARGEST_TURN)
     """Angle of a further counter-clockwise rotation [degrees], by bilinear interpolation."""
     turn_about: Literal["centre", "corner"] = "centre"
@@ -129,8 +126,6 @@ class Preparation(Configuration):
     def _is_whole(self) -> Preparation:
         if self.mosaic is not None and self.channel is None:
             raise ValueError("mosaic is of planes; give channel too")
-        if self.channel is not None and self.orientation == TO_FILE:
-            raise ValueError("orientation 'file' would exchange the mosaic's colours; give the number, 1 to 8")
         if self.flat_dark is not None and self.flat is None:
             raise ValueError("flat_dark is taken off a flat; give flat too")
         return self
@@ -162,10 +157,6 @@ class Wanted:
         Allowed bits of PNG and TIFF; frames exclude 2 and 4, which Pillow scales to 0 to 255.
     raw
         Layout of files without a header; None: such files are refused.
-    orientation
-        Treatment of pictures with an orientation. None: refused; `file`: turned as stated; a number: read as stored.
-    mosaic
-        Colour filters of the frames, or None; a file that states others is refused.
     """
 
     what: str = "frame"
@@ -173,12 +164,6 @@ class Wanted:
     bits: Sequence[int] = (8, 16, 32)
     colour: bool = False
     raw: Raw | None = None
-    orientation: Literal["file", 1, 2, 3, 4, 5, 6, 7, 8] | None = None
-    mosaic: str | None = None
-
-    @classmethod
-    def of(cls, raw: Raw | None, how: Preparation) -> Wanted:
-        return cls(raw=raw, orientation=how.orientation, mosaic=how.mosaic)
 
     def refusal(self, path: Path, reason: str) -> MitsimError:
         return MitsimError(f"{self.what} {path}: {reason}")

@@ -1,7 +1,7 @@
-"""Numbers of pictures (PNG, TIFF, NPY, OpenEXR, DNG and bare numbers), and PNG and HTML for people.
+"""Numbers of pictures (PNG, TIFF, NPY, OpenEXR and bare numbers), and PNG and HTML for people.
 
-Nothing is scaled, inverted or converted to grey, and a picture is turned only on request; a file whose numbers the
-library would change is refused. Files are never mapped, because a mapped file that is cut short ends the process.
+Nothing is scaled, inverted, turned or converted to grey; a file whose numbers the library would change is refused.
+Files are never mapped, because a mapped file that is cut short ends the process.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import npy_header
-from mitsim.core.errors import MitsimError, cut, reason_of
-from mitsim.core.files import FRAME_LIMITS, check_plain, fits_a_frame, stderr_silenced
-from mitsim.core.imagelist import BARE, FORMATS, FRAME, TO_FILE, Wanted
+from mitsim.core.errors import MitsimError, reason_of
+from mitsim.core.files import FRAME_LIMITS, check_plain, fits_a_frame
+from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
 from mitsim.core.job import Cost, Limits
 
 # -------- Pictures of other programs
@@ -50,8 +50,6 @@ _PIXEL_BYTES = 24
 """Memory of a pixel while a page is read and checked; measured: at most 21, for a PNG of 16 bits."""
 _BLACK_IS_ZERO, _RGB = 1, 2
 """PhotometricInterpretation of TIFF; 0 (refused) stores black as the largest number."""
-_FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}
-"""TIFF orientations by LibRaw's flip."""
 _CHANNEL = "DN"
 
 
@@ -141,23 +139,14 @@ def _png(path: Path, wanted: Wanted) -> _Reader:
             raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
         # Some versions of Pillow give 16 bits of a PNG as 32.
         values = np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
-        stated = picture.getexif().get(_ORIENTATION, _UPRIGHT)  # which a PNG may say behind its pixels
-        yield _upright(path, values, stated, wanted)
+        _check_upright(path, picture.getexif().get(_ORIENTATION, _UPRIGHT), wanted)  # perhaps behind its pixels
+        yield values
 
 
-def _upright(path: Path, values: Numbers, stated: Any, wanted: Wanted) -> Numbers:
-    """Turn a picture as ``wanted``; MitsimError if it states an orientation and no choice was made."""
-    if wanted.orientation is None and stated != _UPRIGHT:
-        raise wanted.refusal(
-            path,
-            f"has the orientation {stated}: it is to be shown turned or mirrored; save it as it is to be read"
-            + ("" if wanted.colour else ", or give --orientation file to turn it so, or 1 to read it as it is stored"),
-        )
-    if wanted.orientation != TO_FILE:
-        return values
-    if stated not in _TURNS:
-        raise wanted.refusal(path, f"has the orientation {stated}; there are 1 to 8, so give the one that is meant")
-    return orient(values, stated)
+def _check_upright(path: Path, stated: Any, wanted: Wanted) -> None:
+    if stated != _UPRIGHT:
+        problem = f"has the orientation {stated}: it is to be shown turned or mirrored; save it as it is to be read"
+        raise wanted.refusal(path, problem + ("" if wanted.colour else ", and turn frames by --orientation 2 to 8"))
 
 
 def orient(values: Numbers, orientation: int) -> Numbers:
@@ -172,8 +161,7 @@ def _tiff(path: Path, wanted: Wanted) -> _Reader:
 
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what matters is raised
 
-    def check(page: Any) -> int:
-        """Return the orientation of a page that is as wanted."""
+    def check(page: Any) -> None:
         bits, kind = page.bitspersample, page.photometric
         grey = kind == _BLACK_IS_ZERO and page.samplesperpixel == 1 and page.ndim == 2 and bits in wanted.bits
         colour = wanted.colour and kind == _RGB and page.ndim == 3 and bits == 8
@@ -184,20 +172,18 @@ def _tiff(path: Path, wanted: Wanted) -> _Reader:
         if page.is_tiled and max(page.tilewidth, page.tilelength) > max(page.shape[:2]) + _TILE_MARGIN:
             raise wanted.refusal(path, "is of tiles larger than the picture; save it in strips")
         _check_size(path, wanted, *page.shape[:2])
-        return int(page.tags[_ORIENTATION].value) if _ORIENTATION in page.tags else _UPRIGHT
+        _check_upright(path, page.tags[_ORIENTATION].value if _ORIENTATION in page.tags else _UPRIGHT, wanted)
 
     # Given a file and no name, tifffile cannot map it.
     with open(path, "rb") as file, tifffile.TiffFile(file) as tiff:
         pages = tiff.pages
         if not 0 < len(pages) <= _MOST_PAGES:
             raise wanted.refusal(path, f"has {len(pages)} pages; give 1 to {_MOST_PAGES}")
-        stated, size = check(pages[0]), pages[0].shape[:2]
-        _upright(path, np.empty((0, 0)), stated, wanted)
-        turned = wanted.orientation == TO_FILE and abs(_TURNS[stated][0]) == 1
-        yield len(pages), size[::-1] if turned else size, _PIXEL_BYTES
+        check(pages[0])
+        yield len(pages), pages[0].shape[:2], _PIXEL_BYTES
         for page in pages:
-            stated = check(page)
-            yield _upright(path, page.asarray(), stated, wanted)
+            check(page)
+            yield page.asarray()
 
 
 def _npy(path: Path, wanted: Wanted) -> _Reader:
@@ -229,28 +215,6 @@ def _exr(path: Path, wanted: Wanted) -> _Reader:
     yield channels[name]
 
 
-def _dng(path: Path, wanted: Wanted) -> _Reader:
-    try:
-        import rawpy  # an extra: most benches write other files
-    except ImportError:
-        raise wanted.refusal(path, "rawpy is not installed; pip install 'mitsim[raw]', or save it as TIFF") from None
-
-    with stderr_silenced():
-        raw = rawpy.imread(str(path))
-    with raw:
-        sizes, colours = raw.sizes, raw.color_desc.decode("ascii", "replace")
-        corner = [(sizes.top_margin + row, sizes.left_margin + column) for row in (0, 1) for column in (0, 1)]
-        mosaic = "".join(colours[raw.raw_color(*place)] for place in corner) if raw.num_colors > 1 else None
-        if mosaic is not None and mosaic != (wanted.mosaic or mosaic):
-            raise wanted.refusal(path, f"its mosaic is {cut(mosaic)}, and {wanted.mosaic} is stated; correct that")
-        yield 1, (sizes.height, sizes.width), _PIXEL_BYTES
-        if raw.raw_type != rawpy.RawType.Flat:
-            raise wanted.refusal(path, "holds colours, and no number a pixel; save the raw numbers")
-        with stderr_silenced():
-            values = raw.raw_image_visible.copy()
-        yield _upright(path, values, _FLIPS.get(sizes.flip, 0), wanted)
-
-
 def _bare(path: Path, wanted: Wanted) -> _Reader:
     raw = wanted.raw
     if raw is None:
@@ -267,7 +231,7 @@ def _bare(path: Path, wanted: Wanted) -> _Reader:
 
 
 _READERS: dict[str, Callable[[Path, Wanted], _Reader]] = {
-    **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr, _dng), strict=True)),
+    **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr), strict=True)),
     **dict.fromkeys(BARE, _bare),
 }
 

@@ -6,7 +6,7 @@ Saturated pixels, and pixels interpolated from them, get the saturation level th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +22,6 @@ from mitsim.core.manifests import Digital
 LEAST_RESPONSE = 0.1
 """Pixels with a smaller response, relative to the mean, are not corrected, because that would multiply their noise by
 ten."""
-_MOST_DIFFERENT = 16
-_NO_CHANCE = 1 << 15
-"""By chance, k of at most 16 different numbers share a factor f once in f^(k - 1) times."""
 _EDGE = 1e-9
 """Pixels by which rounding of sine and cosine may exceed the picture."""
 
@@ -141,7 +138,7 @@ class Preparer:
 
     def _place(self, path: Path, values: Numbers) -> Numbers:
         values = self.plane(values)
-        values = orient(values, self.how.orientation) if isinstance(self.how.orientation, int) else values
+        values = values if self.how.orientation is None else orient(values, self.how.orientation)
         first, end, crop = (0, 0), values.shape, self.how.crop
         if crop is not None:
             rows, columns = values.shape
@@ -179,12 +176,9 @@ class CommonFactor:
     factor: int = 0
     high: float = 0.0
     _bits: int = 0
-    _different: set[float] = field(default_factory=set)
 
     def add(self, values: Numbers) -> None:
         self.high, self._bits = max(self.high, float(values.max())), 8 * values.dtype.itemsize
-        if len(self._different) < _MOST_DIFFERENT:
-            self._different.update(np.unique(values)[:_MOST_DIFFERENT].tolist())
         if values.dtype.kind not in "ui" and not np.array_equal(values, np.rint(values)):
             self.factor = 1
         for row in values:  # of noisy numbers the first row tells
@@ -192,19 +186,16 @@ class CommonFactor:
                 break
             self.factor = int(np.gcd.reduce(np.append(row.astype(np.int64), self.factor)))
 
-    def shift(self, end: float | None) -> int:
-        """Return the power of two by which the numbers of a camera that counts to ``end`` were shifted, or 1."""
-        shift = 1 if end is None else 1 << max(self._bits - int(end).bit_length(), 0)
-        return shift if self.factor % shift == 0 else 1
+    def choose(self, end: float | None) -> int:
+        """Return the factor by which numbers beyond the camera's ``end`` were scaled, or 1.
 
-    def choose(self, end: float | None) -> tuple[int, int]:
-        """Return the factor to divide by, and a doubtful factor that the user may divide by; 1 for none."""
-        chance = self.factor ** (len(self._different) - 1) < _NO_CHANCE
-        shift = self.shift(end)
-        likely = shift if shift > 1 else self.factor
-        if end is not None and self.high > end >= self.high / max(likely, 1) and (shift > 1 or not chance):
-            return likely, 1
-        return 1, 1 if chance else likely
+        Bits that were shifted to the high ones are likelier than a larger factor, which few numbers share by chance.
+        """
+        if end is None or self.high <= end:
+            return 1
+        shift = 1 << max(self._bits - int(end).bit_length(), 0)
+        likely = shift if shift > 1 and self.factor % shift == 0 else max(self.factor, 1)
+        return likely if self.high / likely <= end else 1
 
 
 def _size(values: npt.NDArray[np.generic]) -> str:

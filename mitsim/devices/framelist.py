@@ -167,7 +167,7 @@ class SessionFrames:
 
     @property
     def wanted(self) -> Wanted:
-        return Wanted.of(self.listed.raw, self.listed.prepare)
+        return Wanted(raw=self.listed.raw)
 
     @property
     def planes(self) -> tuple[str, ...]:
@@ -275,19 +275,13 @@ def load_frames(folder: Path | str) -> SessionFrames:
         raise _refusal(folder, f"{problem}; take them, and name them in the list")
     session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
     _check_files(folder, session.files)
-    _check_exposures(session)
-    return session
-
-
-def _check_exposures(session: SessionFrames) -> None:
-    folder, rungs = session.folder, len(session.listed.exposure_ladder)
-    frames: tuple[StripeFile | DarkFile, ...] = (*session.shots.values(), *session.dark)
-    for frame in frames:
-        if frame.exposure >= rungs:
-            problem = f"{frame.file} is of exposure {frame.exposure}, but exposure_ladder has {rungs}"
+    every: tuple[StripeFile | DarkFile, ...] = (*session.shots.values(), *session.dark)
+    for each in every:
+        if each.exposure >= rungs:
+            problem = f"{each.file} is of exposure {each.exposure}, but exposure_ladder has {rungs}"
             raise _refusal(folder, f"{problem}; give 0 to {rungs - 1}")
-        if rungs > 1 and frame.exposure_s is not None:
-            problem = f"{frame.file} states exposure_s, and exposure_ladder as well"
+        if rungs > 1 and each.exposure_s is not None:
+            problem = f"{each.file} states exposure_s, and exposure_ladder as well"
             raise _refusal(folder, f"{problem}; leave it out, and give the number `exposure`")
     for (side, index, sign, exposure, repeat), shot in session.shots.items():
         other = session.shots[side, index, sign if repeat or not session.pairs else -sign, exposure, 0]
@@ -300,6 +294,7 @@ def _check_exposures(session: SessionFrames) -> None:
     if session.dark and without and not session.pairs:
         problem = f"no dark frame is exposed for {min(without):g} s, as other frames are"
         raise _refusal(folder, f"{problem}; take one for each exposure, or none")
+    return session
 
 
 def _words(key: Key) -> str:
@@ -489,8 +484,23 @@ def load_known(path: Path | str) -> KnownCaptures:
         check_plain(found.picture(capture), "picture")
         if number == 0:
             found = KnownCaptures(path, listed, lines.colours, manifests)
-        if unlike := _difference(manifests, found.manifests, capture.run, listed.known[0].run, path):
-            raise MitsimError(f"list {path}: {unlike}")
+        if [*manifests] != [*found.manifests]:
+            names = [", ".join(name for name in each if name) or "no" for each in (manifests, found.manifests)]
+            problem = f"list {path}: {capture.run} has {names[0]} planes, but {listed.known[0].run} has {names[1]}"
+            raise MitsimError(f"{problem}; give runs of one kind")
+        for name, manifest in manifests.items():
+            ours, run, first = found.manifests[name], f"list {path}: {capture.run}", listed.known[0].run
+            if manifest.camera != ours.camera:
+                raise MitsimError(f"{run} is of another camera than {first}; calibrate each by its own")
+            how, first_how = (preparation_of(each, path) for each in (manifest, ours))
+            unlike = next((field for field in _PLACING if getattr(how, field) != getattr(first_how, field)), None)
+            if unlike is not None:
+                remedy = "so its pixels see other parts of the mask; import both alike"
+                raise MitsimError(f"{run} was imported with another {unlike} than {first}, {remedy}")
+            sides, own = ([len(rows) for rows in (each.patterns.P_L, each.patterns.P_R)] for each in (manifest, ours))
+            if sides != own:
+                pixels = f"{sides[0]} x {sides[1]} scene pixels, but {first} {own[0]} x {own[1]}"
+                raise MitsimError(f"{run} has {pixels}; give runs of one size")
     return found
 
 
@@ -500,28 +510,6 @@ def preparation_of(manifest: RunManifest, place: Path | str) -> Preparation:
     Raises MitsimError if the manifest states another one.
     """
     return validate(Preparation, manifest.configuration.get("prepare") or {}, f"{place}: a run's configuration.prepare")
-
-
-def _difference(
-    manifests: dict[str, RunManifest], known: dict[str, RunManifest], run: str, first: str, path: Path
-) -> str:
-    if [*manifests] != [*known]:
-        names = [", ".join(name for name in each if name) or "no" for each in (manifests, known)]
-        return f"{run} has {names[0]} planes, but {first} has {names[1]}; give runs of one kind"
-    for name, manifest in manifests.items():
-        ours = known[name]
-        if manifest.camera != ours.camera:
-            return f"{run} is of another camera than {first}; calibrate each by its own"
-        how, first_how = (preparation_of(each, path) for each in (manifest, ours))
-        unlike = next((field for field in _PLACING if getattr(how, field) != getattr(first_how, field)), None)
-        if unlike is not None:
-            how_seen = "so its pixels see other parts of the mask; import both alike"
-            return f"{run} was imported with another {unlike} than {first}, {how_seen}"
-        sides, own = ([len(rows) for rows in (each.patterns.P_L, each.patterns.P_R)] for each in (manifest, ours))
-        if sides != own:
-            pixels = f"{sides[0]} x {sides[1]} scene pixels, but {first} {own[0]} x {own[1]}"
-            return f"{run} has {pixels}; give runs of one size"
-    return ""
 
 
 # -------- Places of a colour chart's patches in an image

@@ -115,25 +115,6 @@ class MaskProfile(Configuration):
         stated = [f"{name} {getattr(self, name):g}" for name in type(self).model_fields if name in self._stated]
         return Plate(drawn.feature_mm, values, ", ".join([drawn.words, *stated]), flaws)
 
-    def plate_of_light(self, folder: Path, mask_distance_mm: float) -> Plate:
-        """Return the light behind a phase mask as a plate: brightness relative to light without a mask.
-
-        A point at depth z0 lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask at distance d.
-
-        Raises
-        ------
-        MitsimError for a picture that cannot be read or is too large, and a point that is not beyond the mask.
-        """
-        path, distance = folder / str(self.file), self.psf_distance_mm or 0.0
-        if distance <= mask_distance_mm:
-            problem = f"mask psf: psf_distance_mm is {distance:g}"
-            raise MitsimError(f"{problem}; the point must lie beyond the mask, at {mask_distance_mm:g} mm")
-        light = load_psf(path, self.psf_reduce, LARGEST // 2)
-        feature, values = make_square(light, self.feature_mm * self.psf_reduce * (1 - mask_distance_mm / distance))
-        values *= float(self.aperture_mm2 or 0.0) / (values.sum() * feature**2)
-        words = f"point spread function {path.name} of {distance:g} mm, aperture {self.aperture_mm2:g} mm2"
-        return Plate(feature, values, words, irradiance=True)
-
     @property
     def _stated(self) -> set[str]:
         return {name for name in _FLAWS if getattr(self, name) != type(self).model_fields[name].default}
@@ -159,7 +140,17 @@ class MaskProfile(Configuration):
     def put_on(self, camera: CameraGeometry, folder: Path) -> CameraGeometry:
         mask: dict[str, object] = {"mask_feature": self.feature_mm, "mask_plate": None}
         if self.kind == "psf":
-            picture = self.plate_of_light(folder, camera.mask_distance)
+            # The light behind a phase mask as a plate: brightness relative to light without a mask. A point at depth z0
+            # lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask at distance d.
+            path, near, far = folder / str(self.file), camera.mask_distance, self.psf_distance_mm or 0.0
+            if far <= near:
+                problem = f"mask psf: psf_distance_mm is {far:g}; the point must lie beyond the mask"
+                raise MitsimError(f"{problem}, at {near:g} mm")
+            light = load_psf(path, self.psf_reduce, LARGEST // 2)
+            feature, values = make_square(light, self.feature_mm * self.psf_reduce * (1 - near / far))
+            values *= float(self.aperture_mm2 or 0.0) / (values.sum() * feature**2)
+            words = f"point spread function {path.name} of {far:g} mm, aperture {self.aperture_mm2:g} mm2"
+            picture = Plate(feature, values, words, irradiance=True)
             mask |= {"mask": "plate", "mask_plate": picture, "mask_feature": picture.feature_mm}
         elif self.kind in get_args(MaskKind) and not self._stated:
             mask |= {"mask": self.kind, "mask_order": self.order}

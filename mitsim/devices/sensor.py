@@ -27,7 +27,6 @@ PITCH_TOLERANCE = 1e-3
 """Relative difference of two pitches of the same pixels that is rounding in a data sheet."""
 BASE = "base"
 """Name of a file's line that names the camera whose fields it inherits."""
-_MOST_BASES = 4
 _LARGEST_CODE = 2**32 - 1
 """What a frame's uint32 holds."""
 _ALWAYS = {"binning", "dark_current_e_per_s", "black_level_dn", "bits"}
@@ -373,8 +372,8 @@ def sensor_table(path: Path | str) -> dict[str, Any]:
     A line ``base`` names a shipped camera, or a file beside it, whose fields are inherited. Raises MitsimError if there
     is no such base.
     """
-    table, read, first = read_toml(path), [Path(path).resolve()], path
-    while (base := table.pop(BASE, None)) is not None:
+    table = read_toml(path)
+    if (base := table.pop(BASE, None)) is not None:
         if not isinstance(base, str):
             raise MitsimError(f"file {path}: {BASE}: got {base!r}; give the name of a camera, or a file")
         beside, known = Path(path).parent / base, shipped_files("calibration", ".toml", CAMERA)
@@ -382,17 +381,15 @@ def sensor_table(path: Path | str) -> dict[str, Any]:
         if not is_beside and Path(base).name == base and not Path(base).suffix and base not in known:
             problem = f"file {path}: {BASE}: got {base!r}, no such camera"
             raise MitsimError(f"{problem}; {near_name(base, known)}shipped are {', '.join(known)}")
-        path = beside if is_beside else locate(base, "calibration", ".toml", CAMERA)
-        if path.resolve() in read or len(read) > _MOST_BASES:
-            raise MitsimError(f"file {path}: {BASE}: its bases come back to it, or are over {_MOST_BASES}; remove some")
-        read.append(path.resolve())
-        below: dict[str, object] = read_toml(path)
-        if "mask" in below and "mask" not in table:
-            raise MitsimError(f"file {first}: {BASE}: {path} has a table [mask], which stays there; give one here")
+        place = beside if is_beside else locate(base, "calibration", ".toml", CAMERA)
+        below: dict[str, object] = read_toml(place)
+        for name in (BASE, "mask"):
+            if name in below and name not in table:
+                raise MitsimError(f"file {path}: {BASE}: {place} has {name}, which is not inherited; give its own here")
         for name in ("rows", "columns"):
             most, asked = below.get(name), table.get(name)
             if isinstance(most, int) and isinstance(asked, int) and asked > most:
-                raise MitsimError(f"file {first}: {name}: got {asked}, but {path.stem} has {most}; give no more")
+                raise MitsimError(f"file {path}: {name}: got {asked}, but {place.stem} has {most}; give no more")
         if any(kind & table.keys() for kind in _EFFICIENCIES):
             others = [kind for kind in _EFFICIENCIES if not kind & table.keys()]
             below = {name: below[name] for name in below.keys() - set().union(*others)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,6 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import ALL, BARE, CORRECTIONS, Crop, Preparation, Raw, Wanted, check_channel, image_files
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, ColourManifest, Digital
-from mitsim.core.seeds import check_root
 from mitsim.devices.framelist import Identity
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
@@ -134,7 +134,7 @@ class RealCapture:
 
     @property
     def wanted(self) -> Wanted:
-        return Wanted.of(self.listed.raw, self.listed.prepare)
+        return Wanted(raw=self.listed.raw)
 
     @property
     def colours(self) -> ColourManifest | None:
@@ -169,56 +169,63 @@ class RealCapture:
 
     def check(self, source: Path) -> None:
         """Raise MitsimError for invalid values, and a ``source`` without frames, before any frame is opened."""
-        listed = self.listed
-        check_root(listed.seed)
+        listed, prepare = self.listed, self.listed.prepare
         if listed.closing_exposure_s is not None:
             check_exposure(listed.closing_exposure_s)
-            if listed.closing_frame is None or listed.prepare.dark is not None:
-                why = "without a closing frame" if listed.closing_frame is None else "beside dark frames of another"
-                said = f"{listed.closing_exposure_s:g}: is of no use {why}; leave it out"
+            if prepare.dark is not None:
+                said = f"{listed.closing_exposure_s:g}: is of no use beside dark frames of another; leave it out"
                 raise ArgumentError("closing_exposure", said)
-        if listed.n is not None and listed.n < 1:
-            raise ArgumentError("projector_pixels", f"{listed.n}: give 1 or more, those a side")
-        if listed.ambient_shots is not None and (listed.ambient is None or listed.ambient_shots < 1):
-            raise ArgumentError("ambient_shots", f"{listed.ambient_shots}: give 1 or more, of an ambient frame")
         self.electronics()
-        if self.calibration is not None:
-            self._check_calibration(self.calibration)
-        elif listed.n is None:
+        folder, colours = self.calibration, self.colours
+        if folder is None and listed.n is None:
             needed = "is not given, and patterns need its projector; give it, or --projector-pixels"
             raise ArgumentError("calibration", needed)
+        if folder is not None and colours is not None:
+            manifests.read_colours(folder, manifests.CALIBRATION)
+            manifests.check_lines(colours, "channel all", folder)
+        for part in [] if folder is None else [folder / line for line in (colours.names if colours else ("",))]:
+            manifest = manifests.read_manifest(part, CalibrationManifest)
+            if listed.centre not in (None, manifest.centre):
+                raise MitsimError(
+                    f"calibration {part}: its centre is {str(manifest.centre).lower()}, and the list's "
+                    f"{str(listed.centre).lower()}: it takes other means off frames; calibrate as the list says"
+                )
+            turned = manifest.configuration.get(TURNED, prepare.turn_deg)
+            if turned != prepare.turn_deg:
+                raise MitsimError(
+                    f"calibration {part}: is of frames turned by {turned} degrees, not by {prepare.turn_deg:g}; "
+                    f"give --turn {turned}"
+                )
         if self.in_file:
             check_plain(self.patterns)
         else:
             read_name(self.patterns, listed.n)
-        for place in (source, *(getattr(listed.prepare, name) for name in CORRECTIONS)):
+        for place in (source, *(getattr(prepare, name) for name in CORRECTIONS)):
             if place is not None:
                 image_files(Path(place), self.wanted)
-
-    def _check_calibration(self, folder: Path) -> None:
-        colours = self.colours
-        if colours is not None:
-            manifests.read_colours(folder, manifests.CALIBRATION)
-            manifests.check_lines(colours, "channel all", folder)
-        for line in ("",) if colours is None else colours.names:
-            manifest, asked = manifests.read_manifest(folder / line, CalibrationManifest), self.listed.centre
-            if asked is not None and manifest.centre != asked:
-                raise MitsimError(
-                    f"calibration {folder / line}: its centre is {str(manifest.centre).lower()}, and the list's "
-                    f"{str(asked).lower()}: it takes other means off frames; calibrate as the list says, or correct it"
-                )
-            turned = manifest.configuration.get(TURNED, self.listed.prepare.turn_deg)
-            if turned != self.listed.prepare.turn_deg:
-                raise MitsimError(
-                    f"calibration {folder / line}: is of frames turned by {turned} degrees, not by "
-                    f"{self.listed.prepare.turn_deg:g}; give --turn {turned}"
-                )
 
 
 # ---- Options in place of a list ----
 
 _OF_BARE = ("shape", "bits", "byte_order")
 """Options of files without a header alone."""
+_LISTED = {
+    **{name: name for name in ("patterns", "closing_frame", "order", "seed", "ambient_shots")},
+    "closing_exposure": "closing_exposure_s",
+    "ambient_frame": "ambient",
+    "projector_pixels": "n",
+}
+_PREPARED = {
+    "channel": "channel",
+    "mosaic": "mosaic",
+    "divide": "divide_by",
+    "turn": "turn_deg",
+    "orientation": "orientation",
+    "dark_frame": "dark",
+    "flat_frame": "flat",
+    "flat_dark_frame": "flat_dark",
+}
+"""Fields of a list, and of its preparation, by the option that takes the place of each."""
 _said = partial(option, None)
 _LISTS, _CAMERAS = (partial(configuration.shipped_names, field) for field in (configuration.LIST, configuration.CAMERA))
 
@@ -261,7 +268,7 @@ class FrameFacts(Options):
     dark_frame: FilePath | None = _said("frame, or folder of frames, without any light", metavar="PATH")
     flat_frame: FilePath | None = _said("the same of even light without a mask", metavar="PATH")
     flat_dark_frame: FilePath | None = _said("the same without light, of the flat's exposure", metavar="PATH")
-    orientation: int | str | None = _said("of frames: Exif's, or as the file says", metavar="1..8|file")
+    orientation: int | None = _said("of frames: turned as Exif numbers it", min=1, max=8, metavar="1..8")
     turn: float | None = _said("of frames: turned counter-clockwise after that", metavar="DEGREES")
     crop: str | tuple[int, ...] | None = _said(
         "of frames: part that is taken in the end", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
@@ -269,52 +276,47 @@ class FrameFacts(Options):
     seed: int | None = _said("root of every random stream", panel=configuration.QUALITY)
 
     def of(self, source: Path) -> RealCapture:
-        listed = CaptureList() if self.list is None else load_capture_list(self.list)
         bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
         if self.shape is None or not bare:
             self.refuse(_OF_BARE, "on files that have a header, or without a shape")
-        stated = {
-            "patterns": self.patterns, "closing_frame": self.closing_frame, "order": self.order, "seed": self.seed,
-            "closing_exposure_s": self.closing_exposure,
-        }  # fmt: skip
-        said: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
-        said["prepare"] = self._preparation(listed.prepare)
+
+        def given(fields: Mapping[str, str]) -> dict[str, Any]:
+            values = {field: getattr(self, option) for option, field in fields.items()}
+            return {
+                field: str(each) if isinstance(each, Path) else each
+                for field, each in values.items()
+                if each is not None
+            }
+
+        listed = CaptureList() if self.list is None else load_capture_list(self.list)
+        known, prepare = (
+            {name: getattr(each, name) for name in each.model_fields_set} for each in (listed, listed.prepare)
+        )
+        prepare |= given(_PREPARED)
+        if self.channel is not None:
+            check_channel(self.channel)
+        if self.crop is not None:
+            prepare["crop"] = Crop.of(_text_of(self.crop, ","))
+        if self.turn is not None:
+            prepare["turn_about"] = "centre"
         if self.ambient_frame is not None:
-            said["ambient"] = str(self.ambient_frame)
-        if self.ambient_frame is not None or listed.ambient_shots is None:
-            said["ambient_shots"] = self.ambient_shots
-        if self.projector_pixels is not None or self.calibration is not None:
-            said["n"] = self.projector_pixels
+            known.pop("ambient_shots", None)
+        if self.calibration is not None:
+            known.pop("n", None)
         if self.shape is not None:
-            said["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little")
-        known = RealCapture(
-            listed.model_copy(update=said),
+            known["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little")
+        known |= {**given(_LISTED), "prepare": validate(Preparation, prepare, "import")}
+        capture = RealCapture(
+            validate(CaptureList, known, "import"),
             None if self.camera is None else str(self.camera),
             self.exposure,
             calibration=None if self.calibration is None else Path(self.calibration),
             black_level_dn=self.black_level,
         )
-        if not takes_seed(known.patterns):
+        if not takes_seed(capture.patterns):
             self.refuse(("seed",), "on patterns that are not drawn at random")
-        known.check(source)
-        return known
-
-    def _preparation(self, listed: Preparation) -> Preparation:
-        paths = {"dark": self.dark_frame, "flat": self.flat_frame, "flat_dark": self.flat_dark_frame}
-        stated = {"channel": self.channel, "mosaic": self.mosaic, "divide_by": self.divide, "turn_deg": self.turn}
-        given: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
-        given |= {name: str(path) for name, path in paths.items() if path is not None}
-        if self.channel is not None:
-            check_channel(self.channel)
-        if self.orientation is not None:
-            text = str(self.orientation)
-            given["orientation"] = int(text) if text.isascii() and text.isdecimal() else text
-        if self.crop is not None:
-            given["crop"] = Crop.of(_text_of(self.crop, ","))
-        if "turn_deg" in given:
-            given["turn_about"] = "centre"
-        known = {name: value for name, value in listed if name in listed.model_fields_set}
-        return validate(type(listed), {**known, **given}, "import")
+        capture.check(source)
+        return capture
 
 
 def _text_of(parts: str | tuple[int, ...], sign: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -30,8 +30,6 @@ from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
 
 _SECONDS_PER_PIXEL = 1e-7
 """Every frame is read twice and written once: 30 s for 256 megapixels on a slow disk."""
-_MOST_STAMPED = 1e-3
-"""Fraction of a picture's numbers that may be a stamp and not light; a line of text is below."""
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """Parts of a run that are unknown for a real capture."""
 
@@ -55,16 +53,14 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     if (held := sum(number for number, _ in pages.values())) != count + bool(closing):
         last = " and a closing frame" if closing else ""
         hint = " (is the last a closing frame? say so)" if held == count + 1 else ""
-        several = [f"{path.name} has {number}" for path, (number, _) in pages.items() if number > 1]
-        hint += f" (each page is a frame: {several[0]})" if several else ""
         raise MitsimError(
             f"{source}: holds {held} frames, but patterns {known.patterns!r} take {count}{last}, in the order "
-            f"(row, column), of signed ones + before -; give all of them and no others{hint}"
+            f"(row, column), of signed ones + before -; give all of them and no others, each page a frame{hint}"
         )
     pixels = sum(number * math.prod(size) for number, size in pages.values())
     cost = Cost(seconds=pixels * _SECONDS_PER_PIXEL, disk_bytes=pixels * np.dtype(np.uint32).itemsize)
     cost.check(f"import of {count} frames", Limits(), output)
-    first, common, checks = np.empty(0), CommonFactor(), []
+    first, common = np.empty(0), CommonFactor()
     places, notes, warnings = list[tuple[Path, int]](), list[str](), list[str]()
     for path in files:
         for number, frame in enumerate(read_images(path, known.wanted)):
@@ -75,25 +71,19 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
                     "give frames of one size"
                 )
             places.append((path, number))
-            checks.append(_range_check(path, frame, camera))
             common.add(frame)
-    factor, doubtful, largest = prepare.divide_by, 1, camera.largest
+    factor = prepare.divide_by
     if factor is None:
-        factor, doubtful = common.choose(largest)
+        factor = common.choose(camera.largest)
         if factor > 1:
-            of = ""
-            if largest is not None and factor == common.shift(largest):
-                of = f" ({largest.bit_length()} bits in the high bits of {8 * first.itemsize})"
-            notes.append(f"numbers are divided by {factor}, which all are multiples of{of}")
-        elif doubtful > 1:
+            notes.append(f"numbers are divided by {factor}, which all are multiples of")
+        elif common.factor > 1:
             warnings.append(
                 f"all numbers are multiples of {common.factor}, and are taken as they are: if the camera's numbers "
-                f"were shifted or scaled, give --divide {doubtful}, else --divide 1"
+                f"were shifted or scaled, give --divide {common.factor}, else --divide 1"
             )
     elif common.factor % factor:
         raise ArgumentError("divide_by", f"{factor}: the numbers' common factor is {common.factor}; give that, or 1")
-    for check in checks:
-        check(factor, False)
     if order is not None:
         places[:count] = [places[frame] for frame in orders[order]]
     prepare, runs = prepare.model_copy(update={"divide_by": factor}), {}
@@ -127,37 +117,25 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     }
 
 
-def _range_check(path: Path, frame: Numbers, camera: Electronics) -> Callable[[int, bool], None]:
-    """Return a function that raises MitsimError if numbers, divided by a factor, exceed the camera's range."""
+def _check_range(path: Path, frame: Numbers, camera: Electronics, factor: int, mean: bool = False) -> None:
+    """Raise MitsimError if numbers, divided by a factor, are none of the camera; ``mean`` marks means of frames."""
     largest, low, high, kind = camera.largest, float(frame.min()), float(frame.max()), frame.dtype
-    whole = kind.kind != "f" or np.array_equal(frame, np.rint(frame))
-    cause = "they were scaled, or the camera is another; save them as they are, or give the right camera file"
-    if largest is not None and high > largest:
-        bits = 8 * frame.itemsize
-        shift = 1 << max(bits - largest.bit_length(), 0)
-        others = np.count_nonzero(frame % shift)
-        if 0 < others <= frame.size * _MOST_STAMPED:
-            cause = (
-                f"but for {others} all are multiples of {shift}: the camera writes more than light into pictures; "
-                f"switch that off, or give a camera file of {bits} bits"
-            )
-
-    def check(factor: int, mean: bool) -> None:
-        if largest is None:
-            return
-        counts = f"camera {camera.name} counts"
-        if not mean and not whole:
-            raise MitsimError(f"{path}: holds fractions, but {counts} whole numbers; give single shots")
-        if high / factor > largest or (low < 0 and not mean):
-            number = low / factor if low < 0 else high / factor
-            raise MitsimError(f"{path}: has the number {number:g}, but {counts} 0 to {largest}: {cause}")
-        if not mean and kind.kind != "f" and np.iinfo(kind).max < largest:
-            raise MitsimError(
-                f"{path}: holds numbers of {8 * kind.itemsize} bits, but {counts} to {largest}: they were made "
-                "smaller; save them as they are, or give a camera file of these numbers"
-            )
-
-    return check
+    if largest is None:
+        return
+    counts = f"camera {camera.name} counts"
+    if not mean and kind.kind == "f" and not np.array_equal(frame, np.rint(frame)):
+        raise MitsimError(f"{path}: holds fractions, but {counts} whole numbers; give single shots")
+    if high / factor > largest or (low < 0 and not mean):
+        raise MitsimError(
+            f"{path}: has the number {(low if low < 0 else high) / factor:g}, but {counts} 0 to {largest}: they were "
+            "scaled, hold more than light (as a text in the picture), or the camera is another; save them as they are, "
+            "or give the right camera file"
+        )
+    if not mean and kind.kind != "f" and np.iinfo(kind).max < largest:
+        raise MitsimError(
+            f"{path}: holds numbers of {8 * kind.itemsize} bits, but {counts} to {largest}: they were made "
+            "smaller; save them as they are, or give a camera file of these numbers"
+        )
 
 
 class _Plane:
@@ -249,6 +227,7 @@ class _Plane:
             following = path, page + 1
             if (values := next(pages, None)) is None:
                 raise MitsimError(f"{path}: has fewer frames than before; leave it alone while it is read")
+            _check_range(path, values, camera, how.divide_by or 1)
             made = (of_last if name == CLOSING else preparer).frame(path, values)
             channels = {"DN": cast(Channel, np.array(self._part(path, made, how), kind))}  # parts do not keep pictures
             if name == CLOSING:
@@ -276,7 +255,7 @@ class _Plane:
         total, count, stated = np.zeros(shape), 0, self.known.listed.ambient_shots
         for path in image_files(source, self.known.wanted):
             for frame in read_images(path, self.known.wanted):
-                _range_check(path, frame, self.camera)(preparer.how.divide_by or 1, True)
+                _check_range(path, frame, self.camera, preparer.how.divide_by or 1, mean=True)
                 part = self._part(path, preparer.frame(path, frame, mean=True), preparer.how)
                 if part.shape != shape:
                     raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(shape)}")

@@ -215,10 +215,10 @@ def _checked(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
         common = CommonFactor()
         for name in (session.files[0], session.files[-1]):
             common.add(read_image(session.folder / name, session.wanted))
-        factor, doubtful = common.choose(end)
-        if doubtful > 1:
+        factor = common.choose(end)
+        if factor == 1 < common.factor:
             are = f"are multiples of {common.factor}, and are taken as they are"
-            remedy = f"state prepare.divide_by = {doubtful} if they were shifted or scaled, else 1"
+            remedy = f"state prepare.divide_by = {common.factor} if they were shifted or scaled, else 1"
             return session.with_preparer(), (f"frames: all numbers of {session.files[0]} {are}; {remedy}",)
         if factor > 1:
             prepare = prepare.model_copy(update={"divide_by": factor})

@@ -5,8 +5,6 @@ Sections without data are left out. The same data give the same bytes.
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,13 +23,11 @@ from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report import plots
 from mitsim.report.pages import (
-    Mean,
     Picture,
     Scale,
     page_figure,
     reflectance,
     render_page,
-    sentence,
     stages_of,
     total_of,
 )
@@ -63,10 +59,8 @@ class Trust:
         """Compare an ``image`` with the truth; None where its uncertainty is not known."""
         if image.uncertainty is None:
             return None
-        misfit, error = image.misfit, np.abs(image.image - truth)
-        return (
-            cls(image.uncertainty, error, misfit.chi_square, misfit.reason) if misfit else cls(image.uncertainty, error)
-        )
+        found = (image.misfit.chi_square, image.misfit.reason) if image.misfit else (None, "")
+        return cls(image.uncertainty, np.abs(image.image - truth), *found)
 
     @property
     def stated(self) -> float:
@@ -202,26 +196,12 @@ def render_html(report: ReportData) -> str:
         psnr = {f.name: getattr(f, row).quality.psnr_db for f in report.families if getattr(f, row) is not None}
         best[row] = max(psnr, key=lambda name: psnr[name]) if psnr else ""
     curves = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
-    both = {
-        f.label: {
-            "idealised model, ideal factors": Mean(f.idealised.quality.psnr_db, math.nan, 1),
-            "rendered light, calibrated factors": Mean(f.rendered.quality.psnr_db, math.nan, 1),
-        }
-        for f in report.families
-        if f.idealised is not None and f.rendered is not None
-    }
-    positive = {row.name: row.value for row in report.budget if row.value}
-    figures = {
-        "singular_values": plots.singular_values(curves) if curves else None,
-        "quality": plots.grouped_bars(both, "PSNR [dB]") if both else None,
-        "budget": plots.error_bars(positive, report.accuracy) if positive else None,
-    }
     trust = next((f.rendered.trust for f in report.families if f.rendered and f.name == report.main), None)
     return render_page(
         "report.html",
         report=report,
         best=best,
-        figures={name: page_figure(figure)[0] for name, figure in figures.items() if figure is not None},
+        singular_values=page_figure(plots.singular_values(curves))[0] if curves else "",
         frames=[Picture.of(name, name, _finite(dn, name), Scale.of(dn, "DN")) for name, dn in report.frames.items()],
         errors=trust.pictures() if trust else (),
         total=total_of(report.seconds),
@@ -229,7 +209,6 @@ def render_html(report: ReportData) -> str:
         pattern_corner=_PATTERN_CORNER,
         picture_of=_reflectance,
         pattern_of=_pattern,
-        trouble_in=_trouble,
         chi_square=chi_square_text,
     )
 
@@ -248,7 +227,3 @@ def _finite(image: npt.ArrayLike, name: str) -> FloatArray:
     if values.ndim != 2 or values.size == 0 or not np.all(np.isfinite(values)):
         raise MitsimError(f"report: {name} of shape {values.shape} must be rows x columns of finite numbers")
     return values
-
-
-def _trouble(status: str) -> str:
-    return "" if status.startswith("Solved: ") else sentence(re.split(r"; |\. ", status)[0])

@@ -6,7 +6,6 @@ The truth of an image is read from its run, if the run is still in its place.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,6 @@ from mitsim.core.manifests import (
 )
 from mitsim.core.runs import TRUTH, load_mosaic, load_run
 from mitsim.devices.framelist import ChartPlace
-from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality, truth_for
 from mitsim.reconstruct.colour import chart, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
@@ -68,24 +66,14 @@ _SHOWN_PERCENT = 99.0
 """Part of the errors within the scale of their picture."""
 
 
-@dataclass(frozen=True)
-class Shown:
-    """Content of a folder's page; ``tables`` are lines by title, ``parts`` pages of the folders in it."""
+Shown = dict[str, Any]
+"""Content of a folder's page: variables of its template, of which `parts` are pages of the folders in it."""
 
-    kind: str
-    verdict: str
-    detail: str = ""
-    warnings: Sequence[str] = ()
-    command: str | None = None
-    pictures: Sequence[Picture] = ()
-    plan: Sequence[PlanRow] = ()
-    accuracy: float | None = None
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    kernels: Mapping[str, float] = field(default_factory=dict)
-    tables: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    parts: Mapping[str, Shown] = field(default_factory=dict)
-    colours: ColourImage | None = None
-    facts: Mapping[str, str] = field(default_factory=dict)
+
+def _shown(kind: str, verdict: str, **more: Any) -> Shown:
+    absent = {"detail": "", "command": None, "accuracy": None, "colours": None, "plan": (), "pictures": ()}
+    tables: Shown = {"warnings": (), "seconds": {}, "kernels": {}, "tables": {}, "parts": {}, "facts": {}}
+    return {"kind": kind, "verdict": verdict, **absent, **tables, **more}
 
 
 @check_arguments
@@ -111,11 +99,7 @@ def report_folder(folder: Path | str) -> Path:
 
 def _write(folder: Path, shown: Shown) -> None:
     """Write pictures and pages, the folder's own page last, because it marks completion."""
-
-    def named(xyz: FloatArray) -> str:
-        return f"#{bytes(np.rint(255 * lightness(linear_srgb(xyz))).astype(np.uint8)).hex()}"
-
-    for name, part in shown.parts.items():
+    for name, part in shown["parts"].items():
         _write(folder / name, part)
     with output_folder(folder, overwrite=True):
         remove_page(folder)
@@ -124,16 +108,14 @@ def _write(folder: Path, shown: Shown) -> None:
             "folder.html",
             page=shown,
             folder=folder.absolute(),
-            images=[name for name in images if (folder / name / PAGE).is_file() and name not in shown.parts],
-            stages=stages_of(shown.seconds),
-            total=total_of(shown.seconds),
-            chart=chart() if shown.colours and shown.colours.chart else None,
-            hex=named,
+            images=[name for name in images if (folder / name / PAGE).is_file() and name not in shown["parts"]],
+            stages=stages_of(shown["seconds"]),
+            total=total_of(shown["seconds"]),
         )
         try:
-            if shown.pictures:
+            if shown["pictures"]:
                 prepare_output(folder / PICTURES, overwrite=True)
-            for picture in shown.pictures:
+            for picture in shown["pictures"]:
                 picture.write(folder / PICTURES)
             write_text(folder / PAGE, text)
         except BaseException:
@@ -169,13 +151,13 @@ def _content(folder: Path) -> Shown:
 def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> Shown:
     parts = {name: _content(folder / name) for name in names}
     first, *_, last = *parts.values(), *parts.values()
-    return Shown(
-        kind=f"{first.kind} by {axis}",
-        verdict=f"{len(parts)} {axis}{'s' if len(parts) > 1 else ''}: {', '.join(parts)}{unit}",
-        warnings=[f"{name}: {text}" for name, part in parts.items() for text in part.warnings],
-        command=first.command,
-        seconds=last.seconds,
-        tables={"Versions": first.tables["Versions"]},
+    return _shown(
+        f"{first['kind']} by {axis}",
+        f"{len(parts)} {axis}{'s' if len(parts) > 1 else ''}: {', '.join(parts)}{unit}",
+        warnings=[f"{name}: {text}" for name, part in parts.items() for text in part["warnings"]],
+        command=first["command"],
+        seconds=last["seconds"],
+        tables={"Versions": first["tables"]["Versions"]},
         parts=parts,
     )
 
@@ -193,11 +175,11 @@ def _of_run(lines: SpectralFolder) -> Shown:
     def frame(name: str) -> FloatArray:
         return np.asarray(shots.read(name)[0]["DN"] - black)
 
-    first, columns = frame(taken.captures[0].file), max(count // shots.patterns[0].shape[1], 1)
+    first = frame(taken.captures[0].file)
     single = {"frame": (f"One of them, {taken.captures[0].file}", first, "")} if count > 1 else {}
     titles = {"ambient": "Projector off: what is taken off", "closing": "Closing frame: no part of the image"}
     single |= {kind: (titles[kind], frame(name), name) for kind, name in manifest.others.items()}
-    pictures = [contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape, columns)]
+    pictures = [contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape)]
     for name, (title, values, about) in single.items():
         pictures.append(Picture.of(name, title, values, Scale.of(values, "DN above the black level", 0.0), about))
     if shots.truth is not None:
@@ -207,9 +189,9 @@ def _of_run(lines: SpectralFolder) -> Shown:
             truth = finite_channel(read_frame(path)[0], "reflectance", path)
             pictures.append(Picture.of(f"truth_{name}", f"The truth at {name}", truth, REFLECTANCE))
     asked = "" if error is None or accuracy is None else f"accuracy {accuracy:g} asked for, "
-    return Shown(
-        kind="Capture",
-        verdict=f"{count} frame{'s' if count > 1 else ''}{'' if error is None else f', error at most {error:.1e}'}",
+    return _shown(
+        "Capture",
+        f"{count} frame{'s' if count > 1 else ''}{'' if error is None else f', error at most {error:.1e}'}",
         detail=f"{first.shape[0]} x {first.shape[1]} pixels, patterns {taken.family or 'from elsewhere'}, {asked}"
         f"exposure {shots.exposure_s:.3g} s a frame",
         warnings=manifest.warnings,
@@ -236,9 +218,9 @@ def _of_calibration(folder: Path) -> Shown:
         scale = Scale.of(side, "sqrt(electrons/s)")
         pictures.append(Picture.of(name, f"The {name} factor, of {axis}", side.T, scale, about, wide=True))
     known = {key: value for key, value in result.items() if key not in _ELSEWHERE}
-    return Shown(
-        kind="Calibration",
-        verdict=verdict if error is None else f"{verdict}, factor error {error:.1e}",
+    return _shown(
+        "Calibration",
+        verdict if error is None else f"{verdict}, factor error {error:.1e}",
         detail="" if manifest.estimate in manifest.warnings else manifest.estimate or "",
         warnings=manifest.warnings,
         command=manifest.command,
@@ -300,9 +282,9 @@ def _of_image(folder: Path) -> Shown:
         about = "chi-square a datum by place on the sensor, 1 where only noise is left"
         scale = Scale(0.0, max(float(tiles.max()), _MISFIT), "a datum")
         pictures.append(Picture.of("misfit", "Where the frames do not fit", tiles, scale, about))
-    return Shown(
-        kind="Image",
-        verdict=("Flagged. " if warnings else "") + ", ".join(known),
+    return _shown(
+        "Image",
+        ("Flagged. " if warnings else "") + ", ".join(known),
         detail="" if warnings else str(result.get("status", "")),
         warnings=[*map(str, warnings)],
         command=result.get("command"),
@@ -377,6 +359,11 @@ def _of_colours(lines: SpectralFolder) -> Shown:
     elif image.delta_e is not None:
         verdict = f"Mean Delta E 2000 to the truth: {image.delta_e.mean():.2f}"
         detail = f"{quality}Mean over all pixels."
+    swatches = []
+    if image.chart is not None:  # the spectrum's colour, and this image's
+        both = np.stack([chart().xyz, image.chart.means(image.xyz)], axis=1)
+        levels = np.rint(255 * lightness(linear_srgb(both))).astype(np.uint8)
+        swatches = [[f"#{bytes(each).hex()}" for each in pair] for pair in levels]
     size = f"in sRGB under D65, {images.shape[0]} x {images.shape[1]} projector pixels"
     ideal, pictures = "what a perfect image of the same lines would show, by the same matrix", list[Picture]()
     for name, xyz, about in (("image", image.xyz, size), ("truth", image.truth_xyz, ideal)):
@@ -391,9 +378,9 @@ def _of_colours(lines: SpectralFolder) -> Shown:
         pictures.append(Picture.of(f"image_{line.name}", title, images[..., number], REFLECTANCE))
         if truth is not None:
             pictures.append(Picture.of(f"truth_{line.name}", f"{title}, truth", truth[..., number], REFLECTANCE))
-    return Shown(
-        kind="Image in colour",
-        verdict=verdict,
+    return _shown(
+        "Image in colour",
+        verdict,
         detail=detail,
         warnings=data.get("warnings") or (),
         command=data.get("command"),
@@ -401,5 +388,6 @@ def _of_colours(lines: SpectralFolder) -> Shown:
         tables={"Versions": versions()},
         parts=parts,
         colours=image,
+        swatches=swatches,
         facts=data.get("facts") or {},
     )

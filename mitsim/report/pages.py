@@ -99,19 +99,19 @@ def sentence(text: str) -> str:
 
 def typeset(text: str) -> str:
     """Replace 4.9e-03 by a power of ten, +- and x in sizes by signs, and um by µm."""
-    text = _POWER.sub(_power, text).replace("+-", "\N{PLUS-MINUS SIGN}")
+
+    def power(found: re.Match[str]) -> str:
+        mantissa, exponent = found[1], int(found[2])
+        if not float(mantissa):
+            return "0"
+        if mantissa != "1" and 1e-2 <= float(found[0]) < 1e4:  # as ``scientific`` prints it, with the digits it has
+            return f"{float(found[0]):.{max(len(mantissa.partition('.')[2]) - exponent, 0)}f}"
+        power = f"10{str(exponent).translate(_SUPERSCRIPT)}"
+        return power if float(mantissa) == 1 and "." not in mantissa else f"{mantissa}{_TIMES}{power}"
+
+    text = _POWER.sub(power, text).replace("+-", "\N{PLUS-MINUS SIGN}")
     text = _SIZE.sub(rf"\1\2{_TIMES}\2", text)
     return re.sub(r"(?<=[\d\[(] )um\b|(?<=[\[(/])um\b", "\N{GREEK SMALL LETTER MU}m", text)
-
-
-def _power(found: re.Match[str]) -> str:
-    mantissa, exponent = found[1], int(found[2])
-    if not float(mantissa):
-        return "0"
-    if mantissa != "1" and 1e-2 <= float(found[0]) < 1e4:  # as ``scientific`` prints it, with the digits that it has
-        return f"{float(found[0]):.{max(len(mantissa.partition('.')[2]) - exponent, 0)}f}"
-    power = f"10{str(exponent).translate(_SUPERSCRIPT)}"
-    return power if float(mantissa) == 1 and "." not in mantissa else f"{mantissa}{_TIMES}{power}"
 
 
 # -------- Plans, times and plain data on a page
@@ -176,8 +176,6 @@ SMALLEST, LARGEST = 512, 1024
 _MOST_FRAMES = 64
 _MOST_READ = _MOST_FRAMES << 18
 """Pixels that are read for a contact sheet, which takes 0.3 s."""
-_LONGEST = 4
-"""Largest ratio of the sides of a contact sheet."""
 _GAP = 2
 
 
@@ -234,42 +232,22 @@ class Picture:
         return path
 
 
-def write_beside(path: Path, values: npt.NDArray[Any], unit: str) -> tuple[Path, str]:
-    """Write FRAME.exr.png beside a frame's file, and return its path and caption."""
-    picture = Picture.of(path.name, path.name, values, Scale.of(values, unit))
-    return picture.write(path.parent), picture.caption
-
-
-def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[int, int], columns: int) -> Picture:
+def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[int, int]) -> Picture:
     """Draw ``count`` frames of a ``shape`` side by side, or as many, evenly taken, as fit a page.
 
     ``read`` returns frame i less the black level [DN].
     """
-    most = max(1, min(_MOST_FRAMES, _MOST_READ // (shape[0] * shape[1])))
+    most = max(1, min(_MOST_FRAMES, _MOST_READ // math.prod(shape)))
     chosen = [number * count // most for number in range(most)] if count > most else [*range(count)]
-    if count > most or columns**2 > _LONGEST * count or columns**2 * _LONGEST < count:
-        columns = math.ceil(math.sqrt(len(chosen)))
-    rows = math.ceil(len(chosen) / columns)
-    factor = max(1, math.ceil(max(rows * shape[0], columns * shape[1]) / LARGEST))
-    down, across = (min(factor, side) for side in shape)
-    tall, broad = shape[0] // down, shape[1] // across
-
-    def reduced(number: int) -> FloatArray:
-        frame = read(number)[: tall * down, : broad * across]
-        return np.asarray(frame.reshape(tall, down, broad, across).mean(axis=(1, 3)))
-
-    frames = in_threads(reduced, chosen)
-    white = max(float(frame.max()) for frame in frames)
-    sheet = np.full((rows * (tall + _GAP) - _GAP, columns * (broad + _GAP) - _GAP), white)
+    columns, frames = math.ceil(math.sqrt(len(chosen))), in_threads(read, chosen)
+    rows, white = math.ceil(len(chosen) / columns), max(float(frame.max()) for frame in frames)
+    sheet = np.full((rows * (shape[0] + _GAP) - _GAP, columns * (shape[1] + _GAP) - _GAP), white)
     for place, frame in enumerate(frames):
-        top, left = place // columns * (tall + _GAP), place % columns * (broad + _GAP)
-        sheet[top : top + tall, left : left + broad] = frame
-    scale = Scale(0.0, white, "DN above the black level")
+        top, left = place // columns * (shape[0] + _GAP), place % columns * (shape[1] + _GAP)
+        sheet[top : top + shape[0], left : left + shape[1]] = frame
     which = f"all {count}" if len(chosen) == count else f"{len(chosen)} of {count}, evenly taken"
-    order = f"row by row, {columns} a row" if columns > 1 else "one below the other"
-    mean = f"; a pixel is the mean of {factor} x {factor}" if factor > 1 else ""
-    data = png(scale.levels(sheet), smallest=SMALLEST)
-    return Picture("frames", "What the camera recorded", f"{which}, {order}{mean}: {scale.words(sheet)}", data, True)
+    scale, about = Scale(0.0, white, "DN above the black level"), f"{which}, row by row, {columns} a row"
+    return Picture.of("frames", "What the camera recorded", sheet, scale, about, wide=True)
 
 
 # -------- Means of the rows of a study

@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import FuncNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
@@ -36,7 +35,7 @@ SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
 """Okabe and Ito's palette, distinct in all common forms of colour blindness and in grey."""
 _PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
-_GRID, LINK, GREY, PALE = "#e5e7eb", "#d1d5db", "#6b7280", "#c7d2de"
+_GRID, GREY, PALE = "#e5e7eb", "#6b7280", "#c7d2de"
 FONT = 11.0
 WIDTH = 8.6
 COLUMN = 4.65
@@ -65,51 +64,44 @@ Point = tuple[float, float]
 
 
 def curves(
-    panels: Mapping[str, Mapping[str, Curve]],
-    x: str,
-    y: str = "PSNR [dB]",
-    log: bool = False,
-    ticks: bool = True,
-    title: str = "",
+    panels: Mapping[str, Mapping[str, Curve]], x: str, y: str = "PSNR [dB]", log: bool = False, title: str = ""
 ) -> Figure:
     """Draw curves with bars of one standard error, in panels below each other on one scale.
 
-    Panels with fewer than two places along x are left out. A curve without a name is not in the legend. ``log`` forces
-    a logarithmic x axis, and ``ticks`` sets one at every measured x that has room.
+    Panels with fewer than two places along x are left out; a figure of none has no axes. A curve without a name is not
+    in the legend. ``log`` forces a logarithmic x axis.
     """
-
-    def points(curve: Curve) -> FloatArray:
-        found = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
-        rows = np.array(found, dtype=np.float64).reshape(-1, 3)
-        return rows[np.isfinite(rows[:, :2]).all(axis=1)]
-
-    def column(shown: Mapping[str, FloatArray], number: int) -> set[float]:
-        return {float(value) for rows in shown.values() for value in rows[:, number]}
-
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
-    found = {panel: {name: points(curve) for name, curve in shown.items()} for panel, shown in panels.items()}
-    told = {panel: shown for panel, shown in found.items() if len(column(shown, 0)) > 1}
-    if not told:
+    found: dict[str, dict[str, FloatArray]] = {}
+    for panel, shown in panels.items():
+        rows = {}
+        for name, curve in shown.items():
+            points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
+            each = np.array(points, dtype=np.float64).reshape(-1, 3)
+            rows[name] = each[np.isfinite(each[:, :2]).all(axis=1)]
+        if len(np.unique(np.concatenate([each[:, 0] for each in rows.values()] or [np.empty(0)]))) > 1:
+            found[panel] = rows
+    if not found:
         return Figure()
-    figure, places = panels_of(len(told), 1, _PANEL * len(told) + 0.9, COLUMN, sharex=True, sharey=True)
-    measured = sorted({number for shown in told.values() for number in column(shown, 0)})
-    levels = [level for shown in told.values() for level in column(shown, 1)]
+    figure, places = panels_of(len(found), 1, _PANEL * len(found) + 0.9, COLUMN, sharex=True, sharey=True)
+    every = np.concatenate([each for rows in found.values() for each in rows.values()])
     shown_by_name: dict[str, Any] = {}
-    for axes, (panel, shown) in zip(places[:, 0], told.items(), strict=True):
-        for name, rows in ((name, rows) for name, rows in shown.items() if len(rows)):
+    for axes, (panel, rows) in zip(places[:, 0], found.items(), strict=True):
+        for name, each in ((name, each) for name, each in rows.items() if len(each)):
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
-            drawn = axes.errorbar(rows[:, 0], rows[:, 1], _bar_errors(rows[:, 2]), label=name, **style)
+            drawn = axes.errorbar(each[:, 0], each[:, 1], _bar_errors(each[:, 2]), label=name, **style)
             shown_by_name[name] = drawn  # a panel may lack curves that another has
         axes.set_title(panel, fontsize=FONT)
         label_axes(axes, fill(x, TITLE_LETTERS) if axes is places[-1, 0] else "", fill(y, _UPRIGHT_LETTERS))
-        if log or spans_decades(measured):
+        if log or spans_decades(every[:, 0]):
             axes.set_xscale("log")
-        if spans_decades(levels):
+        if spans_decades(every[:, 1]):
             axes.set_yscale("log")
-    if ticks:
-        _tick_at(places[-1, 0], measured)
-    labels = [name for name in names if name and name in shown_by_name]
-    legend_below(figure, [shown_by_name[name] for name in labels], labels)
+    if labels := [name for name in names if name and name in shown_by_name]:
+        room = figure.get_figwidth() / (_HANDLE + _LETTER * max(map(len, labels)))
+        style = {"fontsize": FONT - 1, "frameon": False, "loc": "outside lower center"}
+        handles = [shown_by_name[name] for name in labels]
+        figure.legend(handles, labels, ncols=max(min(int(room), len(labels)), 1), **style)
     if title:
         figure.suptitle(fill(title, TITLE_LETTERS), fontsize=FONT + 1)
     return figure
@@ -119,21 +111,6 @@ def spans_decades(values: Iterable[float]) -> bool:
     """Return True if all ``values`` are positive and span a factor of :data:`LOGARITHMIC`."""
     found = np.array(list(values), dtype=np.float64)
     return bool(found.size and found.min() > 0 and found.max() >= LOGARITHMIC * found.min())
-
-
-def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
-    logarithmic = axes.get_xscale() == "log"
-    places = np.log(numbers) if logarithmic else np.asarray(numbers, dtype=np.float64)
-    inches = (places - places[0]) / np.ptp(places) * (COLUMN - 1.2)
-    kept, end = [], -np.inf
-    for number, place in zip(numbers, inches, strict=True):
-        half = _LETTER * (len(f"{number:g}") + 1) / 2
-        if place - half >= end:
-            kept.append(number)
-            end = place + half
-    axes.xaxis.set_major_locator(FixedLocator(kept))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter("{x:g}")
 
 
 def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
@@ -160,16 +137,13 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
     return figure
 
 
-def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = "", ordered: bool = False) -> Figure:
-    """Draw horizontal bars with one standard error: a group for each name, a bar for each kind.
-
-    With ``ordered``, the group with the largest first mean is on top.
-    """
+def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = "") -> Figure:
+    """Draw horizontal bars with one standard error: a group for each name, a bar for each kind."""
     kinds = list(dict.fromkeys(kind for bars in groups.values() for kind in bars))
-    if ordered:
-        groups = dict(sorted(groups.items(), key=lambda item: -next(iter(item[1].values())).value))
     slots = len(kinds) if max(map(len, groups.values())) > 1 else 1
-    figure, axes = figure_of(0.9 + max(0.75 * slots, 1.0) * _rows_height(groups), _BARS)
+    lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in groups]
+    rows_height = ROW * len(lines) * (1 + 0.6 * (max(lines) - 1))
+    figure, axes = figure_of(0.9 + max(0.75 * slots, 1.0) * rows_height, _BARS)
     height, places = 0.8 / slots, np.arange(len(groups))[::-1]
     for index, kind in enumerate(kinds):
         own = [(place, bars[kind]) for place, bars in zip(places, groups.values(), strict=True) if kind in bars]
@@ -203,50 +177,7 @@ def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
     return figure
 
 
-def error_bars(
-    errors: Mapping[str, float],
-    limit: float | None = None,
-    bounds: Mapping[str, float] | None = None,
-    axes: Axes | None = None,
-) -> Figure:
-    """Draw relative errors on a logarithmic axis, the largest on top, with ``bounds`` as thin lines; 0 has no dot."""
-    ordered = sorted(errors.items(), key=lambda item: item[1])
-    if axes is None:
-        figure, axes = figure_of(0.7 + 0.36 * len(ordered))
-    else:
-        figure = axes.figure
-    values = np.array([value for _, value in ordered], dtype=np.float64)
-    shown = np.append(values[values > 0], [] if limit is None else limit)
-    low, high = (shown.min(), shown.max()) if shown.size else (1e-3, 1e-3)
-    left = 10.0 ** np.floor(np.log10(low) - 0.3)
-    seen = np.flatnonzero(values > 0)
-    axes.hlines(seen, left, values[seen], color=LINK, lw=2)
-    axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
-    if bounds:
-        axes.hlines(seen, values[seen], [bounds[ordered[row][0]] for row in seen], color=BLUE, lw=1)
-    for row, (_, value) in enumerate(ordered):
-        place: Any = axes.get_yaxis_transform()
-        style = {"xycoords": place, "textcoords": "offset points", "va": "center", "fontsize": FONT}
-        axes.annotate(scientific(value), (1.0, row), (8, 0), **style)
-    if limit is not None:
-        axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
-        where: Any = axes.get_xaxis_transform()
-        style = {"color": VERMILION, "fontsize": FONT - 1, "xycoords": where, "textcoords": "offset points"}
-        axes.annotate(f"accuracy asked for: {limit:g}", (limit, 1.0), (4, 3), **style)
-    axes.set_xscale("log")
-    axes.set_xlim(left, 3.0 * high)
-    axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=FONT)
-    axes.set_ylim(-0.6, len(values) - 0.4)
-    label_axes(axes, "relative error [1]", "", grid="x")
-    return figure
-
-
 # -------- Parts of figures
-
-
-def _rows_height(names: Iterable[str]) -> float:
-    lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in names]
-    return ROW * len(lines) * (1 + 0.6 * (max(lines, default=1) - 1))
 
 
 def _bar_errors(errors: FloatArray) -> FloatArray | None:
@@ -264,34 +195,6 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
         axes.set_ylabel(y, fontsize=FONT)
     axes.grid(True, which="major", axis=grid, color=_GRID)
     axes.set_axisbelow(True)
-
-
-def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
-    names = list(labels)
-    if not names:
-        return
-    room = figure.get_figwidth() / (_HANDLE + _LETTER * max(map(len, names)))
-    columns = max(min(int(room), len(names)), 1)
-    figure.legend(handles, names, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
-
-
-def tells(figure: Figure) -> bool:
-    for axes in figure.axes:
-        if axes.images or any(
-            isinstance(each, PolyCollection) or len(each.get_offsets()) > 1 for each in axes.collections
-        ):
-            return True
-        points = {
-            (float(x), float(y))
-            for line in axes.lines
-            if all(line.get_transform().contains_branch_seperately(axes.transData))
-            for x, y in np.asarray(line.get_xydata(), dtype=np.float64)
-            if np.isfinite((x, y)).all()
-        }
-        bars: list[Any] = [each for each in axes.patches if np.isfinite(each.get_extents().bounds).all()]
-        if len(points) + len(bars) > 1:
-            return True
-    return False
 
 
 def figure_of(
@@ -387,20 +290,23 @@ def draw_image(
 
 
 def draw_plan(plan: Plan, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
+    """Draw the error of the frames without each effect, or the predicted seconds of each stage, as bars."""
     if quantity == "error":
-        errors = {f"{row.name} ({row.state})": row.error_if_off for row in plan.effects if row.error_if_off is not None}
-        axes = _axes(ax, 0.7 + 0.36 * len(errors))
-        error_bars(errors, plan.accuracy, axes=axes)
-        axes.set_xlabel("relative error of the frames if it were off [1]", fontsize=FONT)
-        axes.set_title(f"Plan at accuracy {plan.accuracy:g}", fontsize=FONT, pad=22)
-        return axes
-    axes = _axes(ax, 1.0 + ROW * len(plan.predicted))
-    names = [*plan.predicted][::-1]
-    bars = axes.barh(names, [plan.predicted[name] for name in names], color=BLUE)
-    axes.bar_label(bars, fmt="%.2f", padding=3, fontsize=FONT - 1)
+        values = {f"{row.name} ({row.state})": row.error_if_off for row in plan.effects if row.error_if_off is not None}
+        label, title = "relative error of the frames if it were off [1]", f"Plan at accuracy {plan.accuracy:g}"
+    else:
+        values = dict(plan.predicted)
+        label, title = "predicted time [s]", f"Plan: {plan.predicted_seconds:.2f} s from start to finish"
+    names = sorted(values, key=values.__getitem__) if quantity == "error" else [*values][::-1]
+    axes = _axes(ax, 1.0 + ROW * len(values))
+    bars = axes.barh(names, [values[name] for name in names], color=BLUE)
+    axes.bar_label(bars, [scientific(values[name]) for name in names], padding=3, fontsize=FONT - 1)
+    if quantity == "error":
+        axes.set_xscale("log")
+        axes.axvline(plan.accuracy, color=VERMILION, lw=1.5, ls="--")
     axes.margins(x=0.12)
-    label_axes(axes, "predicted time [s]", "", grid="x")
-    axes.set_title(f"Plan: {plan.predicted_seconds:.2f} s from start to finish", fontsize=FONT)
+    label_axes(axes, label, "", grid="x")
+    axes.set_title(title, fontsize=FONT)
     return axes
 
 
@@ -428,8 +334,7 @@ def _draw(
     if white is not None:
         curve = (lambda part: lightness(part / white), lambda shade: white * linear_light(shade))
         style["norm"], scale = FuncNorm(curve, 0.0, white), "shown by the sRGB curve"
-        below, above = shown.min() < 0, shown.max() > white
-        extend = "both" if below and above else "min" if below else "max" if above else "neither"
+        extend = "both" if shown.min() < 0 or shown.max() > white else "neither"
     drawn = axes.imshow(shown, **style)
     axes.set_title(title, fontsize=FONT)
     axes.set_xlabel(f"column [{pixel}pixel]", fontsize=FONT)

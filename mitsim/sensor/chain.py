@@ -86,7 +86,9 @@ def expose(
 
 
 def _read_out(model: Any, light: Any, dark: Any, few: Any, offset: Any, shot: Any, read: Any) -> Any:
-    electrons = bend(clip_at_full_well(_electron_counts(light + dark, few, shot), model), model)
+    counts = poisson_count(light + dark, shot)
+    counts = counts if few is None else operations(counts).select(few == few, few, counts)
+    electrons = bend(clip_at_full_well(counts, model), model)
     if offset is not None:
         electrons = electrons + offset
     return quantise(amplify(add_read_noise(electrons, model, read), model), model)
@@ -242,11 +244,6 @@ def _few(light: FloatArray, dark: FloatArray | float, rng: np.random.Generator) 
     # Of a child, so that the pixels which expect many have the same deviates whatever these have.
     counts[few] = rng.spawn(1)[0].poisson(expected[few])
     return counts
-
-
-def _electron_counts(expected: Any, few: Any, z: Any) -> Any:
-    many = poisson_count(expected, z)
-    return many if few is None else operations(many).select(few == few, few, many)
 
 
 def poisson_count(expected: Any, z: Any) -> Any:

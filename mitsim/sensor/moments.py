@@ -47,22 +47,18 @@ def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatA
     # Twelve standard deviations below the full well the loss is under 1e-30: left out, and with it nearly all the time.
     near = full_well_e - mean < 12 * np.sqrt(full_well_e) if np.isfinite(full_well_e) else np.zeros(mean.shape, bool)
     if near.any():
-        clipped[near], variance[near] = _clip_moments(mean[near], full_well_e)
+        part, step = mean[near], math.ceil(full_well_e)
+        over = part - full_well_e
+        above, below = _tails(step, part)
+        edge = part * _poisson(step - 1, part)
+        skew = (part + step - 2 * full_well_e) * edge
+        # The differences of nearly equal terms can leave a rounding error below zero, where the truth is zero.
+        loss, room = np.maximum(over * above + edge, 0.0), np.maximum(edge - over * below, 0.0)
+        low = part - ((over**2 + part) * above + skew) - loss**2 + 2 * loss * over
+        high = (over**2 + part) * below - skew - room**2
+        clipped[near] = np.where(over < 0, part - loss, full_well_e - room)
+        variance[near] = np.maximum(np.where(over < 0, low, high), 0.0)
     return clipped, variance
-
-
-def _clip_moments(mean: FloatArray, full_well_e: float) -> tuple[FloatArray, FloatArray]:
-    step = math.ceil(full_well_e)
-    over = mean - full_well_e
-    above, below = _tails(step, mean)
-    edge = mean * _poisson(step - 1, mean)
-    skew = (mean + step - 2 * full_well_e) * edge
-    # The differences of nearly equal terms can leave a rounding error below zero, where the truth is zero.
-    loss, room = np.maximum(over * above + edge, 0.0), np.maximum(edge - over * below, 0.0)
-    low = mean - ((over**2 + mean) * above + skew) - loss**2 + 2 * loss * over
-    high = (over**2 + mean) * below - skew - room**2
-    dim = over < 0
-    return np.where(dim, mean - loss, full_well_e - room), np.maximum(np.where(dim, low, high), 0.0)
 
 
 def _tails(count: int, mean: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -286,7 +286,7 @@ STUDY = Study(
         Lines(
             "seconds", _TIME, y="error", y_label="relative error of the frames [1]", file="accuracy", log=True,
             title="Whole runs from opening the scene to the last file; reference: light alone, extrapolated",
-            colour="estimator", facet="", ticks=False,
+            colour="estimator", facet="",
         ),
         Bars(
             {f"{name}_s".replace(" ", "_"): name for name in _STAGES}, file="stages", title="Stages of whole runs",

@@ -152,7 +152,7 @@ RESOLUTION = Study(
               paper="told apart", at_least=0.1),
     ),
     panels=(
-        Lines("pairs_a_mm", "spatial frequency on the print [line pairs/mm]", ticks=False, y="contrast",
+        Lines("pairs_a_mm", "spatial frequency on the print [line pairs/mm]", y="contrast",
               y_label="contrast of bars at their own frequency [1]"),
         Images("picture", title=f"Bars by line pairs/mm of the print, exposure {EQUAL_FRAME}",
                down=("patterns", "model"), caption="contrast {contrast:.2f}"),

@@ -498,7 +498,7 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
             name: {place: Mean(value, math.nan, 1) for place, value in zip(x.tolist(), y.tolist(), strict=True)}
             for name, y in named.items()
         }
-        return curves({"": lines}, x_label, typeset(y_label), ticks=False, title=typeset(title))
+        return curves({"": lines}, x_label, typeset(y_label), title=typeset(title))
 
     photons, signal, noise = session.transfer()
     charts = {

@@ -98,7 +98,7 @@ def read_planes(frame: Path, image: Path) -> dict[str, tuple[FloatArray, FloatAr
 
     MitsimError for files that are no capture and its image.
     """
-    numbers, n = read_image(frame, Wanted("capture", mosaic=BGGR)), preparation()[1]
+    numbers, n = read_image(frame, Wanted("capture")), preparation()[1]
     if numbers.shape != _RAW or (numbers % _STEP).any() or numbers.min() == numbers.max():
         raise MitsimError(
             f"capture {frame}: is {numbers.shape} of {numbers.min():g} to {numbers.max():g}; give the raw frame, {_RAW}"

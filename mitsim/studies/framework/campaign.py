@@ -107,10 +107,8 @@ class StudyResult:
 
 
 def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figure]:
-    """Write the figures that show two points or more, and return them."""
-    from mitsim.report.plots import tells  # not in processes that measure
-
-    drawn = {file: figure for file, figure in figures.items() if tells(figure)}
+    """Write the figures that show something, and return them."""
+    drawn = {file: figure for file, figure in figures.items() if figure.axes}
     for file, figure in drawn.items():
         with whole_file(folder / file) as part:
             figure.savefig(part, dpi=150, format="png")  # 1290 pixels wide, a page of text on a common screen

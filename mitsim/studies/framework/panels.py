@@ -151,8 +151,8 @@ class Lines(Panel):
         columns of the curves and facets; a mapping shows several columns of numbers instead of ``y``.
     shared
         rows that begin every curve, such as one uniform frame.
-    log, ticks
-        True for a logarithmic x axis, and for a tick at every measured x.
+    log
+        True for a logarithmic x axis.
     """
 
     x: str
@@ -164,7 +164,6 @@ class Lines(Panel):
     facet: Columns = "model"
     shared: Where | None = None
     log: bool = False
-    ticks: bool = True
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         from mitsim.report.plots import curves
@@ -179,7 +178,7 @@ class Lines(Panel):
                 colour: self._means(begin, other or column or self.y) | self._means(line, other or column or self.y)
                 for colour, (line, other) in self.parts(own.drop(begin.index), self.colour).items()
             }
-        return curves(shown, self.x_label, self.y_label, log=self.log, ticks=self.ticks, title=self.title)
+        return curves(shown, self.x_label, self.y_label, log=self.log, title=self.title)
 
     def _means(self, rows: DataFrame, column: str) -> dict[float, Mean]:
         from pandas import to_numeric

@@ -34,7 +34,6 @@ def _sizes() -> list[Case]:
     double = '<bsdf type="diffuse" id="b0"/>' + "".join(
         f'<bsdf type="blendbsdf" id="b{i + 1}"><ref id="b{i}"/><ref id="b{i}"/></bsdf>' for i in range(12)
     )
-    two = '<bsdf type="twosided">' * 11 + '<bsdf type="diffuse"/>' + "</bsdf>" * 11
     tower = "".join(f'<scene version="3.0.0"><include filename="p{i + 1}.xml"/></scene>\0' for i in range(20)).split(
         "\0"
     )
@@ -57,21 +56,13 @@ def _sizes() -> list[Case]:
         Case("8 MiB", put("<!--" + "x" * (8 << 20) + "-->"), ("over 4 MiB",), line=False),
         Case("chain of 4000 references", put(chain), ("nesting", "16 levels")),
         Case("doubling references", put(double), ("nesting", "256 objects")),
-        Case("doubling sides", ball(two), ("nesting",)),
         Case("reference to itself", put('<bsdf type="twosided" id="a"><ref id="a"/></bsdf>'), ("circular reference",)),
-        Case(
-            "two references in a ring",
-            put('<bsdf type="mask" id="a"><ref id="b"/></bsdf><bsdf type="mask" id="b"><ref id="a"/></bsdf>'),
-            ("circular reference",),
-        ),
         Case(
             "ring by another name",
             put('<bsdf type="mask" id="a"><ref id="c"/></bsdf><alias id="a" as="c"/>'),
             ("circular reference",),
         ),
         Case("reference to nothing", ball('<ref id="nope"/>'), ('unresolved reference to "nope"',)),
-        Case("id twice", put('<bsdf type="null" id="a"/><bsdf type="null" id="a"/>'), ('duplicate ID: "a"',)),
-        Case("alias of nothing", put('<alias id="a" as="b"/>'), ('alias source ID "a" not found',)),
         Case("alias over an id", put('<alias id="paper" as="camera"/>'), ("already",)),
         Case("include of itself", put('<include filename="scene.xml"/>'), ("comes back to itself",)),
         Case(
@@ -79,9 +70,6 @@ def _sizes() -> list[Case]:
             put('<include filename="./x/../scene.xml"/>'),
             ("comes back",),
             lambda f: (f / "x").mkdir(),
-        ),
-        Case(
-            "include of its includer", *_second(included('<include filename="scene.xml"/>'), ("comes back to itself",))
         ),
         Case("tower of includes", put('<include filename="p0.xml"/>'), ("64 includes, 8 deep",), towers),
         Case("million includes", put('<include filename="p0.xml"/>'), ("64 includes",), fans),
@@ -113,15 +101,8 @@ def _places() -> list[Case]:
     spectrum = skin("diffuse", '<spectrum name="reflectance" filename="{}"/>')
     return [
         Case("picture above", picture("../out.png"), (lies, "--allow-outside-files"), outside("out.png", png(2, 2))),
-        Case(
-            "picture by a detour",
-            picture("x/../../out.png"),
-            (lies,),
-            lambda f: ((f / "x").mkdir(), outside("out.png", png(2, 2))(f)),
-        ),
         Case("absolute file", picture("/etc/passwd"), (lies,)),
         Case("linked picture", picture("l.png"), (lies,), link("l.png", "/etc/passwd")),
-        Case("linked folder", picture("l/passwd"), (lies,), link("l", "/etc")),
         Case("link to itself", picture("l.png"), ("no such file",), link("l.png", "l.png")),
         Case(
             "file by parameter",
@@ -131,17 +112,8 @@ def _places() -> list[Case]:
             (lies,),
         ),
         Case("device", picture("/dev/zero"), (lies,)),
-        Case("linked device", picture("z.png"), (lies,), link("z.png", "/dev/zero")),
         Case("pipe", picture("pipe.png"), ("plain file",), lambda folder: os.mkfifo(folder / "pipe.png")),
-        Case(
-            "included pipe",
-            put('<include filename="pipe"/>'),
-            ("plain file",),
-            lambda folder: os.mkfifo(folder / "pipe"),
-        ),
         Case("folder", picture("sub"), ("plain file",), lambda folder: (folder / "sub").mkdir()),
-        Case("scene's folder", picture("."), ("plain file",)),
-        Case("no name", picture(""), ("plain file",)),
         Case("empty file", picture("e.png"), ("plain file",), file("e.png", b"")),
         Case(
             "huge sparse file",
@@ -150,24 +122,14 @@ def _places() -> list[Case]:
             lambda folder: os.truncate(_touched(folder / "h.png"), 1 << 40),
         ),
         Case("missing file", picture("none.png"), ("no such file",)),
-        Case("name of 5000 letters", picture("n" * 5000), ("no such file",)),
         Case("address", picture("http://localhost/x.png"), ("no such file",)),
-        Case("file of the working folder", picture("pyproject.toml"), ("no such file",)),
         Case(
             "include above",
             put('<include filename="../p.xml"/>'),
             (lies,),
             outside("p.xml", '<scene version="3.0.0"/>'),
         ),
-        Case("absolute include", put('<include filename="/etc/passwd"/>'), (lies,)),
-        Case("include of nothing", put('<include filename=""/>'), ("plain file",)),
         Case("include of a picture", put('<include filename="projector.png"/>'), ("not well-formed",)),
-        Case(
-            "include of another root",
-            put('<include filename="p.xml"/>'),
-            ("version",),
-            file("p.xml", '<path value="/"/>'),
-        ),
         Case("spectrum above", spectrum.format("../s.spd"), (lies,), outside("s.spd", "400 1\n700 1\n")),
         Case(
             "spectrum of text",
@@ -175,19 +137,9 @@ def _places() -> list[Case]:
             ("s.spd", "wavelength in line 1"),
             file("s.spd", "root:x:0:0\n"),
         ),
-        Case(
-            "spectrum of no number",
-            spectrum.format("s.spd"),
-            ("reflectance: got nan",),
-            file("s.spd", "400 nan\n700 1\n"),
-        ),
         Case("spectrum above 1", spectrum.format("s.spd"), ("reflectance: got 3",), file("s.spd", "400 1\n700 3\n")),
-        Case("negative spectrum", spectrum.format("s.spd"), ("got -3",), file("s.spd", "400 1\n700 -3\n")),
         Case("native plugin", GOOD, ("plugins/evil.so", "native code"), native("plugins/evil.so"), line=False),
         Case("native plugin of a stock name", GOOD, ("native code",), native("plugins/diffuse.so"), line=False),
-        Case("native plugin in capitals", GOOD, ("native code",), native("PLUGINS/evil.SO"), line=False),
-        Case("native plugin of Windows", GOOD, ("native code",), native("Plugins/evil.dll"), line=False),
-        Case("native plugin of macOS", GOOD, ("native code",), native("plugins/evil.dylib"), line=False),
         Case(
             "linked plugins",
             GOOD,
@@ -253,10 +205,7 @@ def _contents() -> list[Case]:
     return [
         shown("claims 2^31 texels", png(4, 4, (65535, 32769)), "65535x32769"),
         shown("claims no texels", png(4, 4, (0, 4)), "damaged PNG"),
-        shown("claims 2^32 a side", png(4, 4, (0xFFFFFFFF, 0xFFFFFFFF)), "4294967295"),
         shown("text", "hello", "no PNG"),
-        shown("SVG", '<svg xmlns="http://www.w3.org/2000/svg"/>', "no PNG"),
-        shown("GIF", b"GIF89a" + bytes(20), "no PNG"),
         shown("cut JPEG", b"\xff\xd8\xff\xe0\0\x10JFIF", "damaged PNG or JPEG"),
         shown("huge JPEG", jpeg(65535, 65535), "65535x65535"),
         shown("JPEG behind a marker without length", jpeg(20000, 20000, hidden=True), "20000x20000"),
@@ -264,15 +213,9 @@ def _contents() -> list[Case]:
             "JPEG of two sizes", jpeg(4, 4).replace(b"\xff\xda", jpeg(20000, 20000)[2:-8] + b"\xff\xda"), "20000x20000"
         ),
         shown("turned JPEG", saved("JPEG"), "orientation 6"),
-        shown("turned PNG", saved("PNG"), "orientation 6"),
         shown("animated PNG", saved("PNG", **frames), "animated"),
         shown("huge PFM", large, "30000x30000"),
         shown("huge HDR", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 90000 +X 90000\n", "90000x90000"),
-        shown(
-            "huge HDR with a blank",
-            b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 20000 +X 20000 \n-Y 4 +X 4\n",
-            "Radiance",
-        ),
         shown("HDR without a size", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n", "Radiance"),
         shown("PFM of no numbers", b"PF\nx 4\n-1.0\n", "PFM"),
         shown("cut EXR", b"\x76\x2f\x31\x01\x02\0\0\0chan", "cut short"),
@@ -289,28 +232,17 @@ def _contents() -> list[Case]:
         meshed("text", "hello", "no PLY"),
         meshed("no end of header", b"ply\n" + b"comment x\n" * 9999, "no PLY"),
         meshed("a billion vertices", header(999999999) + points, "more than its bytes hold"),
-        meshed("a billion faces", header(3, 999999999) + points, "more than its bytes hold"),
-        meshed("10^20 vertices", header(10**20) + points, "not understood"),
         meshed("-1 vertices", header(-1) + points, "not understood"),
         meshed("corner beyond the vertices", header() + points + struct.pack("<B3i", 3, 0, 1, 99999999), "3 vertices"),
-        meshed("negative corner", header() + points + struct.pack("<B3i", 3, 0, 1, -1), "3 vertices"),
-        meshed("corner beyond the vertices, as text", MESH.replace("3 0 1 2", "3 0 1 99999999"), "3 vertices"),
         meshed("faces of 255 corners", header() + points + struct.pack("<B3i", 255, 0, 1, 2), "no triangles"),
         meshed("cut short", good[:-1], "more than its bytes hold"),
-        meshed("cut short, as text", MESH[:-3], "more than its text holds"),
         meshed(
             "vertex not finite",
             header() + struct.pack("<9f", float("nan"), *range(8)) + struct.pack("<B3i", 3, 0, 1, 2),
             "not finite",
         ),
-        meshed(
-            "vertex beyond 10 km",
-            header() + struct.pack("<9f", 1e30, *range(8)) + struct.pack("<B3i", 3, 0, 1, 2),
-            "beyond 1e+07",
-        ),
         meshed("words for numbers", MESH.replace("9 0 500", "9 zero 500"), "no numbers"),
         meshed("unknown format", good.replace(b"binary_little_endian", b"binary_odd"), "no format"),
-        meshed("unknown type", good.replace(b"float x", b"quad x"), "not understood"),
         meshed(
             "vertices with a list",
             good.replace(b"element face", b"element vertex").replace(b"element vertex", b"element face", 1),
@@ -326,11 +258,9 @@ def _contents() -> list[Case]:
             MESH.replace("end_header", "element nothing 999999999\nend_header"),
             "element nothing without properties",
         ),
-        meshed("two properties of a name", MESH.replace("float y", "float x", 1), "two properties of one name"),
         meshed("whole numbers for coordinates", MESH.replace("float x", "int x"), "of type float or double"),
         meshed("no faces", header(3, 0) + points, "cloud of points"),
         meshed("bytes after the last face", good + b"\0", "more than its header"),
-        meshed("words after the last face", f"{MESH} 7", "more than its header"),
         meshed(
             "line ends of another kind",
             good.replace(b"float z\n", b"float z\ncomment \x85property float w\n").replace(points, points[:-4]),
@@ -338,8 +268,6 @@ def _contents() -> list[Case]:
         ),
         meshed("text", "hello", "not understood, 1 ('hello')", kind="obj"),
         meshed("vertex not finite", OBJ.replace("9 0 500", "nan 0 500"), "not finite", kind="obj"),
-        meshed("two coordinates", OBJ.replace("9 0 500", "9 0"), "three numbers", kind="obj"),
-        meshed("words", OBJ.replace("9 0 500", "9 zero 0"), "three numbers", kind="obj"),
     ]
 
 

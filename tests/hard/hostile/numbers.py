@@ -26,20 +26,7 @@ def _numbers() -> list[Case]:
     cases = [Case(f"radius {v}", ball(number("radius", v)), ("radius: got",)) for v in ("0", "-1", "nan", "inf", "1e9")]
     cases += [
         Case(f"reflectance {v}", skin("diffuse", number("reflectance", v, "spectrum")), ("reflectance",))
-        for v in (
-            "1.0001",
-            "-0.1",
-            "nan",
-            "inf",
-            "1e400",
-            "0x1",
-            "1_0",
-            "400:0.5, 700:2",
-            "400:0.5 nan",
-            "700:0.1 400:0.1",
-            "",
-            "½",
-        )
+        for v in ("1.0001", "nan", "1e400", "1_0", "400:0.5, 700:2", "700:0.1 400:0.1", "")
     ]
     cases += [
         Case(f"alpha {v}", ball(rough.format(number("alpha", v))), ("alpha: got", "above 0 to 1"))
@@ -63,21 +50,6 @@ def _numbers() -> list[Case]:
             skin("principled", texture.format("uniform", number("value", "9")).replace("reflectance", "sheen")),
             ("sheen: got 9",),
         ),
-        Case(
-            "opacity by a texture",
-            skin("mask", texture.format("uniform", number("value", "9")).replace("reflectance", "opacity")),
-            ("opacity: got 9",),
-        ),
-        Case(
-            "colour above 1 in a checkerboard",
-            skin(
-                "diffuse",
-                texture.format(
-                    "checkerboard", texture.format("uniform", number("value", "3")).replace("reflectance", "color0")
-                ),
-            ),
-            ("color0: got 3",),
-        ),
         Case("light as a reflectance", skin("diffuse", texture.format("d65", "")), ("type: got 'd65'", "no light")),
         Case(
             "colours of vertices made brighter",
@@ -95,18 +67,11 @@ def _numbers() -> list[Case]:
             ),
             ("to_uv: got", "window"),
         ),
-        Case("colour above 1", skin("diffuse", number("reflectance", "0.1 0.2 1.5", "rgb")), ("got 1.5",)),
-        Case("reflectance as a number", skin("diffuse", number("reflectance", "2")), ("reflectance: got 2",)),
-        Case("uniform texture above 1", skin("diffuse", texture.format("uniform", number("value", "2"))), ("got 2",)),
         Case(
             "checkerboard above 1",
             skin("diffuse", texture.format("checkerboard", number("color0", "2", "rgb"))),
             ("got 2",),
         ),
-        Case(
-            "table above 1", skin("diffuse", texture.format("regular", number("values", "1, 2", "string"))), ("got 2",)
-        ),
-        Case("negative texture", skin("diffuse", texture.format("uniform", number("value", "-1"))), ("got -1",)),
         Case(
             "reflectance by reference",
             put(f'<texture id="t" type="uniform">{number("value", "3")}</texture>').replace(
@@ -126,11 +91,7 @@ def _numbers() -> list[Case]:
         ),
         Case("negative scale of the projector", swap('"111000"', '"-1"'), ("scale: got -1", "at least 0")),
         Case("index below 1", skin("dielectric", number("int_ior", "0.1")), ("int_ior: got 0.1", "1 to 10")),
-        Case("index of 1e9", skin("dielectric", number("ext_ior", "1e9")), ("ext_ior: got 1e+09",)),
         Case("opacity 2", skin("mask", number("opacity", "2")), ("opacity: got 2",)),
-        Case("two numbers for one", ball(number("radius", "1 2")), ("name='radius'", 'value "1 2"')),
-        Case("no number", ball(number("radius", "")), ("radius: got ''",)),
-        Case("a word", ball(number("radius", "big")), ("name='radius'", 'value "big"')),
         Case("digits of another script", ball(number("radius", "١٢")), ("name='radius'", "could not parse")),
         Case(
             "fraction for a whole number",
@@ -154,43 +115,28 @@ def _numbers() -> list[Case]:
         ),
         Case("point beyond 10 km", ball('<point name="center" value="0, 0, 1e30"/>'), ("center: got 1e+30",)),
         camera("fov", "20", "0"),
-        camera("fov", "20", "180"),
-        camera("fov", "20", "-20"),
         camera("mask_order", "9", "40", "from 2 to 16"),
         camera("mask_distance", "2", "0", "from 1e-09"),
         camera("mask_distance", "2", "400", "less than scene_distance"),
-        camera("mask_distance", "2", "-1"),
         camera("scene_distance", "400", "0.4", "1 unit is 1 mm", "metres"),
         camera("pixel_pitch", "0.01172", "1.172e-5", "1 unit is 1 mm", "metres"),
-        camera("mask_feature", "0.06", "6e-5", "1 unit is 1 mm", "metres"),
         camera("width", "32", "1000000", "16384"),
         camera("height", "32", "0", "1 to 16384"),
         camera("sample_count", "4", "0"),
-        camera("sample_count", "4", "999999999"),
         camera("max_depth", "2", "-7"),
-        camera("max_depth", "2", "999999"),
         turned('<scale value="0"/>', "stretching by 0", "invertible"),
-        turned('<scale x="1e-30" y="1e-30" z="1e-30"/>', "invertible"),
         turned('<scale value="1e30"/>', "stretching by 1e+30"),
         turned('<scale value="1 2"/>', "1 or 3 numbers"),
-        turned('<scale value="1" x="2"/>', "1 or 3 numbers"),
         turned('<translate x="nan"/>', "to_world: got", "nan"),
         turned('<translate x="1e20"/>', "moving by 1e+20"),
         turned('<rotate angle="30"/>', "axis cannot be zero"),
-        turned('<rotate x="1" angle="inf"/>', "to_world: got", "nan"),
         turned('<matrix value="1 2 3"/>', "9 or 16"),
-        turned('<matrix value="1 0 0 0 1 0 0 0 0"/>', "invertible"),
         turned('<matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1"/>', "last row"),
-        turned('<matrix value="1 0 0 0 0 1 0 0 0 0 1 nan 0 0 0 1"/>', "to_world: got", "nan"),
         turned('<lookat origin="0 0 0" target="0 0 0"/>', "invalid lookat"),
-        turned('<lookat origin="0 0 0" target="0 5 0" up="0 1 0"/>', "invalid lookat"),
         turned('<lookat origin="0 0" target="0 5 0"/>', "expected 3 values"),
         posed("camera", '<scale value="2"/>'),
-        posed("camera", '<scale x="-1"/>'),
-        posed("camera", '<scale z="1000"/>'),
         posed("camera", '<matrix value="1 0.1 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/>'),
         posed("projector", '<scale value="1000"/><translate x="60"/>'),
-        posed("projector", '<scale x="-1"/>'),
     ]
     return cases
 

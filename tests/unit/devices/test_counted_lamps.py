@@ -13,13 +13,6 @@ FILTERS = {"G": (400.0, 700.0), "B": (390.0, 650.0), "R": (300.0, 900.0)}
 """Ends [nm] of the curves of a camera's filters, GBRG."""
 
 
-def test_a_number_is_the_efficiency_at_every_wavelength() -> None:
-    response = Response.of(sensor(quantum_efficiency=0.5))
-    assert response.range_nm == SPECTRA_NM and response.beyond_nm == 0
-    assert response.counts == pytest.approx(0.5 * np.linspace(*SPECTRA_NM, len(response.counts)), rel=1e-14)
-    assert line_units(sensor(quantum_efficiency=0.5), Lines((600.0, 400.0), (0.5, 0.5))) == (1 / 300, 1 / 200)
-
-
 def test_lines_behind_filters_share_a_count_as_their_power() -> None:
     """Together they make as many electrons of a pixel in the mean. (Planted: each line all of it.)"""
     ends = {"R": 0.0, "G": 0.2, "B": 0.4}
@@ -32,12 +25,6 @@ def test_lines_behind_filters_share_a_count_as_their_power() -> None:
     blind = {name: {"wavelengths_nm": [390.0, 395.0, 610.0], "efficiency": [0.4, 0, 0]} for name in "RGB"}
     with pytest.raises(MitsimError, match="is blind to all lines of the projector"):
         line_units(sensor(**{**change, "mosaic_curves": blind}), Lines((600.0, 500.0), (0.75, 0.25)))
-
-
-def test_bands_are_even_and_so_are_their_parts() -> None:
-    response = Response(np.ones(2), (400.0, 800.0))
-    assert response.bands(4) == ((400, 500), (500, 600), (600, 700), (700, 800))
-    assert response.bands(2, 1, 2) == ((500, 600), (700, 800))
 
 
 def test_a_curve_that_goes_on_beyond_spectra_says_how_far() -> None:
@@ -82,21 +69,6 @@ def test_each_colour_of_filters_counts_in_its_own_pixels() -> None:
     assert [each.beyond_nm for each in found[:2]] == [0, 0] and found[2].beyond_nm > 50
     (bare,) = Response.of_each(sensor(quantum_efficiency=0.5))
     assert bare == Response.of(sensor(quantum_efficiency=0.5)) and bare.planes == (0, 1, 2, 3) and bare.part == 1
-
-
-def test_a_curve_that_has_fallen_to_nothing_goes_on_as_nothing() -> None:
-    """And one that is next to nothing as next to nothing. (Planted: a division by none; small ones taken for none.)"""
-    ends = {(0.0, 0.0): 0.0, (0.0, 0.5): 0.0, (1e-4, 1e-4): (1030**2 - 830**2) / 2 / 830}
-    for last, beyond in ends.items():
-        curve = {"wavelengths_nm": [400.0, 830.0, 1030.0], "efficiency": [0.5, *last]}
-        found = Response.of(sensor(quantum_efficiency=None, quantum_efficiency_curve=curve))
-        assert found.beyond_nm == pytest.approx(beyond)
-
-
-def test_a_curve_of_one_wavelength_of_spectra_counts_nothing() -> None:
-    curve = {"wavelengths_nm": [830.0, 1030.0], "efficiency": [0.5, 0.5]}
-    with pytest.raises(MitsimError, match="switch lamps off"):
-        Response.of(sensor(quantum_efficiency=None, quantum_efficiency_curve=curve))
 
 
 def test_lamps_have_four_rows_of_each_response() -> None:

@@ -9,15 +9,7 @@ import pytest
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.session import DRIFT_PARAMETERS, DRIFT_UNITS, DRIFT_WORDS, Drift, MaskMotion, load_recipe
-
-
-def test_nothing_moves_where_nothing_is_said() -> None:
-    """(Planted: a rotation of 1 by default.)"""
-    none = Drift()
-    assert none.kinds == () and none.mask_mm == (0, 0, 0) and none.motion is None and load_recipe().drift == none
-    assert set(DRIFT_UNITS) == set(DRIFT_WORDS)
-    assert set(DRIFT_UNITS) == {*Drift.model_fields} - set(DRIFT_PARAMETERS)
+from mitsim.devices.session import DRIFT_UNITS, Drift, MaskMotion, load_recipe
 
 
 def test_one_kind_alone() -> None:
@@ -39,15 +31,6 @@ def test_a_ripple_has_a_frequency_and_keeps_it() -> None:
     assert both.alone("power").ripples == {} and Drift(power_ripple_hz=60.0).kinds == ()
     with pytest.raises(MitsimError, match=r"^drift[^\n]*lamp_ripple 0\.1 has no frequency; give lamp_ripple_hz[^\n]*$"):
         Drift(power_ripple_hz=60.0).alone("lamp_ripple", 0.1)
-
-
-@pytest.mark.parametrize(
-    ("kind", "amount", "reported"),
-    [("speed", 1, "no such kind"), ("power", -2, "power"), ("mask_tilt_rows_mrad", 51, "50")],
-)
-def test_what_cannot_be_is_one_line(kind: str, amount: float, reported: str) -> None:
-    with pytest.raises(MitsimError, match=rf"^drift[^\n]*{reported}[^\n]*$"):
-        Drift().alone(kind, amount)
 
 
 def test_the_shipped_drift_is_of_the_shipped_session(tmp_path: Path) -> None:

@@ -18,10 +18,6 @@ PLANES = {
 COLOUR = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": PLANES}
 
 
-def test_a_number_holds_at_all_wavelengths() -> None:
-    assert sensor(quantum_efficiency=0.75).efficiency(400.0) == 0.75 == sensor(quantum_efficiency=0.75).efficiency(1e5)
-
-
 def test_a_curve_is_linear_between_its_points() -> None:
     model = sensor(quantum_efficiency=None, quantum_efficiency_curve=CURVE)
     found = [model.efficiency(wavelength) for wavelength in (450.0, 500.0, 550.0, 575.0, 650.0)]
@@ -42,11 +38,6 @@ def test_each_plane_of_a_mosaic_has_its_curve() -> None:
         model.efficiency(550.0)
     with pytest.raises(MitsimError, match="no mosaic, and plane G"):
         sensor().efficiency(550.0, "G")
-
-
-def test_no_efficiency_no_electrons() -> None:
-    with pytest.raises(MitsimError, match="states no quantum_efficiency"):
-        sensor(quantum_efficiency=None).efficiency(550.0)
 
 
 @pytest.mark.parametrize(
@@ -87,12 +78,3 @@ mosaic = "GRBG"
     (tmp_path / "b.toml").write_text(plain + "".join(f"{plane} = {line}\n" for plane in "RG"))
     with pytest.raises(MitsimError, match=r"b\.toml: mosaic_curves\.B: is missing"):
         load_sensor(tmp_path / "b.toml")
-
-
-def test_a_manifest_tells_the_curve() -> None:
-    """Frames of two curves are not taken for those of one camera."""
-    model = sensor(quantum_efficiency=None, quantum_efficiency_curve=CURVE)
-    assert model.identity["quantum_efficiency_curve"] == {
-        "wavelengths_nm": (450.0, 550.0, 650.0), "efficiency": (0.5, 0.7, 0.4),
-    }  # fmt: skip
-    assert "mosaic" not in model.identity and "quantum_efficiency" not in model.identity

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import (
     FAMILIES,
-    Lighting,
     hadamard_matrix,
     hadamard_orders,
     parse_patterns,
@@ -79,19 +78,6 @@ def test_dots_light_every_pixel_exactly_once(n: int, data: st.DataObject) -> Non
     assert len(np.unique(labels)) == rows * columns
 
 
-def test_uniform_lighting_is_the_uniform_familys() -> None:
-    family, uniform = parse_patterns("uniform", 7), Lighting.uniform(7)
-    assert family.lighting is family.lighting, "found once"
-    assert np.array_equal(family.lighting.labels, uniform.labels)
-    assert np.array_equal(family.lighting.weights, uniform.weights)
-
-
-def test_dots_are_the_papers_grid_of_every_kth_pixel() -> None:
-    family = parse_patterns("dots:3", 8)
-    lit = family.light(next(c for c in family.shots if (c.row, c.column) == (1, 2)))
-    assert np.array_equal(np.argwhere(lit), [(r, c) for r in (1, 4, 7) for c in (2, 5)])
-
-
 def test_dots_of_two_periods_repeat_each_along_its_own_axis() -> None:
     family = parse_patterns("dots:3x2", 7)
     lit = family.light(next(c for c in family.shots if (c.row, c.column) == (1, 1)))
@@ -119,15 +105,6 @@ def test_hadamard_matrices_are_hadamard(order: int) -> None:
     assert (matrix[:, 0] == 1).all(), "the uniform pattern has to be among them"
 
 
-def test_hadamard_orders_reach_every_multiple_of_four_up_to_48() -> None:
-    assert hadamard_orders(48) == [1, 2, *range(4, 49, 4)]
-
-
-def test_a_missing_hadamard_order_names_its_neighbours() -> None:
-    with pytest.raises(MitsimError, match=r"order 52 .* use 48 or 56"):
-        hadamard_matrix(52)
-
-
 def test_random_is_seeded_and_covers_every_pixel() -> None:
     # With k = 2 a quarter of the rows would be dark by chance: the cover must be made, not hoped for.
     family = parse_patterns("random:2", 64, seed=3)
@@ -137,12 +114,6 @@ def test_random_is_seeded_and_covers_every_pixel() -> None:
     assert np.array_equal(family.left, again.left) and np.array_equal(family.right, again.right)
     assert not np.array_equal(family.left, other.left)
     assert not np.array_equal(family.left, family.right), "rows and columns need streams of their own"
-
-
-def test_random_is_a_fair_coin() -> None:
-    bits = parse_patterns("random:40", 500, seed=1).left
-    # 20 000 flips: standard deviation 0.0035; five of them. (Forced pixels: 500 x 2^-40, none.)
-    assert abs(bits.mean() - 0.5) < 0.018
 
 
 @pytest.mark.parametrize(
@@ -239,8 +210,3 @@ def test_a_registered_family_is_known_to_the_command_line(tmp_path: Path) -> Non
 def test_a_name_is_registered_once() -> None:
     with pytest.raises(ValueError, match="'dots' is there already; known are uniform, dots, "):
         pattern_family("dots:K")
-
-
-def test_the_documents_name_every_family() -> None:
-    text = Path(__file__).parents[3].joinpath("docs/formats.md").read_text(encoding="utf-8")
-    assert not [form for family in FAMILIES.values() for form in family.forms if f"`{form}`" not in text]

@@ -36,13 +36,6 @@ def test_masks_of_one_or_two_terms_have_them_exactly(values: np.ndarray, terms: 
     np.testing.assert_allclose(product(plate), values, rtol=0, atol=1e-15)
 
 
-def test_the_one_term_of_a_drawn_mls_mask_is_its_code() -> None:
-    mask = mls_mask(order=6)
-    ((weight, rows, columns),) = Plate(0.06, drawn("separable"), "it").terms
-    ((_, code, _),) = mask.terms
-    assert weight == 1 and np.array_equal(rows, code) and np.array_equal(columns, code)
-
-
 def test_any_other_mask_is_its_singular_vectors_but_for_what_is_stated() -> None:
     """Singular values that fall by ten each: as many terms as the bound asks for, and the stated rest is the rest.
     Rows and columns come up to nine times, as in drawings of several pixels a feature. (Planted: no weights.)"""
@@ -109,14 +102,6 @@ def test_grids_hold_what_is_open_once(values: np.ndarray) -> None:
     plate = Plate(0.06, values, "it")
     assert plate.grids is not None
     np.testing.assert_array_equal(sum(np.outer(r, c).astype(int) for r, c in plate.openings), values)
-
-
-def test_what_is_not_few_grids_lies_in_their_rectangle() -> None:
-    values = np.random.default_rng(1).random((9, 9))
-    values[0], values[:, 3] = 0, 0
-    plate = Plate(0.06, values, "it")
-    ((rows, columns),) = plate.openings
-    assert plate.grids is None and rows.tolist() == [False] + 8 * [True] and not columns[3] and columns.sum() == 8
 
 
 @pytest.mark.parametrize("most", [0.0, 5e-324, 1e-300, 1e-12])

@@ -9,29 +9,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from mitsim.core.configuration import load_model, shipped_path, validate
+from mitsim.core.configuration import load_model, validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines, ProjectorModel
 
 BASE = {"name": "test", "effective_wavelength_nm": 550.0}
-
-
-def test_the_shipped_file_is_a_projector_with_its_sources() -> None:
-    model = load_model(shipped_path("calibration", "mp_cl1.toml"), ProjectorModel)
-    assert (model.luminous_flux_lm, model.columns, model.rows, model.laser_class) == (32.0, 1920, 720, "3R")
-    assert "wavelengths_nm" in model.assumed and "radiant_shares" in model.derived and model.source
-    assert model.black_level == pytest.approx(1 / 80_000)
-
-
-def test_a_mistyped_field_is_refused_with_the_field_it_resembles(tmp_path: Path) -> None:
-    """`blur_pixel = 3` was ignored, and the projector was sharp."""
-    path = tmp_path / "mine.toml"
-    path.write_text('name = "mine"\neffective_wavelength_nm = 550\nblur_pixel = 3\n')
-    with pytest.raises(MitsimError, match=r"mine\.toml: blur_pixel: got 3, no such .* mean blur_pixels\?"):
-        load_model(path, ProjectorModel)
-    path.write_text('name = "mine"\neffective_wavelenght_nm = 550\n')
-    with pytest.raises(MitsimError, match=r"effective_wavelenght_nm: [^;]*; did you mean effective_wavelength_nm\?"):
-        load_model(path, ProjectorModel)
 
 
 @pytest.mark.parametrize(
@@ -72,10 +54,6 @@ def test_a_scattered_chessboard_has_the_ansi_contrast(contrast: float, black: fl
     middles = [place for start in range(field // 2 - 1, side, field) for place in (start, start + 1)]
     seen, bright = light[np.ix_(middles, middles)], white[np.ix_(middles, middles)]
     assert seen[bright].mean() / seen[~bright].mean() == pytest.approx(contrast, rel=1e-3)
-
-
-def test_a_lens_scatters_nothing_unless_its_file_says_so() -> None:
-    assert ProjectorModel(**BASE).glare == ProjectorModel(**BASE, contrast_ratio=100.0).glare == 0
 
 
 @pytest.mark.parametrize(
@@ -119,17 +97,6 @@ def test_speckle_is_a_number_or_a_table(tmp_path: Path) -> None:
 LED = Lines((630.0, 460.0, 450.0, 440.0, 620.0), (0.2, 0.1, 0.3, 0.1, 0.3))
 
 
-def test_bands_are_cut_between_lines_that_are_far_apart() -> None:
-    """Each keeps its lines' power at the wavelength of as many photons (planted: the plain mean, 450 and 625)."""
-    blue, red = LED.bands(2)
-    assert blue == Lines((440.0, 450.0, 460.0), (0.1, 0.3, 0.1)) and red == Lines((620.0, 630.0), (0.3, 0.2))
-    assert (blue.mean_nm, red.mean_nm) == (450.0, 624.0)
-    model = ProjectorModel(**BASE, wavelengths_nm=LED.wavelengths_nm, radiant_shares=LED.shares)
-    assert model.in_bands(2).wavelengths_nm == (450.0, 624.0)
-    assert model.in_bands(2).radiant_shares == pytest.approx((0.5, 0.5))
-    assert model.in_bands(2).lines.mean_nm == pytest.approx(model.lines.mean_nm)
-
-
 def spread(bands: Sequence[Lines]) -> float:
     """Power times squared distance from the band's mean."""
     return sum(
@@ -149,13 +116,3 @@ def test_no_other_cuts_leave_less_of_the_power_off_its_bands_mean() -> None:
         every = combinations(range(1, 9), count - 1)
         least = min(spread([Lines(waves[a:b], shares[a:b]) for a, b in pairwise((0, *at, 9))]) for at in every)
         assert len(lines.bands(count)) == count and spread(lines.bands(count)) == pytest.approx(least)
-
-
-def test_bands_of_as_many_as_lines_are_the_lines() -> None:
-    """To the last bit, so that folders and calibrations are the same; lines without power are none, and two of one
-    wavelength one."""
-    assert [band.mean_nm for band in LED.bands(5)] == sorted(LED.wavelengths_nm)
-    assert Lines((600.0, 500.0, 600.0), (0.25, 0.0, 0.75)).bands(1) == (Lines((600.0,), (1.0,)),)
-    for count in (0, 6):
-        with pytest.raises(MitsimError, match=f"{count} bands of 5 lines of light: give 1 to 5"):
-            LED.bands(count)

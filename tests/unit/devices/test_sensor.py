@@ -31,12 +31,6 @@ def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
     assert model.largest_dn == 9 * 4095
 
 
-def test_without_binning_a_superpixel_is_a_pixel() -> None:
-    model = SensorModel(**BASE)
-    assert (model.superpixel_full_well_e, model.superpixel_read_noise_e) == (1000.0, 3.0)
-    assert model.largest_dn is None
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -66,20 +60,6 @@ def test_without_binning_a_superpixel_is_a_pixel() -> None:
 def test_a_value_out_of_range_is_refused(field: str, value: object) -> None:
     with pytest.raises(ValidationError, match=field):
         SensorModel(**{**BASE, field: value})
-
-
-def test_whole_numbers_are_numbers() -> None:
-    assert SensorModel(**{**BASE, "full_well_e": 1000, "read_noise_e": 3}) == SensorModel(**BASE)
-
-
-def test_a_black_level_at_the_ceiling_is_refused() -> None:
-    with pytest.raises(ValidationError, match="no room"):
-        SensorModel(**BASE, black_level_dn=255.0, bits=8)
-
-
-def test_a_model_does_not_change() -> None:
-    with pytest.raises(ValidationError, match="frozen"):
-        SensorModel(**BASE).read_noise_e = 0.0
 
 
 @pytest.mark.parametrize(

@@ -77,14 +77,6 @@ def test_a_scene_has_the_pixels_of_the_camera_that_is_named(
         assert each.geometry == each.loaded.camera.geometry == bench.geometry
 
 
-def test_a_camera_with_the_scenes_own_pixels_says_nothing(small_scene: Callable[..., Path], variant: str) -> None:
-    """The usual camera, named, gives the frames that it gives unnamed, whatever the film. (Planted: a note always.)"""
-    scene = small_scene()
-    named, usual = open_bench(scene, variant, camera="imx249"), open_bench(scene, variant)
-    assert named.loaded.sensor_note == "" and usual.loaded.sensor_note is None
-    assert named.geometry == usual.geometry and named.identity() == usual.identity()
-
-
 def test_a_base_that_is_no_camera_is_told_with_all_cameras(tmp_path: Path) -> None:
     """And with no projector or list, which lie beside them. (Planted: every file of the shelf.)"""
     (tmp_path / "own.toml").write_text('base = "imx251"\n')
@@ -98,19 +90,6 @@ def test_a_sensor_has_no_more_rows_than_its_base(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('base = "imx250"\nrows = 4000\nbinning = 4\n')
     with pytest.raises(MitsimError, match=r"rows: got 4000, but imx250 has \d+; give no more"):
         load_sensor(tmp_path / "own.toml")
-
-
-def test_the_page_of_formats_lists_every_camera() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "formats.md").read_text(encoding="utf-8")
-    rows = [
-        line.split("|")[1:4]
-        for line in page.splitlines()
-        if re.match(r"\| `(imx|mt9|ov)\w*\d", line) and line.count("|") == 5
-    ]
-    listed = {name: verbs for names, _, verbs in rows for name in re.findall(r"`(\w+)`", names)}
-    assert listed.keys() == {camera.stem for camera in SENSORS}
-    for camera in SENSORS:
-        assert re.findall(r"`([a-z]+)[ `]", listed[camera.stem]) == serves(camera)
 
 
 @pytest.mark.slow

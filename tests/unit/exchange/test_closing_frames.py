@@ -32,10 +32,6 @@ def imported(bench: Made, frames: list[np.ndarray], patterns: str, name: str = "
     return ms.load_run(folder / name)
 
 
-def test_a_run_without_a_closing_frame_has_none(tmp_path: Path) -> None:
-    assert ms.load_run(made(tmp_path).run).closing is None
-
-
 @pytest.mark.parametrize("kind", ["first", "uniform"])
 @pytest.mark.parametrize("ambient", [False, True])
 def test_light_of_a_closing_frame_is_that_of_measurements(kind: str, ambient: bool, tmp_path: Path) -> None:
@@ -112,7 +108,7 @@ def test_what_does_not_fit_a_closing_frame_is_refused_in_a_line(tmp_path: Path) 
     refused = {
         "holds 6 frames, but patterns 'dots:2x3' take 6 and a closing frame": (frames, {"closing_frame": "first"}),
         r"holds 7 frames.*\(is the last a closing frame\? say so\)": ([*frames, frames[0]], {}),
-        "closing_exposure 0.5: is of no use without": (frames, {"closing_exposure": 0.5}),
+        "closing_exposure_s is of a closing frame; give closing_frame too": (frames, {"closing_exposure": 0.5}),
         "beside dark frames": (frames, {"closing_frame": "first", "closing_exposure": 0.5,
                                         "dark_frame": tmp_path / "dark.npy"}),
         "closing_frame 'last': give 'first' or 'uniform'": (frames, {"closing_frame": "last"}),

@@ -144,9 +144,3 @@ def test_what_cannot_be_drawn_is_refused_and_leaves_nothing(devices: tuple[str, 
         with pytest.raises(MitsimError, match=words):
             session_of(devices[1], exposure, n, mode)
     assert not place.exists()
-
-
-def test_a_run_of_imported_frames_has_no_projector_and_the_refusal_says_so() -> None:
-    """(Planted: the words for a projector without rows, when none was given.)"""
-    with pytest.raises(MitsimError, match=r"projector is not known of a run of imported frames; give"):
-        Raster.of_projector({})

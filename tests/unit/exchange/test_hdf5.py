@@ -131,14 +131,6 @@ def test_a_file_that_is_no_run_is_refused(bench: Made, tmp_path: Path, what: str
     assert not (tmp_path / "run 2").exists()
 
 
-def test_what_is_no_hdf5_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.h5").write_bytes(b"not this")
-    with pytest.raises(MitsimError, match="no HDF5 file"):
-        import_file(tmp_path / "a.h5", tmp_path / "run 2")
-    with pytest.raises(MitsimError, match="cannot be read"):
-        import_file(tmp_path / "b.h5", tmp_path / "run 2")
-
-
 def test_frames_that_differ_in_shape_are_refused_and_no_file_is_left(bench: Made, tmp_path: Path) -> None:
     manifest = json.loads((bench.run / "manifest.json").read_text())
     (bench.run / "manifest.json").write_text(json.dumps({**manifest, "checksums": {}}))
@@ -189,19 +181,6 @@ def test_what_is_not_stored_takes_no_memory(
     with pytest.raises(MitsimError, match=words):
         import_file(path, tmp_path / "run 2")
     assert not (tmp_path / "run 2").exists()
-
-
-def test_a_frame_that_was_never_stored_is_no_black_one(bench: Made, tmp_path: Path) -> None:
-    """The third of six. (Planted: a dataset with any chunk counts as stored.)"""
-    path = exported(bench, tmp_path)
-    with h5py.File(path, "r+") as file:
-        frames = file["run/shots/DN"][()]
-        del file["run/shots/DN"]
-        stack = file.create_dataset("run/shots/DN", frames.shape, frames.dtype, chunks=(1, *frames.shape[1:]))
-        for number in (0, 1, 3, 4, 5):
-            stack[number] = frames[number]
-    with pytest.raises(MitsimError, match=r"/run/shots/DN claims \(6, 40, 52\), of which not all is stored"):
-        import_file(path, tmp_path / "run 2")
 
 
 def test_a_file_that_is_cut_while_it_is_read_is_refused(bench: Made, tmp_path: Path) -> None:

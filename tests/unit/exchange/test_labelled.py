@@ -81,14 +81,6 @@ def test_an_image_lies_where_its_factors_were_calibrated(shots: Capture, factors
         image.to_xarray(other)
 
 
-def test_datasets_can_be_kept(shots: Capture, factors: ms.Factors) -> None:
-    """As dictionaries, from which JSON and netCDF are made. (Planted: a tuple of sides among the attributes.)"""
-    for data in (shots.to_xarray(), factors.to_xarray()):
-        for value in data.attrs.values():
-            assert isinstance(value, (str, int, float))
-        assert xarray.Dataset.from_dict(data.to_dict()).identical(data)
-
-
 def test_without_xarray_it_is_said_in_a_line(monkeypatch: pytest.MonkeyPatch, shots: Capture) -> None:
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(ms.MitsimError, match=r"xarray is not installed; type: pip install 'mitsim\[xarray\]'"):

@@ -16,9 +16,8 @@ from scipy.io import loadmat, savemat, whosmat
 import mitsim as ms
 from mitsim.core import arrays
 from mitsim.core.errors import MitsimError
-from mitsim.core.exr import read_frame
 from mitsim.exchange.formats import export, import_file
-from tests.exchanged import COLUMNS, DIGITAL, ROWS, Made, made
+from tests.exchanged import COLUMNS, ROWS, Made, made
 
 CASES = ["dots", "signed", "real output", "ambient", "closing"]
 
@@ -48,16 +47,6 @@ def test_the_papers_variables_are_its_model(case: str, tmp_path: Path) -> None:
             expected = held["phi_left"] @ lit @ held["phi_right"].T
             # Shot and read noise of some 1e4 electrons: 40 DN at most; a wrong scale, sign or order is hundreds.
             assert np.abs(found - expected).mean() < 0.05 * np.abs(expected).mean() + 30
-
-
-def test_background_is_black_level_and_dark_current_or_the_ambient_frame(tmp_path: Path) -> None:
-    export(made(tmp_path / "a").run, "mat", tmp_path / "a.mat")
-    held = loadmat(tmp_path / "a.mat")
-    dark = DIGITAL.black_level_dn + DIGITAL.dark_current_e_per_s * DIGITAL.exposure_s * DIGITAL.gain_dn_per_e
-    assert np.array_equal(held["measBg"], np.full((ROWS, COLUMNS), dark)) and "phi_left" not in held
-    bench = made(tmp_path / "b", ambient=True)
-    export(bench.run, "mat", tmp_path / "b.mat")
-    assert np.array_equal(loadmat(tmp_path / "b.mat")["measBg"], read_frame(bench.run / "ambient.exr")[0]["DN"])
 
 
 OCTAVE = """

@@ -116,21 +116,6 @@ def test_frames_with_the_projector_off_are_taken_off(tmp_path: Path) -> None:
     assert np.array_equal(again.read("ambient.exr")[0]["DN"], dark.mean(axis=0).astype(np.float32))
 
 
-def test_pictures_and_frames_of_a_run_are_read_again(tmp_path: Path) -> None:
-    """export --format png, then import: the same numbers under the same patterns, and the same ambient frame."""
-    bench = made(tmp_path, ambient=True)
-    projector = tmp_path / "projector.toml"
-    projector.write_text('name = "p"\neffective_wavelength_nm = 550.0\ncolumns = 96\nrows = 54\n')
-    export(bench.run, "png", tmp_path / "out", projector=str(projector))
-    out, shots = tmp_path / "out", ms.load_run(bench.run)
-    more = {"ambient": out / "ambient.npy", "ambient_shots": 5}
-    import_capture(out / "frames", tmp_path / "run 2", known(bench, str(out / "patterns.json"), **more))
-    again = ms.load_run(tmp_path / "run 2")
-    assert np.array_equal(again.dn, shots.dn) and again.ambient is not None and shots.ambient is not None
-    assert np.array_equal(again.ambient.rate, shots.ambient.rate) and again.ambient.shots == 5
-    assert again.manifest.patterns.captures == shots.manifest.patterns.captures
-
-
 @pytest.mark.parametrize("signed", [False, True])
 def test_pictures_show_each_pattern_in_the_middle_of_the_projector(signed: bool, tmp_path: Path) -> None:
     """Cells of 5 x 5 pixels: 54 rows hold 10 of them, 96 columns 14 and more. (Planted: rows and columns changed
@@ -168,13 +153,6 @@ def test_a_plane_of_a_colour_sensor_is_cut_as_flatcams_loader_does(tmp_path: Pat
         plane = mosaic[corner[0] :: 2, corner[1] :: 2]
         assert plane.shape == (42, 55)
         assert np.array_equal(ms.load_run(tmp_path / channel).dn[0], plane[1:41, 1:53])
-
-
-def test_the_black_level_that_is_stated_is_taken(tmp_path: Path) -> None:
-    bench = made(tmp_path)
-    written(tmp_path / "frames", "png", ms.load_run(bench.run).dn)
-    import_capture(tmp_path / "frames", tmp_path / "run 2", known(bench, black_level_dn=151.5))
-    assert ms.load_run(tmp_path / "run 2").manifest.digital.black_level_dn == 151.5
 
 
 def refused(words: str, tmp_path: Path, source: Path, about: RealCapture) -> None:

@@ -35,19 +35,3 @@ def test_the_file_holds_what_the_solver_sees(tmp_path: Path) -> None:
     assert np.array_equal(held["x"][0], shots.truth)
     for name, expected in zip(("P_L", "P_R", "left", "right"), (*shots.patterns, *factors.sides), strict=True):
         assert np.array_equal(held[name], expected)
-
-
-def test_a_full_disk_is_told_in_a_line(tmp_path: Path) -> None:
-    """A file may have 4 KiB. (Planted: torch's own error.)"""
-    pytest.importorskip("torch")
-    resource, bench = pytest.importorskip("resource"), made(tmp_path)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 12, before[1]))
-    try:
-        with pytest.raises(
-            MitsimError, match=r"run\.pt: cannot be written \(torch: .* choose a writable folder"
-        ) as told:
-            export(bench.run, "torch", tmp_path / "run.pt", bench.calibration)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert "\n" not in str(told.value) and not (tmp_path / "run.pt").exists()

@@ -1,13 +1,10 @@
 """Figures of studies: curves by numbers in order, grids with their own titles."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
-from mitsim.report.pages import Mean, page_figure
-from mitsim.report.plots import curves, error_bars, figure_of, grouped_bars, image_grid, singular_values, tells
+from mitsim.report.pages import Mean
+from mitsim.report.plots import curves, grouped_bars, image_grid
 
 
 def test_curves_are_in_the_order_of_their_numbers() -> None:
@@ -32,13 +29,6 @@ def test_a_curve_without_points_keeps_its_colour_from_others() -> None:
     assert [text.get_text() for text in without.legends[0].get_texts()] == ["a", "c"]
 
 
-def test_long_names_of_rows_take_two_lines() -> None:
-    """(Planted: one; "49 dots, idealised" then ran into the next row's beside small images.)"""
-    cells = [(np.zeros((4, 4)), "")] * 8
-    figure = image_grid({"49 dots, idealised": cells, "card": cells}, [""] * 8)
-    assert [axes.get_ylabel() for axes in figure.axes[::8]] == ["49 dots,\nidealised", "card"]
-
-
 def test_a_grid_has_a_title_of_its_own_and_one_for_each_column() -> None:
     """(Planted: the last column's for the whole.)"""
     cells = [(np.full((4, 4), value), f"{value} dB") for value in (0.2, 0.8)]
@@ -47,20 +37,6 @@ def test_a_grid_has_a_title_of_its_own_and_one_for_each_column() -> None:
     assert [axes.get_title() for axes in figure.axes] == ["a", "b", "", ""]
     assert [axes.get_xlabel() for axes in figure.axes] == ["0.2 dB", "0.8 dB"] * 2
     assert [axes.get_ylabel() for axes in figure.axes] == ["one", "", "two", ""]
-
-
-def test_long_titles_of_columns_take_two_lines() -> None:
-    """(Planted: one; "as the matt scene" then ran into its neighbour.)"""
-    cells = [(np.zeros((4, 4)), "")] * 6
-    figure = image_grid({"card": cells}, ["49 dots\nas the matt scene"] * 6)
-    assert figure.axes[0].get_title() == "49 dots\nas the matt\nscene"
-
-
-def test_a_title_stands_above_all_panels() -> None:
-    """(Planted: the last panel's own.)"""
-    shown = {"a": {"1": Mean(1.0, 0.1, 2), "2": Mean(1.0, 0.1, 2)}}
-    figure = curves({"above": shown, "below": shown}, "x [mm]", title="both")
-    assert figure.get_suptitle() == "both"
 
 
 def test_an_error_that_nobody_knows_is_no_bar_of_zero() -> None:
@@ -76,22 +52,15 @@ def test_an_error_that_nobody_knows_is_no_bar_of_zero() -> None:
     assert [tick.get_text() for tick in both.axes[0].get_yticklabels()] == ["mask, 2 \N{GREEK SMALL LETTER MU}m"]
 
 
-def test_a_curve_alone_has_no_legend_and_a_long_name_of_an_axis_two_lines() -> None:
-    """(Planted: one line, which a figure cut off.)"""
-    curve = {"1": Mean(1.0, 0.1, 2), "2": Mean(2.0, 0.1, 2)}
-    figure = curves({"": {"": curve}}, "x [mm]", "misfit: part of the measurements that no image explains [1]")
-    assert not figure.legends and "\n" in figure.axes[0].get_ylabel()
-
-
 def test_what_an_image_has_lost_and_would_lose_are_told_apart() -> None:
-    """Bars of two kinds are in one order, each kind in its colour. (Planted: one colour.)"""
+    """Each kind of bar has its colour. (Planted: one colour.)"""
     groups = {
         "noise": {"has lost": Mean(2.0, 0.1, 1)},
         "b": {"would lose": Mean(3.0, 0.1, 1)},
         "a": {"would lose": Mean(1.0, 0.1, 1)},
     }
-    (axes,) = grouped_bars(groups, "lost [dB]", ordered=True).axes
-    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["b", "noise", "a"], "from the top"
+    (axes,) = grouped_bars(groups, "lost [dB]").axes
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["noise", "b", "a"], "from the top"
     legend = axes.get_legend()
     assert legend and [text.get_text() for text in legend.get_texts()] == ["has lost", "would lose"]
     assert len({patch.get_facecolor() for patch in axes.patches}) == 2
@@ -123,42 +92,5 @@ def test_a_panel_of_nothing_is_left_out() -> None:
     """One point, or none that is a number, tells nothing along x. (Planted: an empty panel beside the other.)"""
     nothing = {"point": {"a": curve((1, 20.0))}, "nan": {"a": curve((1, float("nan")), (2, float("nan")))}}
     figure = curves({**nothing, "told": {"a": curve((1, 20.0), (2, 30.0))}}, "x [mm]")
-    assert [axes.get_title() for axes in figure.axes] == ["told"] and tells(figure)
+    assert [axes.get_title() for axes in figure.axes] == ["told"]
     assert not curves(nothing, "x [mm]").axes
-
-
-def charts_of_nothing() -> dict[str, Figure]:
-    """By what is wrong with them."""
-    level, axes = figure_of(2.0)
-    axes.axhline(1.0)
-    axes.plot([1.0], [2.0], "o")
-    return {
-        "one point": curves({"": {"a": curve((1, 20.0))}}, "x [mm]"),
-        "no number": singular_values({"a": np.full(3, np.nan)}),
-        "a level and a point": level,
-        "one error": error_bars({"a": 1e-3}, 1e-2),
-        "no axes": Figure(),
-    }
-
-
-def test_a_chart_of_nothing_tells_nothing() -> None:
-    """(Planted: lines across all of the axes counted as data; what is not a number counted.)"""
-    assert {name: tells(figure) for name, figure in charts_of_nothing().items()} == dict.fromkeys(
-        charts_of_nothing(), False
-    )
-    assert tells(image_grid({"a": [(np.zeros((2, 2)), "")]}, [""])) and tells(error_bars({"a": 1e-3, "b": 1e-4}))
-    assert tells(grouped_bars({"a": {"one": Mean(2.0, 0.1, 2), "other": Mean(1.0, 0.1, 2)}}, "x [dB]"))
-
-
-def test_ticks_of_many_numbers_do_not_run_into_each_other() -> None:
-    """(Planted: one at each number that was measured.)"""
-    figure = curves({"": {"a": curve(*((1000 + x, 20.0 + x) for x in range(30)))}}, "x [mm]")
-    figure.canvas.draw()
-    boxes = [text.get_window_extent() for text in figure.axes[0].get_xticklabels() if text.get_text()]
-    assert len(boxes) > 3 and all(one.x1 <= other.x0 for one, other in pairwise(boxes))
-
-
-def test_a_figure_on_a_page_is_the_same_file_each_time() -> None:
-    """(Planted: matplotlib's own names, which are random, and its date.)"""
-    pages = [page_figure(curves({"": {"a": curve((1, 20.0), (2, 30.0))}}, "x [mm]")) for _ in range(2)]
-    assert pages[0] == pages[1] and pages[0][0].startswith("data:image/svg+xml;base64,")

@@ -24,7 +24,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import MANIFEST, RUN, ColourManifest, write_colours
 from mitsim.core.runs import RunFolder, load_run
 from mitsim.report.folder_page import report_folder
-from mitsim.report.pages import Picture, Scale, contact_sheet, lines_of, plan_rows
+from mitsim.report.pages import Picture, Scale, contact_sheet, lines_of
 from mitsim.report.reconstruct_run import reconstruct
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, Made, made
 from tests.unit.report.test_report import _Outside
@@ -125,14 +125,12 @@ def test_many_frames_are_evenly_taken_and_large_ones_are_fewer_and_smaller() -> 
         seen.append(number)
         return np.full((8, 8), float(number))
 
-    shown = contact_sheet(read, 640, (8, 8), 20)
+    shown = contact_sheet(read, 640, (8, 8))
     assert sorted(seen) == list(range(0, 640, 10)) and "64 of 640, evenly taken, row by row, 8 a row" in shown.caption
     seen.clear()
-    large = contact_sheet(lambda number: read(number).repeat(256, 0).repeat(256, 1), 9, (2048, 2048), 3)
-    assert len(seen) == 4 and "4 of 9" in large.caption and "a pixel is the mean of 4 x 4" in large.caption
-    assert Image.open(BytesIO(large.data)).size == (2 * 512 + 2,) * 2
-    tall = contact_sheet(lambda _: np.eye(4), 16, (4, 4), 1)
-    assert "4 a row" in tall.caption, "a column of 16 is no page"
+    large = contact_sheet(lambda number: read(number).repeat(256, 0).repeat(256, 1), 9, (2048, 2048))
+    assert len(seen) == 4 and "4 of 9" in large.caption
+    assert max(Image.open(BytesIO(large.data)).size) <= 1024
 
 
 def test_a_picture_says_what_is_black_white_and_beyond() -> None:
@@ -276,10 +274,6 @@ def test_a_frame_in_one_file_has_its_picture_beside(tmp_path: Path, capsys: pyte
     colour = np.stack([values, 0 * values, values], axis=-1)
     assert Pictured(as_json=True).finish_frame((tmp_path / "c.exr", colour, "W/m^2"), {}, [], []) == 0
     assert np.asarray(Image.open(json.loads(capsys.readouterr().out)["picture"]["file"])).shape == (384, 512, 3)
-
-
-def test_rows_of_a_plan_that_other_programs_wrote_are_left_out() -> None:
-    assert plan_rows({"effects": "none"}) == plan_rows(None) == () and len(plan_rows({"effects": [*EFFECTS, 1]})) == 3
 
 
 def test_plain_data_are_lines_of_a_table() -> None:

@@ -32,11 +32,6 @@ def test_ssim_is_one_for_equal_and_follows_the_formula_for_flat_images() -> None
     assert ssim(*flat) == pytest.approx((2 * a * b + c1) / (a * a + b * b + c1))
 
 
-def test_ssim_keeps_the_data_range_of_dark_images() -> None:
-    """Images of range 0.01 must not be stretched: noise below the constants (0.03^2) changes SSIM little."""
-    assert ssim(0.01 * TRUTH, 0.01 * TRUTH[::-1]) > 0.9
-
-
 def test_quality_of_an_image_smaller_than_the_window_has_no_ssim() -> None:
     assert Quality.of(TRUTH + 0.1, TRUTH) == Quality(psnr(TRUTH + 0.1, TRUTH), ssim(TRUTH + 0.1, TRUTH))
     assert Quality.of(TRUTH[:6] + 0.1, TRUTH[:6]) == Quality(pytest.approx(20.0), None)  # type: ignore[arg-type]
@@ -83,10 +78,6 @@ def test_truth_follows_the_board_of_the_calibration(board: float | None, expecte
     stated = Capture(manifest(), memory={"truth.exr": (wrong, {"board_reflectance": 0.99})})
     assert truth_error_for(stated, board) == pytest.approx(0.03 * expected / values.max(), rel=1e-6)
     assert truth is not None and truth.dtype == np.float64 and truth == pytest.approx(expected)
-
-
-def test_frames_of_a_real_camera_have_no_truth() -> None:
-    assert truth_for(Capture(manifest()), 0.9) is None
 
 
 def manifest() -> RunManifest:

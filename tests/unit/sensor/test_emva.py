@@ -55,11 +55,6 @@ def test_what_noise_leaves_in_the_mean_of_a_stack_is_taken_off_all_its_parts() -
         assert getattr(found, name) == pytest.approx(0, abs=5 * left / part * np.sqrt(2 / size)), name
 
 
-def test_a_stack_needs_two_frames() -> None:
-    with pytest.raises(ValueError, match="1 frames tell no temporal noise"):
-        alike([np.zeros((4, 4))])
-
-
 def test_figures_of_an_ideal_camera_are_its_numbers() -> None:
     """Statistics by the linear model's own formulas, no frame: K 0.5, eta 0.4, sigma_d 3, saturation at 9000."""
     gain, efficiency, read, full, dark = 0.5, 0.4, 3.0, 9000.0, 7.0

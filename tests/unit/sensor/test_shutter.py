@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.configuration import shipped_path, validate
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor.chain import expose, ripple_level, ripple_response
@@ -52,15 +52,6 @@ def test_a_rows_level_is_the_light_over_its_own_exposure(
         assert np.allclose(level[:, 0], [np.mean(each) for each in lines], rtol=0, atol=1e-12)
 
 
-def test_an_exposure_of_whole_waves_sees_no_ripple() -> None:
-    """At f T = 1, 2, 3 no row does, by either shutter; at 1.5 by 2 / (3 pi). (Planted: sinc without pi.)"""
-    for sensor in (SENSOR, camera()):
-        for waves in (1, 2, 3):
-            assert np.abs(ripple_response(sensor, waves / HERTZ, HERTZ, ROWS)).max() < 1e-15
-    still = np.abs(ripple_response(SENSOR, 1.5 / HERTZ, HERTZ, ROWS))
-    assert np.allclose(still, 2 / (3 * np.pi), rtol=1e-12)
-
-
 def test_over_all_phases_levels_have_the_stated_mean_and_covariance() -> None:
     """1 and c^2 Re[A_r A_s*] / 2, exact over 64 even phases. (Planted: the variance of both parts of A.)"""
     response = ripple_response(camera(), 3e-3, HERTZ, ROWS)
@@ -90,15 +81,6 @@ def test_noise_of_a_frame_in_ripple_is_that_of_its_rows_means() -> None:
     assert np.abs(by_row).max() < 5 * np.sqrt(2 / (frames - 1) / off.shape[1])
 
 
-def test_under_constant_light_a_rolling_shutter_changes_nothing() -> None:
-    """Bit for bit."""
-    light = 2000 * np.random.default_rng(1).random((ROWS, 20))
-    still, rolling = (
-        expose(light, 0.01, sensor, np.random.default_rng(5), np.random.default_rng(6)) for sensor in (SENSOR, camera())
-    )
-    assert np.array_equal(still, rolling)
-
-
 def test_shutters_of_the_shipped_cameras(tmp_path: Path) -> None:
     """Nothing is said of a global one in manifests, so that they stay as they are."""
     rolling = {
@@ -114,16 +96,3 @@ def test_shutters_of_the_shipped_cameras(tmp_path: Path) -> None:
     assert rolling["ov5647"].identity["shutter"] == "rolling"
     with pytest.raises(MitsimError, match=r"^sensor 'Aptina MT9M034': [^\n]*give line_time_us[^\n]*$"):
         rolling["mt9m034"].known_line_time_s()
-
-
-@pytest.mark.parametrize(
-    ("changes", "reported"),
-    [
-        ({"shutter": "curtain"}, "shutter"),
-        ({"line_time_us": 30.0}, "line_time_us 30 is of a rolling shutter; set shutter 'rolling'"),
-        ({"shutter": "rolling", "line_time_us": 0.0}, "line_time_us"),
-    ],
-)
-def test_a_shutter_that_cannot_be_is_one_line(changes: dict[str, Any], reported: str) -> None:
-    with pytest.raises(MitsimError, match=rf"^camera[^\n]*{reported}[^\n]*$"):
-        validate(SensorModel, {**SENSOR.model_dump(exclude_none=True), **changes}, "camera")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.core.configuration import shipped_path, validate
+from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.devices.sensor import SensorModel, load_sensor
+from mitsim.devices.sensor import SensorModel
 from mitsim.sensor import chain, moments
 from mitsim.sensor.chain import (
     dark_current_variance,
@@ -140,18 +140,6 @@ def test_row_noise_leaves_other_draws_as_they_were() -> None:
     np.testing.assert_allclose(noises[1], noises[0], rtol=0, atol=1e-9)
 
 
-def test_effects_of_zero_are_no_effects() -> None:
-    model = load_sensor(shipped_path("calibration", "imx249.toml"))
-    expected = np.linspace(0, 1.3e5, 64 * 48).reshape(64, 48)
-
-    def frame(model: SensorModel) -> np.ndarray:
-        return chain.expose(expected, 0.01, model, stream(SEED, "shot"), stream(SEED, "read"))
-
-    zeros = {"dsnu_row_e": 0.0, "prnu_pixel": 0.0, "crosstalk": 0.0, "linearity": (), "row_noise_e": 0.0}
-    assert np.array_equal(frame(model.model_copy(update=zeros)), frame(model))
-    assert not np.array_equal(frame(model.model_copy(update={"prnu_pixel": 0.01})), frame(model))
-
-
 def test_a_camera_without_effects_makes_no_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("specimen", "neighbours"):
         monkeypatch.setattr(chain, name, lambda *_: pytest.fail("a map was asked for"))
@@ -249,14 +237,6 @@ def test_crosstalk_shares_light_with_four_neighbours_and_keeps_it() -> None:
     assert chain.mean_electrons(spot, 1.0, model)[0][2, 2] == pytest.approx(95)
 
 
-def test_counts_that_share_light_stay_independent_of_their_neighbours() -> None:
-    """Charge that strays before it is counted correlates no counts: covariance 0 to five deviations."""
-    model = camera(crosstalk=0.4, bits=None)
-    off = frames(model, np.full((SIDE, SIDE), 400.0), 100)
-    off -= off.mean()
-    assert (off[:, :, 1:] * off[:, :, :-1]).mean() == pytest.approx(0, abs=5 * off.var() / math.sqrt(off.size))
-
-
 # ---- linearity
 
 
@@ -291,13 +271,6 @@ def test_moments_of_a_bent_full_well_equal_the_sum_over_counts(mean: float, bits
     found = moments.frame_moments(np.array([mean]), 0.0, model)
     assert found[0][0] == pytest.approx(first, rel=1e-9)
     assert found[1][0] == pytest.approx(second, rel=1e-8)
-
-
-def test_a_full_well_is_read_as_the_polynomial_says() -> None:
-    model = camera(linearity=(-0.1,), read_noise_e=0.0, bits=None)
-    assert model.full_well_dn == pytest.approx(2000 * 0.9 * 1.5 + 100)
-    frame = chain.expose(np.full((4, 4), 1e5), 0.0, model, stream(0, "a"), stream(0, "b"))
-    np.testing.assert_allclose(frame, model.full_well_dn)
 
 
 # ---- binning on chip
