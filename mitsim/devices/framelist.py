@@ -285,10 +285,10 @@ def load_frames(folder: Path | str) -> SessionFrames:
             raise _refusal(folder, f"{problem}; leave it out, and give the number `exposure`")
     for (side, index, sign, exposure, repeat), shot in session.shots.items():
         other = session.shots[side, index, sign if repeat or not session.pairs else -sign, exposure, 0]
-        seconds, others = session.exposure_s(shot), session.exposure_s(other)
-        if seconds != others:
+        seconds, expected = session.exposure_s(shot), session.exposure_s(other)
+        if seconds != expected:
             problem = f"{shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one pattern"
-            raise _refusal(folder, f"{problem}, exposed for {seconds:g} and {others:g} s; expose them alike")
+            raise _refusal(folder, f"{problem}, exposed for {seconds:g} and {expected:g} s; expose them alike")
     exposures = {session.exposure_s(shot) for shot in session.shots.values()}
     without = exposures - {session.exposure_s(frame) for frame in session.dark}
     if session.dark and without and not session.pairs:
