@@ -256,8 +256,6 @@ def highlights(setup: OpticalSetup) -> Highlights:
     directions = np.cos(angle)[:, None] * normal[:, None] + np.sin(angle)[:, None] * across
     points = centre[:, None] + radius[:, None, None] * directions
     aimed = points.reshape(-1, 3)
-    out = aimed - np.repeat(centre, _POINTS, axis=0)
-    out /= np.linalg.norm(out, axis=1, keepdims=True)
     to, back = aimed - rays.origin, eye - aimed
     far, near = (np.linalg.norm(way, axis=1) for way in (to, back))
     window, depth = rays.points(aimed)
@@ -266,7 +264,17 @@ def highlights(setup: OpticalSetup) -> Highlights:
     pixel = np.where(
         inside, np.clip(window[:, 0].astype(int), 0, n - 1) * n + np.clip(window[:, 1].astype(int), 0, n - 1), 0
     )
-    sent, facing = _radiance_toward(scene, rays.origin, aimed, eye, np.repeat(radius, _POINTS))
+    # Radiance that each point sends to the eye over its sharp lobe, and its cosine to the projector.
+    start, target, count = mi.Point3f(rays.origin.tolist()), mi.Point3f(eye.tolist()), len(aimed)
+    si = scene.ray_intersect(mi.Ray3f(start, mi.Vector3f(*base.device_vectors(to / far[:, None]))))
+    active = si.is_valid() & ~scene.ray_test(si.spawn_ray_to(target))
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    value, density = si.bsdf().eval_pdf(context, si, si.to_local(dr.normalize(target - si.p)), active)
+    sharp = mi.unpolarized_spectrum(dr.select(active & (density > _LEAST_SHARP), value, 0))
+    reach = _ON_BALL * np.repeat(radius, _POINTS) + 1e-4 * np.abs(aimed).max(axis=1)
+    met = np.linalg.norm(base.vectors(si.p, count) - aimed, axis=1) < reach
+    sent = base.channels(sharp, count).mean(axis=1) * met
+    facing = base.host_values(dr.abs(mi.Frame3f.cos_theta(si.wi)), count)
     local = -back @ turn
     stop = (np.abs(local[:, :2]) <= setup.geometry.tan_half_fov * local[:, 2:]).all(axis=1)
     # Part of the window that each point represents, by the tangents of one pixel, and its light.
@@ -276,28 +284,6 @@ def highlights(setup: OpticalSetup) -> Highlights:
     each = seen * light
     irradiance, moments = (v.reshape(len(balls), -1).sum(axis=1) for v in (each, each * light * rays.area))
     return Highlights(pixel[::_POINTS], irradiance, moments)
-
-
-def _radiance_toward(
-    scene: mi.Scene, origin: FloatArray, aimed: FloatArray, eye: FloatArray, radius: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    to = aimed - origin
-    ray = mi.Ray3f(
-        mi.Point3f(origin.tolist()), mi.Vector3f(*base.device_vectors(to / np.linalg.norm(to, axis=1, keepdims=True)))
-    )
-    si = scene.ray_intersect(ray)
-    target = mi.Point3f(eye.tolist())
-    context = mi.BSDFContext(mi.TransportMode.Importance)
-    way = si.to_local(dr.normalize(target - si.p))
-    active = si.is_valid() & ~scene.ray_test(si.spawn_ray_to(target))
-    value, density = si.bsdf().eval_pdf(context, si, way, active)
-    count = len(aimed)
-    sharp = dr.select(active & (density > _LEAST_SHARP), value, 0)
-    light = base.channels(mi.unpolarized_spectrum(sharp), count).mean(axis=1)
-    met = np.linalg.norm(base.vectors(si.p, count) - aimed, axis=1) < _ON_BALL * radius + 1e-4 * np.abs(aimed).max(
-        axis=1
-    )
-    return light * met, base.host_values(dr.abs(mi.Frame3f.cos_theta(si.wi)), count)
 
 
 # -------- Direct light over sharp lobes
@@ -365,11 +351,11 @@ class SharpLight:
 def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     """Estimate direct light over lobes too sharp for connections."""
     n, paths_per_sample = setup.projector.n, setup.projector.n**2
-    lobes = _Lobes(setup)
-    first = lobes.trace(np.arange(paths_per_sample), seed, 0, -(-samples // _FEWER), _WIDER)
+    least, every = dr.full(mi.Float, _LEAST_SHARP, paths_per_sample), np.arange(paths_per_sample)
+    first = _trace_lobes(setup, least, every, seed, 0, -(-samples // _FEWER), _WIDER)
     if not len(first.widths):
         return SharpLight.none(paths_per_sample)
-    lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
+    least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
     if first.widths.min() >= _BROAD * setup.geometry.half_width:
         # Broad lobes are met by connections, which measure their light.
         count, width = max(1, _CONNECTIONS // paths_per_sample), float(first.widths.min())
@@ -385,9 +371,9 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
         if hits * count >= _WELL_MET:
             return SharpLight(total, error, hits, by_pixel, moments, width, float(others.value.sum()) / count)
     few = -(-samples // _QUARTER)
-    found = lobes.trace(np.arange(paths_per_sample), seed, 0, few)
+    found = _trace_lobes(setup, least, every, seed, 0, few)
     if len(found.widths) < _ENOUGH_MET:
-        found = lobes.trace(np.arange(paths_per_sample), seed, 0, samples)
+        found = _trace_lobes(setup, least, every, seed, 0, samples)
     else:
         samples = few
     if len(found.widths) < _PLENTY:
@@ -397,7 +383,7 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
         )
         pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), n)
         if len(pixels):
-            found = lobes.trace(pixels, seed, samples, samples * paths_per_sample // len(pixels))
+            found = _trace_lobes(setup, least, pixels, seed, samples, samples * paths_per_sample // len(pixels))
     total, moment = float(found.by_pixel.sum()), float(found.moments.sum())
     hits = total**2 / moment if moment else 0.0
     rest = 0.0
@@ -465,61 +451,31 @@ class _Connections(DirectTracer):
 # ---- Rays that sharp lobes send to the sensor
 
 
-class _Lobes:
-    def __init__(self, setup: OpticalSetup) -> None:
-        self.setup, self.least = setup, dr.full(mi.Float, _LEAST_SHARP, setup.projector.n**2)
+@keep_scenes()
+def _trace_lobes(
+    setup: OpticalSetup, least: mi.Float, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0
+) -> _LobeLight:
+    """Follow rays of some pixels over lobes sharper than ``least`` of each pixel to a ``wider`` sensor."""
+    half = dr.opaque(mi.Float, wider * setup.geometry.half_width)
 
-    @keep_scenes()
-    def trace(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _LobeLight:
-        squares, met, weights = 0.0, [], []
-        by_pixel, moments = np.zeros((2, self.setup.projector.n**2))
-        turned = dr.zeros(mi.Float, len(by_pixel))
-        for sample, place in launches(len(pixels), first, samples):
-            pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
-            hits = self.meet(seed, sample, pixel, wider)
-            # Whole numbers, whose sums in any order are the same.
-            dr.scatter_reduce(dr.ReduceOp.Add, turned, hits.turns, pixel, hits.turns > 0)
-            # Few rays meet the sensor: of the others nothing is fetched. What is not a number is no zero either.
-            lit = ~(hits.mean == 0)
-            dr.eval(hits, turned, lit)
-            lit = dr.compress(lit)
-            number = np.array(dr.gather(mi.UInt32, pixel, lit), dtype=np.int64)
-            mean, product, density = (
-                np.array(dr.gather(mi.Float, values, lit), dtype=np.float64)
-                for values in (hits.mean, hits.moment, hits.density)
-            )
-            check_finite(mean)
-            check_finite(product)
-            by_pixel += np.bincount(number, mean, minlength=len(by_pixel)) / samples
-            moments += np.bincount(number, product, minlength=len(by_pixel)) / samples
-            squares += float(np.square(mean).sum())
-            met.append((number, density))
-            weights.append(mean)
-        sharp = np.array(turned, dtype=np.float64) / samples
-        variance = max(squares / samples - float(by_pixel.sum()) ** 2 / len(pixels), 0.0)
-        pixel_of, densities = (np.concatenate(parts) for parts in zip(*met, strict=True))
-        widths = np.sqrt(sharp[pixel_of] / (np.pi * densities))
-        return _LobeLight(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
-
-    def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float) -> _SensorHits:
-        setup, half = self.setup, dr.opaque(mi.Float, wider * self.setup.geometry.half_width)
+    def meet(seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> _SensorHits:
         _, rng = base.streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
         wavelengths, spectral = sample_wavelengths(setup.camera, rng, setup.projector.lines)
         ray = setup.rays.sample(pixel, jitter, rng, wavelengths)
-        flux, least = setup.rays.flux(pixel, wavelengths) * spectral, dr.gather(mi.Float, self.least, pixel)
+        flux, own_least = setup.rays.flux(pixel, wavelengths) * spectral, dr.gather(mi.Float, least, pixel)
 
         def meet_sensor(at: Arrival, state: tuple[_SensorHits, mi.PCG32]) -> tuple[_SensorHits, mi.PCG32]:
             met, rng = state
             turn = at.turn(rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
             density = at.density(turn.wo)
             active = at.active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-            turns = dr.select(active & (density > least), mi.Float(1), 0)
+            turns = dr.select(active & (density > own_least), mi.Float(1), 0)
             place = landing(setup, at.si, at.si.to_world(turn.wo), active)
             active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
             sensor = mi.Point3f(place.x, place.y, 0)
             reception = setup.receive(at.si, -at.direction, sensor, active)
-            active &= reception.pdf > least
+            active &= reception.pdf > own_least
             per_area = density * reception.solid_angle(sensor)
             connected = dr.select(active, base.panchromatic(reception.irradiance * at.light), 0)
             mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
@@ -531,3 +487,33 @@ class _Lobes:
 
         none = _SensorHits(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
         return setup.passage.along(ray, flux, (none, rng), meet_sensor)[0]
+
+    squares, met, weights = 0.0, [], []
+    by_pixel, moments = np.zeros((2, setup.projector.n**2))
+    turned = dr.zeros(mi.Float, len(by_pixel))
+    for sample, place in launches(len(pixels), first, samples):
+        pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
+        hits = meet(seed, sample, pixel)
+        # Whole numbers, whose sums in any order are the same.
+        dr.scatter_reduce(dr.ReduceOp.Add, turned, hits.turns, pixel, hits.turns > 0)
+        # Few rays meet the sensor: of the others nothing is fetched. What is not a number is no zero either.
+        lit = ~(hits.mean == 0)
+        dr.eval(hits, turned, lit)
+        lit = dr.compress(lit)
+        number = np.array(dr.gather(mi.UInt32, pixel, lit), dtype=np.int64)
+        mean, product, density = (
+            np.array(dr.gather(mi.Float, values, lit), dtype=np.float64)
+            for values in (hits.mean, hits.moment, hits.density)
+        )
+        check_finite(mean)
+        check_finite(product)
+        by_pixel += np.bincount(number, mean, minlength=len(by_pixel)) / samples
+        moments += np.bincount(number, product, minlength=len(by_pixel)) / samples
+        squares += float(np.square(mean).sum())
+        met.append((number, density))
+        weights.append(mean)
+    sharp = np.array(turned, dtype=np.float64) / samples
+    variance = max(squares / samples - float(by_pixel.sum()) ** 2 / len(pixels), 0.0)
+    pixel_of, densities = (np.concatenate(parts) for parts in zip(*met, strict=True))
+    widths = np.sqrt(sharp[pixel_of] / (np.pi * densities))
+    return _LobeLight(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
