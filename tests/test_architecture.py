@@ -565,7 +565,7 @@ SIZES = {
     "sensor": (5, 1190),
     "sessions": (4, 818),
     "studies": (22, 5227),
-    "transport": (20, 4204),
+    "transport": (20, 4190),
     "verbs": (1, 309),
     "version": (1, 1),
 }
