@@ -31,11 +31,9 @@ from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorde
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.cost_model import first_shadow, frame_seconds, frames_cost
-from mitsim.light.light import SampledLight, Sampling, trace_light, trace_lines
-from mitsim.light.light_file import write_light
+from mitsim.light.light import SampledLight, Sampling, Truth, trace_light, trace_lines, trace_truths, write_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
-from mitsim.light.truth import Truth, trace_truths
 from mitsim.planner.planner import known_losses
 
 _FIREFLIES = 0.72

@@ -31,11 +31,10 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import SPECTRA_NM, Band, CountedLamps, Lines, Response, Spectrum, line_units
 from mitsim.light.cost_model import frame_seconds, frames_cost
-from mitsim.light.light import SampledLight
+from mitsim.light.light import SampledLight, Truth
+from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, expected_of
-from mitsim.light.truth import Truth
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.planner.planner import make_plan, plan_within
 from mitsim.reconstruct.colour import PLANES, behind

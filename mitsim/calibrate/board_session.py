@@ -37,9 +37,9 @@ from mitsim.light.cost_model import (
     light_bytes,
 )
 from mitsim.light.light import SampledLight, Sampling, trace_lines
+from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
-from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import raster
 from mitsim.optics.frames import Frame, at_once, mixes
 from mitsim.optics.image_formation import number_of_terms

@@ -40,9 +40,8 @@ from mitsim.core.seeds import integer
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import GRIDS, LightEstimate
+from mitsim.light.passes import GRIDS, LightEstimate, Simulation
 from mitsim.light.plan import Plan
-from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import Frame
 from mitsim.optics.terms import lacking
 from mitsim.reconstruct.colour import behind

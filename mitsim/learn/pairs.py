@@ -55,7 +55,7 @@ from mitsim.learn.pair_store import (
 from mitsim.learn.requests import PairsRequest, picture_files
 from mitsim.light.cost_model import first_shadow, frames_cost
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.simulation import Simulation, emission
+from mitsim.light.passes import Simulation, emission
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.transport.records import Bundle
 

@@ -22,7 +22,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.plate import FEW, MOST_TERMS, Plate
 from mitsim.devices.projector import Spectrum
-from mitsim.light.passes import PASSES
+from mitsim.light.passes import PASSES, Simulation
 from mitsim.light.settings import (
     CELLS_OF_COARSE,
     FOLLOWED_WIDTH,
@@ -33,7 +33,6 @@ from mitsim.light.settings import (
     SampleCost,
     Settings,
 )
-from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS, cells_a_side, cells_per_pixel, points_per_cell
 from mitsim.optics.frames import PROBES, formed_frames, frames_in_memory, mixes
 from mitsim.optics.image_formation import SUMMED_BYTES
@@ -234,7 +233,7 @@ def traced_for(lines: int, parted: bool = False) -> float:
 
 
 def truth_seconds(pilot_result: PilotResult, settings: Settings) -> float:
-    """Return the time of the truth's rays for both fluxes (:mod:`mitsim.light.truth`)."""
+    """Return the time of the truth's rays for both fluxes (:func:`mitsim.light.light.trace_truths`)."""
     row, direct = PASSES["direct"], pilot_result.sample_costs["direct"]
     rate = (pilot_result.spread if settings.anchors > 1 else direct).rate
     pixels, samples = direct.paths, float(row.whole(row.predicted_samples(settings)))

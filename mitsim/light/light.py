@@ -2,33 +2,186 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, reduce
 from itertools import product
 from operator import add
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import sparse
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board
-from mitsim.core.arrays import FloatArray, Labels
-from mitsim.core.errors import check_arguments
+from mitsim.bench.effects import Physics, names
+from mitsim.core.arrays import PACKED, FloatArray, Labels, mean_of_neighbours, whole_hdf5
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.job import Progress, silent
 from mitsim.core.parallel import Behind, single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
-from mitsim.light.cost_model import CHECKED_SHOTS, MOST_CHECKED, SHARED_COST, tells_all
-from mitsim.light.passes import EVEN, PASSES, LightEstimate, even
+from mitsim.devices.session import load_recipe
+from mitsim.light.cost_model import (
+    BOARD_SAMPLES,
+    CHECKED_SHOTS,
+    MOST_CHECKED,
+    MOST_RAYS,
+    MOST_SAMPLES,
+    SHARED_COST,
+    TRUTH_GROUPS,
+    TRUTH_PART,
+    TRUTH_SAMPLES,
+    tells_all,
+)
+from mitsim.light.passes import EVEN, GRIDS, PASSES, Grid, LightEstimate, Simulation, even, expected_of
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, PATHS_AT_ONCE, Estimate, Settings
-from mitsim.light.simulation import Simulation, expected_of
-from mitsim.light.truth import Truth, trace_truth
 from mitsim.optics.frames import ExpectedFrames, bound_of
+from mitsim.optics.image_formation import anchor_positions, anchor_weights
+from mitsim.optics.terms import shadow_terms
+from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.transport.direct import FluxTracer, IntArray
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import DeviceSums, PathSamples
+from mitsim.version import __version__
+
+if TYPE_CHECKING:
+    import h5py
+
+# -------- Truth: the apparent reflectance that a perfect reconstruction shows, with its standard error
+#
+# It is each projector pixel's flux of direct light toward the sensor over that of the calibration board, with its own
+# random streams, so that an error of the frames is never an error of the truth.
+
+_FINEST = 1e-4
+_BOARD_PART = 0.5
+_RATE = 2.0
+"""Power of the samples with which a pixel's variance falls: 1 random, 2 about an edge, 3 over smooth light."""
+_ANYWHERE = 0.01
+_AIM = 0.98
+_DOUBLINGS, _AT_ONCE = 8, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    reflectance: FloatArray
+    standard_error: FloatArray
+    board_flux: FloatArray
+    rays: int
+
+    @property
+    def error(self) -> float:
+        return float(np.sqrt(np.square(self.standard_error).mean()))
+
+    def error_of(self, flux_error: FloatArray) -> float:
+        """Return the rms error that sampling leaves in any image, from the frames' ``flux_error`` (n^2,)."""
+        return float(_rms(_over(flux_error, self.board_flux)))
+
+
+def trace_truth(bench: Apparatus, settings: Settings, seed: int, flux_error: FloatArray) -> Truth:
+    """Trace until the truth's standard error, rms over the image, is a sixth of the frames', or 1e-4.
+
+    ``flux_error`` (n^2,) is the standard error of each projector pixel's direct light in the frames [W m^-2].
+    """
+    (truth,) = trace_truths(bench, settings, seed, flux_error[None])
+    return truth
+
+
+def trace_truths(bench: Apparatus, settings: Settings, seed: int, flux_errors: FloatArray) -> list[Truth]:
+    effects = names(lambda effect: effect.in_truth) & settings.effects
+    board = _Flux(before_board(bench, load_recipe().board_reflectance), effects, seed, "board", BOARD_SAMPLES)
+    unit = board.mean
+    target = np.maximum(TRUTH_PART * _rms(_over(flux_errors, unit)), _FINEST)
+    board.refine(unit, _BOARD_PART * target, np.ones(unit.shape[1]))
+    scene = _Flux(bench, effects, seed, "scene", TRUTH_SAMPLES)
+    likely = np.square(_over(flux_errors, unit)).sum(axis=0)
+    scene.refine(unit, float(np.sqrt(1 - _BOARD_PART**2)) * target, likely)
+    reflectance = _over(scene.mean, board.mean)
+    error = np.hypot(_over(scene.standard_error, board.mean), reflectance * _over(board.standard_error, board.mean))
+    shape, rays = (bench.n, bench.n), scene.rays + board.rays
+    lines = zip(reflectance, error, board.mean, strict=True)
+    return [Truth(own.reshape(shape), its.reshape(shape), flux, rays) for own, its, flux in lines]
+
+
+class _Flux:
+    def __init__(self, bench: Apparatus, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
+        physics, loaded, pixels = Physics.with_effects(bench, effects), bench.loaded, bench.n**2
+        setup = replace(bench.setup, projector=physics.projector, geometry=physics.geometry)
+        self._tracer = FluxTracer(setup, loaded.glossy)
+        self._seed = integer(seed, "truth", name)
+        lines = len(bench.lines.shares) if physics.projector.by_line and bench.lines else 1
+        self._sums, self._samples = np.zeros((lines, TRUTH_GROUPS, pixels)), np.zeros(pixels, np.int64)
+        self._shape, self._first = (bench.n, bench.n), samples
+        self._sample(np.full(pixels, samples))
+
+    @property
+    def rays(self) -> int:
+        return int(TRUTH_GROUPS * self._samples.sum())
+
+    @property
+    def mean(self) -> FloatArray:
+        return np.asarray(self._sums.mean(axis=1) / self._samples)
+
+    @property
+    def standard_error(self) -> FloatArray:
+        return np.asarray(self._sums.std(axis=1, ddof=1) / self._samples / np.sqrt(TRUTH_GROUPS))
+
+    def refine(self, unit: FloatArray, target: FloatArray, likely: FloatArray) -> None:
+        """Trace more where that reduces the error most, until every line meets its target or needs too many rays.
+
+        ``likely`` (n^2,) has variances from other knowledge, because a pixel whose samples happen to agree would get no
+        more.
+        """
+        # An edge goes on in the next pixel, where all samples so far may have missed it.
+        likely = likely + mean_of_neighbours(likely.reshape(self._shape)).ravel()
+        likely += _ANYWHERE * likely.mean() or 1.0
+        most = max(MOST_RAYS, MOST_SAMPLES * len(unit)) // TRUTH_GROUPS
+        while ((error := _rms(_over(self.standard_error, unit))) > target).any():
+            part = float(np.square(_AIM * target / np.maximum(error, np.finfo(float).tiny)).min())
+            wanted = _allot(likely, self._samples, self._first, part, most)
+            if (wanted == self._samples).all():
+                return
+            self._sample(wanted)
+
+    def _sample(self, wanted: IntArray) -> None:
+        pixels = np.flatnonzero(wanted > self._samples)
+        done, more = self._samples[pixels], (wanted - self._samples)[pixels]
+        block = int(np.gcd.reduce(more))
+        blocks = more // block
+        place = np.repeat(np.arange(len(pixels)), blocks)
+        within = np.arange(len(place)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+        starts = done[place] + block * within
+        light = self._tracer.sums(self._seed, TRUTH_GROUPS, pixels[place], starts, block)
+        for groups, parts in zip(self._sums, light, strict=True):
+            for sums, part in zip(groups, parts, strict=True):
+                sums += np.bincount(pixels[place], part, len(sums))
+        self._samples = wanted
+
+
+def _allot(likely: FloatArray, samples: IntArray, first: int, part: float, most: int) -> IntArray:
+    doublings = np.arange(_DOUBLINGS)
+    left = (likely * (samples / first) ** -_RATE)[:, None] * 2.0 ** (-_RATE * doublings)
+    gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings
+    best = np.argsort(-(gain / cost), axis=None, kind="stable")
+    enough = int(np.searchsorted(np.cumsum(gain.ravel()[best]), (1 - part) * left[:, 0].sum())) + 1
+    accuracy_for_time = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
+    made = np.bincount(best[: min(enough, accuracy_for_time)] // _DOUBLINGS, minlength=len(likely))
+    return np.asarray(samples << np.minimum(made, _AT_ONCE))
+
+
+def _over(flux: FloatArray, unit: FloatArray) -> FloatArray:
+    return np.divide(flux, unit, out=np.zeros_like(flux), where=unit > 0)
+
+
+def _rms(values: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.square(values).mean(axis=-1)))
+
+
+# -------- Light of a scene
 
 _TOLD, _OF_HEAVY = 1.2, 0.55
 """Ratio of bound and error beyond which few heavy paths dominate both; the bound then falls with power 0.8 to 0.93."""
@@ -533,3 +686,114 @@ def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> Float
 
     scene, board = view(bench), view(before_board(bench, board_reflectance))
     return np.asarray(np.divide(scene, board, out=np.zeros(scene.shape), where=board > 0))
+
+
+# -------- Light by projector pixel in an HDF5 file, from which NumPy and SciPy form the frame of any pattern
+#
+# The file has sparse matrices for the light, and dense factors for the mask's shadow. docs/exchange.md has the layout.
+
+LAYOUT, LAYOUT_OF_TWO_SIDES = 1, 2
+"""The second version has separate weights of anchors for columns."""
+_SPECULAR_BYTES = 2**31
+"""Memory of frames of light over mirrors, one for each projector pixel."""
+
+
+def write_light(path: Path, light: SampledLight) -> None:
+    """Write light by projector pixel to one file as a whole.
+
+    Raises MitsimError for light by class, too many projector pixels with light over mirrors, or an unwritable file.
+    """
+    count = light.bench.n**2
+    if not np.array_equal(light.labels, np.arange(count)):
+        raise MitsimError(f"file {path}: the light was traced for one family alone; trace it by pixel, by bench.light")
+    specular = _specular(path, light)
+    with whole_hdf5(path) as file:
+        file.attrs.update(_facts(light))
+        grids = file.create_group("light", track_order=True)
+        for name, row in GRIDS.items():
+            groups = [group[name][:count] for group in light.groups]
+            if any(group.nnz for group in groups):
+                place = grids.create_group(row.key, track_order=True)
+                _write_matrix(place, sparse.csr_array(sparse.vstack(groups, format="csr")))
+                _write_shadow(place, light.simulation.grids[name])
+        if light.simulation.physics.lamps:
+            file.create_dataset("ambient", data=_ambient(light).astype(np.float32), **PACKED)
+        if specular is not None:
+            _write_matrix(file.create_group("glint", track_order=True), specular)
+
+
+def _facts(light: SampledLight) -> dict[str, Any]:
+    bench, plan, devices = light.bench, light.plan, light.bench.devices
+    rows, columns = bench.geometry.frame_shape
+    joule = electrons_from_irradiance(1.0, 1.0, devices.sensor, devices.projector.effective_wavelength_nm)
+    return {
+        "mitsim_transport": LAYOUT if bench.geometry.axes_alike else LAYOUT_OF_TWO_SIDES,
+        "mitsim_version": __version__,
+        "n": bench.n,
+        **({"pixels": rows} if rows == columns else {}),
+        "rows": rows,
+        "columns": columns,
+        "groups": len(light.groups),
+        "black_level": light.simulation.physics.black_level,
+        "electrons_per_j_m2": float(joule),
+        "patterns": plan.request.patterns if plan.request else "",
+        "accuracy": plan.accuracy,
+        "seed": light.seed,
+        "mc_error": light.sampling_error,
+        "total_error_bound": light.error_bound,
+        "lost_light": light.lost,
+        "provenance": json.dumps({**bench.provenance(), **bench.identity()}, default=str),
+        "warnings": json.dumps([*light.warnings, *light.unreached]),
+    }
+
+
+def _write_matrix(group: h5py.Group, matrix: sparse.csr_array) -> None:
+    group.attrs["shape"] = matrix.shape
+    parts = {"data": np.float32, "indices": np.int64 if matrix.shape[1] > 2**31 else np.int32, "indptr": np.int64}
+    for name, kind in parts.items():
+        group.create_dataset(name, data=getattr(matrix, name).astype(kind), **PACKED)
+
+
+def _write_shadow(group: h5py.Group, grid: Grid) -> None:
+    bundle, geometry, spectrum, _ = grid.key
+    layers = [shadow_terms(geometry, bundle.rows, bundle.columns, depth, spectrum) for depth in bundle.depths]
+    for side, name in enumerate(("left", "right")):
+        factors = np.stack([[term[side] for term in terms] for terms in layers])
+        group.create_dataset(name, data=factors.astype(np.float32), **PACKED)
+    positions = anchor_positions(bundle.anchors, geometry.half_width)
+    arrays = {
+        "anchors": anchor_weights(positions, geometry.centres(0)),
+        **({"column_anchors": anchor_weights(positions, geometry.centres(1))} if not geometry.axes_alike else {}),
+        "rows": bundle.rows.centres,
+        "columns": bundle.columns.centres,
+        "depths_mm": np.array(bundle.depths),
+    }
+    for name, values in arrays.items():
+        group.create_dataset(name, data=values)
+
+
+def _ambient(light: SampledLight) -> FloatArray:
+    frames = np.zeros((len(light.groups), *light.bench.geometry.frame_shape))
+    for accumulated in light.simulation.with_optics(light.groups, light.bench.n**2)[1]:
+        for frame, group in zip(frames, accumulated.groups, strict=True):
+            group.sort_indices()
+            frame += accumulated.optics.frame(group.indices, group.data)
+    return frames
+
+
+def _specular(path: Path, light: SampledLight) -> sparse.csr_array | None:
+    if not light.simulation.physics.mirrors:
+        return None
+    (rows, columns), count = light.bench.geometry.frame_shape, light.bench.n**2
+    shining = len(np.unique(light.bench.specular.beams.pixel))
+    if shining * rows * columns * 8 > _SPECULAR_BYTES:
+        raise MitsimError(
+            f"file {path}: {shining} projector pixels shine over mirrors, in frames of over {_SPECULAR_BYTES >> 30} "
+            f"GiB at {rows}x{columns}; leave the mirror out, or take a sensor of fewer pixels"
+        )
+    found = light.simulation.specular_frames(light.labels)
+    if found is None:
+        return None
+    lit = sparse.csr_array(found.irradiance.reshape(len(found.classes), -1))
+    places = np.ones(len(found.classes)), (found.classes, np.arange(len(found.classes)))
+    return sparse.csr_array(sparse.csr_array(places, shape=(count, len(found.classes))) @ lit)

@@ -18,7 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import Numbers, forming_seconds
-from mitsim.light.passes import PASSES
+from mitsim.light.passes import PASSES, Simulation
 from mitsim.light.settings import (
     REPLICATES,
     Approximation,
@@ -28,7 +28,6 @@ from mitsim.light.settings import (
     Settings,
     SharpPixels,
 )
-from mitsim.light.simulation import Simulation
 from mitsim.planner.pilot_direct import FINER, GOOD_ENOUGH, SHARP_RATE, DirectRuns, Sample
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns, PenumbraRuns
 from mitsim.scene.load import why_dark

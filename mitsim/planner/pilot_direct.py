@@ -20,9 +20,8 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.cost_model import cells_to_choose, drawing_seconds
-from mitsim.light.passes import Grid
+from mitsim.light.passes import Grid, Simulation, emission
 from mitsim.light.settings import REPLICATES, Approximation, Drawn, Estimate, Forming, SampleCost, Settings
-from mitsim.light.simulation import Simulation, emission
 from mitsim.optics.fft_shadow import cells_per_pixel, raster
 from mitsim.optics.image_formation import Entries, number_of_terms, raster_error
 from mitsim.optics.shadow import Places

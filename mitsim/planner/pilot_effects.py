@@ -16,9 +16,8 @@ from mitsim.bench.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
-from mitsim.light.passes import PASSES, Grid
+from mitsim.light.passes import PASSES, Grid, Simulation, emission
 from mitsim.light.settings import REPLICATES, WIDE, Approximation, ErrorCovariance, SampleCost, Settings
-from mitsim.light.simulation import Simulation, emission
 from mitsim.planner.pilot_direct import (
     EVEN_CELLS,
     GOOD_ENOUGH,

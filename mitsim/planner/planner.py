@@ -22,10 +22,9 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light import cost_model
-from mitsim.light.passes import FOLLOWED, PASSES
+from mitsim.light.passes import FOLLOWED, PASSES, Simulation
 from mitsim.light.plan import Plan, PlanRow, State
 from mitsim.light.settings import COUNTED, GROUPS, WIDE, Estimate, PilotResult, Settings
-from mitsim.light.simulation import Simulation
 from mitsim.optics.diffraction import check_openings
 from mitsim.optics.fft_shadow import check_waves
 from mitsim.planner import choose, pilot

@@ -64,11 +64,9 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
-from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.passes import FOLLOWED, PASSES, LightEstimate
+from mitsim.light.light import SampledLight, Truth, traced_again
+from mitsim.light.passes import FOLLOWED, PASSES, LightEstimate, Simulation, TracedPass, expected_of
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, TracedPass, expected_of
-from mitsim.light.truth import Truth
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.scene.load import straightening
 from mitsim.transport.connect import CanvasMap

@@ -19,9 +19,9 @@ from mitsim.bench import effects
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
+from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Estimate, Settings
-from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
 
 GROUPS = 6

@@ -19,8 +19,8 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core.configuration import shipped_path
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
+from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, expected_of
 from mitsim.planner.planner import make_plan
 from tests.physics.radiosity import gauss, solid_angle
 from tests.physics.test_estimators_agree import (

@@ -81,8 +81,8 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
     Light of one reflection is traced apart from light of more.
     """
     from mitsim.api.bench import open_bench
+    from mitsim.light.passes import Simulation, expected_of
     from mitsim.light.settings import Settings
-    from mitsim.light.simulation import Simulation, expected_of
 
     bench = open_bench(scene, for_render=True)
     family = bench.family(f"dots:{K}", 0)

@@ -183,8 +183,8 @@ def centroid(frame: np.ndarray) -> tuple[float, float]:
 def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
     """Frame of the factored estimator when projector pixel (r, c) emits ``light[r, c]`` of its power."""
     from mitsim.api.bench import open_bench
+    from mitsim.light.passes import Simulation, expected_of
     from mitsim.light.settings import Settings
-    from mitsim.light.simulation import Simulation, expected_of
 
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)

@@ -18,7 +18,7 @@ from scipy.signal import max_len_seq
 
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light.light import Sampling, trace_light
-from mitsim.light.simulation import expected_of
+from mitsim.light.passes import expected_of
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import SpecularFrames, specular_frames
 from mitsim.planner.planner import make_plan

@@ -21,7 +21,7 @@ from mitsim.core.exr import checksum, read_frame
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light.light import SampledLight
-from mitsim.light.simulation import Simulation
+from mitsim.light.passes import Simulation
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare

@@ -16,12 +16,10 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
-from mitsim.light.light import Sampling, trace_light
-from mitsim.light.light_file import write_light
-from mitsim.light.passes import GRIDS, LightEstimate
+from mitsim.light.light import Sampling, trace_light, write_light
+from mitsim.light.passes import GRIDS, LightEstimate, Simulation
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings, SharpPixels
-from mitsim.light.simulation import Simulation
 from mitsim.planner.planner import make_plan
 from tests.exchanged import frame_of
 
@@ -114,7 +112,7 @@ def test_a_scene_without_lamps_and_mirrors_has_none_in_its_file(
 
 
 def test_too_much_light_over_mirrors_is_refused(light: Light, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsim.light.light_file._SPECULAR_BYTES", 1000)
+    monkeypatch.setattr("mitsim.light.light._SPECULAR_BYTES", 1000)
     with pytest.raises(MitsimError, match="projector pixels shine over mirrors"):
         light.save(tmp_path / "light.h5")
     assert not (tmp_path / "light.h5").exists()

@@ -22,11 +22,9 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import CountedLamps, Response, Spectrum
 from mitsim.devices.sensor import EfficiencyCurve, MosaicCurves
 from mitsim.devices.session import load_recipe
-from mitsim.light.light import SampledLight
-from mitsim.light.passes import Grid
+from mitsim.light.light import SampledLight, Truth
+from mitsim.light.passes import Grid, Simulation
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
-from mitsim.light.truth import Truth
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.colour import behind
 from mitsim.transport.records import AMBIENT, DIRECT, PathSamples

@@ -9,8 +9,8 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
 
 pytestmark = pytest.mark.usefixtures("variant")
 

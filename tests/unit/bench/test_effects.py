@@ -18,8 +18,8 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench import effects
 from mitsim.bench.effects import _TABLE, EFFECTS, Physics, _value
 from mitsim.devices.patterns import Lighting
+from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, expected_of
 from tests.extended import Section, Step
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -36,7 +36,7 @@ LAMP_AND_MIRROR = """<emitter type="constant"><spectrum name="radiance" value="0
     <translate x="-90" z="300"/></transform><bsdf type="conductor"/></shape>"""
 ALWAYS = ("interreflection", "diffraction")
 """Light turns at several surfaces and bends at masks wherever there are any."""
-_EFFECTS, _PASSES = "mitsim/bench/effects.py", "mitsim/light/simulation.py"
+_EFFECTS, _PASSES = "mitsim/bench/effects.py", "mitsim/light/passes.py"
 TOY = (
     Step(_EFFECTS, "below", "interreflection: bool", "    lamp: float\n"),
     Step(

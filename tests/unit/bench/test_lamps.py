@@ -13,8 +13,8 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
 from mitsim.planner.planner import known_losses
 
 N, ALBEDO, Z, HALF, SCALE = 16, 0.5, 400.0, 64.0, 111000.0

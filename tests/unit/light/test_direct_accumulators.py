@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.light.passes import LightEstimate
+from mitsim.light.passes import LightEstimate, Simulation
 from mitsim.light.settings import Settings, SharpPixels
-from mitsim.light.simulation import Simulation
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SAMPLES = 16, 96

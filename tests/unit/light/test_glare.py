@@ -8,8 +8,8 @@ import pytest
 
 from mitsim.api.bench import open_bench
 from mitsim.devices.patterns import Lighting
+from mitsim.light.passes import Simulation, emission
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, emission
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, FIELD, GROUPS, SAMPLES = 16, 4, 8, 256

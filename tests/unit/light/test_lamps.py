@@ -23,9 +23,8 @@ from mitsim.api.bench import open_bench
 from mitsim.core.manifests import MOSAIC, RUN
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import SPECTRA_NM, CountedLamps, Response, Spectrum
-from mitsim.light.passes import Grid
+from mitsim.light.passes import Grid, Simulation, expected_of
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.records import PathSamples

@@ -17,9 +17,9 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import light as module
 from mitsim.light.light import SampledLight, Sampling, trace_light
+from mitsim.light.passes import Simulation, TracedPass
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
-from mitsim.light.simulation import Simulation, TracedPass
 from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.planner import planner
 from mitsim.planner.planner import make_plan

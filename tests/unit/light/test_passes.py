@@ -27,7 +27,7 @@ import numpy as np
 import mitsim as ms
 from mitsim.light.cost_model import tracing_seconds
 from mitsim.light.light import trace_light
-from mitsim.light.light_file import write_light
+from mitsim.light.light import write_light
 from mitsim.light.light import next_samples
 from mitsim.planner import pilot
 assert pathlib.Path(ms.__file__).parents[1] == pathlib.Path.cwd(), ms.__file__

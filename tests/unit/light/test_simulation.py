@@ -9,8 +9,8 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
+from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.transport.records import AMBIENT, PathSamples

@@ -14,10 +14,9 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import parse_patterns
-from mitsim.light import truth as module
-from mitsim.light.light import Sampling, trace_light
+from mitsim.light import light as module
+from mitsim.light.light import Sampling, Truth, trace_light, trace_truth
 from mitsim.light.settings import GROUPS, Settings
-from mitsim.light.truth import Truth, trace_truth
 from mitsim.planner.planner import make_plan
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

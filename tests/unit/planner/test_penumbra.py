@@ -14,8 +14,8 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, parse_patterns
+from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, expected_of
 from mitsim.planner.pilot import occluded_pixels
 from mitsim.planner.planner import make_plan
 

@@ -17,8 +17,8 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
+from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import REPLICATES, WIDE, PilotResult, Settings
-from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns

@@ -16,8 +16,8 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import SampledLight, Sampling, trace_light
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner.pilot import light_reach
 from mitsim.planner.planner import make_plan

@@ -10,9 +10,8 @@ import pytest
 import mitsim as ms
 from mitsim.core.arrays import FloatArray
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.passes import GRIDS
+from mitsim.light.passes import GRIDS, Simulation
 from mitsim.light.settings import SharpPixels
-from mitsim.light.simulation import Simulation
 from mitsim.report import IDEALISED
 from mitsim.report.lit_scene import LitScene
 from mitsim.studies import causes

@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.core.configuration import shipped_path
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.light.simulation import Simulation
+from mitsim.light.passes import Simulation
 from mitsim.metrics import psnr
 from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED
 from mitsim.report.lit_scene import LitScene

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
+from mitsim.light.light import trace_truth
 from mitsim.light.settings import Settings
-from mitsim.light.truth import trace_truth
 from mitsim.transport.direct import FluxTracer
 from tests.hard.hard_light import gauss, glossy, lobe
 

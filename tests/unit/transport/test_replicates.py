@@ -9,8 +9,8 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench import effects
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
 from mitsim.transport.integrator import Tracer
 from mitsim.transport.records import PathSamples
 
