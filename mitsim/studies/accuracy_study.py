@@ -31,9 +31,9 @@ from mitsim.core.job import Job
 from mitsim.devices.patterns import PatternFamily, read_name
 from mitsim.light.cost_model import frame_seconds
 from mitsim.light.light import SampledLight, Sampling, trace_light
+from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.light.settings import COUNTED, Approximation, PilotResult
-from mitsim.light.simulation import Simulation
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner import pilot
