@@ -545,37 +545,27 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 
 SIZES = {
     "__main__": (1, 18),
-    "acquire": (6, 1290),
+    "acquire": (6, 1293),
     "api": (2, 223),
     "bench": (6, 1197),
-    "calibrate": (6, 1293),
-    "cli": (6, 1464),
-    "core": (16, 3090),
+    "calibrate": (6, 1294),
+    "cli": (6, 1457),
+    "core": (16, 3083),
     "devices": (10, 2120),
     "exchange": (7, 1411),
     "learn": (7, 1301),
-    "light": (6, 1715),
+    "light": (9, 1728),
     "metrics": (1, 81),
     "mitsim": (1, 26),
-<<<<<<< HEAD
     "optics": (8, 1812),
     "planner": (6, 1673),
-=======
-    "optics": (8, 1827),
-    "planner": (6, 1669),
->>>>>>> 91603c0d (Imports follow)
     "reconstruct": (21, 5921),
     "report": (9, 2041),
     "scene": (6, 1407),
     "sensor": (5, 1193),
     "sessions": (4, 818),
-<<<<<<< HEAD
-    "studies": (22, 5256),
+    "studies": (22, 5229),
     "transport": (20, 4204),
-=======
-    "studies": (22, 5254),
-    "transport": (20, 4213),
->>>>>>> 91603c0d (Imports follow)
     "verbs": (1, 309),
     "version": (1, 1),
 }
