@@ -181,8 +181,9 @@ def run(
             kept = {**steps.earlier, **{each.output: each for each in results}}
             known = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
             write_json(folder / SUMMARY, {**head, **known, **more})
-            write_text(folder / SESSION_FILE, text)
 
+        if not again:
+            write_text(folder / SESSION_FILE, text)
         for step, task in work:
             started = time.perf_counter()
             if steps.is_finished(step):
@@ -193,6 +194,7 @@ def run(
                 says, warnings = _end(task)
                 steps.made[step.output] = _Made(inputs=steps.inputs(step), files=_checksums(folder / step.output))
                 found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
+                write_text(folder / SESSION_FILE, text)  # not before: a step that is refused changes no session
             results.append(replace(found, page=steps.page_of(step, found.left_alone)))
             note()
         remove_page(folder)
