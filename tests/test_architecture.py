@@ -563,7 +563,7 @@ SIZES = {
     "report": (9, 1912),
     "scene": (6, 1407),
     "sensor": (5, 1190),
-    "sessions": (4, 818),
+    "sessions": (4, 820),
     "studies": (22, 5225),
     "transport": (20, 4190),
     "verbs": (1, 309),
