@@ -33,7 +33,7 @@ from mitsim.learn.verbs import train as train_model
 from mitsim.reconstruct.request import MODEL, ImageRequest
 
 if TYPE_CHECKING:
-    from mitsim.report.colour_image import ColourImage
+    from mitsim.report.folder_page import ColourImage
     from mitsim.report.reconstruct_run import Judged
 
 # ---- Images of frames ------------------------------------------------------------------------------------------------

@@ -16,8 +16,7 @@ from pydantic.json_schema import SkipJsonSchema
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, validate
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
-from mitsim.devices.mask import NO_FLAWS, CameraMask, Mask, MaskKind, mls_mask
-from mitsim.devices.plate import FEW, Plate, within
+from mitsim.devices.mask import FEW, NO_FLAWS, CameraMask, Mask, MaskKind, Plate, mls_mask, within
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import MaskMotion

@@ -1,19 +1,28 @@
-"""A coded mask: from a 0/1 code, a construction and a feature size to its transmission at any point of the mask plane.
+"""Coded masks: from a code to the transmission at any point, and masks given feature by feature with their terms.
 
-Coordinates are index coordinates, ``s_row = -y`` and ``s_col = -x`` in mm, centred on the optical axis. The mask is
-opaque outside its features.
+Coordinates are index coordinates, ``s_row = -y`` and ``s_col = -x`` in mm, centred on the optical axis. A mask is
+opaque outside its features. Masks of one or two terms (maximum length sequences, FlatCam, MURA) are exact crosses of
+the matrix (Bebendorf, Numerische Mathematik 86, 565, 2000). Other masks are sums of singular vectors.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import ByValue, FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.imagelist import Wanted
+from mitsim.core.images import image_size, own_end, read_image
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 
 MaskKind = Literal["separable", "flatcam", "open"]
 CameraMask = Literal["separable", "flatcam", "open", "plate"]
@@ -176,3 +185,373 @@ def mls_code(order: int) -> npt.NDArray[np.int8]:
 
 def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int = 9) -> Mask:
     return Mask(kind, feature_mm, mls_code(order))
+
+
+# -------- Masks feature by feature
+
+LEFT_OUT = 1e-7
+"""Part of a transmission (rms) that singular vectors may leave: a tenth of the finest accuracy of a plan."""
+RASTER_LEFT_OUT = 1e-4
+"""The same for light on a raster; frames of dots err by 1e-5 or less."""
+_SKETCHES = 96, 192
+"""Directions in which the largest terms are searched; with more terms, correlations are faster."""
+MOST_TERMS = _SKETCHES[-1]
+"""Of a raster."""
+_SMALL = 512
+"""Values per side up to which means start at every value: a third of a pixel between means leaves 6e-3 of a frame."""
+_TURNS = 2
+"""Power iterations of a sketch; a third changes the number of terms by 1 %."""
+FEW = 2
+_MOST_DECOMPOSED = 1024
+"""Most distinct rows and columns for singular vectors: 4096 take six minutes, and correlations are then faster."""
+LARGEST = 4096
+"""Features a side: a transmission takes 128 MiB."""
+_MOST_CELLS = 2 * LARGEST
+_ROUNDING = 1e-12
+_GRIDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Plate(ByValue):
+    """A square plate of square features, each with its own transmission; MitsimError for values out of range.
+
+    ``values`` (N, N) are transmissions of power, read-only, or of any size with ``irradiance``: the light behind the
+    plate, which includes waves. Light is always averaged over ``averaged`` features, the side of a sensor pixel.
+    ``words`` describe the plate in manifests.
+    """
+
+    feature_mm: float
+    values: FloatArray = field(repr=False)
+    words: str
+    flaws: Flaws = NO_FLAWS
+    irradiance: bool = False
+    averaged: int = 1
+
+    def __post_init__(self) -> None:
+        values = np.array(self.values, dtype=np.float64)
+        most = _MOST_CELLS if self.irradiance else LARGEST
+        if values.ndim != 2 or values.shape[0] != values.shape[1] or not 1 <= len(values) <= most:
+            raise MitsimError(f"{self.words}: has shape {values.shape}; give a square of 1 to {most} features a side")
+        if not values.max() > (0 if self.irradiance else _ROUNDING):
+            raise MitsimError(f"{self.words}: no feature lets light through; open some")
+        self._hold(values=values)
+
+    def _values(self) -> tuple[object, ...]:
+        return self.feature_mm, self.words, self.digest, self.flaws, self.irradiance, self.averaged
+
+    @cached_property
+    def digest(self) -> str:
+        return hashlib.sha256(np.ascontiguousarray(self.values).tobytes()).hexdigest()
+
+    @property
+    def identity(self) -> str:
+        return f"{self.words}, features of {self.feature_mm:g} mm, sha256 {self.digest}"
+
+    @property
+    def extent_mm(self) -> float:
+        return len(self.values) * self.feature_mm
+
+    @cached_property
+    def lines(self) -> FloatArray:
+        return np.asarray((np.arange(len(self.values) + 1) - len(self.values) / 2) * self.feature_mm)
+
+    @property
+    def blur_mm(self) -> float:
+        return self.flaws.blur_mm
+
+    @property
+    def even(self) -> bool:
+        return not self.blur_mm
+
+    @property
+    def plain(self) -> bool:
+        return self.flaws == NO_FLAWS
+
+    @property
+    def open_part(self) -> float:
+        width = np.diff(self.lines) / self.extent_mm
+        return float(width @ self.values @ width)
+
+    @cached_property
+    def opening_mm(self) -> float:
+        """Return the mean width of the openings along rows or columns, whichever is less [mm].
+
+        A feature is open if it transmits half as much as the clearest one.
+        """
+        is_open, widths = self.values >= self.values.max() / 2, np.diff(self.lines)
+        return min(mean_opening(is_open, widths), mean_opening(is_open.T, widths))
+
+    @cached_property
+    def crosses(self) -> tuple[Term, ...] | None:
+        rest = self.values.copy()
+        terms: list[Term] = []
+        while True:
+            row, column = np.unravel_index(np.argmax(np.abs(rest)), rest.shape)
+            pivot = rest[row, column]
+            if abs(pivot) <= _ROUNDING:
+                return tuple(terms)
+            if len(terms) == FEW:
+                return None
+            terms.append((1.0, rest[:, column].copy(), rest[row] / pivot))
+            rest -= np.outer(terms[-1][1], terms[-1][2])
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return self._terms_and_rest[0]
+
+    @property
+    def left_out(self) -> float:
+        return self._terms_and_rest[1]
+
+    @cached_property
+    def _terms_and_rest(self) -> tuple[tuple[Term, ...], float]:
+        if self.crosses is not None:
+            return self.crosses, 0.0
+        if self.irradiance:
+            found = self.largest
+            if found.left_out > RASTER_LEFT_OUT:
+                found = LargestTerms(self.values, self.averaged, sizes=(len(self.values),))
+            return found.terms(), found.left_out
+        if self.many:
+            patterns, which = np.unique(self.values, axis=0, return_inverse=True)
+            return tuple((1.0, (which.ravel() == k) * 1.0, pattern) for k, pattern in enumerate(patterns)), 0.0
+        (rows, columns), weights, weighted = _distinct(self.values)
+        if self.symmetric:
+            singular, left = np.linalg.eigh(weighted)
+            singular, left = (each[..., np.argsort(-np.abs(singular))] for each in (singular, left))
+            right = left.T
+        else:
+            left, singular, right = np.linalg.svd(weighted, full_matrices=False)
+        left, right = left / weights[0], right / weights[1]
+        beyond = np.sqrt(np.cumsum(np.square(singular[::-1]))[::-1])  # what the terms from each on hold
+        count = int(np.count_nonzero(beyond > LEFT_OUT * beyond[0]))
+        terms = tuple((float(singular[k]), left[rows, k], right[k, columns]) for k in range(count))
+        return terms, float(beyond[count] / beyond[0]) if count < len(beyond) else 0.0
+
+    @cached_property
+    def most_terms(self) -> int:
+        if self.crosses is not None:
+            return len(self.crosses)
+        both = self.values, np.ascontiguousarray(self.values.T)
+        return min(len({line.tobytes() for line in lines}) for lines in both)
+
+    @property
+    def many(self) -> bool:
+        return self.most_terms > _MOST_DECOMPOSED
+
+    @cached_property
+    def largest(self) -> LargestTerms:
+        return LargestTerms(self.values, self.averaged)
+
+    @cached_property
+    def residuals(self) -> tuple[float, float]:
+        """Return the relative part beyond one term, of the mask and of the mask without means of rows and columns."""
+
+        def beyond_one(values: FloatArray) -> float:
+            *_, weighted = _distinct(values)
+            total = np.linalg.norm(weighted)
+            if not total:
+                return 0.0
+            if min(weighted.shape) > _MOST_DECOMPOSED:
+                from scipy.sparse.linalg import svds  # here: only the largest masks need it
+
+                left, singular, right = svds(weighted, k=1, v0=np.ones(min(weighted.shape)))
+                return float(np.linalg.norm(weighted - singular * left * right) / total)
+            singular = np.linalg.svd(weighted, compute_uv=False)
+            rest = float(np.linalg.norm(singular[1:]) / total)
+            return rest if rest > _ROUNDING * len(values) else 0.0
+
+        centred = self.values - self.values.mean(axis=0)
+        return beyond_one(self.values), beyond_one(centred - centred.mean(axis=1, keepdims=True))
+
+    @property
+    def centred(self) -> bool:
+        plain, without = self.residuals
+        return without < plain
+
+    @property
+    def residual(self) -> float:
+        return min(self.residuals)
+
+    @cached_property
+    def amplitude(self) -> Plate:
+        return self if self.binary else replace(self, values=np.sqrt(self.values))
+
+    @cached_property
+    def binary(self) -> bool:
+        return bool(np.isin(self.values, (0, 1)).all())
+
+    @property
+    def mirrored(self) -> tuple[bool, bool]:
+        return tuple(np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
+
+    @cached_property
+    def symmetric(self) -> bool:
+        return np.array_equal(self.values, self.values.T)
+
+    @property
+    def uneven_part(self) -> float:
+        return float(0.5 ** (sum(self.mirrored) + self.symmetric))
+
+    @property
+    def diffracts(self) -> bool:
+        """Return True if diffraction is computed: not for light behind a plate, nor for several blurred terms."""
+        sharp = not self.blur_mm or (self.crosses is not None and len(self.crosses) == 1 and not self.flaws.turn_deg)
+        return not self.irradiance and sharp
+
+    @cached_property
+    def grids(self) -> tuple[tuple[BoolArray, BoolArray], ...] | None:
+        """Return at most 4 grids of openings that do not overlap; None for more, and with flaws."""
+        if not self.binary or not self.plain:
+            return None
+        patterns, which = np.unique(self.values[self.values.any(axis=1)], axis=0, return_inverse=True)
+        if len(patterns) > _GRIDS:
+            return None
+        row_of = np.full(len(self.values), -1)
+        row_of[self.values.any(axis=1)] = which.ravel()
+        return tuple((row_of == k, pattern.astype(bool)) for k, pattern in enumerate(patterns))
+
+    @property
+    def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
+        """Return grids that hold all openings; with flaws, a square of :attr:`cover`."""
+        if self.grids is not None:
+            return self.grids
+        rows, columns = (np.asarray(self.values.any(axis=axis)) for axis in (1, 0))
+        return ((rows, columns),) if self.plain else ((np.ones(self.cover, dtype=bool),) * 2,)
+
+    @property
+    def cover(self) -> int:
+        return int(np.ceil(self.flaws.reach(self.extent_mm) / self.feature_mm))
+
+    def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
+        count = len(self.values)
+        turned = self.flaws.turned_back(np.asarray(s_row), np.asarray(s_col))
+        row, column = (np.floor(np.asarray(s) / self.feature_mm + count / 2) for s in turned)
+        inside = (row >= 0) & (row < count) & (column >= 0) & (column < count)
+        place = (np.where(inside, at, 0).astype(np.intp) for at in np.broadcast_arrays(row, column))
+        return np.asarray(np.where(inside, self.values[tuple(place)], 0.0))
+
+
+@lru_cache(maxsize=8)
+def within(plate: Plate, reach_mm: float) -> Plate:
+    flaws = plate.flaws
+    if flaws.turn_deg:
+        reach_mm *= 2**0.5
+    if plate.crosses is not None:
+        return plate
+    seen = reach_mm + flaws.margin_mm
+    beyond, more = int((plate.extent_mm / 2 - seen) / plate.feature_mm), 1
+    while beyond > 0:
+        part = plate.values[beyond:-beyond, beyond:-beyond]
+        if part.any():
+            return replace(plate, values=part)
+        # The part is closed all over, although no plate is: grow it to the next open feature.
+        beyond, more = beyond - more, 2 * more
+    return plate
+
+
+def _distinct(
+    values: FloatArray,
+) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
+    """Return the distinct rows and columns of ``values``, weighted by their number.
+
+    The result has the (N,) index of each row and column, roots of the weights, and weighted (rows, columns) values.
+    """
+    rows, first, row = np.unique(values, axis=0, return_index=True, return_inverse=True)
+    if np.array_equal(values, values.T):
+        columns, column = rows[:, first], row  # in the rows' order
+    else:
+        columns, column = np.unique(rows, axis=1, return_inverse=True)
+    weights = np.sqrt(np.bincount(row.ravel()))[:, None], np.sqrt(np.bincount(column.ravel()))
+    return (row.ravel(), column.ravel()), weights, weights[0] * columns * weights[1]
+
+
+# -------- The largest terms of a raster
+
+
+class LargestTerms:
+    """Terms of large ``values`` (N, N) that hold means over squares of ``averaged`` values per side up to 1e-4, rms.
+
+    With S the means along an axis, and U sigma W^T the largest singular vectors of S V S^T, the terms are V S^T W
+    sigma^-1 U^T S V (Nystroem's approximation). Vectors come from a sketch in random directions (Halko, Martinsson and
+    Tropp, SIAM Review 53, 217, 2011). ``sizes`` are tried in order; ``left_out`` is the rms part of the means that is
+    missing, above 1e-4 where ``count`` is too small.
+    """
+
+    def __init__(self, values: FloatArray, averaged: int = 1, sizes: Sequence[int] = _SKETCHES) -> None:
+        self._values, self._averaged = values, averaged
+        apart = max(averaged // 3, 1) if len(values) > _SMALL else 1
+        self._starts = np.arange(1 - averaged, len(values), apart)
+        with single_threaded_blas():
+            seen = self._seen = self._means(self._means(values).T).T
+            whole = float(np.square(seen).sum())
+            for size in sizes:
+                directions = stream(0, "terms").standard_normal((len(seen), min(size, len(seen))))
+                for _ in range(_TURNS):
+                    directions = np.linalg.qr(seen.T @ (seen @ directions))[0]
+                along = seen @ directions
+                squared, turn = np.linalg.eigh(along.T @ along)
+                held = np.cumsum(squared[::-1])
+                rest = np.sqrt(np.maximum(whole - held, 0) / whole)
+                enough = np.flatnonzero(rest <= RASTER_LEFT_OUT)
+                if len(enough) or size >= len(seen):
+                    break
+        self.count = int(enough[0]) + 1 if len(enough) else len(held)
+        self.left_out = float(rest[self.count - 1])
+        self._squared, self._turn = squared[::-1][: self.count], directions @ turn[:, ::-1][:, : self.count]
+
+    def terms(self) -> tuple[Term, ...]:
+        with single_threaded_blas():
+            left = self._values @ self._spread(self._turn)
+            right = (self._spread(self._seen @ self._turn) / self._squared).T @ self._values
+        return tuple((1.0, left[:, k], right[k]) for k in range(self.count))
+
+    def _means(self, values: FloatArray) -> FloatArray:
+        below = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
+        ends = np.minimum(self._starts + self._averaged, len(values))
+        return np.asarray((below[ends] - below[np.maximum(self._starts, 0)]) / self._averaged)
+
+    def _spread(self, means: FloatArray) -> FloatArray:
+        below = np.concatenate((np.zeros((1, means.shape[1])), np.cumsum(means, axis=0)))
+        places = np.arange(len(self._values))
+        first, beyond = (np.searchsorted(self._starts, places - less, "right") for less in (self._averaged, 0))
+        return np.asarray((below[beyond] - below[first]) / self._averaged)
+
+
+# -------- A drawing or scan of a mask
+
+_DRAWING = Wanted("mask drawing", most=LARGEST, bits=(1, 2, 4, 8, 16, 32))
+"""2 and 4 bits are read as 8, in which white is the same."""
+_PICTURES = ".png", ".tif", ".tiff"
+"""Files whose whole numbers are parts of white; other files hold transmissions."""
+
+
+def read_drawing(path: Path) -> FloatArray:
+    """Return the (rows, columns) transmissions, 0 to 1, of the drawing ``path``; pictures are linear in transmission.
+
+    Row 0 is at the top and column 0 at the left for a viewer from the sensor. Raises MitsimError for a file that is no
+    PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
+    """
+    rows, columns = image_size(path, _DRAWING)
+    if (rows - columns) % 2 and 2 * max(rows, columns) > LARGEST:
+        problem = f"{rows} x {columns} pixels: about its centre the shorter side needs half a pixel, so features become"
+        allowed = f"half as large, of which {LARGEST} a side are allowed"
+        raise _DRAWING.refusal(path, f"{problem} {allowed}; make its sides differ by an even number")
+    values = read_image(path, _DRAWING)
+    white = own_end(values) if path.suffix.lower() in _PICTURES else None
+    transmissions = np.asarray(values, dtype=np.float64) / (white or 1.0)
+    if transmissions.min() < 0 or transmissions.max() > 1:
+        raise _DRAWING.refusal(path, "has values outside 0 to 1; give transmissions")
+    return transmissions
+
+
+def make_square(values: FloatArray, feature_mm: float) -> tuple[float, FloatArray]:
+    """Return the side of the pixels, and a drawing with opaque margins that make it square about its centre.
+
+    Pixels are halved if margins of half a pixel are needed.
+    """
+    if (values.shape[0] - values.shape[1]) % 2:
+        values, feature_mm = values.repeat(2, axis=0).repeat(2, axis=1), feature_mm / 2
+    side = max(values.shape)
+    margins = [((side - own) // 2,) * 2 for own in values.shape]
+    return feature_mm, np.pad(values, margins)

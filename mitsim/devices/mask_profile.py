@@ -18,9 +18,8 @@ from mitsim.core.images import image_size, read_image
 from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Flaws, MaskKind, mls_mask
+from mitsim.devices.mask import LARGEST, Flaws, MaskKind, Plate, make_square, mls_mask, read_drawing
 from mitsim.devices.patterns import is_prime
-from mitsim.devices.plate import LARGEST, Plate, make_square, read_drawing
 
 KINDS: Mapping[str, str] = MappingProxyType({
     "separable": "a maximum length sequence times itself, a quarter of it open",

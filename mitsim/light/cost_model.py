@@ -19,8 +19,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Cost
 from mitsim.core.worker import workers
 from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import FEW, MOST_TERMS, Plate
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.plate import FEW, MOST_TERMS, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.light.passes import PASSES, Simulation
 from mitsim.light.settings import (

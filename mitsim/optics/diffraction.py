@@ -34,8 +34,7 @@ import scipy
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
-from mitsim.devices.mask import Mask
-from mitsim.devices.plate import FEW, Plate
+from mitsim.devices.mask import FEW, Mask, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.shadow import (
     Antiderivative,

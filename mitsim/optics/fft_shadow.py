@@ -22,8 +22,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import NO_FLAWS, Flaws, Mask, Term
-from mitsim.devices.plate import Plate
+from mitsim.devices.mask import NO_FLAWS, Flaws, Mask, Plate, Term
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
 from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, Steps, blurred_step

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.plate import FEW, RASTER_LEFT_OUT, Plate
+from mitsim.devices.mask import FEW, RASTER_LEFT_OUT, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import (
     CORRELATION_PRODUCTS,

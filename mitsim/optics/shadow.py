@@ -30,8 +30,7 @@ import scipy
 from mitsim.core.arrays import ByValue, FloatArray, SeparableTerm
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Mask
-from mitsim.devices.plate import Plate
+from mitsim.devices.mask import Mask, Plate
 
 # -------- Piecewise constant transmission of one axis of a mask, and its means over a sensor pixel and a cell
 #

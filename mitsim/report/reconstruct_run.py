@@ -52,8 +52,7 @@ from mitsim.reconstruct.reconstruct import (
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
 from mitsim.reconstruct.solution import Solution, Status
 from mitsim.reconstruct.solver import automatic_lambda, prepare
-from mitsim.report.colour_image import ColourImage, state_image
-from mitsim.report.folder_page import report_folder
+from mitsim.report.folder_page import ColourImage, report_folder, state_image
 
 # -------- The image of one line
 

@@ -11,9 +11,8 @@ import numpy as np
 from scipy import ndimage, special
 
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import mls_mask
+from mitsim.devices.mask import Plate, mls_mask
 from mitsim.devices.mask_profile import MaskProfile
-from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import SampledTerm, geometric_samplers, wave_samplers
 from mitsim.optics.shadow import Directions

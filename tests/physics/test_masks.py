@@ -24,8 +24,7 @@ from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job, Limits
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import mls_mask
-from mitsim.devices.plate import Plate
+from mitsim.devices.mask import Plate, mls_mask
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import Modelling, load_recipe
 from mitsim.optics.image_formation import FrameOptics

@@ -66,8 +66,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import BoolArray, Flaws, Mask
-from mitsim.devices.plate import Plate
+from mitsim.devices.mask import BoolArray, Flaws, Mask, Plate
 from mitsim.transport.plugins import base
 
 PLUGIN = "mitsim_lensless"

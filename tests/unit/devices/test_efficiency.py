@@ -44,17 +44,11 @@ def test_each_plane_of_a_mosaic_has_its_curve() -> None:
     ("change", "message"),
     [
         ({"quantum_efficiency_curve": CURVE}, "quantum_efficiency and quantum_efficiency_curve; give one"),
-        ({**COLOUR, "quantum_efficiency": 0.5}, "quantum_efficiency and mosaic_curves; give one"),
         ({"mosaic": "RGGB"}, "go together"),
-        ({"quantum_efficiency": None, "mosaic_curves": PLANES}, "go together"),
         ({**COLOUR, "binning": 2}, "mosaic RGGB: binning 2"),
-        ({**COLOUR, "mosaic": "RGBG"}, "'RGGB', 'BGGR', 'GRBG' or 'GBRG'"),
         ({"quantum_efficiency_curve": {**CURVE, "wavelengths_nm": [450.0, 550.0]}}, "2 wavelengths_nm and 3"),
-        ({"quantum_efficiency_curve": {**CURVE, "wavelengths_nm": [450.0, 650.0, 650.0]}}, "650 after 650"),
         ({"quantum_efficiency_curve": {**CURVE, "efficiency": [0.5, 1.01, 0.5]}}, "efficiency.1"),
-        ({"quantum_efficiency_curve": {**CURVE, "efficiency": [0.0, 0.0, 0.0]}}, "all are 0"),
         ({"quantum_efficiency_curve": {"wavelengths_nm": [500.0], "efficiency": [0.5]}}, "at least 2"),
-        ({"quantum_efficiency_curve": 0.5}, "quantum_efficiency_curve"),
     ],
 )
 def test_what_is_no_efficiency_is_refused(change: dict[str, Any], message: str) -> None:

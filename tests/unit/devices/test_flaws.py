@@ -9,8 +9,8 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import Plate
 from mitsim.devices.mask_profile import MaskProfile, load_mask
-from mitsim.devices.plate import Plate
 
 BARE = CameraGeometry(pixels=64)
 

@@ -11,8 +11,8 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import RASTER_LEFT_OUT, Plate
 from mitsim.devices.mask_profile import MaskProfile
-from mitsim.devices.plate import RASTER_LEFT_OUT, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics import fft_shadow as rasters
 from mitsim.optics import image_formation
