@@ -66,11 +66,6 @@ class Exposer:
         sensor = self.devices.sensor
         return dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
 
-    def rendering_noise(self, frame: Frame) -> float:
-        wavelength = self.devices.projector.effective_wavelength_nm
-        unit = electrons_from_irradiance(1.0, self.exposure_s, self.devices.sensor, wavelength)
-        return float(np.sqrt(frame.variance) * unit)
-
     def sensor_noise(self, electrons: FloatArray) -> float:
         variance = mean_variance(electrons, self.exposure_s, self.devices.sensor)
         return math.sqrt(variance) / self.devices.sensor.gain_dn_per_e
@@ -257,13 +252,14 @@ class Shooting:
         return math.sqrt((noise + own) / signal) if signal else math.inf
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
-        exposer = self.exposer
+        exposer, wavelength = self.exposer, self.exposer.devices.projector.effective_wavelength_nm
 
         def expose_shot(item: tuple[int, Shot, Frame]) -> tuple[int, Shot, FloatArray, Digital, float]:
             index, shot, frame = item
             electrons = exposer.shot_electrons(frame, *shot.names)
             digital = exposer.digital(electrons, *shot.names)
-            return index, shot, electrons, digital, exposer.rendering_noise(frame)
+            unit = electrons_from_irradiance(1.0, exposer.exposure_s, exposer.devices.sensor, wavelength)
+            return index, shot, electrons, digital, float(np.sqrt(frame.variance) * unit)
 
         def measure(exposed: tuple[int, Shot, FloatArray, Digital, float]) -> tuple[float, bool, FloatArray]:
             _, _, electrons, digital, rendered = exposed
@@ -280,7 +276,10 @@ class Shooting:
                     "row": shot.row, "column": shot.column, "sign": shot.sign, "exposure_s": exposer.exposure_s,
                     "rendering_noise_e": rendered, "seed": exposer.seed,
                 }  # fmt: skip
-                self.recorder.write_frame(index, frame_channels(digital, electrons), metadata)
+                # EXR has no 64-bit numbers: what a sensor without an ADC gives is kept in single precision.
+                dn = digital.astype(np.uint32 if digital.dtype == np.uint32 else np.float32, copy=False)
+                channels: dict[str, Channel] = {"DN": dn, "electrons": electrons.astype(np.float32)}
+                self.recorder.write_frame(index, channels, metadata)
 
         chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
         job.progress("frames", 0.0)
@@ -302,13 +301,6 @@ class Shooting:
                 job.progress("frames", (chunk[-1][0] + 1) / len(expected))
             with job.clock.stage("write"):
                 writing.wait()
-
-
-def frame_channels(digital: Digital, electrons: FloatArray) -> dict[str, Channel]:
-    # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
-    whole = digital.dtype == np.uint32
-    dn: Channel = digital.astype(np.uint32, copy=False) if whole else digital.astype(np.float32)
-    return {"DN": dn, "electrons": electrons.astype(np.float32)}
 
 
 # -------- Drift of a bench and of a camera's exposure

@@ -311,11 +311,6 @@ def frame_seconds(bench: Apparatus, shots: int) -> dict[str, float]:
     return {"sensor": pixels * _EXPOSING_S, "write": pixels * _WRITING_S}
 
 
-def frames_bytes(classes: int, shots: int, pixels: float) -> float:
-    formed = frames_in_memory(classes, shots, pixels) * (pixels + GROUPS * (PROBES + 1))
-    return 8.0 * pixels * (formed + _EXPOSED * frames_at_once(round(pixels**2)) * pixels)
-
-
 def frames_cost(
     bench: Apparatus, settings: Settings, lighting: Lighting, seconds: float = 0.0, on_disk: float = 0.0, lines: int = 1
 ) -> Cost:
@@ -330,7 +325,10 @@ def frames_cost(
         return float(_BYTES_PER_PIXEL * rows * columns + _BYTES_PER_ROW * rows + _HEADER_BYTES)
 
     files = shots * file_bytes(*geometry.frame_shape) + file_bytes(bench.n, bench.n)
-    held = light_bytes(bench, classes, settings, lines) + frames_bytes(classes, shots, geometry.frame_side)
+    pixels = geometry.frame_side
+    formed = frames_in_memory(classes, shots, pixels) * (pixels + GROUPS * (PROBES + 1))
+    formed_bytes = 8.0 * pixels * (formed + _EXPOSED * frames_at_once(round(pixels**2)) * pixels)
+    held = light_bytes(bench, classes, settings, lines) + formed_bytes
     return Cost(seconds=seconds, memory_bytes=held, disk_bytes=max(lines * files - on_disk, 0.0))
 
 
