@@ -277,7 +277,8 @@ class Shooting:
                     "rendering_noise_e": rendered, "seed": exposer.seed,
                 }  # fmt: skip
                 # EXR has no 64-bit numbers: what a sensor without an ADC gives is kept in single precision.
-                dn = digital.astype(np.uint32 if digital.dtype == np.uint32 else np.float32, copy=False)
+                whole = digital.dtype == np.uint32
+                dn: Channel = digital.astype(np.uint32, copy=False) if whole else digital.astype(np.float32)
                 channels: dict[str, Channel] = {"DN": dn, "electrons": electrons.astype(np.float32)}
                 self.recorder.write_frame(index, channels, metadata)
 

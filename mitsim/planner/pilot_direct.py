@@ -250,16 +250,12 @@ def gather_places(places: Labels, values: FloatArray, size: int) -> Entries:
     return found, light[found]
 
 
-def product(one: FloatArray, other: FloatArray) -> float:
-    replicates = len(one)
-    # Sums by numpy: those of BLAS depend on the number of its threads in the last bits.
-    whole = float((one.sum(axis=0) * other.sum(axis=0)).sum())
-    return (whole - float((one * other).sum())) / (replicates * (replicates - 1))
-
-
 def norm(seen: FloatArray) -> float:
     """Return the norm of frames without their noise."""
-    return math.sqrt(max(product(seen, seen), 0.0))
+    replicates = len(seen)
+    # Sums by numpy: those of BLAS depend on the number of its threads in the last bits.
+    whole = float(np.square(seen.sum(axis=0)).sum())
+    return math.sqrt(max((whole - float(np.square(seen).sum())) / (replicates * (replicates - 1)), 0.0))
 
 
 def noise(seen: FloatArray) -> float:
