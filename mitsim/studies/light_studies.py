@@ -16,8 +16,18 @@ reflectance of the glossy scene, its mean over the sensor:
     interreflection  = R(Y_all) - R(Y_direct)
     rest             = R(Y_even) - t and noise       error that a matt scene of the same brightness has as well
 
-where Y_even is the twin's light, with that of each projector pixel times t / L. A user's scene needs a parameter
-``finish``.
+where Y_even is the twin's light, with that of each projector pixel times t / L. A user's scene is measured for gloss
+if it has a parameter ``finish``, otherwise for global light.
+
+*Global light*, which came over several surfaces, is nearly the same in all frames under shifting dots (Nayar, Krishnan,
+Grossberg and Raskar 2006). With P_ij the patterns, frames are Y_ij = L (P_ij o X) R^T + F, and the image of F is linear
+between nodes as far apart as the dots: F = Q f S^T. The least squares of all K frames over X and f have, with A =
+(sum_i U_i)^T Q and B alike,
+
+    K f - A^T (A f B^T) B = Q^T (sum_ij Y_ij) S - A^T W B
+
+where W are the summed products of frames and patterns. An eigenvalue of the left side over K is the part of a mode of F
+that lit pixels do not explain: 0 under uniform light.
 """
 
 from __future__ import annotations
@@ -37,8 +47,9 @@ from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
-from mitsim.report.lit_scene import DIM, LitScene, Unexposed
+from mitsim.report.lit_scene import DIM, LitScene, Pair, Unexposed
 from mitsim.studies.framework.claims import Gain, Level, measured, stated
 from mitsim.studies.framework.experiment import Axes, Found, Point, Scope, Study
 from mitsim.studies.framework.panels import Bars, Images, Lines
@@ -268,14 +279,90 @@ _PLAIN_DB = 20.0
 _ACCURACY = 3e-3
 
 
+BOUNCING = ("corner", "cookie_bag")
+GLOSS, GLOBAL_LIGHT = ("gloss", "global light")
+AS_IT_IS, MENDED = ("as it is", "depth mended")
+_ALL, SEPARATED, ALONE = DIRECT_IMAGES = ("all light", "separated", "direct alone")
+_LEAST_EIGENVALUE = 1e-3
+
+
 def _reflectivity_points(scope: Scope) -> list[Point]:
     base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
-    subjects = scope.choose(SHIPPED, (CARD, DISC))
+    parts = {GLOSS: scope.choose(SHIPPED, (CARD, DISC)), GLOBAL_LIGHT: scope.choose(BOUNCING, BOUNCING[:1])}
     if scope.pictures == (None,):
-        if 'name="finish"' not in locate(base.scene, "scenes", "scene.xml").read_text(errors="replace"):
-            raise MitsimError(f"study reflectivity: {base.scene} has no parameter finish, whose matt is the truth")
-        subjects = (base.scene,)
-    return [Point.of(replace(base, scene=name), subject=name, seed=seed) for name in subjects for seed in scope.repeats]
+        glossy = 'name="finish"' in locate(base.scene, "scenes", "scene.xml").read_text(errors="replace")
+        parts = {GLOSS if glossy else GLOBAL_LIGHT: (base.scene,)}
+    return [
+        Point.of(replace(base, scene=name), part=part, subject=name, seed=seed)
+        for part, names in parts.items()
+        for name in names
+        for seed in scope.repeats
+    ]
+
+
+@single_threaded_blas()
+def separate(model: Prepared, factors: Pair, patterns: Pair, weights: FloatArray, total: FloatArray) -> FloatArray:
+    """Return the (m, m') light that all frames under shifting dots share.
+
+    ``weights`` (n, n) are the sums of a `model` over the frames, and ``total`` (m, m') is the sum of all frames.
+    """
+    lit, bases, measured = [], [], (model.sigma > 0).astype(np.float64)
+    for side, factor, lights in zip((model.left, model.right), factors, patterns, strict=True):
+        pixels, dots = lights.shape
+        # Functions linear between nodes a period of the dots apart, the outer ones at the window's ends.
+        count = max(2, 1 + -(-(pixels - 1) // dots))
+        place = np.arange(pixels) * (count - 1) / max(pixels - 1, 1)
+        hats = np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count)))
+        bases.append(np.linalg.qr(factor @ hats)[0])
+        lit.append(side.common.T @ bases[-1])
+    (rows, columns), frames = (each.shape[1] for each in lit), model.left.pattern_count * model.right.pattern_count
+    pairs = [(each[:, :, None] * each[:, None, :]).reshape(len(each), -1) for each in lit]
+    explained = (pairs[0].T @ measured @ pairs[1]).reshape(rows, rows, columns, columns).transpose(0, 2, 1, 3)
+    target = bases[0].T @ total @ bases[1] - lit[0].T @ (measured * weights) @ lit[1]
+    left, modes = np.linalg.eigh(np.eye(target.size) - explained.reshape(target.size, target.size) / frames)
+    if left[-1] < _LEAST_EIGENVALUE:
+        raise MitsimError("separation: these patterns light all pixels in each frame; use dots:K with K of 2 or more")
+    inverse = np.divide(1.0, frames * left, out=np.zeros_like(left), where=left > _LEAST_EIGENVALUE)
+    return np.asarray(bases[0] @ (modes @ (inverse * (modes.T @ target.ravel()))).reshape(rows, columns) @ bases[1].T)
+
+
+def _measure_reflectivity(studio: Studio, point: Point) -> Found:
+    return (_measure_gloss if point["part"] == GLOSS else _measure_global)(studio, point)
+
+
+def _measure_global(studio: Studio, point: Point) -> Found:
+    frames = studio.frames(point.setup, RENDERED, "dots:7", int(point["seed"]))
+    lit, family, model = frames.lit, frames.family, frames.prepare()
+    if not lit.light.simulation.physics.interreflection:
+        raise MitsimError(f"study reflectivity: {point['subject']} has no light over several surfaces to follow")
+    seconds, electrons = frames.seconds(EQUAL_PEAK), frames.exposer(1.0).electrons
+    exposer, (left, right) = frames.exposer(seconds), frames.sides
+    direct = [electrons(frame) for frame in LitScene(direct_of(lit.light)).expected_frames(RENDERED, family)]
+    bounced = [electrons(frame) - own for frame, own in zip(frames.expected, direct, strict=True)]
+    mended = [np.asarray(left @ (family.light(shot) * lit.truth) @ right.T) for shot in family.shots]
+
+    def expose(rates: list[FloatArray]) -> list[FloatArray]:
+        shown = zip(family.shots, rates, strict=True)
+        return [exposer.rate(exposer.digital(np.maximum(rate, 0.0) * seconds, *shot.names)) for shot, rate in shown]
+
+    def accumulate(taken: list[FloatArray], less: FloatArray | float = 0.0) -> Accumulator:
+        sums = model.accumulator()
+        for shot, frame in zip(family.shots, taken, strict=True):
+            sums.add(frame - less, shot.row, shot.column)
+        return sums
+
+    rows, arrays = [], {"direct, true": lit.truth}
+    for depth, own in ((AS_IT_IS, direct), (MENDED, mended)):
+        taken = expose([one + more for one, more in zip(own, bounced, strict=True)])
+        whole, patterns = accumulate(taken), (family.left.astype(float), family.right.astype(float))
+        common = separate(model, frames.sides, patterns, whole.sum, np.sum(taken, axis=0))
+        solved = zip(DIRECT_IMAGES, (whole, accumulate(taken, common), accumulate(expose(own))), strict=True)
+        images = {name: model.solve(sums).image for name, sums in solved}
+        levels = {f"{name}_db": psnr(image, lit.truth) for name, image in images.items()}
+        gain = levels[f"{SEPARATED}_db"] - levels[f"{_ALL}_db"]
+        rows.append(point.row(depth=depth, gain_db=gain, **levels))
+        arrays |= {f"{depth} {name}": image for name, image in images.items()}
+    return Found(tuple(rows), single_precision(arrays))
 
 
 def _measure_gloss(studio: Studio, point: Point) -> Found:
@@ -304,34 +391,50 @@ def _measure_gloss(studio: Studio, point: Point) -> Found:
 
 REFLECTIVITY = Study(
     "reflectivity",
-    "Gloss",
-    "What do shiny surfaces do to the image?",
+    "Gloss and global light",
+    "What do shiny surfaces and light over several surfaces do to the image?",
     points=_reflectivity_points,
-    measure=_measure_gloss,
-    claims=tuple(
-        Level(
-            f"{words} (artefacts of gloss, 49 dots)", paper=paper, where={"subject": name}, column="artefacts_db",
-            at_least=low, at_most=high, optional=True,
-        )
-        for name, words, paper, low, high in (
-            (CARD, "The gift card comes out well", "quite good", _PLAIN_DB, inf),
-            (BLADE, "The metal blade comes out well", "quite good", _PLAIN_DB, inf),
-            (DISC, "The compact disc is worst", "severe artefacts", -inf, _PLAIN_DB),
-        )
+    measure=_measure_reflectivity,
+    claims=(
+        *(
+            Level(
+                f"{words} (artefacts of gloss, 49 dots)", paper=paper, where={"subject": name}, column="artefacts_db",
+                at_least=low, at_most=high, optional=True,
+            )
+            for name, words, paper, low, high in (
+                (CARD, "The gift card comes out well", "quite good", _PLAIN_DB, inf),
+                (BLADE, "The metal blade comes out well", "quite good", _PLAIN_DB, inf),
+                (DISC, "The compact disc is worst", "severe artefacts", -inf, _PLAIN_DB),
+            )
+        ),
+        *(
+            Level(
+                f"49 dots separate global light, {depth} (Nayar et al. 2006)", every="subject", column="gain_db",
+                where={"part": GLOBAL_LIGHT, "depth": depth}, at_least=0.0, optional=True,
+            )
+            for depth in (AS_IT_IS, MENDED)
+        ),
     ),
     panels=(
         Images(
             {_IMAGE: (_IMAGE, "{psnr_db:.1f} dB"),
              **{cause: (cause.replace("interr", "inter-r"), f"{{{cause}_db:.1f}} dB") for cause in ERROR_SOURCES}},
             title="Images and their errors by cause, grey is none", before={name: name for name in _TRUTHS},
-            down=("subject",),
+            down=("subject",), where={"part": GLOSS},
+        ),
+        Images(
+            {"direct, true": ("direct, true", ""),
+             **{f"{{depth}} {name}": (name, f"{{{name}_db:.1f}} dB") for name in DIRECT_IMAGES}},
+            file="global", title="49 dots", down=("subject",), where={"part": GLOBAL_LIGHT}, each="depth",
         ),
     ),
     heads=("Paper", "", "Rendered"),
     note="Each scene with gloss has a twin of matt paint, the truth of errors; apparent is the mean of the glossy "
     "scene over the sensor, the truth of the image's decibels. Decibels of a cause are the PSNR that its errors alone "
     "would leave. Pixels: brightness that is not the matt one; sensor: light of a projector pixel that changes over "
-    "the sensor.",
+    "the sensor. Global light came over several surfaces. All light: taken for direct; separated: less the light that "
+    "all frames share; direct alone: the best that separation can reach. Depth mended: direct light is that of the "
+    "calibration at any depth.",
 )  # fmt: skip
 
 STUDIES = {each.name: each for each in (PATTERNS, EXPOSURE, AMBIENT, REFLECTIVITY)}
