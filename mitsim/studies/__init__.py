@@ -40,6 +40,7 @@ GONE = {
     "diffraction": "study calibration SCENE",
     "models": "calibrate SCENE --model wave",
     "regularisation": "study sweep SCENE --over method=tikhonov,tv",
+    "separation": "study reflectivity",
     "transfer": "study learned --data DIR",
 }
 """Former studies, and the command that replaces each."""
