@@ -176,8 +176,8 @@ def test_a_page_states_the_accuracy_that_light_was_traced_to() -> None:
 def test_figures_of_gloss_have_each_image_under_its_title() -> None:
     """(Seen failing: the truths twice in a row, more images than titles.)"""
     names = ["matt paint", "apparent", "49 dots", *ERROR_SOURCES]
-    rows = [{"point": name, "part": "gloss", "subject": name, "psnr_db": 20.0, **{f"{cause}_db": 30.0 for cause in ERROR_SOURCES}}
-            for name in ("gift_card", "compact_disc")]  # fmt: skip
+    levels_db = {"psnr_db": 20.0, **{f"{cause}_db": 30.0 for cause in ERROR_SOURCES}}
+    rows = [{"point": name, "part": "gloss", "subject": name, **levels_db} for name in ("gift_card", "compact_disc")]
     levels = dict(zip(names, np.linspace(0, 0.4, len(names)), strict=True))
     arrays = {(str(row["point"]), name): np.full((2, 2), level) for row in rows for name, level in levels.items()}
     cells = find_experiment("reflectivity").draw(Results(rows, arrays))["images.png"].axes
