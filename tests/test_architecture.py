@@ -564,7 +564,7 @@ SIZES = {
     "scene": (6, 1407),
     "sensor": (5, 1190),
     "sessions": (4, 820),
-    "studies": (22, 5225),
+    "studies": (22, 5303),
     "transport": (20, 4189),
     "verbs": (1, 309),
     "version": (1, 1),
