@@ -76,7 +76,7 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     if factor is None:
         factor = common.choose(camera.largest)
         if factor > 1:
-            notes.append(f"numbers are divided by {factor}, which all are multiples of")
+            notes.append(f"numbers are divided by {factor}, because all are multiples of it")
         elif common.factor > 1:
             warnings.append(
                 f"all numbers are multiples of {common.factor}, and are taken as they are: if the camera's numbers "

@@ -120,7 +120,7 @@ def test_a_plane_through_the_cameras_axis(plane: Callable[..., Bench]) -> None:
 def test_a_scene_that_the_sensors_centre_cannot_see_is_refused(plane: Callable[..., Bench]) -> None:
     """The plane alone: the pilot looks from the centre, to which it is a line. Not silently black, and it says why."""
     bench = plane(np.array([0.0, 0.0, Z]), np.array([1.0, 0.0, 0.0]))
-    with pytest.raises(MitsimError, match="edge-on") as caught:
+    with pytest.raises(MitsimError, match="centre sees no light") as caught:
         make_plan(bench, Lighting.uniform(N), 1e-2, 1)
     assert "\n" not in str(caught.value)
 

@@ -193,7 +193,7 @@ def test_numbers_in_the_high_bits_are_found_and_named(tmp_path: Path) -> None:
     )
     again = ms.load_run(tmp_path / "run a")
     assert np.array_equal(again.dn, dn) and result["divided_by"] == 16 and not result["warnings"]
-    assert "divided by 16, which all are multiples of" in result["notes"][0]
+    assert "divided by 16, because all are multiples of it" in result["notes"][0]
     assert np.allclose(again.read("ambient.exr")[0]["DN"], dn[0] / 3)
     odd = dn * 16
     odd[:, 0, :2] = 24123, 36053
