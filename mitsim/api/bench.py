@@ -413,7 +413,7 @@ class Bench(Apparatus):
     def view(self) -> BenchView:
         """Draw the bench to scale, with its distances and the camera's view, before any light is simulated.
 
-        The drawing shows itself in a notebook, and is saved as a picture or as a page.
+        The drawing shows itself in a notebook, and is saved as a picture or as a page on which it can be turned.
         """
         from mitsim.report.bench_view import view
 

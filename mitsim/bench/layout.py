@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -24,8 +24,10 @@ from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.scene.load import why_dark
 from mitsim.transport.connect import PinholeRays
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.plugins.base import channels, host_values, turn_and_origin, vectors
+from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
 
+_TRIANGLES = 40_000
+"""Triangles into which meshes are divided that have fewer, so that corners show their prints."""
 _GRID = 48
 """Cells per side of a shape without faces, by its surface parameters."""
 _BOX = np.array([
@@ -61,6 +63,8 @@ class Surface:
         (k, 3) corners [mm].
     triangles
         (m, 3) indices of corners.
+    reflectance
+        (k, 1 or 3) diffuse reflectance at the corners, 0 to 1; 0.5 where the material has none.
     is_lamp
         True if it emits.
     """
@@ -68,6 +72,7 @@ class Surface:
     name: str
     points: FloatArray
     triangles: npt.NDArray[np.int64]
+    reflectance: FloatArray
     is_lamp: bool
 
 
@@ -151,25 +156,46 @@ def layout_of(bench: Apparatus) -> Layout:
 
 
 def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[Surface, ...]:
-    tags, found = bench.loaded.shapes, []
-    for number, shape in enumerate(bench.loaded.scene.shapes()):
+    tags, shapes, found = bench.loaded.shapes, bench.loaded.scene.shapes(), []
+    areas = [float(np.array(shape.surface_area()).ravel()[0]) if shape.is_mesh() else 0.0 for shape in shapes]
+    for number, shape in enumerate(shapes):
         name = shape.id()
         if not name or name.startswith("_"):
             kind = tags[number].attributes.get("type", "shape") if tags else shape.class_name().lower()
             name = f"{kind} {number + 1}"
         if shape.is_mesh():
-            count = shape.face_count()
-            corners = shape.face_indices(dr.arange(mi.UInt32, count))
-            places = [vectors(shape.vertex_position(corner), count) for corner in corners]
-            points, triangles = np.concatenate(places), np.arange(3 * count).reshape(3, count).T
+            points, triangles, reflectance = _triangles_of_mesh(
+                shape, _TRIANGLES * areas[number] / max(sum(areas), 1e-30)
+            )
         else:
-            points, triangles = _triangles_without_faces(shape)
+            points, triangles, reflectance = _triangles_without_faces(shape)
         if len(triangles):
-            found.append(Surface(name, (points - origin) @ turn, triangles, bool(shape.is_emitter())))
+            found.append(Surface(name, (points - origin) @ turn, triangles, reflectance, bool(shape.is_emitter())))
     return tuple(found)
 
 
-def _triangles_without_faces(shape: mi.Shape) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+def _triangles_of_mesh(mesh: mi.Mesh, wanted: float) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
+    count = mesh.face_count()
+    # Of each corner: place, place in the texture, and number of its face.
+    parts = np.zeros((count, 3, 6))
+    parts[..., 3:5], parts[..., 5] = [[0, 0], [1, 0], [0, 1]], np.arange(count)[:, None]
+    for number, corner in enumerate(mesh.face_indices(dr.arange(mi.UInt32, count))):
+        parts[:, number, :3] = vectors(mesh.vertex_position(corner), count)
+        if mesh.has_vertex_texcoords():
+            parts[:, number, 3:5] = np.array(mesh.vertex_texcoord(corner)).T
+    while count and 4 * len(parts) <= wanted:
+        a, b, c = parts.swapaxes(0, 1)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        parts = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3, 6)
+    corners, triangles = np.unique(parts.reshape(-1, 6), axis=0, return_inverse=True)
+    at = dr.zeros(mi.SurfaceInteraction3f, len(corners))
+    at.p, at.wi = mi.Point3f(*device_vectors(corners[:, :3])), mi.Vector3f(0, 0, 1)
+    at.uv = mi.Point2f(corners[:, 3:5].T.astype(np.float32))
+    at.shape, at.prim_index = mi.ShapePtr(mesh), mi.UInt32(corners[:, 5].astype(np.uint32))
+    return corners[:, :3], triangles.reshape(-1, 3), _reflectance(mesh.bsdf(), at, len(corners))
+
+
+def _triangles_without_faces(shape: mi.Shape) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
     """Return a shape on a grid of its surface parameters, or its bounding box where Mitsuba has none."""
     line = np.linspace(1e-6, 1 - 1e-6, _GRID + 1).astype(np.float32)  # The middle of a disk is undefined.
     u, v = (mi.Float(axis.ravel()) for axis in np.meshgrid(line, line))
@@ -178,12 +204,22 @@ def _triangles_without_faces(shape: mi.Shape) -> tuple[FloatArray, npt.NDArray[n
     try:
         at = shape.eval_parameterization(mi.Point2f(u, v))
         if host_values(at.is_valid(), len(line) ** 2).all():
-            return vectors(at.p, len(line) ** 2), triangles
+            return vectors(at.p, len(line) ** 2), triangles, _reflectance(shape.bsdf(), at, len(line) ** 2)
     except RuntimeError:
         pass
     box = shape.bbox()
     ends = np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)
-    return np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), _BOX
+    return np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), _BOX, np.full((8, 1), 0.5)
+
+
+def _reflectance(bsdf: Any, at: mi.SurfaceInteraction3f, count: int) -> FloatArray:
+    try:
+        diffuse = channels(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(at)), count)
+    except (RuntimeError, NotImplementedError, AttributeError):  # materials need not know it
+        return np.full((count, 1), 0.5)
+    if diffuse.shape[1] != 3:
+        diffuse = diffuse.mean(axis=1, keepdims=True)
+    return np.clip(np.nan_to_num(diffuse, nan=0.5), 0, 1)
 
 
 # -------- Pictures of the bench in its own light
@@ -263,13 +299,7 @@ def _picture(scene: mi.Scene, place: FloatArray, angle: float) -> FloatArray:
     met = scene.ray_intersect(ray)
     hit = host_values(met.is_valid(), side * side).astype(float)[:, None]
     cosine = np.abs(host_values(dr.dot(met.sh_frame.n, ray.d), side * side))[:, None]
-    try:
-        diffuse = channels(mi.unpolarized_spectrum(met.bsdf(ray).eval_diffuse_reflectance(met)), side * side)
-    except (RuntimeError, NotImplementedError, AttributeError):  # materials need not know it
-        diffuse = np.full((side * side, 1), 0.5)
-    if diffuse.shape[1] != 3:
-        diffuse = diffuse.mean(axis=1, keepdims=True)
-    lamp = np.clip(np.nan_to_num(diffuse, nan=0.5), 0, 1) * cosine * hit
+    lamp = _reflectance(met.bsdf(ray), met, side * side) * cosine * hit
     by_lamp, full = (
         np.asarray(values.reshape(_PIXELS, _EDGES, _PIXELS, _EDGES, -1).mean(axis=(1, 3))) for values in (lamp, hit)
     )

@@ -127,14 +127,14 @@ def _repeat(asked: Running, folder: Path) -> int:
 class Viewing(OfScene, Opening, Common):
     """Options of `mitsim view`."""
 
-    output: Path = to_make(Path("view.png"), "picture, or page", "FILE.png|FILE.html")
+    output: Path = to_make(Path("view.png"), "picture, or page to turn the bench on", "FILE.png|FILE.html")
 
 
 @command
 def view(asked: Viewing) -> int:
     """Draw the bench to scale, before any light is simulated.
 
-    With its distances, the depths that light is seen at, and what the camera sees.
+    With its distances, the depths that light is seen at, and what the camera sees. A page (.html) can be turned.
 
     $ mitsim view cookie_bag
     $ mitsim view photograph -D sheet_z=420 -o bench.html

@@ -1,13 +1,14 @@
-"""A drawing of a bench to scale, with previews in its own light."""
+"""A drawing of a bench to scale, previews in its own light, and a model that can be turned."""
 
 from __future__ import annotations
 
+import html
 import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -29,6 +30,9 @@ from mitsim.core.images import lightness
 from mitsim.report.pages import page_figure, render_page, typeset
 from mitsim.report.plots import BLACK, BLUE, GREY, ORANGE, PALE
 
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure as Model
+
 _DPI = 110
 _STYLE = {
     "font.size": 8.5,
@@ -45,11 +49,15 @@ _FEW = 60_000
 _FLAT = 1e-4
 _NO_PIXELS = 5e-3
 """Parallax [projector pixels] that no image shows."""
+_IN_SIGHT = 1.8
+"""Longest side of a scene, relative to the mean, that the first view of the model shows whole."""
 _NAMES = 3
 _BESIDE, _BEHIND = 0.3, 1.2
 """Part of the scene that is drawn beside and behind the light."""
 _LAMP, _DARK = "#f0c419", "#9a6b00"
 _SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+_CLOSED, _PYRAMID = [0, 1, 2, 3, 0], [1, 2, 3, 4, 1, 0, 2, 0, 3, 0, 4]
+"""Points of a line around four corners, and of one along all edges of a pyramid, whose tip is point 0."""
 _SMALL_GAP: dict[str, Any] = {"textcoords": "offset points"}
 
 
@@ -286,11 +294,65 @@ class BenchView:
         rows, columns = preview.picture.shape[:2]
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
 
+    # ---- As a model that can be turned ----
+
+    def model(self) -> Model:
+        """Return a figure of plotly, which shows itself in a notebook and can be turned there."""
+        from plotly import graph_objects
+
+        layout, geometry, end, eye = self.layout, self.bench.geometry, self._end, np.zeros((1, 3))
+        light = np.concatenate([layout.projector[None], layout.window_at(end)])
+        stop = np.concatenate([eye, _field_at(geometry.tan_half_fov, end)])
+        sensor = np.column_stack([_SQUARE * geometry.half_sides[::-1], np.zeros(4)])
+        opaque = np.column_stack([_SQUARE * geometry.build_mask().extent_mm / 2, np.full(4, geometry.mask_distance)])
+        parts: list[tuple[str, FloatArray, dict[str, Any]]] = [
+            ("projector and its light", light[_PYRAMID], {"line": {"color": ORANGE, "width": 3}}),
+            ("camera and its field stop", stop[_PYRAMID], {"line": {"color": BLUE, "width": 3}}),
+            ("calibrated window", layout.window[_CLOSED], {"line": {"color": ORANGE, "width": 6}}),
+            ("sensor", sensor[_CLOSED], {"line": {"color": BLUE, "width": 5}}),
+            ("mask", opaque[_CLOSED], {"line": {"color": BLACK, "width": 5}}),
+        ]
+        lamp = {"mode": "markers", "marker": {"color": _LAMP, "size": 5}}
+        parts += [(name, place[None], lamp) for name, place in layout.lamps.items()]
+        for surface in layout.surfaces:
+            shown = lightness(surface.reflectance)
+            color: dict[str, Any] = {"color": _LAMP}
+            if not surface.is_lamp and shown.shape[1] == 1:
+                grey = shown[:, 0].astype(np.float32)
+                color = {"intensity": grey, "colorscale": "gray", "cmin": 0, "cmax": 1, "showscale": False}
+            elif not surface.is_lamp:
+                color = {"vertexcolor": np.rint(255 * shown).astype(int).tolist()}
+            faces = dict(zip("ijk", surface.triangles.astype(np.int32).T, strict=True))
+            parts.append((surface.name, surface.points, {**faces, **color}))
+        figure = graph_objects.Figure()
+        for name, points, style in parts:
+            # Plotly's x is the bench's z, and its z, which is up, is y. It reads names, which may be any text, as HTML.
+            common = {"name": html.escape(name), **dict(zip("yzx", points.astype(np.float32).T, strict=True)), **style}
+            if "i" in style:
+                light_on = {"ambient": 0.75, "diffuse": 0.35, "specular": 0.0}
+                hover = "%{x:.4g} mm from the sensor<br>x %{y:.4g} mm, y %{z:.4g} mm"
+                figure.add_mesh3d(**common, lighting=light_on, flatshading=True, showlegend=True, hovertemplate=hover)
+            else:
+                figure.add_scatter3d(**{"mode": "lines", **common})
+        # Plotly makes the sides' geometric mean 1. Therefore the eye moves back for a scene with one long side.
+        extents = np.ptp(np.concatenate([points for _, points, _ in parts]), axis=0)
+        back = max(1.0, float(extents.max() / np.cbrt(extents.prod())) / _IN_SIGHT)
+        place = {"x": -2.1 * back, "y": -1.45 * back, "z": back}
+        titles = {"xaxis": "z, from the sensor [mm]", "yaxis": "x, to the left [mm]", "zaxis": "y, up [mm]"}
+        scene = {name: {"title": {"text": title}} for name, title in titles.items()}
+        figure.update_layout(
+            scene={**scene, "aspectmode": "data", "camera": {"eye": place, "center": {"x": 0, "y": 0, "z": -0.15}}},
+            legend={"orientation": "h", "y": 0, "yanchor": "top"},
+            margin={"l": 0, "r": 0, "t": 0, "b": 0},
+            height=560,
+        )
+        return figure
+
     # ---- As a file, and in a notebook ----
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the drawing to a PNG file, or to a page (HTML).
+        """Write the drawing to a PNG file, or all of it to a page (HTML) without network.
 
         Raises MitsimError for another ending, and when the file cannot be written.
         """
@@ -312,6 +374,9 @@ class BenchView:
             scene=str(self.bench.loaded.path),
             facts=self.facts,
             warnings=self.warnings,
+            model=self.model().to_html(
+                full_html=False, include_plotlyjs=True, config={"displayModeBar": False, "responsive": True}
+            ),
             pictures=pictures,
             versions=versions(),
         )

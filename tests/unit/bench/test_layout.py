@@ -79,6 +79,20 @@ def test_shapes_have_their_outlines(small_scene: Callable[..., Path]) -> None:
     assert_allclose(box, [[28, 25, 378], [12, -8, 362]], atol=1e-3)
 
 
+def test_a_print_is_seen_on_its_surface(small_scene: Callable[..., Path]) -> None:
+    """A sheet whose upper left is white, for one who looks along +z: +x is left, +y up. It is divided, and still
+    whole. (Planted: parts of a triangle left out; rows and columns of the print exchanged.)"""
+    reflectance = np.full((16, 16), 51)
+    reflectance[:8, :12] = 255
+    (sheet,) = layout(small_scene(reflectance=reflectance)).surfaces
+    white = sheet.reflectance[:, 0] > 0.6
+    inside = (np.abs(sheet.points[:, :2] - [-32, 0]) > 5).all(axis=1)  # not on the print's edges
+    assert_allclose(white[inside], ((sheet.points[:, 0] > -32) & (sheet.points[:, 1] > 0))[inside])
+    corners = sheet.points[sheet.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    assert area == pytest.approx(128**2, rel=1e-4) and len(sheet.triangles) > 10_000
+
+
 @pytest.mark.slow
 def test_a_preview_shows_what_the_camera_sees(
     small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import itertools
 import json
 import re
 from collections.abc import Callable
@@ -26,9 +28,9 @@ def seen(shared_scene: Callable[..., Path], variant: str) -> BenchView:
     """Of a made layout: nothing is traced. A tower of 30 x 50 mm stands at 340 to 380 mm, a lamp far above."""
     box = np.array([[x, y, z] for x in (-10.0, 20) for y in (-60, -10) for z in (340, 380)])
     sides = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 3, 7], [2, 7, 6]]
-    tower = Surface("tower", box, np.array(sides), False)
-    sheet = Surface("sheet", CORNERS, np.array([[0, 1, 2], [0, 2, 3]]), False)
-    lamp = Surface("lamp", CORNERS + [0, 900, 0], np.array([[0, 1, 2]]), True)
+    tower = Surface("tower", box, np.array(sides), np.full((8, 1), 0.5), False)
+    sheet = Surface("sheet", CORNERS, np.array([[0, 1, 2], [0, 2, 3]]), np.full((4, 3), 0.8), False)
+    lamp = Surface("lamp", CORNERS + [0, 900, 0], np.array([[0, 1, 2]]), np.full((4, 1), 0.8), True)
     layout = Layout(
         surfaces=(tower, sheet, lamp),
         projector=np.array([60.0, 0, 0]),
@@ -103,6 +105,26 @@ def test_words_state_what_the_numbers_do(seen: BenchView) -> None:
     assert dark.facts["light is seen"] == "nowhere" and dark.warnings == ("no light",)
 
 
+def test_the_model_has_every_part_in_place(seen: BenchView) -> None:
+    """Plotly's x is z of the bench, its z is y; only lamps have the lamp's colour. (Planted: y for x; a line's corners
+    in another order.)"""
+    traces = {trace.name: trace for trace in seen.model().data}
+    places = {name: np.stack([trace.y, trace.z, trace.x], axis=1) for name, trace in traces.items()}
+    for surface in seen.layout.surfaces:
+        mesh = traces[surface.name]
+        assert_allclose(places[surface.name], surface.points)
+        assert_allclose(np.stack([mesh.i, mesh.j, mesh.k], axis=1), surface.triangles)
+        assert (mesh.color is not None) == surface.is_lamp
+    assert_allclose(traces["tower"].intensity, 0.735, atol=1e-3)  # 0.5 by the curve of sRGB
+    assert_allclose(traces["sheet"].vertexcolor, 231)
+    assert_allclose(places["bulb, line 3"], [[0, 90, 300]])
+    line = places["projector and its light"].tolist()
+    edges = {frozenset([tuple(a), tuple(b)]) for a, b in itertools.pairwise(line)}
+    corners = [tuple(corner) for corner in CORNERS]
+    around = zip(corners, [*corners[1:], corners[0]], strict=True)
+    assert edges == {frozenset(edge) for edge in [*around, *((corner, (60.0, 0, 0)) for corner in corners)]}
+
+
 def test_a_view_is_written_whole_or_not_at_all(
     seen: BenchView, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,10 +144,14 @@ def test_a_view_is_written_whole_or_not_at_all(
 
 
 def test_names_of_a_scene_are_no_html(seen: BenchView, tmp_path: Path) -> None:
-    """A page requests nothing, and dollar signs are no formula. (Planted: a name with dollar signs in the title.)"""
+    """Plotly reads tags and entities in names, which are shown as they are; a page requests nothing, and dollar signs
+    are no formula. (Planted: a surface's name as the scene has it; a name with dollar signs in the title.)"""
     bad = "<b style=\"background:url(http://evil.example/x)\">s</b>&lt;img src='http://evil.example'&gt; $^{x$"
     shapes = [replace(surface, name=bad) for surface in seen.layout.surfaces]
     layout = replace(seen.layout, surfaces=shapes, lamps={bad: np.array([0.0, 9000, 300])}, obstacles=(bad,))
-    text = replace(seen, layout=layout).save(tmp_path / "bench.html").read_text()
-    assert "<b style" not in text and "<script" not in text
+    view = replace(seen, layout=layout)
+    named = [trace.name for trace in view.model().data if "evil" in trace.name]
+    assert len(named) == len(shapes) + 1 and {*named} == {html.escape(bad)}
+    text = view.save(tmp_path / "bench.html").read_text()
+    assert "<b style" not in text and "Plotly.newPlot(" in text
     assert not re.search(r'<(script|link|img)[^>]*\b(src|href)="https?:', text)
