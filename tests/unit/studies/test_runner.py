@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from mitsim.core.errors import MitsimError
 from mitsim.report import plots
@@ -14,9 +15,9 @@ from mitsim.verbs import study
 from tests.unit.studies.test_colour_by_line import main
 
 
-def test_a_chart_of_one_point_is_not_drawn(tmp_path: Path) -> None:
+def test_a_figure_without_axes_is_not_written(tmp_path: Path) -> None:
     """(Planted: it is.)"""
-    figures = {"toy.png": plots.error_bars({"a": 2.0, "b": 1.0}), "none.png": plots.error_bars({"a": 1.0})}
+    figures = {"toy.png": plots.singular_values({"a": [2.0, 1.0]}), "none.png": Figure()}
     assert [*write_figures(tmp_path, figures)] == ["toy.png"] == [path.name for path in tmp_path.iterdir()]
 
 
