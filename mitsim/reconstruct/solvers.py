@@ -1,7 +1,7 @@
 """Solvers by name: each prepares a camera and its patterns once, and solves any number of scenes.
 
-A new solver is a function that :class:`ByIterations` names, or a class with ``init`` and ``compute`` (:class:`Solver`). It
-needs an entry of :data:`_ALL`, and its name in :data:`mitsim.reconstruct.request.METHODS`.
+A new solver is a function that :class:`ByIterations` names, or a class with ``init`` and ``compute`` (:class:`Solver`).
+It needs an entry of :data:`_ALL`, and its name in :data:`mitsim.reconstruct.request.METHODS`.
 
 *Total variation and bounds.* P(X) = 1/2 sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + weight TV(X) + ridge / 2
 ||X||^2, isotropic TV, is minimised within bounds by ADMM (Boyd et al. 2011, section 3.1.1) on X = Z, D = grad Z, B = Z.
