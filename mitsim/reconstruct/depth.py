@@ -355,14 +355,17 @@ def depth_map(
     basis, width, pixel = arrivals.basis, arrivals.width, arrivals.pixel
     pixels = PixelDepths(basis, arrivals.reach, _STEP * pixel)
 
-    offsets = {centre / pixel}
+    # The lambda that finds the light best at the middle is that of the other offsets.
+    tried = {(lam, centre / pixel): pixels.solve(arrivals.most(lam, centre / pixel)[0]).left_over for lam in _LAMBDAS}
     if arrivals.limited:
-        offsets |= {begin / pixel + offset for begin in (centre, start) for offset in (0.0, *_OFFSETS)}
-    tried = {offset: pixels.solve(arrivals.most(offset)[0]).left_over for offset in sorted(offsets)}
-    best = min(tried, key=lambda offset: tried[offset])
+        sharpest = min(tried, key=lambda begin: tried[begin])[0]
+        offsets = {begin / pixel + offset for begin in (centre, start) for offset in (0.0, *_OFFSETS)}
+        more = sorted({(sharpest, offset) for offset in offsets} - tried.keys())
+        tried |= {begin: pixels.solve(arrivals.most(*begin)[0]).left_over for begin in more}
+    best = min(tried, key=lambda begin: tried[begin])
     rivals = [other for other, left in tried.items() if left < _RIVAL * tried[best]]
-    shift, confidence = arrivals.most(best)
-    shift, found = _improve(pixels, shift, (best * pixel - width / 2, best * pixel + width / 2), pixel)
+    shift, confidence = arrivals.most(*best)
+    shift, found = _improve(pixels, shift, (best[1] * pixel - width / 2, best[1] * pixel + width / 2), pixel)
     # The depths are doubted where they explain no more than the calibrated one, or where others explain as much.
     reliable, doubt = confidence >= _RELIABLE, ""
     variance, unknowns = pixels.variance(found), 2 * shift.size
@@ -372,7 +375,7 @@ def depth_map(
         doubt = "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
     else:
         span = float(np.ptp(np.percentile(shift[reliable], (1, 99))))
-        away = (np.abs(arrivals.most(rival)[0] - shift)[reliable] > width / 2 for rival in rivals)
+        away = (np.abs(arrivals.most(*rival)[0] - shift)[reliable] > width / 2 for rival in rivals)
         spared = not arrivals.limited or width - span >= SPARE * pixel
         ties = [(other.mm, other.difference**2 * basis.energy) for other in plane.alternatives]
         others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
@@ -502,7 +505,8 @@ class PixelDepths:
 
 # ---- Where most light of each projector pixel arrives ----------------------------------------------------------------
 
-_SHARP = 1e-6
+_LAMBDAS = 1e-5, 1e-6, 1e-7
+"""Lambdas over the largest sigma^2 where light arrives: smaller ones add noise, larger ones blur dots."""
 _OFFSETS = -1.0, -0.5, 0.5, 1.0
 _POOLED = 1.0
 _BESIDE_LARGEST = 2
@@ -542,10 +546,12 @@ class Arrivals:
             (row, column), (down, across) = (each.row, each.column), self._open
             of_class = sums[row if down else 0, column if across else 0]
             of_class.add(each.frame, 0 if down else row, 0 if across else column)
-        images = [prepared.solve(each, _SHARP * prepared.problem(each).scale).image for each in sums.values()]
-        self._images = np.stack(images).reshape(*counts, *images[0].shape)
+        scales, self._images = [prepared.problem(each).scale for each in sums.values()], dict[float, FloatArray]()
+        for lam in _LAMBDAS:
+            images = [prepared.solve(*each).image for each in zip(sums.values(), lam * np.array(scales), strict=True)]
+            self._images[lam] = np.stack(images).reshape(*counts, *images[0].shape)
 
-    def most(self, offset: float) -> tuple[FloatArray, FloatArray]:
+    def most(self, lam: float, offset: float) -> tuple[FloatArray, FloatArray]:
         """Return the change of 1/z (n, n') at which most light arrives, and its confidence (n, n')."""
         count = 2 * int(np.ceil(self.width / self.pixel / _STEP / 2)) + 1
         shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
@@ -556,7 +562,7 @@ class Arrivals:
                 for side, classes, opened in zip(self.basis.sides, self._classes, self._open, strict=True)
             )
             places = np.broadcast_arrays(self._classes[0][:, None], self._classes[1], rows[:, None], columns)
-            map_coordinates(self._images, np.stack(places), arriving, order=1, mode="nearest")
+            map_coordinates(self._images[lam], np.stack(places), arriving, order=1, mode="nearest")
         light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
         place, step, peak = light.argmax(axis=0), shifts[1] - shifts[0], light.max(axis=0)
         beside = np.arange(count)[:, None, None] - place
