@@ -559,7 +559,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (8, 1809),
     "planner": (6, 1667),
-    "reconstruct": (21, 5921),
+    "reconstruct": (21, 5925),
     "report": (8, 1962),
     "scene": (6, 1407),
     "sensor": (5, 1190),
