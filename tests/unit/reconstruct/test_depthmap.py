@@ -18,7 +18,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture, Measurement
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.accumulation import accumulate
-from mitsim.reconstruct.depth import Arrivals, CommonBasis, Depth, PixelDepths, best_depth, depth_map
+from mitsim.reconstruct.depth import Arrivals, Depth, PixelDepths, best_depth, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import DerivedCapture
 from mitsim.reconstruct.misfit import Cause
