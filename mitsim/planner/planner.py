@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_left
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,10 +37,10 @@ if TYPE_CHECKING:
 
 _OPENING_S = 1.5
 """Seconds to start the program and open a scene (1.2 to 1.6 on two cores)."""
-_FIRST_ACCURACY, _FINEST_ACCURACY = 1e-3, 1e-5
-"""Accuracy that is tried first for a time, and the finest, near the end of the ladders of anchors and cells."""
-_TRIES, _NEAR, _LEAST_S = 4, 0.9, 0.05
-"""Tries of an accuracy for a time, the step to a finer one that is not worth another pilot, and least time of light."""
+_FIRST_ACCURACY = 1e-3
+"""Accuracy of the first pilot for a time."""
+_GRID = [HIGHEST_ACCURACY, *(float(f"{10 ** (-step / 10):.3g}") for step in range(6, 51))]
+"""Accuracies for a time: ten a decade, to near the end of the ladders of anchors and cells."""
 _TIMED = 2**18
 """Paths that measure the pace of this machine."""
 _FOR_HEAVY_PATHS = 2**21
@@ -60,47 +61,75 @@ def make_plan(
     lines: int = 1,
 ) -> Plan:
     check_accuracy(accuracy)
-    started, chosen = time.perf_counter(), _choose(bench, lighting, accuracy, seed, switches or {}, lines)
-    return _explain(accuracy, chosen, switches or {}, started)
+    started, look = time.perf_counter(), _look(bench, lighting, accuracy, seed, switches or {}, lines)
+    return _explain(accuracy, look, look.taken(accuracy), started)
 
 
 @single_threaded_blas()
 def plan_within(bench: Apparatus, lighting: Lighting, seconds: float, seed: int, switches: Mapping[str, bool]) -> Plan:
-    """Make the plan of the finest accuracy, of a few tries, that is predicted to take at most ``seconds``.
+    """Make the plan of the finest accuracy that is predicted to take at most ``seconds`` from the program's start.
 
-    They begin with the program. Predictions use fixed unit costs, so that the same time gives the same plan.
+    A pilot predicts what finer accuracies than its own take, but not whether they are kept; so a second one looks at
+    the finest that there is time for. Predictions use fixed unit costs, so that the same time gives the same plan.
     """
-    started, accuracy, found = time.perf_counter(), _FIRST_ACCURACY, list[tuple[bool, float, float, _Chosen]]()
-    around = _OPENING_S + sum(cost_model.frame_seconds(bench, len(lighting.weights)).values())
-    while len(found) < _TRIES and accuracy not in [tried for _, tried, _, _ in found]:
-        chosen = _choose(bench, lighting, accuracy, seed, switches, 1)
-        pilot_s = chosen.runs.seconds
-        light, around = sum(_stages(chosen.runs.pilot_result, chosen.taken.settings, 1.0).values()), around + pilot_s
-        fits = light <= seconds - around and chosen.taken.fits
-        found.append((fits, accuracy, light + around, chosen))
-        # Light takes seconds as the inverse square of its accuracy, and another try another pilot.
-        step = math.sqrt(light / max(seconds - around - pilot_s, _LEAST_S))
-        if fits and step > _NEAR:
+    started, accuracy, best = time.perf_counter(), _FIRST_ACCURACY, None
+    left = seconds - _OPENING_S - sum(cost_model.frame_seconds(bench, len(lighting.weights)).values())
+    for _ in range(2):
+        look = _look(bench, lighting, accuracy, seed, switches, 1)
+        left -= look.runs.seconds
+        found = _finest(look, left, accuracy)
+        if best is None or (look.seconds(found) <= left and found <= best[0]):
+            best = found, look, look.seconds(found) - left
+        accuracy = _finest(look, left - look.runs.seconds)
+        if best[2] > 0 or accuracy >= best[0]:
             break
-        accuracy = float(f"{min(max(step * accuracy, _FINEST_ACCURACY), HIGHEST_ACCURACY):.3g}")
-    fits, accuracy, taken, chosen = min(found, key=lambda each: (not each[0], each[1] if each[0] else -each[1]))
-    plan = replace(_explain(accuracy, chosen, switches, started), asked_seconds=seconds)
+    accuracy, look, over = best
+    plan = replace(_explain(accuracy, look, look.taken(accuracy), started), asked_seconds=seconds)
     few = (
-        f"{seconds:g} seconds are too few: accuracy {accuracy:g}, which was taken, is predicted to take {taken:.1f} s "
-        "from start to finish, or is not kept; give more"
+        f"{seconds:g} seconds are too few: even accuracy {accuracy:g}, which was taken, is predicted to take "
+        f"{seconds + over:.1f} s from start to finish; give more"
     )
-    return plan if fits else replace(plan, warnings=(few, *plan.warnings))
+    return plan if over <= 0 else replace(plan, warnings=(few, *plan.warnings))
 
 
-class _Chosen(NamedTuple):
+def _finest(look: _Look, seconds: float, kept_from: float | None = None) -> float:
+    """Return the finest accuracy whose light takes at most ``seconds``, or the loosest if none does.
+
+    With ``kept_from``, the accuracy must be kept, and is no finer than that.
+    """
+
+    def fails(tried: float) -> bool:
+        kept = kept_from is None or (tried >= kept_from and look.taken(tried).fits)
+        return look.seconds(tried) > seconds or not kept
+
+    return _GRID[max(bisect_left(_GRID, True, key=fails) - 1, 0)]
+
+
+class _Look(NamedTuple):
+    """A pilot run that serves one accuracy, and what it shows of others."""
+
     runs: pilot.PilotRuns
-    taken: choose.Candidate
+    candidates: choose.Candidates
     notes: tuple[str, ...]
 
+    def taken(self, accuracy: float) -> choose.Candidate:
+        chosen, result = self.candidates.choice(accuracy), self.runs.pilot_result
+        if result.sharp is None:
+            return chosen
+        # Light over two sharp lobes comes in paths so rare that nothing shows it where the first samples meet none.
+        samples, costs = dict(chosen.settings.samples), result.sample_costs
+        for name in ("from_camera", "camera_residual"):
+            if samples.get(name) and costs[name].paths:
+                samples[name] = max(samples[name], _FOR_HEAVY_PATHS / (GROUPS * costs[name].paths))
+        return replace(chosen, settings=replace(chosen.settings, samples=samples))
 
-def _choose(
+    def seconds(self, accuracy: float) -> float:
+        return sum(_stages(self.runs.pilot_result, self.taken(accuracy).settings, 1.0).values())
+
+
+def _look(
     bench: Apparatus, lighting: Lighting, accuracy: float, seed: int, switches: Mapping[str, bool], lines: int
-) -> _Chosen:
+) -> _Look:
     if bench.loaded.unfit.factored is not None:
         raise bench.loaded.unfit.factored
     if bench.geometry.diffracts and switches.get("diffraction") is not False:
@@ -125,20 +154,12 @@ def _choose(
             notes = (note,)
             break
         runs.refine(run)
-    chosen = candidates.choice(accuracy)
-    if runs.pilot_result.sharp is not None:
-        # Light over two sharp lobes comes in paths so rare that nothing shows it where the first samples meet none.
-        samples, costs = dict(chosen.settings.samples), runs.pilot_result.sample_costs
-        for name in ("from_camera", "camera_residual"):
-            if samples.get(name) and costs[name].paths:
-                samples[name] = max(samples[name], _FOR_HEAVY_PATHS / (GROUPS * costs[name].paths))
-        chosen = replace(chosen, settings=replace(chosen.settings, samples=samples))
-    return _Chosen(runs, chosen, notes)
+    return _Look(runs, candidates, notes)
 
 
-def _explain(accuracy: float, chosen: _Chosen, switches: Mapping[str, bool], started: float) -> Plan:
-    (runs, taken, notes), bench = chosen, chosen.runs.bench
-    simulation = Simulation(bench, taken.settings)
+def _explain(accuracy: float, look: _Look, taken: choose.Candidate, started: float) -> Plan:
+    (runs, candidates, notes), bench = look, look.runs.bench
+    simulation, switches = Simulation(bench, taken.settings), candidates.switches
     pace = _measure_pace(runs.pilot_result, simulation, runs.lighting.labels, integer(runs.seed, "pilot", "paces"))
     plan = explain_plan(accuracy, runs.pilot_result, SceneFacts.of(bench, switches), switches, taken, pace)
     if simulation.physics.mirrors:
