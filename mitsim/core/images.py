@@ -255,7 +255,7 @@ def _one_line_refusals(path: Path, wanted: Wanted) -> Iterator[None]:
         raise wanted.refusal(
             path,
             f"cannot be read: damaged, or of another kind than its name says ({reason_of(error)}); "
-            "write or copy it again",
+            "write or copy it again, without compression",
         ) from error
 
 

@@ -72,18 +72,17 @@ def plan_within(bench: Apparatus, lighting: Lighting, seconds: float, seed: int,
     A pilot predicts what finer accuracies than its own take, but not whether they are kept; so a second one looks at
     the finest that there is time for. Predictions use fixed unit costs, so that the same time gives the same plan.
     """
-    started, accuracy, best = time.perf_counter(), _FIRST_ACCURACY, None
+    started, accuracy, tried = time.perf_counter(), _FIRST_ACCURACY, list[tuple[float, float, _Look]]()
     left = seconds - _OPENING_S - sum(cost_model.frame_seconds(bench, len(lighting.weights)).values())
-    for _ in range(2):
+    while len(tried) < 2:
         look = _look(bench, lighting, accuracy, seed, switches, 1)
         left -= look.runs.seconds
         found = _finest(look, left, accuracy)
-        if best is None or (look.seconds(found) <= left and found <= best[0]):
-            best = found, look, look.seconds(found) - left
+        tried.append((found, look.seconds(found) - left, look))
         accuracy = _finest(look, left - look.runs.seconds)
-        if best[2] > 0 or accuracy >= best[0]:
+        if tried[0][1] > 0 or accuracy >= found:
             break
-    accuracy, look, over = best
+    accuracy, over, look = min((each for each in tried if each[1] <= 0), key=lambda each: each[0], default=tried[0])
     plan = replace(_explain(accuracy, look, look.taken(accuracy), started), asked_seconds=seconds)
     few = (
         f"{seconds:g} seconds are too few: even accuracy {accuracy:g}, which was taken, is predicted to take "
