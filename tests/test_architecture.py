@@ -558,7 +558,7 @@ SIZES = {
     "metrics": (1, 81),
     "mitsim": (1, 26),
     "optics": (8, 1809),
-    "planner": (6, 1676),
+    "planner": (6, 1675),
     "reconstruct": (21, 5925),
     "report": (8, 1962),
     "scene": (6, 1407),
