@@ -309,8 +309,7 @@ def read_picture(path: Path, right: dict[str, Any]) -> Iterator[tuple[str, Calla
     import mitsuba as mi
 
     from mitsim.acquire.sense import read_image
-    from mitsim.core.images import read_images
-    from mitsim.core.prepare import read_reflectance
+    from mitsim.core.images import read_images, read_reflectance
     from mitsim.scene.load import load_scene
 
     codes, most = np.load(f"{path}.npy").astype(float), right["most"]

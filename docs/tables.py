@@ -16,16 +16,13 @@ from typing import Any
 from pydantic import BaseModel
 
 from mitsim.cli.shelf_verbs import KINDS, meanings
-from mitsim.core.imagelist import Crop, Preparation, Raw
+from mitsim.core.colour_files import ColourManifest, Crop, Line, MosaicManifest, Preparation, Raw
 from mitsim.core.manifests import (
     AmbientFile,
     CalibrationManifest,
     ClosingFile,
-    ColourManifest,
     Digital,
     FactorNoise,
-    Line,
-    MosaicManifest,
     Parallax,
     Patterns,
     RunManifest,

@@ -30,6 +30,8 @@ from mitsim.bench.request import (
     check_image,
     family_of,
 )
+from mitsim.core.colour_files import BANDS, LINES, RUN, bands_of
+from mitsim.core.colour_files import MOSAIC as MOSAIC_RUN
 from mitsim.core.configuration import (
     CAMERA,
     LIMITS,
@@ -49,8 +51,6 @@ from mitsim.core.configuration import (
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.job import Job
-from mitsim.core.manifests import BANDS, LINES, RUN, bands_of
-from mitsim.core.manifests import MOSAIC as MOSAIC_RUN
 from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe

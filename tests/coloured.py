@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsim.core.manifests import AmbientFile, Digital, MosaicManifest, Patterns, RunManifest
+from mitsim.core.colour_files import MosaicManifest
+from mitsim.core.manifests import AmbientFile, Digital, Patterns, RunManifest
 from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, frame_name
 from mitsim.devices.framelist import ChartPlace
 from mitsim.devices.patterns import parse_patterns

@@ -10,8 +10,9 @@ import numpy as np
 from PIL import Image
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.colour_files import RUN, ColourManifest, write_colours
 from mitsim.core.exr import write_frame
-from mitsim.core.manifests import RUN, ColourManifest, Digital, Patterns, RunManifest, write_colours, write_manifest
+from mitsim.core.manifests import Digital, Patterns, RunManifest, write_manifest
 from mitsim.devices.patterns import parse_patterns
 
 ROWS, COLUMNS, N = 64, 72, 20

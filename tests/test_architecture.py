@@ -65,7 +65,7 @@ CHECKS_A_REQUEST = (
     "mitsim.cli",
     "mitsim.bench.request",
     "mitsim.core.manifests",
-    "mitsim.core.imagelist",
+    "mitsim.core.colour_files",
     "mitsim.devices.sensor",
     "mitsim.devices.session",
     "mitsim.devices.framelist",

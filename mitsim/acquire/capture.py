@@ -19,14 +19,14 @@ from mitsim.acquire.spectral import MosaicLight, SpectralBench, excess_behind_fi
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request, Task
-from mitsim.core import manifests
+from mitsim.core import colour_files, manifests
+from mitsim.core.arrays import single_threaded_blas
 from mitsim.core.configuration import takes
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import ArgumentError, check_arguments, cut
 from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
-from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
@@ -278,7 +278,7 @@ def _run(
 
 
 @contextmanager
-def colour_folder(task: Task, manifest: manifests.ColourManifest) -> Iterator[Path | None]:
+def colour_folder(task: Task, manifest: colour_files.ColourManifest) -> Iterator[Path | None]:
     """Claim the folder of the lines' folders; write colour.json when all of them are finished."""
     if task.output is None:
         yield None
@@ -286,17 +286,17 @@ def colour_folder(task: Task, manifest: manifests.ColourManifest) -> Iterator[Pa
     again = task.resume and any((task.output / name).is_dir() for name in manifest.names)
     with output_folder(task.output, overwrite=again) as folder:
         yield folder
-        manifests.write_colours(folder, manifest)
+        colour_files.write_colours(folder, manifest)
 
 
 def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> dict[str, Capture]:
-    lines = SpectralBench.of(bench, manifests.RUN)
+    lines = SpectralBench.of(bench, colour_files.RUN)
     return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
 def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> MosaicCapture:
-    lines = SpectralBench.of(bench, manifests.MOSAIC)
-    assert isinstance(lines.manifest, manifests.MosaicManifest)
+    lines = SpectralBench.of(bench, colour_files.MOSAIC)
+    assert isinstance(lines.manifest, colour_files.MosaicManifest)
     captured, board = capture(lines, request, task, plan), load_recipe().board_reflectance
     each = [LineTruth(truth.reflectance, truth.standard_error, board) for truth in captured.truths]
     found = MosaicCapture(captured.runs[0], lines.manifest, dict(zip(lines.names, each, strict=True)))

@@ -15,12 +15,11 @@ import numpy as np
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import names, present
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, integer
 from mitsim.core.environment import DEFAULT_VARIANT, keep_scenes, load_variant, versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import write_frame
 from mitsim.core.job import Cost, Job
-from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import first_shadow, frames_cost
 from mitsim.light.light import Sampling, trace_light

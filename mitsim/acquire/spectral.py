@@ -24,10 +24,9 @@ from mitsim.bench.apparatus import Apparatus, Opened, reopen
 from mitsim.bench.effects import present
 from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request
-from mitsim.core import manifests
-from mitsim.core.arrays import FloatArray
+from mitsim.core import colour_files
+from mitsim.core.arrays import FloatArray, integer
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import SPECTRA_NM, Band, CountedLamps, Lines, Response, Spectrum, line_units
 from mitsim.light.cost_model import frame_seconds, frames_cost
@@ -48,7 +47,7 @@ _RAYS, _ALIKE = 4, 0.9
 @dataclass(frozen=True)
 class SpectralBench:
     whole: Apparatus
-    manifest: manifests.ColourManifest | None = None
+    manifest: colour_files.ColourManifest | None = None
 
     @classmethod
     def of(cls, bench: Apparatus, kind: str) -> SpectralBench:
@@ -57,20 +56,20 @@ class SpectralBench:
         Raises MitsimError if light cannot be traced by line, and for :data:`MOSAIC` without filters that pass the
         lines.
         """
-        if kind == manifests.MOSAIC:
+        if kind == colour_files.MOSAIC:
             bench = without_filters(bench)
         if not bench.variant.endswith("_spectral"):
-            needed = manifests.spectral_of(bench.variant)
+            needed = colour_files.spectral_of(bench.variant)
             raise ArgumentError("variant", f"{bench.variant}: knows no wavelengths; open the bench with {needed}")
         lines = bench.projector.traced_lines
         named = tuple(
-            manifests.Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
+            colour_files.Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
             for wavelength, share in zip(lines.wavelengths_nm, lines.shares, strict=True)
         )
         message: dict[str, Any] = {"kind": kind, "channels": named}
-        if kind == manifests.MOSAIC:
+        if kind == colour_files.MOSAIC:
             message |= {"mosaic": bench.counting.mosaic, "weights": bench.counting.planes(lines.wavelengths_nm)}
-        model = manifests.MosaicManifest if kind == manifests.MOSAIC else manifests.ColourManifest
+        model = colour_files.MosaicManifest if kind == colour_files.MOSAIC else colour_files.ColourManifest
         return cls(replace(bench, lines=lines), model.model_validate(message))
 
     @cached_property
@@ -204,7 +203,7 @@ def choose_colour(bench: Apparatus, request: Request) -> Coloured:
             return np.asarray(sum(total))
 
         mono = electrons(bench, (bench,))  # before another variant is set
-        whole = SpectralBench.of(reopen(bench, manifests.spectral_of(bench.variant)), manifests.RUN)
+        whole = SpectralBench.of(reopen(bench, colour_files.spectral_of(bench.variant)), colour_files.RUN)
         seen = electrons(whole.whole, whole.benches)
         error = float(np.linalg.norm(mono - seen) / np.linalg.norm(seen)) if seen.any() else 0.0
         error = 0.0 if error < _NONE else float(f"{error:.1e}")
@@ -216,8 +215,8 @@ def choose_colour(bench: Apparatus, request: Request) -> Coloured:
     else:
         own, plan = whole.whole, whole.plan(request)
     looked = time.perf_counter() - started - plan.predicted["plan"]
-    ways = [{"name": manifests.MONO, "error": error}, {"name": manifests.LINES, "error": 0.0}]
-    choice = {"chosen": manifests.MONO if is_mono else manifests.LINES, "candidates": ways}
+    ways = [{"name": colour_files.MONO, "error": error}, {"name": colour_files.LINES, "error": 0.0}]
+    choice = {"chosen": colour_files.MONO if is_mono else colour_files.LINES, "candidates": ways}
     note = f"colour: {choice['chosen']}, because mono leaves {error:.1e} of direct light in frames"
     plan = replace(plan.taking(plan=plan.predicted["plan"] + looked), request=request, colour=choice)
     return Coloured(replace(plan, notes=(*plan.notes, note)), own, is_mono)
@@ -411,12 +410,12 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
 
         def counted(*bands: Band, response: Response = response) -> FloatArray:
             seen = LampTracer(tracer, LampResponse(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
-            lit = np.bincount(seen.pixel - tracer.projector.n**2, seen.value, manifests.MOST_LINES)
+            lit = np.bincount(seen.pixel - tracer.projector.n**2, seen.value, colour_files.MOST_LINES)
             return np.asarray(lit / _SAMPLES)
 
         first, last = response.range_nm
-        parts = math.ceil((last - first) / manifests.MOST_LINES / _STEP_NM)
-        cut = [response.bands(manifests.MOST_LINES, part, parts) for part in range(parts)]
+        parts = math.ceil((last - first) / colour_files.MOST_LINES / _STEP_NM)
+        cut = [response.bands(colour_files.MOST_LINES, part, parts) for part in range(parts)]
         of_parts = np.stack([counted(*bands) for bands in cut], axis=1)  # (bands, parts)
         beyond = counted((begin, first), (last, end), (end - _END_NM, end), (end, end))
         missing = float(beyond[0] + beyond[1] + beyond[2] / _END_NM * response.beyond_nm)
@@ -431,7 +430,7 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
     shares, lines = np.concatenate(light), bench.projector.lines
     counted_lamps = CountedLamps(
         responses,
-        tuple(band for response in responses for band in response.bands(manifests.MOST_LINES)),
+        tuple(band for response in responses for band in response.bands(colour_files.MOST_LINES)),
         tuple(spectra),
         shares / shares.sum() if shares.any() else np.full(len(shares), 1 / len(shares)),
         unknown,

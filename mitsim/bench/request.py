@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mitsim.bench.effects import check_switches, parse_switches
+from mitsim.core.colour_files import BANDS, LINES, bands_of, spectral_of
 from mitsim.core.configuration import (
     CAMERA,
     DEVICES,
@@ -30,11 +31,9 @@ from mitsim.core.configuration import (
     validated_by,
 )
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
-from mitsim.core.errors import ArgumentError, MitsimError, short_text
+from mitsim.core.errors import ArgumentError, MitsimError, check_root, short_text
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
-from mitsim.core.manifests import BANDS, LINES, bands_of, spectral_of
-from mitsim.core.seeds import check_root
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel, load_sensor

@@ -19,10 +19,9 @@ from mitsim.acquire.exposure import camera_warnings, levels
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
 from mitsim.bench.layout import MOST_LOST, mask_fault
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, in_threads
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Cost, Job
-from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum

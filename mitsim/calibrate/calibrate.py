@@ -29,14 +29,13 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, SessionRequest, Task
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.lit_session import MOST_TIFF, KeptFrames, LitSession, Response
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, integer, single_threaded_blas
+from mitsim.core.colour_files import CALIBRATION
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PARTS, output_folder, plain, read_json, remove_page, whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Job, Limits
-from mitsim.core.manifests import CALIBRATION, MANIFEST, CalibrationManifest, resumable
-from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.seeds import integer
+from mitsim.core.manifests import MANIFEST, CalibrationManifest, resumable
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light.light import SampledLight

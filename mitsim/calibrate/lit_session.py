@@ -18,11 +18,10 @@ from PIL import Image
 from mitsim.acquire.exposure import Exposer, in_chunks
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.board_session import Session, stripe_frames
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, in_threads
 from mitsim.core.files import whole_file, write_json
 from mitsim.core.job import Job
 from mitsim.core.manifests import Digital
-from mitsim.core.parallel import in_threads
 from mitsim.devices.framelist import LISTS, FrameList, StripeFile
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.session import SIDES

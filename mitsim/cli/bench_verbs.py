@@ -26,9 +26,10 @@ from mitsim.cli.commands import (
     to_make,
     wrap_text,
 )
+from mitsim.core.colour_files import MONO, RUN, read_colours
 from mitsim.core.configuration import OUTPUT, QUALITY, WHAT, option
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import MANIFEST, MONO, RUN, read_colours
+from mitsim.core.manifests import MANIFEST
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.requests import PairOptions, PairsRequest

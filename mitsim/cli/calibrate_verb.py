@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 from mitsim.bench.request import NO, Coloured, Exposure, Opening, Request, SessionRequest, Task
 from mitsim.cli.bench_verbs import check_work, memory_line, payload_of_lines
 from mitsim.cli.commands import LimitedPictured, Resumed, command, option_name, scene_named, to_make
+from mitsim.core.colour_files import CALIBRATION, is_coloured
 from mitsim.core.configuration import OUTPUT, WHAT, option
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import CALIBRATION, is_coloured
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.session import load_recipe
 from mitsim.verbs import calibrate_in, open_as

@@ -20,9 +20,9 @@ from mitsim.cli.commands import (
     shown,
     to_make,
 )
+from mitsim.core.colour_files import MOSAIC, RUN, SpectralFolder, is_coloured, open_lines
 from mitsim.core.configuration import CAMERA, DEVICES, OUTPUT, WHAT, option, shipped_names
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import MOSAIC, RUN, SpectralFolder, is_coloured, open_lines
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.exchange.capture_list import FrameFacts

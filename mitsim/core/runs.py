@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
-from mitsim.core import manifests
+from mitsim.core import colour_files, manifests
 from mitsim.core.arrays import FloatArray
+from mitsim.core.colour_files import MosaicManifest
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder, remove_page
 from mitsim.core.images import card, from_above, normalise, span
-from mitsim.core.manifests import MANIFEST, ClosingKind, Digital, MosaicManifest, RunHead, RunManifest
+from mitsim.core.manifests import MANIFEST, ClosingKind, Digital, RunHead, RunManifest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -523,7 +524,7 @@ class MosaicCapture:
                 channels = {"reflectance": truth.reflectance, "standard_error": truth.standard_error}
                 single = {key: values.astype(np.float32) for key, values in channels.items()}
                 write_frame(place / TRUTH, single, {"board_reflectance": truth.board})
-        manifests.write_colours(folder, self.manifest)
+        colour_files.write_colours(folder, self.manifest)
 
     def summary(self) -> dict[str, Any]:
         """Return the facts that the command line reports: the keys of a capture, and of colour.json."""
@@ -540,7 +541,7 @@ class MosaicCapture:
 def load_mosaic(folder: Path | str) -> MosaicCapture:
     """Return the run behind colour filters in ``folder``; MitsimError if it is not complete."""
     folder = Path(folder)
-    manifest = cast("MosaicManifest", manifests.read_colours(folder, manifests.MOSAIC))
+    manifest = cast("MosaicManifest", colour_files.read_colours(folder, colour_files.MOSAIC))
     truths = {}
     for name in manifest.names:
         if (path := folder / name / TRUTH).is_file():

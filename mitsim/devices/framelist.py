@@ -15,22 +15,29 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, field_validator, model_validator
 
+from mitsim.core.colour_files import (
+    ALL,
+    MOSAIC,
+    PLANES,
+    RUN,
+    ColourManifest,
+    Preparation,
+    Raw,
+    Wanted,
+    image_files,
+    open_lines,
+)
 from mitsim.core.configuration import Configuration, Positive, locate, read_table, validate
 from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.core.files import check_plain, read_json
-from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import (
-    MOSAIC,
     MOST_PIXELS,
     MOST_SHOTS,
-    RUN,
-    ColourManifest,
     Digital,
     FileName,
     Parallax,
     Plain,
     RunManifest,
-    open_lines,
     read_manifest,
 )
 from mitsim.devices.patterns import stripe_count
@@ -39,8 +46,7 @@ from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures,
 
 if TYPE_CHECKING:  # numpy takes 0.1 s to import, and a refusal needs none of it
     from mitsim.core.arrays import FloatArray
-    from mitsim.core.images import Numbers
-    from mitsim.core.prepare import Preparer
+    from mitsim.core.images import Numbers, Preparer
 
 LISTS = ("session.toml", "session.json")
 """Names of a list of frames."""
@@ -187,7 +193,7 @@ class SessionFrames:
         """
         if self.preparer is not None or self.listed.prepare == Preparation():
             return self
-        from mitsim.core.prepare import Preparer
+        from mitsim.core.images import Preparer
 
         if self.listed.prepare.channel == ALL:
             raise _refusal(self.folder, "prepare.channel all is of every plane; take one, by `of_plane`")

@@ -10,13 +10,12 @@ from typing import Literal, cast, get_args
 import numpy as np
 from pydantic import Field, model_validator
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, stream
+from mitsim.core.colour_files import Wanted
 from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import MitsimError
-from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, read_image
 from mitsim.core.job import Cost, Limits
-from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import LARGEST, Flaws, MaskKind, Plate, make_square, mls_mask, read_drawing
 from mitsim.devices.patterns import is_prime

@@ -15,7 +15,6 @@ from itertools import product
 from typing import TYPE_CHECKING, Literal
 
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.seeds import stream
 
 if TYPE_CHECKING:
     import numpy as np
@@ -301,6 +300,8 @@ def random_binary(axis: PatternAxis) -> PatternFactor:
 
     Each pixel of an ``axis`` is lit by at least one column: the union must cover the scene."""
     import numpy as np
+
+    from mitsim.core.arrays import stream
 
     rng = stream(axis.seed, "patterns", "random", axis.name)
     bits = rng.integers(0, 2, size=(axis.n, axis.k), dtype=np.int8)

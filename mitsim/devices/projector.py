@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from mitsim.core.arrays import ByValue, FloatArray
+from mitsim.core.colour_files import MOST_LINES
 from mitsim.core.configuration import Configuration
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import MOST_LINES
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 
 _FIELDS = 4

@@ -10,12 +10,23 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from mitsim.core import configuration, manifests
+from mitsim.core import colour_files, configuration, manifests
+from mitsim.core.colour_files import (
+    ALL,
+    BARE,
+    CORRECTIONS,
+    ColourManifest,
+    Crop,
+    Preparation,
+    Raw,
+    Wanted,
+    check_channel,
+    image_files,
+)
 from mitsim.core.configuration import Configuration, FilePath, Options, Positive, option, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
-from mitsim.core.imagelist import ALL, BARE, CORRECTIONS, Crop, Preparation, Raw, Wanted, check_channel, image_files
-from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, ColourManifest, Digital
+from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital
 from mitsim.devices.framelist import Identity
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
@@ -140,7 +151,9 @@ class RealCapture:
     def colours(self) -> ColourManifest | None:
         """Return all planes as lines of a coloured folder; None for a single plane, or a picture without mosaic."""
         prepare = self.listed.prepare
-        return manifests.lines_of_planes(manifests.RUN, prepare.wavelengths_nm) if prepare.channel == ALL else None
+        return (
+            colour_files.lines_of_planes(colour_files.RUN, prepare.wavelengths_nm) if prepare.channel == ALL else None
+        )
 
     def electronics(self) -> tuple[Electronics, Preparation]:
         """Return camera and preparation with its mosaic; MitsimError if neither file nor list has them."""
@@ -181,8 +194,8 @@ class RealCapture:
             needed = "is not given, and patterns need its projector; give it, or --projector-pixels"
             raise ArgumentError("calibration", needed)
         if folder is not None and colours is not None:
-            manifests.read_colours(folder, manifests.CALIBRATION)
-            manifests.check_lines(colours, "channel all", folder)
+            colour_files.read_colours(folder, colour_files.CALIBRATION)
+            colour_files.check_lines(colours, "channel all", folder)
         for part in [] if folder is None else [folder / line for line in (colours.names if colours else ("",))]:
             manifest = manifests.read_manifest(part, CalibrationManifest)
             if listed.centre not in (None, manifest.centre):

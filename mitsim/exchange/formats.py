@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.core import configuration
+from mitsim.core.colour_files import MOSAIC, RUN, check_channel, open_lines
 from mitsim.core.configuration import FilePath, Options, option, takes
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, check_root
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
-from mitsim.core.imagelist import check_channel
-from mitsim.core.manifests import MOSAIC, MOST_PIXELS, RUN, CalibrationManifest, RunManifest, open_lines, read_manifest
-from mitsim.core.seeds import check_root
+from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest, read_manifest
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.exchange.capture_list import TURNED, FrameFacts
 

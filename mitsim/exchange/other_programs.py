@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, read_variables, write_variables
+from mitsim.core.colour_files import ALL, CALIBRATION, WAVELENGTHS_NM, lines_of_planes
 from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
 from mitsim.core.exr import Channel
 from mitsim.core.files import whole_file
-from mitsim.core.imagelist import ALL, WAVELENGTHS_NM
-from mitsim.core.manifests import CALIBRATION, SIDES, CalibrationManifest, lines_of_planes
+from mitsim.core.manifests import SIDES, CalibrationManifest
 from mitsim.core.runs import TRUTH, Capture
 from mitsim.exchange.capture_list import TURNED
 from mitsim.exchange.packed import FACTORS, Calibration, Content, Loaded, Packed, Run, as_channel, shots_of

@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
-from mitsim.core import files, manifests
+from mitsim.core import colour_files, files, manifests
 from mitsim.core.arrays import PACKED, checked_hdf5, hdf5_errors, whole_hdf5
+from mitsim.core.colour_files import ColourManifest
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata, Value, checksum, read_frame, verify, write_frame
 from mitsim.core.files import MOST_BYTES, parse_json, read_text, write_text
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import CalibrationManifest, ColourManifest, RunManifest, ShotFile
+from mitsim.core.manifests import CalibrationManifest, RunManifest, ShotFile
 from mitsim.core.runs import TRUTH, load_run
 from mitsim.version import __version__
 
@@ -73,7 +74,7 @@ class Packed(Generic[Manifest]):
 
 
 @dataclass(frozen=True, eq=False)
-class Content(manifests.Coloured, Generic[Manifest]):
+class Content(colour_files.Coloured, Generic[Manifest]):
     """Content of a RUN or CAL folder.
 
     Attributes
@@ -103,7 +104,7 @@ class Content(manifests.Coloured, Generic[Manifest]):
             (folder / name).mkdir()
             write_frame(folder / name / TRUTH, *truth)
         if self.colours:
-            write_text(folder / manifests.COLOUR, self.text)
+            write_text(folder / colour_files.COLOUR, self.text)
 
 
 Run = Content[RunManifest]
@@ -131,16 +132,16 @@ def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
 
 
 def run_content(folder: Path) -> Run:
-    lines = manifests.open_lines(folder, manifests.RUN, manifests.MOSAIC)
+    lines = colour_files.open_lines(folder, colour_files.RUN, colour_files.MOSAIC)
     files = {name: folder / name / TRUTH for name in (lines.names if lines.filters else ())}
     truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
-    text = read_text(folder / manifests.COLOUR, MOST_BYTES) if lines.colours else ""
+    text = read_text(folder / colour_files.COLOUR, MOST_BYTES) if lines.colours else ""
     return Content({name: pack_run(part) for name, part in lines.parts.items()}, lines.colours, text, truths)
 
 
 def calibration_content(folder: Path) -> Calibration:
-    lines = manifests.open_lines(folder, manifests.CALIBRATION)
-    text = read_text(folder / manifests.COLOUR, MOST_BYTES) if lines.colours else ""
+    lines = colour_files.open_lines(folder, colour_files.CALIBRATION)
+    text = read_text(folder / colour_files.COLOUR, MOST_BYTES) if lines.colours else ""
     return Content({name: pack_calibration(part) for name, part in lines.parts.items()}, lines.colours, text)
 
 
@@ -193,9 +194,9 @@ def unpack_colours(text: str, kind: str, place: Path, beside: Sequence[str] = ()
     try:
         data = parse_json(text)
     except ValueError as error:
-        raise MitsimError(f"{place}: its {manifests.COLOUR} is not valid JSON ({error}); export it again") from error
-    colours = manifests.checked_colours(data, kind, place)
-    taken = {manifests.COLOUR, files.LOCK, *((manifests.MANIFEST, *beside) if kind == manifests.MOSAIC else ())}
+        raise MitsimError(f"{place}: its {colour_files.COLOUR} is not valid JSON ({error}); export it again") from error
+    colours = colour_files.checked_colours(data, kind, place)
+    taken = {colour_files.COLOUR, files.LOCK, *((manifests.MANIFEST, *beside) if kind == colour_files.MOSAIC else ())}
     for name in taken.intersection(colours.names):
         raise MitsimError(f"{place}: a line is called {name}; give it a name of its own")
     return colours
@@ -293,8 +294,8 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
                 raise MitsimError(
                     f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
                 )
-            kind = manifests.RUN if manifests.RUN in file else manifests.MOSAIC
-            own = {"": _run_in(file, path)} if _LINES not in file or kind == manifests.MOSAIC else {}
+            kind = colour_files.RUN if colour_files.RUN in file else colour_files.MOSAIC
+            own = {"": _run_in(file, path)} if _LINES not in file or kind == colour_files.MOSAIC else {}
             if _LINES not in file:
                 run, factors = Content(own), _calibration_in(file, path) if "calibration" in file else None
                 calibration = Content({"": factors}) if factors else None
@@ -310,9 +311,9 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
                     {name: _frame_in(line, "truth", path) for name, line in truths.items()},
                 )
                 calibration = None
-                if manifests.CALIBRATION in file:
-                    text = _text_in(file, manifests.CALIBRATION, path)
-                    colours = unpack_colours(text, manifests.CALIBRATION, path)
+                if colour_files.CALIBRATION in file:
+                    text = _text_in(file, colour_files.CALIBRATION, path)
+                    colours = unpack_colours(text, colour_files.CALIBRATION, path)
                     for name in colours.names:
                         if "calibration" not in lines.get(name, ()):
                             raise MitsimError(f"{path}: has no calibration of {name}; export it again")

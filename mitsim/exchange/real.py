@@ -12,16 +12,15 @@ from typing import Any, cast
 
 import numpy as np
 
+from mitsim.core.colour_files import CORRECTIONS, Preparation, image_files
 from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum
 from mitsim.core.files import read_json, whole_folder
-from mitsim.core.imagelist import CORRECTIONS, Preparation, image_files
-from mitsim.core.images import Numbers, image_pages, read_images
+from mitsim.core.images import LEAST_RESPONSE, CommonFactor, Numbers, Preparer, image_pages, read_images
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import AmbientFile, ClosingFile, Patterns, RunHead, RunManifest
-from mitsim.core.prepare import LEAST_RESPONSE, CommonFactor, Preparer
 from mitsim.core.runs import AMBIENT, CLOSING, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns, shot_orders
 from mitsim.devices.sensor import PITCH_TOLERANCE

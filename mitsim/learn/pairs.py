@@ -31,13 +31,12 @@ from mitsim.api.bench import Bench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import show_white
 from mitsim.bench.request import Task
-from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.arrays import FloatArray, Labels, integer, stream
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PAIRS, check_plain, output_folder, plain, write_json
+from mitsim.core.images import read_reflectance
 from mitsim.core.job import Cost
-from mitsim.core.prepare import read_reflectance
-from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import Drift

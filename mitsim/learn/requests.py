@@ -8,10 +8,9 @@ from typing import Annotated
 from pydantic import AfterValidator, Field, field_validator
 
 from mitsim.bench.request import Exposure, Request, Seeded
+from mitsim.core.colour_files import PRINTS
 from mitsim.core.configuration import LIMITS, QUALITY, Configuration, FilePath, Options, load_model, option, validate
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
-from mitsim.core.imagelist import PRINTS
-from mitsim.core.seeds import stream
 from mitsim.devices.session import Drift
 
 # -------- Pairs
@@ -52,6 +51,8 @@ class Variation(Configuration):
 
     def draw(self, seed: int, group: int) -> dict[str, float]:
         """Return the drawn numbers of bench number ``group``: `exposure_fraction`, and `mask.` with a field's name."""
+        from mitsim.core.arrays import stream  # here: it imports numpy
+
         rng, ranges = stream(seed, "bench", group), {f"mask.{name}": limits for name, limits in self.mask.items()}
         if self.exposure_fraction is not None:
             ranges["exposure_fraction"] = self.exposure_fraction

@@ -20,12 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.arrays import FloatArray, Labels, integer, single_threaded_blas, stream
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.job import Cost, Job
-from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.seeds import integer, stream
 from mitsim.learn.methods import (
     CLASSES,
     Data,

@@ -17,9 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from mitsim.core.arrays import FloatArray
-from mitsim.core.parallel import in_threads
-from mitsim.core.seeds import stream
+from mitsim.core.arrays import FloatArray, in_threads, stream
 from mitsim.devices.camera import Devices, side_of
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Coherence

@@ -33,9 +33,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import MitsimError
-from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.solution import Solution
 
 # ---- Images of all lines behind a mosaic of filters ------------------------------------------------------------------

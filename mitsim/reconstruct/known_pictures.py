@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.colour_files import CALIBRATION, PLANES, Wanted, write_colours
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, finite_channel, read_frame
 from mitsim.core.files import output_folder
-from mitsim.core.imagelist import PLANES, Wanted
 from mitsim.core.images import own_end, read_image
 from mitsim.core.job import Cost, Job, Limits
-from mitsim.core.manifests import CALIBRATION, MANIFEST, CalibrationManifest, FactorNoise, write_colours
+from mitsim.core.manifests import MANIFEST, CalibrationManifest, FactorNoise
 from mitsim.core.runs import load_run
 from mitsim.devices.framelist import MOST_TERMS, KnownCaptures, load_known, preparation_of
 from mitsim.reconstruct.factors import (

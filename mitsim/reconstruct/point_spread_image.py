@@ -23,10 +23,9 @@ from typing import Any, Literal
 import numpy as np
 from scipy import fft
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.job import Cost, Job, Limits
-from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.devices.mask_profile import load_psf
 from mitsim.reconstruct.point_spread import Array, PointSpreadFit, ShiftedLight, minimise, reduce_frame

@@ -28,11 +28,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.colour_files import BGGR, Preparation, planes_of
 from mitsim.core.errors import MitsimError
-from mitsim.core.imagelist import BGGR, Preparation, planes_of
 from mitsim.core.images import orient
-from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.solver import centre_columns, centre_frame
 
 # ---- What is seen ----------------------------------------------------------------------------------------------------

@@ -46,9 +46,8 @@ import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 from scipy.sparse.csgraph import connected_components
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import MitsimError
-from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 
 # ---- One side of the model -------------------------------------------------------------------------------------------

@@ -14,6 +14,17 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.colour_files import (
+    CALIBRATION,
+    COLOUR,
+    IMAGE,
+    MOSAIC,
+    RUN,
+    ColourManifest,
+    SpectralFolder,
+    open_lines,
+    write_colours,
+)
 from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
@@ -30,20 +41,7 @@ from mitsim.core.files import (
 )
 from mitsim.core.images import card, lightness, png
 from mitsim.core.job import size_text
-from mitsim.core.manifests import (
-    CALIBRATION,
-    COLOUR,
-    IMAGE,
-    MANIFEST,
-    MOSAIC,
-    RUN,
-    CalibrationManifest,
-    ColourManifest,
-    SpectralFolder,
-    open_lines,
-    read_manifest,
-    write_colours,
-)
+from mitsim.core.manifests import MANIFEST, CalibrationManifest, read_manifest
 from mitsim.core.runs import TRUTH, load_mosaic, load_run
 from mitsim.devices.framelist import ChartPlace
 from mitsim.metrics import Quality, psnr, summary_of, truth_for

@@ -20,9 +20,8 @@ from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off, takes_a
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.lit_session import DARK, READ, ROUNDING, SHOT
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import MitsimError
-from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import CameraMask
 from mitsim.devices.patterns import PatternFamily

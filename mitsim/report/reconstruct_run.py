@@ -13,27 +13,25 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError, check_arguments
-from mitsim.core.exr import write_frame
-from mitsim.core.files import output_folder, read_json, write_bytes
-from mitsim.core.images import png
-from mitsim.core.job import Job
-from mitsim.core.manifests import (
+from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.colour_files import (
     COLOUR,
     IMAGE,
     JOINT,
     MOSAIC,
     RUN,
-    CalibrationManifest,
     ColourManifest,
     check_lines,
     is_coloured,
     open_lines,
     read_colours,
-    read_manifest,
 )
-from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.exr import write_frame
+from mitsim.core.files import output_folder, read_json, write_bytes
+from mitsim.core.images import png
+from mitsim.core.job import Job
+from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.runs import load_mosaic, load_run
 from mitsim.devices.framelist import ChartPlace
 from mitsim.devices.mask_profile import load_psf

@@ -19,7 +19,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
-from mitsim.core.prepare import fit_square, read_reflectance
+from mitsim.core.images import fit_square, read_reflectance
 from mitsim.scene import tree
 from mitsim.scene.check import PICTURE, PLUGINS, SMALL_LAMPS, CheckedScene, Range, Unfit, check_file, looking_beside
 from mitsim.scene.headers import check_obj, check_ply
@@ -404,7 +404,7 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
 #
 # Pictures and meshes of the user in the tree of a checked scene, converted to files that Mitsuba reads.
 #
-# A picture becomes the reflectances of a sheet (:func:`mitsim.core.prepare.read_reflectance`), in the middle of a
+# A picture becomes the reflectances of a sheet (:func:`mitsim.core.images.read_reflectance`), in the middle of a
 # square. A mesh is moved and scaled before the scene's own ``to_world`` acts: its longest side is 1, it stands on the
 # plane y = 0, and the middle of its box is over the origin.
 

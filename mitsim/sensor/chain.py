@@ -19,11 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, stream
 from mitsim.core.environment import compiled_arrays
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import compiled_kernels
-from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 
 Digital = FloatArray | npt.NDArray[np.uint32]

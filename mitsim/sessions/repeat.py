@@ -12,23 +12,13 @@ from pydantic import BaseModel, Field
 
 from mitsim.bench.apparatus import check_devices, spelling
 from mitsim.bench.request import Request
+from mitsim.core.colour_files import COLOUR, IMAGE, KINDS, is_coloured, open_lines, spectral_of
 from mitsim.core.configuration import load_model, shipped_path, validate
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions
 from mitsim.core.errors import MitsimError, check_arguments, cut
 from mitsim.core.exr import checksum
 from mitsim.core.files import plain, read_json, write_text
-from mitsim.core.manifests import (
-    COLOUR,
-    IMAGE,
-    KINDS,
-    MANIFEST,
-    CalibrationManifest,
-    RunManifest,
-    is_coloured,
-    open_lines,
-    read_manifest,
-    spectral_of,
-)
+from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe

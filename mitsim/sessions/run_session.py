@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, Field
 
 from mitsim.bench.request import NO, Exposure, Opening, Request, SessionRequest, Task
+from mitsim.core.colour_files import MOSAIC, RUN, is_coloured, open_lines
 from mitsim.core.configuration import Configuration, takes, validate
 from mitsim.core.environment import deciding_versions
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -34,7 +35,7 @@ from mitsim.core.files import (
     write_text,
 )
 from mitsim.core.job import Job
-from mitsim.core.manifests import MOSAIC, RUN, CalibrationManifest, RunManifest, is_coloured, open_lines, read_manifest
+from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, check_export, export
 from mitsim.reconstruct.request import MODEL, ImageRequest

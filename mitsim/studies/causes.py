@@ -61,8 +61,7 @@ import numpy as np
 from scipy import sparse
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.core.arrays import FloatArray, Labels
-from mitsim.core.seeds import integer
+from mitsim.core.arrays import FloatArray, Labels, integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.light.light import SampledLight, Truth, traced_again
 from mitsim.light.passes import FOLLOWED, PASSES, LightEstimate, Simulation, TracedPass, expected_of

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.core.manifests import MOST_LINES
+from mitsim.core.colour_files import MOST_LINES
 from mitsim.devices.projector import SPECTRA_NM, Band, Response
 from mitsim.transport import integrator
 from mitsim.transport.connect import OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths

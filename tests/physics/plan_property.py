@@ -16,7 +16,7 @@ import numpy as np
 
 from mitsim.api.bench import Bench
 from mitsim.bench import effects
-from mitsim.core.seeds import integer
+from mitsim.core.arrays import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.passes import Simulation, expected_of

@@ -20,8 +20,8 @@ import pytest
 from mitsim.acquire.reference import reference
 from mitsim.acquire.spectral import SpectralBench, line_alone, lit_by_lamps
 from mitsim.api.bench import Bench, open_bench
+from mitsim.core.colour_files import RUN
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import RUN
 from mitsim.transport.direct import DirectTracer, FluxTracer
 from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.indirect import IndirectTracer

@@ -13,9 +13,8 @@ import mitsuba as mi
 import numpy as np
 import scipy
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, integer, stream
 from mitsim.core.errors import MitsimError
-from mitsim.core.seeds import integer, stream
 from mitsim.transport.plugins.base import host_values, vectors
 
 _THICKNESS_MM = 1.0

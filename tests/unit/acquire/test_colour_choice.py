@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from mitsim.api.bench import open_bench
+from mitsim.core.colour_files import spectral_of
 from mitsim.core.errors import ArgumentError
-from mitsim.core.manifests import spectral_of
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -16,9 +16,9 @@ import pytest
 import tifffile
 from PIL import Image, PngImagePlugin
 
+from mitsim.core.colour_files import Raw, Wanted, image_files
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
-from mitsim.core.imagelist import Raw, Wanted, image_files
 from mitsim.core.images import _one_line_refusals, _read_header, image_size, own_end, read_image, read_images
 
 NUMBERS = (np.arange(35).reshape(5, 7) * 113).astype(np.uint16)

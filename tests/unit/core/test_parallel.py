@@ -8,8 +8,8 @@ import time
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from mitsim.core.arrays import Behind, in_threads, single_threaded_blas
 from mitsim.core.errors import MitsimError
-from mitsim.core.parallel import Behind, in_threads, single_threaded_blas
 
 
 def test_two_lots_are_held_and_no_more() -> None:
@@ -92,7 +92,7 @@ def test_blas_that_is_loaded_later_has_one_thread_too(module: str) -> None:
     that had kept NumPy's to one before.)"""
     program = f"""if True:
         from threadpoolctl import threadpool_info, threadpool_limits
-        from mitsim.core.parallel import single_threaded_blas
+        from mitsim.core.arrays import single_threaded_blas
         import numpy
 
         def threads():

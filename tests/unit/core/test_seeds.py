@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from mitsim.core.arrays import integer, stream
 from mitsim.core.errors import MitsimError
-from mitsim.core.seeds import integer, stream
 
 
 def first(*args: int | str) -> int:

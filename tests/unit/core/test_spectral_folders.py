@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from mitsim.core.colour_files import CALIBRATION, MOSAIC, RUN, open_lines
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import CALIBRATION, MOSAIC, RUN, open_lines
 
 NAMES = ("638nm", "520nm")
 LINES = [{"name": name, "wavelength_nm": float(name[:3])} for name in NAMES]

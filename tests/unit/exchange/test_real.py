@@ -17,9 +17,9 @@ import tifffile
 from PIL import Image
 
 import mitsim as ms
+from mitsim.core.colour_files import Preparation, Raw, Wanted
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
-from mitsim.core.imagelist import Preparation, Raw, Wanted
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.exchange import real
 from mitsim.exchange.capture_list import CaptureList, RealCapture

@@ -18,8 +18,8 @@ import mitsim as ms
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Request, Task
+from mitsim.core.arrays import integer
 from mitsim.core.errors import MitsimError
-from mitsim.core.seeds import integer
 from mitsim.learn import pairs as pairs_module
 from mitsim.learn.pair_store import PairStore, PrintPart
 from mitsim.learn.pairs import electrons_per_joule, make_pairs

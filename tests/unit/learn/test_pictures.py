@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mitsim.core.arrays import stream
 from mitsim.core.errors import MitsimError
-from mitsim.core.seeds import stream
 from mitsim.learn.pairs import DrawnPictures, FolderPictures, pink_noise
 
 N = 64

@@ -20,7 +20,7 @@ import pytest
 
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
-from mitsim.core.manifests import MOSAIC, RUN
+from mitsim.core.colour_files import MOSAIC, RUN
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import SPECTRA_NM, CountedLamps, Response, Spectrum
 from mitsim.light.passes import Grid, Simulation, expected_of

@@ -5,8 +5,7 @@ import pytest
 from scipy import stats
 from scipy.special import ndtri
 
-from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.seeds import stream
+from mitsim.core.arrays import single_threaded_blas, stream
 from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.optics.frames import add_speckle, contrast_of

@@ -12,12 +12,11 @@ import pytest
 from PIL import Image
 
 from mitsim import calibrate_known, load_calibration, load_run, reconstruct
+from mitsim.core.colour_files import CALIBRATION, Preparation, read_colours
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
-from mitsim.core.imagelist import Preparation
-from mitsim.core.images import orient
-from mitsim.core.manifests import CALIBRATION, Digital, read_colours
-from mitsim.core.prepare import Preparer
+from mitsim.core.images import Preparer, orient
+from mitsim.core.manifests import Digital
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.known_pictures import guess_noise
 from mitsim.reconstruct.shifted_codes import TURNS, plane_offsets

@@ -16,12 +16,13 @@ import pytest
 from PIL import Image
 
 from mitsim.cli.commands import Pictured, command_line
+from mitsim.core.colour_files import RUN, ColourManifest, write_colours
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json
 from mitsim.core.images import lightness
 from mitsim.core.job import Job
-from mitsim.core.manifests import MANIFEST, RUN, ColourManifest, write_colours
+from mitsim.core.manifests import MANIFEST
 from mitsim.core.runs import RunFolder, load_run
 from mitsim.report.folder_page import report_folder
 from mitsim.report.pages import Picture, Scale, contact_sheet, lines_of

@@ -13,7 +13,7 @@ import pytest
 from mitsim.acquire.sense import read_image
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
-from mitsim.core.prepare import read_reflectance
+from mitsim.core.images import read_reflectance
 from mitsim.scene.headers import check_image, check_obj, check_ply
 
 # -------- Wavefront meshes

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special, stats
 
+from mitsim.core.arrays import stream
 from mitsim.core.errors import MitsimError
-from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor import chain, moments
 from mitsim.sensor import chain as compiled

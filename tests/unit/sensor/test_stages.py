@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mitsim.core.arrays import stream
 from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
-from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor import chain, moments
 from mitsim.sensor.chain import (

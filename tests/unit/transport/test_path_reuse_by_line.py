@@ -19,7 +19,7 @@ import pytest
 
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
-from mitsim.core.manifests import RUN
+from mitsim.core.colour_files import RUN
 from mitsim.transport.records import Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from tests.conftest import write_small_scene
 from tests.unit.transport.test_path_reuse import BENT, OBJECT, WALL, tracers
