@@ -51,7 +51,7 @@ html_css_files = ["site.css"]
 CONTENTS = """
 ```{toctree}
 :hidden:
-:caption: Learn
+:caption: Start
 
 Five minutes </README>
 tour
@@ -61,41 +61,51 @@ gallery
 
 ```{toctree}
 :hidden:
-:caption: Do
+:caption: How-to
 
 howto
-shipped
-command_line
-bench
 sessions
+bench
 exchange
 studies
 learned
-extending
 ```
 
 ```{toctree}
 :hidden:
-:caption: Understand
+:caption: Background
 
 scope
 physics
 rare_light
 reconstruction
-architecture
-robustness
-growth
 ```
 
 ```{toctree}
 :hidden:
-:caption: Look up
+:caption: Reference
 
 formats
+scene_files
+device_files
+folders
+json_keys
+real_camera
 api
 glossary
-decisions
 /CHANGELOG
+migrating
+```
+
+```{toctree}
+:hidden:
+:caption: Developers
+
+architecture
+extending
+decisions
+robustness
+growth
 /CONTRIBUTING
 ```
 """

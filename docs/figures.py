@@ -167,7 +167,7 @@ def closed() -> dict[str, float]:
 _README = ROOT / "README.md"
 TOUR = {"plan": ROOT / "docs" / "tour.md", "capture": _README, "calibrate": _README, "reconstruct": _README}
 """Pages that print a plan of cookie_bag, and of photograph all from scene to image with every figure at its default."""
-STATUSES = ROOT / "docs" / "command_line.md"
+STATUSES = ROOT / "docs" / "howto.md"
 """The page that has the table of exit statuses."""
 _BLOCK = r"^    \$ mitsim ({verb} .*)\n((?:    (?!\$ ).*\n)*)"
 _MACHINE = re.compile(

@@ -1,9 +1,10 @@
-"""Tables of docs/formats.md and docs/shipped.md: models of formats and lists of what is shipped in, Markdown out.
+"""Write the tables of the docs from the models of file formats and from the lists of shipped things.
 
     python docs/tables.py
 
-rewrites what stands between ``<!-- fields: NAME -->`` and ``<!-- end -->``, and, as `mitsim list KIND` says it, between
-``<!-- list: KIND -->`` and the same. tests/unit/core/test_formats.py fails when a file differs from models or lists.
+replaces the text between ``<!-- fields: NAME -->`` and ``<!-- end -->`` by the fields of a model, and the text between
+``<!-- list: KIND -->`` and ``<!-- end -->`` by the output of `mitsim list KIND`. tests/unit/core/test_formats.py fails
+if a page differs from models or lists.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from mitsim.learn.pair_store import ModelManifest, PairsManifest, Shard
 from mitsim.learn.requests import Variation
 from mitsim.light.plan import PlanFile
 
-FORMATS, SHIPPED = (Path(__file__).with_name(name) for name in ("formats.md", "shipped.md"))
+PAGES = sorted(Path(__file__).parent.glob("*.md"))
 MODELS = (
     *(CameraGeometry, MaskProfile, ProjectorModel, Coherence),
     *(SensorModel, EfficiencyCurve),
@@ -96,7 +97,7 @@ def allowed_text(rules: Mapping[str, Any]) -> str:
 
 
 def table(model: type[BaseModel]) -> str:
-    """Markdown table of a ``model``: its fields, what is allowed, the default and the meaning."""
+    """Return the Markdown table of a ``model``: fields, allowed values, defaults and meanings."""
     schema, known = model.model_json_schema(), meanings(model)
     lines = ["| field | allowed | default | meaning |", "|---|---|---|---|"]
     for name, rules in schema["properties"].items():
@@ -106,7 +107,7 @@ def table(model: type[BaseModel]) -> str:
 
 
 def list_table(kind: str) -> str:
-    """Markdown table of what `mitsim list` says of a ``kind``."""
+    """Return the output of `mitsim list` for a ``kind`` as a Markdown table."""
     entries = [*KINDS[kind]()]
     two = any(each.what for each in entries)
     rows = [f"| `{each.name}` |{f' {each.what} |' if two else ''} {each.serves} |" for each in entries]
@@ -114,15 +115,11 @@ def list_table(kind: str) -> str:
 
 
 def rewritten(text: str) -> str:
-    """``text`` of formats.md with every table between its marks as the models have it, and its lists."""
-    for model in MODELS:
-        text = _between(f"fields: {model.__name__}", table(model), text)
-    return with_lists(text)
-
-
-def with_lists(text: str) -> str:
-    """The ``text`` of any page with the lists that it has marks for."""
-    for kind in re.findall("<!-- list: (\\w+) -->", text):
+    """Return the ``text`` of a page with all tables between its marks made anew."""
+    fields = {model.__name__: model for model in MODELS}
+    for name in re.findall(r"<!-- fields: (\w+) -->", text):
+        text = _between(f"fields: {name}", table(fields[name]), text)
+    for kind in re.findall(r"<!-- list: (\w+) -->", text):
         text = _between(f"list: {kind}", list_table(kind), text)
     return text
 
@@ -134,5 +131,5 @@ def _between(mark: str, made: str, text: str) -> str:
 
 
 if __name__ == "__main__":
-    FORMATS.write_text(rewritten(FORMATS.read_text(encoding="utf-8")), encoding="utf-8")
-    SHIPPED.write_text(with_lists(SHIPPED.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(rewritten(page.read_text(encoding="utf-8")), encoding="utf-8")

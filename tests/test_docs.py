@@ -189,7 +189,7 @@ def test_the_exit_statuses_of_the_table(status: str, line: str, sentence: str, t
 
 
 def measured_responses() -> dict[str, object]:
-    """What docs/formats.md calls measured: responses of a separable camera of 144 pixels to 128 stripes a side."""
+    """Return the responses that docs/real_camera.md uses: a separable camera of 144 pixels, 128 stripes a side."""
     from scipy.linalg import hadamard
 
     rng = np.random.default_rng(0)
@@ -232,7 +232,7 @@ def made_folders() -> dict[str, object]:
 
 GIVEN: dict[str, Callable[[], dict[str, object]]] = {
     "docs/api.md": made_folders,
-    "docs/formats.md": measured_responses,
+    "docs/real_camera.md": measured_responses,
     "docs/exchange.md": exchanged_file,
     "docs/learned.md": stored_pairs,
 }

@@ -99,7 +99,7 @@ def test_plan(call: Callable[..., Any], lab: Any) -> None:
         assert isinstance(effect["reason"], str) and (effect["reason"] or effect["error_if_off"] is not None), effect
         assert effect["error_if_off"] is None or number(effect["error_if_off"])
         assert number(effect["seconds"])
-    # The names are those that docs/formats.md lists.
+    # The names are those that docs/json_keys.md lists.
     names = " ".join(effect["name"] for effect in plan["effects"])
     for effect in ("anchors", "layers", "interreflection", "aperture", "ambient", "diffraction", "thickness", "noise"):
         assert effect in names

@@ -1,4 +1,4 @@
-"""Frames of a real camera: folders made by hand with no more than docs/formats.md asks for reconstruct as well.
+"""Frames of a real camera: folders made by hand with no more than docs/real_camera.md asks for reconstruct as well.
 
 The 'real camera' is numpy: frames of the paper's model with factors of its own, rounded to digital numbers. No part of
 mitsim's renderer or sensor is in it, so that scale, sign and order of the documented keys are checked independently.
@@ -122,8 +122,8 @@ def test_another_bench_is_refused(refused: Callable[..., str], tmp_path: Path) -
 
 
 def test_the_example_of_the_documentation(call: Callable[..., Any], tmp_path: Path) -> None:
-    """The manifest in docs/formats.md is read as it stands there."""
-    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    """The manifest in docs/real_camera.md can be read."""
+    text = (Path(__file__).parents[2] / "docs" / "real_camera.md").read_text(encoding="utf-8")
     section = text[text.index("## A real camera") :]
     manifest = section[section.index("```json") + 7 :]
     run, calibration = tmp_path / "run", tmp_path / "cal"
