@@ -142,7 +142,7 @@ def notebooks() -> str:
 
 def plugins() -> str:
     """Markdown that shows the manuals of mitsim's own Mitsuba plugins as they stand in their modules."""
-    sources = [ROOT / "mitsim/transport/plugins" / f"{name}.py" for name in ("lensless", "grating", "glass", "lens")]
+    sources = [ROOT / "mitsim/transport/plugins" / f"{name}.py" for name in ("lensless", "materials", "lens")]
     manuals = [ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) for path in sources]
     return "\n\n".join(f"```text\n{manual}\n```" for manual in manuals)
 

@@ -487,7 +487,7 @@ KNOWS_BACKENDS = {
 SUMS = {"sum", "mean", "prod", "prefix_sum", "cumsum", "block_sum", "block_reduce", "block_prefix_sum", "reduce"}
 OF_A_LANE = {
     "mitsim.transport.plugins.base": "the channels of a spectrum",
-    "mitsim.transport.plugins.grating": "the orders of a grating",
+    "mitsim.transport.plugins.materials": "the orders of a grating",
 }
 
 

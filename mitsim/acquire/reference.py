@@ -241,7 +241,7 @@ def rendered_psf(
     The ``variant`` of Mitsuba is selected for the process.
     """
     load_variant(variant)
-    from mitsim.transport.plugins.diffuser import Diffuser, point_spread
+    from mitsim.transport.plugins.lens import Diffuser, point_spread
 
     light = point_spread(Diffuser(), shape, pitch_mm, rays=rays, seed=seed)
     return np.asarray(light / light.sum())

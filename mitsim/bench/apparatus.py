@@ -460,7 +460,7 @@ def _adapt(loaded: LoadedScene, mask: MaskProfile | None, camera: Path, projecto
     if mask is not None:
         loaded.camera.wear(mask.put_on(loaded.camera.geometry, camera.parent))
     if loaded.parting:
-        from mitsim.transport.plugins.glass import tune
+        from mitsim.transport.plugins.materials import tune
 
         tune(loaded.scene, projector.effective_wavelength_nm)
 

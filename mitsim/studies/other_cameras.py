@@ -10,7 +10,7 @@ a grid side by side are therefore one frame of a separable camera,
 which :mod:`mitsim.reconstruct.solver` solves exactly.
 
 *convolutional*, section V-E and figure 12: a DiffuserCam under uniform light and 4 to 49 dots, with the point spread
-function of a rendered diffuser (:mod:`mitsim.transport.plugins.diffuser`) or a measured one (`-D psf=FILE`). The sensor
+function of a rendered diffuser (:mod:`mitsim.transport.plugins.lens`) or a measured one (`-D psf=FILE`). The sensor
 gets all light. Times are CPU seconds on one thread, at an error within 1 % of the direct solution's.
 """
 

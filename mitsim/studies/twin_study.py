@@ -6,7 +6,7 @@ lit sheet, and a camera with a mask of the transmission (1 + c_r(row) c_c(column
 because the learned codes contain it.
 
 *DiffuserCam*. Caustics of a random relief differ in every draw, so that statistics are compared. The slopes of a normal
-relief move light by d (n - 1) grad h (:mod:`mitsim.transport.plugins.diffuser`). The relief's correlation length, rms
+relief move light by d (n - 1) grad h (:mod:`mitsim.transport.plugins.lens`). The relief's correlation length, rms
 move, blur and haze are those whose radial spectrum fits the public picture's best; the light is traced by Mitsuba.
 
 Files lie in folders named as the public repositories: ``flatcam/fc_6.png``, .. and ``rec_6.png``, .. are raw captures
@@ -43,7 +43,7 @@ from mitsim.studies.framework.claims import Judged
 from mitsim.studies.framework.experiment import Found, Point, Scope, Study
 from mitsim.studies.framework.panels import Bars, Images
 from mitsim.studies.framework.studio import Studio, single_precision
-from mitsim.transport.plugins.diffuser import Diffuser, point_spread, random_relief
+from mitsim.transport.plugins.lens import Diffuser, point_spread, random_relief
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.transport.plugins.base import generator
-from mitsim.transport.plugins.glass import is_glass
+from mitsim.transport.plugins.materials import is_glass
 
 CLEAR = 32 * 2.0**-24
 """Start of a ray beyond a surface per mm of coordinates: 32 float32 roundings, 8e-4 mm at 400 mm (Mitsuba 0.036)."""

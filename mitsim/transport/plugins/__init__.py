@@ -1,4 +1,4 @@
-"""Mitsuba plugins of mitsim, one a file."""
+"""Mitsuba plugins of mitsim."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ def register() -> None:
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError
-    from mitsim.transport.plugins import glass, grating, lens, lensless, wrappers
+    from mitsim.transport.plugins import lens, lensless, materials
 
     variant = mi.variant()
     if variant is None:
         raise MitsimError("no Mitsuba variant is selected; call mitsim.core.environment.load_variant first")
     if variant in _REGISTERED:
         return
-    for kind, plugin in (("sensor", lensless), ("bsdf", grating), ("bsdf", glass), ("emitter", lens)):
-        getattr(mi, f"register_{kind}")(plugin.PLUGIN, plugin.plugin_class())
-    for name, made in wrappers.plugin_classes().items():
+    mi.register_sensor(lensless.PLUGIN, lensless.plugin_class())
+    mi.register_emitter(lens.PLUGIN, lens.plugin_class())
+    for name, made in materials.plugin_classes().items():
         mi.register_bsdf(name, made)
     _REGISTERED.add(variant)

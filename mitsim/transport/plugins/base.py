@@ -1,47 +1,18 @@
-"""Common parts of plugins and tracers: the base of BSDFs, coordinates, arrays on the host, and random numbers.
+"""Common parts of plugins and tracers: arrays on the host, coordinates, and random numbers.
 
 Index coordinates grow as rows and columns of images do: row = -y, column = -x in Mitsuba's camera frame.
 """
 
 from __future__ import annotations
 
-import re
 from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel
 
 from mitsim.core.arrays import FloatArray
-
-
-def numbers(text: str) -> list[float]:
-    return [float(word) for word in re.split(r"[\s,]+", text.strip()) if word]
-
-
-def bsdf_class() -> type:
-    """Return the base of our BSDFs; one without ``eval_pdf`` of its own is a delta, which no given direction meets."""
-
-    class ModelBSDF(mi.BSDF):  # type: ignore[misc]
-        name: str
-        model: BaseModel
-
-        def eval_pdf(self, *turn: Any) -> tuple[mi.Spectrum, mi.Float]:
-            return mi.Spectrum(0), mi.Float(0)
-
-        def eval(self, *turn: Any) -> mi.Spectrum:
-            return self.eval_pdf(*turn)[0]
-
-        def pdf(self, *turn: Any) -> mi.Float:
-            return self.eval_pdf(*turn)[1]
-
-        def to_string(self) -> str:
-            return f"{self.name}[{self.model}]"
-
-    return ModelBSDF
-
 
 # -------- Between Dr.Jit and NumPy
 

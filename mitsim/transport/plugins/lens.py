@@ -42,11 +42,16 @@ XML::
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+import scipy
 
+from mitsim.core.arrays import FloatArray, integer, stream
 from mitsim.core.errors import MitsimError
+from mitsim.transport.plugins.base import host_values, vectors
 
 PLUGIN = "mitsim_projector"
 
@@ -112,3 +117,136 @@ def plugin_class() -> type:
             return f"{PLUGIN}[scale={self.scale}, focus={self.focus}]"
 
     return ApertureProjector
+
+
+# -------- A refractive diffuser before a bare sensor
+#  Pattern of light that a refractive diffuser before a bare sensor makes of a distant point.
+#
+# A sheet of glass has a random, smooth relief towards the sensor. For small slopes a ray at x lands at x + d (n - 1)
+# grad h(x), with h the thickness, so that the irradiance is 1 / |det(1 + d (n - 1) Hess h)|, summed over all x that
+# land there: the caustics of a diffuser.
+
+_THICKNESS_MM = 1.0
+_CLEAR_MM = 0.05
+_RAYS_AT_ONCE = 2**22
+_VERTICES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    side_mm: float
+    height_mm: FloatArray
+    slope_x: FloatArray
+    slope_y: FloatArray
+
+
+def random_relief(side_mm: float, correlation_mm: float, slope: float, seed: int) -> Relief:
+    """Draw a normal random surface with the autocorrelation exp(-r^2 / (2 correlation^2)) and an rms slope.
+
+    Raises MitsimError for lengths that do not fit, or a slope that is no small positive number.
+    """
+    if not (0 < correlation_mm < side_mm / 4 and 0 < slope <= 0.5):
+        raise MitsimError(
+            f"diffuser of {side_mm:g} mm with correlation {correlation_mm:g} mm and slope {slope:g}: give a "
+            "correlation above 0 and below a quarter of the side, and a slope above 0 and up to 0.5"
+        )
+    # Twice as wide as it is used, so that it does not repeat.
+    cells = scipy.fft.next_fast_len(int(np.ceil(2 * side_mm / correlation_mm * _VERTICES)))
+    step = 2 * side_mm / cells
+    wave = 2 * np.pi * np.fft.fftfreq(cells, step)
+    wave_x, wave_y = wave[:, None], wave[None, :]
+    noise = scipy.fft.fft2(stream(seed, "diffuser").standard_normal((cells, cells)))
+    spectrum = noise * np.exp(-(correlation_mm**2) * (wave_x**2 + wave_y**2) / 4)
+    used = slice(0, cells // 2 + 1)
+    height, slope_x, slope_y = (
+        np.asarray(scipy.fft.ifft2(spectrum * factor).real[used, used]) for factor in (1, 1j * wave_x, 1j * wave_y)
+    )
+    gain = slope / float(np.sqrt((np.square(slope_x).mean() + np.square(slope_y).mean()) / 2))
+    return Relief((cells // 2) * step, height * gain, slope_x * gain, slope_y * gain)
+
+
+@dataclass(frozen=True, eq=False)
+class Diffuser:
+    """Sheet of an index at a distance [mm] before a sensor; its caustics resemble those of DiffuserCam."""
+
+    relief: Relief = field(default_factory=lambda: random_relief(6.0, 0.35, 0.05, 0))
+    index: float = 1.5
+    distance_mm: float = 8.0
+
+    def scene(self) -> mi.Scene:
+        relief, count = self.relief, len(self.relief.height_mm)
+        across = np.linspace(-relief.side_mm / 2, relief.side_mm / 2, count)
+        x, y = np.meshgrid(across, across, indexing="ij")
+        places = np.stack([x, y, self.distance_mm - relief.height_mm], axis=-1)
+        # Out of the glass, towards the sensor.
+        normals = np.stack([-relief.slope_x, -relief.slope_y, -np.ones_like(x)], axis=-1)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
+        beside, above = corner + count, corner + 1
+        faces = np.concatenate(
+            [np.stack(each, axis=1) for each in ((corner, above, beside), (beside, above, beside + 1))]
+        )
+        glass, properties = {"type": "dielectric", "int_ior": self.index, "ext_ior": 1.0}, mi.Properties()
+        properties["bsdf"] = mi.load_dict(glass)
+        mesh = mi.Mesh("relief", count * count, len(faces), has_vertex_normals=True, props=properties)
+        held = mi.traverse(mesh)
+        held["vertex_positions"] = mi.Float(places.astype(np.float32).ravel())
+        held["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
+        held["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        held.update()
+        # Wider than the relief by the shift of tilted light.
+        side, top = 2 * relief.side_mm, self.distance_mm + _THICKNESS_MM
+        flat = mi.ScalarTransform4f().translate([0, 0, top]).scale([side, side, 1])
+        return mi.load_dict(
+            {"type": "scene", "flat": {"type": "rectangle", "to_world": flat, "bsdf": glass}, "relief": mesh}
+        )
+
+
+def point_spread(
+    diffuser: Diffuser,
+    shape: tuple[int, int],
+    pitch_mm: float,
+    tilt: tuple[float, float] = (0.0, 0.0),
+    rays: int = 4096,
+    seed: int = 0,
+) -> FloatArray:
+    """Return the irradiance (rows, columns) of a distant point behind a diffuser, over that before it.
+
+    ``tilt`` has tangents of the light's direction; ``rays`` is the number along an axis.
+    """
+    scene, side = diffuser.scene(), diffuser.relief.side_mm
+    rows, columns = shape
+    inner = np.array(tilt) / np.sqrt(diffuser.index**2 * (1 + np.dot(tilt, tilt)) - np.dot(tilt, tilt))
+    above = _THICKNESS_MM + 1.0
+    # Where light must meet the flat face to reach the relief's middle, and a millimetre before that.
+    start = -inner * _THICKNESS_MM - np.array(tilt)
+    along = np.array([*tilt, -1.0])
+    unit = mi.Vector3f(*(along / np.linalg.norm(along)).tolist())
+    # Light instead of radiance, and only its refracted part.
+    context = mi.BSDFContext(mi.TransportMode.Importance, mi.BSDFFlags.DeltaTransmission)
+    light = np.zeros(rows * columns)
+    band = max(1, _RAYS_AT_ONCE // rays)
+    for first in range(0, rays, band):
+        count = min(band, rays - first)
+        jitter = stream(integer(seed, "diffuser rays"), first).random((2, count, rays))
+        x = ((np.arange(first, first + count)[:, None] + jitter[0]) / rays - 0.5) * side
+        y = ((np.arange(rays)[None, :] + jitter[1]) / rays - 0.5) * side
+        places = np.stack([x.ravel() + start[0], y.ravel() + start[1], np.full(x.size, diffuser.distance_mm + above)])
+        ray, part, active = mi.Ray3f(mi.Point3f(places.astype(np.float32)), unit), mi.Float(1), mi.Bool(True)
+        for _ in range(2):
+            crossing = scene.ray_intersect(ray, active)
+            active &= crossing.is_valid()
+            turned, weight = crossing.bsdf().sample(context, crossing, 0.5, mi.Point2f(0.5), active)
+            part *= weight[0]  # glass without colour
+            # Not Mitsuba's own start, which leaves the ray's line and loses light at the relief's edge.
+            along_ray = crossing.to_world(turned.wo)
+            ray = mi.Ray3f(crossing.p + along_ray * _CLEAR_MM, along_ray)
+        active &= ray.d.z < 0
+        place = vectors(ray(-ray.o.z / ray.d.z), places.shape[1])
+        part = host_values(mi.Float(mi.UInt32(active)) * part, places.shape[1])
+        row = np.floor(rows / 2 - place[:, 1] / pitch_mm)
+        column = np.floor(columns / 2 - place[:, 0] / pitch_mm)
+        seen = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (part > 0)
+        index = (row[seen] * columns + column[seen]).astype(np.int64)
+        light += np.bincount(index, part[seen], minlength=rows * columns)
+    return np.asarray(light.reshape(shape) * (side / rays / pitch_mm) ** 2)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.diffuser import Diffuser, Relief, point_spread, random_relief
+from mitsim.transport.plugins.lens import Diffuser, Relief, point_spread, random_relief
 
 pytestmark = pytest.mark.usefixtures("variant")
 SIDE, DISTANCE, INDEX = 3.0, 8.0, 1.5

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.glass import GlassModel, is_glass, tune
+from mitsim.transport.plugins.materials import GlassModel, is_glass, tune
 
 pytestmark = pytest.mark.usefixtures("variant")
 LANES = 1000
