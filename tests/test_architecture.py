@@ -565,7 +565,7 @@ SIZES = {
     "sensor": (5, 1189),
     "sessions": (4, 811),
     "studies": (22, 5289),
-    "transport": (20, 4188),
+    "transport": (17, 4158),
     "verbs": (1, 309),
     "version": (1, 1),
 }
