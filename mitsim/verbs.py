@@ -339,7 +339,7 @@ def prepare_study(
     if len(scenes) > 1:
         raise MitsimError(f"study {name}: got {len(scenes)} scenes, {' '.join(map(str, scenes))}; give one scene")
     check_study(name)
-    from mitsim.studies.framework.campaign import Shard, Where, run_experiment
+    from mitsim.studies.framework.campaign import Where, run_experiment, shard_of
 
     place = str(scenes[0]) if scenes else None
     camera, projector, recipe, data = (
@@ -362,7 +362,7 @@ def prepare_study(
         asked.refuse(["patterns"], f"on the study {name}, which has its own")
     if asked.scheduler is not None:
         asked.refuse(["jobs"], "with a scheduler, whose machines have processes of their own")
-    where = Where(Shard.of(asked.shard), asked.jobs, asked.scheduler)
+    where = Where(shard_of(asked.shard), asked.jobs, asked.scheduler)
     _check_setup(scope, place)
     return partial(run_experiment, name, scope, Path(output), job or Job(), where)
 

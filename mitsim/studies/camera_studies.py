@@ -175,7 +175,7 @@ _FOCUSED = {NONE: "factors as calibrated", AUTO: "depth found (--focus auto)", O
 
 
 def _depth_points(scope: Scope) -> Sequence[Point]:
-    setups = [scope.setup.with_print(name) for name in scope.choose(scope.pictures, scope.pictures[:1])]
+    setups = [replace(scope.setup, picture=name) for name in scope.choose(scope.pictures, scope.pictures[:1])]
     seed, depths = scope.seeds[0], scope.choose(DEPTHS_MM, (395.0, CALIBRATED_MM))
     ideal = [
         Point.of(setup, model=IDEALISED, patterns="dots:7", seed=seed, depth=depth, baseline=baseline)

@@ -33,7 +33,7 @@ from mitsim.sensor.camera_fit import FoundCamera, Pixels, Places, nonuniform, sa
 from mitsim.sensor.chain import dark_current_variance, expose, mean_dark_current, response_variance
 from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, MOST_FITTED, SPLIT, Alike, Session, alike, figures, pairs_of
 from mitsim.studies.framework.campaign import study_folder, write_figures
-from mitsim.studies.framework.panels import Part, Section, text_table, write_page
+from mitsim.studies.framework.panels import Part, Section, write_page
 
 CAMERA_FILE = "camera.toml"
 MOST_OFF = 5.0
@@ -482,7 +482,7 @@ class Characterisation:
         if self.output:
             lines.append(f"Page, plots, JSON and the camera found, camera.toml: {self.output}")
         for part in self.parts:
-            lines += [*text_table(part.head, part.rows), *part.notes, ""]
+            lines += [*part.lines(), ""]
         return lines[:-1]
 
 

@@ -353,7 +353,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         raise MitsimError('study drift: drift of a session is studied for signed_capture = "pair"; change the recipe')
     if any(kind in _RIPPLES for kind in amounts):  # refused before any light is traced
         load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml", CAMERA)).known_line_time_s()
-    sheet = scope.setup.with_print(TEST_IMAGES[0])
+    sheet = replace(scope.setup, picture=TEST_IMAGES[0])
     lamp, own = replace(sheet, scene=_LAMP_SCENE).with_parameters(lamp=_LAMP), scope.pictures == (None,)
     found = [
         Point.of(

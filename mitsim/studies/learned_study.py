@@ -98,7 +98,7 @@ def network_of(studio: Studio, point: Point, training: str, method: str, pattern
     from mitsim.learn.pair_store import PairStore
     from mitsim.learn.training import train_network
 
-    setup, count, noise = middle(studio, point.setup.with_print(None)), int(point["pairs"]), int(point["noise"])
+    setup, count, noise = middle(studio, replace(point.setup, picture=None)), int(point["pairs"]), int(point["noise"])
 
     def write_pairs(folder: Path) -> None:
         mask = {"mask_rows_um": (-4.0, 4.0), "mask_columns_um": (-4.0, 4.0)}  # 4 um move the image as 5 mm of depth do
@@ -122,7 +122,7 @@ def images_of(studio: Studio, point: Point) -> Found:
     """Return a row and an image of the best classical method and of each network, of one print at one place."""
     patterns, noise = str(point["patterns"]), int(point["noise"])
     lit = studio.lit_scene(middle(studio, point.setup, str(point["place"])))
-    factors = studio.factors(middle(studio, point.setup.with_print(None)), noise)
+    factors = studio.factors(middle(studio, replace(point.setup, picture=None)), noise)
     frames = lit.rendered_frames(factors, lit.bench.family(patterns, noise), noise)
     family = frames.family.left.astype(np.float64), frames.family.right.astype(np.float64)
     plain = SOLVERS[TIKHONOV].init(factors, family)
@@ -251,7 +251,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         for patterns, training, method, seed in product(families, (ONE, VARIED), METHODS, seeds)
     ]
     shown = [
-        Point.of(scope.setup.with_print(name), place=place, patterns=patterns, **shared)
+        Point.of(replace(scope.setup, picture=name), place=place, patterns=patterns, **shared)
         for patterns, name, place in product(families, scope.pictures, (SAME, DEEPER))
     ]
     return [*networks, *shown]

@@ -337,7 +337,7 @@ def _convolutional_points(scope: Scope) -> Sequence[Point]:
     setup, found = replace(scope.setup, parameters=tuple(sorted(parameters.items()))), []
     psfs = [(MEASURED, measured)] * (measured is not None) + [(TRACED, None)]
     for name, (psf, file), seed, k in product(scope.pictures, psfs, scope.seeds, scope.choose(PERIODS, (1, 7))):
-        at = partial(Point.of, setup.with_print(name), psf=psf, file=file, patterns=k * k, seed=seed)
+        at = partial(Point.of, replace(setup, picture=name), psf=psf, file=file, patterns=k * k, seed=seed)
         raced = name == scope.pictures[0] and seed == scope.seeds[0]
         found += [at(part="quality"), *([at(part="speed")] if raced else [])]
     return found

@@ -99,9 +99,13 @@ _LAST = {"way": IN_ORDER, "effect": EFFECTS[-1]}
 
 def _points(scope: Scope) -> Sequence[Point]:
     pictures = [name for name in scope.pictures if name in (*QUICK_IMAGES, None)] or list(scope.pictures)
-    setups, ways = map(scope.setup.with_print, scope.choose(pictures, pictures[:1])), scope.choose(WAYS, WAYS[:2])
-    fixed = {"patterns": ("dots:7",)}
-    return Point.grid(setups, "patterns seed way effect", seed=scope.repeats, way=ways, effect=EFFECTS, **fixed)
+    return [
+        Point.of(replace(scope.setup, picture=name), patterns="dots:7", seed=seed, way=way, effect=effect)
+        for name in scope.choose(pictures, pictures[:1])
+        for seed in scope.repeats
+        for way in scope.choose(WAYS, WAYS[:2])
+        for effect in EFFECTS
+    ]
 
 
 def _measure(studio: Studio, point: Point) -> Found:

@@ -13,11 +13,11 @@ import tempfile
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatch
-from functools import cache, partial
+from functools import cache
 from itertools import groupby
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -37,20 +37,11 @@ from mitsim.core.files import (
     whole_file,
     write_json,
     write_text,
-)  # fmt: skip
+)
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
-from mitsim.studies.framework.experiment import (
-    HEADS,
-    Claim,
-    Found,
-    Point,
-    Results,
-    Scope,
-    Study,
-    find_experiment,
-)  # fmt: skip
+from mitsim.studies.framework.experiment import HEADS, Claim, Found, Point, Results, Scope, find_experiment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,8 +77,11 @@ class StudyResult:
                 f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
                 "Join all parts with: mitsim study merge PART... -o FOLDER",
             ]
-        heads = self.section.heads if self.section else HEADS
-        lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
+        heads, lines = self.section.heads if self.section else HEADS, []
+        for each in self.claims:
+            figures = zip(heads, (each.paper, each.idealised, each.rendered), strict=True)
+            stated = ", ".join(f"{head.lower()} {figure}" for head, figure in figures if figure)
+            lines.append(f"{each.verdict}: {each.claim} ({stated})")
         return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
 
     def to_pandas(self) -> Any:
@@ -174,18 +168,6 @@ class Store:
                 f"file {path}: cannot be read as a point of a study ({error}); remove it and run again"
             ) from error
 
-    def take(self, other: Path) -> None:
-        for file in sorted(other.glob("*.npz")):
-            if not (self.folder / file.name).exists():
-                check_plain(file)
-                with whole_file(self.folder / file.name) as part:
-                    shutil.copyfile(file, part)
-
-    def results(self, points: Iterable[Point]) -> Results:
-        found = {point.key: self.load(point) for point in points}
-        rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
-        return Results(rows, {(key, name): array for key, each in found.items() for name, array in each.arrays.items()})
-
     def _file(self, point: Point) -> Path:
         return self.folder / f"{point.key}.npz"
 
@@ -200,24 +182,12 @@ def batches(points: Sequence[Point], kept: bool = False) -> list[Batch]:
     return [tuple(group) for _, group in groupby(points, key=lambda point: point.setup)]
 
 
-@dataclass(frozen=True)
-class Shard:
-    """Part ``number`` of ``count``, from 1, of a study that several jobs of a cluster share."""
-
-    number: int = 1
-    count: int = 1
-
-    @classmethod
-    def of(cls, text: str) -> Shard:
-        """Parse a text such as 2/8; MitsimError for anything else."""
-        number, slash, count = text.partition("/")
-        if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-            raise MitsimError(f"--shard {text!r}: give I/N with I from 1 to N, such as 1/4")
-        return cls(int(number), int(count))
-
-    def part(self, points: Sequence[Point], kept: bool = False) -> list[Point]:
-        """Return the points of every ``count``-th batch, because a batch's light is traced once."""
-        return [point for batch in batches(points, kept)[self.number - 1 :: self.count] for point in batch]
+def shard_of(text: str) -> tuple[int, int]:
+    """Parse a part and the number of parts, such as 2/8; MitsimError for anything else."""
+    number, slash, count = text.partition("/")
+    if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise MitsimError(f"--shard {text!r}: give I/N with I from 1 to N, such as 1/4")
+    return int(number), int(count)
 
 
 # -------- A study of many points
@@ -225,9 +195,12 @@ class Shard:
 
 @dataclass(frozen=True)
 class Where:
-    """Part of the points, and local processes or the Dask scheduler that measure it."""
+    """Part of the points, and local processes or the Dask scheduler that measure it.
 
-    shard: Shard = field(default_factory=Shard)
+    A ``shard`` (number from 1, count) has every ``count``-th batch, because a batch's light is traced once.
+    """
+
+    shard: tuple[int, int] = (1, 1)
     jobs: int | None = None
     scheduler: str | None = None
     shared: str | None = None
@@ -252,28 +225,30 @@ def run_experiment(
             return _all(scope, output, lambda name, folder: run_experiment(name, scope, folder, job, together))
     if study in EXPERIMENTS:
         check_study_folder(output, study)  # before the module of the study is imported
-    experiment, started = find_experiment(study), time.perf_counter()
-    points = experiment.points(scope)
-    own = where.shard.part(points, experiment.kept)
+    experiment, (number, count) = find_experiment(study), where.shard
+    own = batches(experiment.points(scope), experiment.kept)[number - 1 :: count]
     # Before there is a folder.
-    for setup in dict.fromkeys(point.setup for point in own):
+    for setup in dict.fromkeys(batch[0].setup for batch in own):
         check_scene(setup.scene, dict(setup.parameters), setup.outside)
-    with _campaign(study, experiment, scope, output) as (folder, store):
-        todo = [point for point in own if not store.has(point)]
+
+    def measure(store: Store) -> None:
+        parts = [tuple(point for point in batch if not store.has(point)) for batch in own]
+        parts, shared, started = [part for part in parts if part], where.shared, time.perf_counter()
         if experiment.kept:
-            (folder / KEPT).mkdir(exist_ok=True)
-            where = replace(where, shared=str(folder / KEPT))
-        parts = batches(todo, experiment.kept)
-        if where.scheduler is not None and todo:
+            shared = str(store.folder.parent / KEPT)
+            Path(shared).mkdir(exist_ok=True)
+        if where.scheduler is not None and parts:
             measured = on_cluster(study, parts, where.scheduler)
         else:
-            measured = in_processes(study, parts, where.jobs or workers(), where.shared)
+            measured = in_processes(study, parts, where.jobs or workers(), shared)
+        todo = sum(map(len, parts))
         for done, (point, found) in enumerate(measured, start=1):
             store.save(point, found)
-            left = (time.perf_counter() - started) / done * (len(todo) - done)
+            left = (time.perf_counter() - started) / done * (todo - done)
             text = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
-            job.progress(f"{study}: {done} of {len(todo)} points, {text} left", done / len(todo))
-        return _finish(study, experiment, scope, points, store, time.perf_counter() - started)
+            job.progress(f"{study}: {done} of {todo} points, {text} left", done / todo)
+
+    return _complete(study, scope, output, measure)
 
 
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> StudyResult:
@@ -282,7 +257,7 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
     ``experiment`` is the module of a user's own study. MitsimError for parts of different or unknown studies, parts
     that hold none, and an output that holds something else.
     """
-    started, heads = time.perf_counter(), [_head(Path(part)) for part in parts]
+    heads = [_head(Path(part)) for part in parts]
     if not heads:
         raise MitsimError("study merge: give the folders of the parts")
     for part, head in zip(parts, heads, strict=True):
@@ -309,12 +284,15 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
         return _all(
             scope, output, lambda name, folder: merge([Path(part) / name for part in parts], folder, experiment)
         )
-    found = find_experiment(study)
-    points = found.points(scope)  # refuses an impossible scope before there is a folder
-    with _campaign(study, found, scope, output) as (_, store):
-        for part in parts:
-            store.take(Path(part) / POINTS)
-        return _finish(study, found, scope, points, store, time.perf_counter() - started)
+
+    def copy(store: Store) -> None:
+        for file in (file for part in parts for file in sorted((Path(part) / POINTS).glob("*.npz"))):
+            if not (store.folder / file.name).exists():
+                check_plain(file)
+                with whole_file(store.folder / file.name) as copied:
+                    shutil.copyfile(file, copied)
+
+    return _complete(study, scope, output, copy)
 
 
 def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResult]) -> StudyResult:
@@ -340,40 +318,39 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
         return result
 
 
-@contextmanager
-def _campaign(study: str, experiment: Study, scope: Scope, output: Path | str) -> Iterator[tuple[Path, Store]]:
-    name = experiment.name
+def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Store], None]) -> StudyResult:
+    """Fill a study's folder with points, and write table, claims, figures and page if no point is missing."""
+    from mitsim.studies.framework.panels import section_of, write_page
+
+    experiment, started = find_experiment(study), time.perf_counter()
+    name, points = experiment.name, experiment.points(scope)  # refuses an impossible scope before there is a folder
     with study_folder(output, name) as folder:
-        head = folder / f"{name}.json"
+        head, store = folder / f"{name}.json", Store(folder / POINTS)
         if head.exists() and (made := read_json(head).get("versions")) != versions():
             raise MitsimError(
                 f"output {folder}: its points were measured by other versions ({made}); choose another folder"
             )
-        (folder / POINTS).mkdir(exist_ok=True)
-        sweep(folder / POINTS)  # half-written files of killed processes
+        store.folder.mkdir(exist_ok=True)
+        sweep(store.folder)  # half-written files of killed processes
         _write_head(folder, name, study, scope, status="incomplete")
-        yield folder, Store(folder / POINTS)
-
-
-def _finish(
-    study: str, experiment: Study, scope: Scope, points: Sequence[Point], store: Store, seconds: float
-) -> StudyResult:
-    from mitsim.studies.framework.panels import section_of, write_page
-
-    folder, there, name = store.folder.parent, sum(map(store.has, points)), experiment.name
-    result = StudyResult(study, str(folder), points=there, missing=len(points) - there, seconds=seconds)
-    if result.missing:
-        return result
-    results = replace(store.results(points), scope=scope)
-    claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
-    write_text(folder / f"{name}.csv", results.frame.to_csv(index=False))
-    section = section_of(experiment, study, claims, figures, results)
-    write_page([section], folder / f"{name}.html", section.title)
-    result = replace(
-        result, rows=tuple(map(dict, results.rows)), claims=claims, figures=tuple(figures), section=section,
-        warnings=section.warnings,
-    )  # fmt: skip
-    _write_head(folder, name, study, scope, status="complete", **result.payload())
+        fill(store)
+        there = sum(map(store.has, points))
+        took, missing = time.perf_counter() - started, len(points) - there
+        result = StudyResult(study, str(folder), points=there, missing=missing, seconds=took)
+        if result.missing:
+            return result
+        found = {point.key: store.load(point) for point in points}
+        rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
+        arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
+        results = Results(rows, arrays, scope)
+        claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
+        write_text(folder / f"{name}.csv", results.frame.to_csv(index=False))
+        section = section_of(experiment, study, claims, figures, results)
+        write_page([section], folder / f"{name}.html", section.title)
+        result = replace(
+            result, rows=rows, claims=claims, figures=tuple(figures), section=section, warnings=section.warnings
+        )
+        _write_head(folder, name, study, scope, status="complete", **result.payload())
     return result
 
 
@@ -412,8 +389,14 @@ class _LazyStudio:
         return getattr(_open(self.shared), name)
 
 
-def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
-    return find_experiment(name).measure(cast("Studio", _LazyStudio(shared)), point)
+def measure_batch(name: str, batch: Batch, shared: str | None = None) -> Iterator[tuple[Point, Found | str]]:
+    """Yield each point of a ``batch`` with its findings, or with the refusal that ends the batch."""
+    for point in batch:
+        try:
+            yield point, find_experiment(name).measure(cast("Studio", _LazyStudio(shared)), point)
+        except MitsimError as error:
+            yield point, str(error)
+            return
 
 
 def in_processes(
@@ -426,12 +409,15 @@ def in_processes(
     waiting, tries = deque(batches), dict[Point, int]()
     # Processes are ended, not asked to end: the files in their temporary folder go with it.
     with tempfile.TemporaryDirectory(prefix="mitsim-study-") as scratch:
-        crew = [_Worker(name, (scratch, shared or scratch)) for _ in range(min(jobs, len(batches)))]
+        folders = scratch, shared or scratch
+        crew = [_Worker(name, folders) for _ in range(min(jobs, len(batches)))]
         try:
             while True:
                 for worker in crew:
                     if not worker.left and waiting:
-                        worker.give(waiting.popleft())
+                        worker.left = deque(waiting.popleft())
+                        with suppress(OSError):  # it died, which is noticed when its answer is read
+                            worker.pipe.send(tuple(worker.left))
                 busy = [worker for worker in crew if worker.left]
                 if not busy:
                     return
@@ -452,7 +438,7 @@ def in_processes(
                                 "--jobs 1"
                             ) from None
                         waiting.appendleft(tuple(worker.left))
-                        crew[crew.index(worker)] = _Worker(name, worker.folders)
+                        crew[crew.index(worker)] = _Worker(name, folders)
                         continue
                     if isinstance(answer, str):
                         raise MitsimError(answer)
@@ -465,18 +451,15 @@ def in_processes(
 
 
 class _Worker:
+    """Process that measures the points ``left`` of its batch."""
+
     def __init__(self, name: str, folders: tuple[str, str]) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.folders, self.left = folders, deque[Point]()
+        self.left = deque[Point]()
         self.process = context.Process(target=_serve, args=(name, folders, theirs), daemon=True)
         self.process.start()
         theirs.close()  # so that its death ends the pipe
-
-    def give(self, batch: Batch) -> None:
-        self.left = deque(batch)
-        with suppress(OSError):  # it died, which is noticed when its answer is read
-            self.pipe.send(batch)
 
 
 def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
@@ -484,12 +467,8 @@ def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
     warnings.showwarning = lambda message, *_: say_note(str(message))
     with suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
-            for point in pipe.recv():
-                try:
-                    pipe.send(measure_point(name, point, shared))
-                except MitsimError as error:
-                    pipe.send(str(error))
-                    break
+            for _, answer in measure_batch(name, pipe.recv(), shared):
+                pipe.send(answer)
 
 
 def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tuple[Point, Found]]:
@@ -506,18 +485,8 @@ def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tu
     except (OSError, ValueError) as error:
         raise MitsimError(f"--scheduler {address}: no Dask scheduler answers there ({error})") from error
     with client:
-        for task in as_completed(client.map(partial(_batch, name), batches, pure=False)):
-            found, refusal = task.result()
-            yield from found
-            if refusal:
-                raise MitsimError(refusal)
-
-
-def _batch(name: str, batch: Batch) -> tuple[list[tuple[Point, Found]], str]:
-    found = []
-    for point in batch:
-        try:
-            found.append((point, measure_point(name, point)))
-        except MitsimError as error:
-            return found, str(error)
-    return found, ""
+        for task in as_completed(client.map(lambda batch: [*measure_batch(name, batch)], batches, pure=False)):
+            for point, answer in task.result():
+                if isinstance(answer, str):
+                    raise MitsimError(answer)
+                yield point, answer

@@ -11,8 +11,10 @@ A claim is judged for each model and exposure that were measured, and confirmed 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import MitsimError
@@ -116,23 +118,20 @@ def every(*holds: Holds) -> Holds:
     return None if None in holds else True
 
 
-def verdict(holds: Holds) -> str:
-    return UNDECIDED if holds is None else CONFIRMED if holds else NOT_CONFIRMED
+def tally(claims: Sequence[Claim]) -> str:
+    """Return how many claims are confirmed, in part or not, in words."""
+    part, open_ = "confirmed in part", "not decided"
+    counts = Counter(
+        each if each in (CONFIRMED, NOT_CONFIRMED) else part if each.startswith(CONFIRMED) else open_
+        for each in (claim.verdict for claim in claims)
+    )
+    kinds = [f"{counts[kind]} {kind}" for kind in (CONFIRMED, part, NOT_CONFIRMED, open_) if counts[kind]]
+    return f"{len(claims)} claim{'s' * (len(claims) > 1)}: {', '.join(kinds)}" if claims else ""
 
 
-def verdict_at(places: Mapping[str, Holds]) -> str:
-    holding = [name for name, holds in places.items() if holds]
-    if len(holding) in (0, len(places)):
-        # Undecided at one place and failing at another: the claim may still hold at the first.
-        return verdict(True if holding else None if None in places.values() else False)
-    undecided = [name for name, holds in places.items() if holds is None]
-    rest = f", {UNDECIDED} at {' and '.join(undecided)}" if undecided else ""
-    return f"confirmed only at {' and '.join(holding)}{rest}"
-
-
-def value_name(column: str, value: Any) -> str:
+def value_name(column: str, value: Any, pattern_name: Callable[[str], str] = in_text) -> str:
     if column == "patterns" and str(value).partition(":")[0] in FAMILIES:
-        return in_text(str(value))
+        return pattern_name(str(value))
     return f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
 
 
@@ -149,8 +148,8 @@ _SHOWN = 4
 
 
 @dataclass(frozen=True)
-class Statement:
-    """A claim as a study declares it.
+class Level:
+    """Claim that the mean of a ``column`` lies in a range from ``at_least`` to ``at_most`` [``unit``].
 
     Attributes
     ----------
@@ -176,50 +175,66 @@ class Statement:
     every: str = ""
     optional: bool = False
     models: tuple[str, str, str] = ("model", IDEALISED, RENDERED)
-
-    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        raise NotImplementedError
+    column: str = "psnr_db"
+    unit: str = "dB"
+    at_least: float = -math.inf
+    at_most: float = math.inf
 
     def judge(self, results: Results) -> list[Claim]:
         rows = choose_rows(results.frame, self.where)
+        if self.optional and any(side.empty for side in self.sides(rows)):
+            return []
         if rows.empty:
-            if self.optional:
-                return []
             raise MitsimError(f"study: nothing was measured of the claim {self.claim!r}")
         if not self.each:
             return [self._judge(rows, self.claim)]
-        return [
-            self._judge(
-                choose_rows(rows, {self.each: value}), self.claim.format(**{self.each: value_name(self.each, value)})
-            )
-            for value in distinct(rows, self.each)
-        ]
+        sentences = {
+            value: self.claim.format(**{self.each: value_name(self.each, value)}) for value in distinct(rows, self.each)
+        }
+        return [self._judge(choose_rows(rows, {self.each: value}), claim) for value, claim in sentences.items()]
 
-    @property
-    def _compared(self) -> frozenset[str]:
-        return frozenset()
+    def sides(self, rows: DataFrame) -> tuple[DataFrame, ...]:
+        return (rows,)
 
-    def _judge(self, rows: DataFrame, claim: str) -> Claim:
+    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
+        """Return the figures in words, whether the claim holds for ``rows``, and the distance from the border."""
+        mean = mean_of(rows, self.column)
+        return self._decide(with_unit(mean, self.unit), mean)
+
+    def _decide(self, text: str, mean: Mean) -> tuple[str, Holds, float]:
+        margin = min(mean.value - self.at_least, self.at_most - mean.value)
+        return text, within(mean, self.at_least, self.at_most), margin
+
+    def _judge(self, rows: DataFrame, claim: str, compared: Collection[str] = ()) -> Claim:
+        """Judge ``rows`` by model and exposure, unless the claim has ``compared`` them."""
         column, *both = self.models
-        known, exposures = ([] if each in self._compared else distinct(rows, each) for each in (column, "exposure"))
-        models, exposures = [model for model in both if model in known] or both[1:], exposures or [None]
-        found: dict[tuple[str, Any], tuple[str, Any]] = {}
-        for model in models:
-            own = choose_rows(rows, {column: model} if model in known else {})
-            for each in exposures:
-                found[model, each] = self._found(own if each is None else choose_rows(own, {"exposure": each}))
-        figures = dict.fromkeys(both, "")
-        for model in models:
-            texts = (found[model, each][0] if len(exposures) == 1 else f"{each}: {found[model, each][0]}"
-                     for each in exposures)  # fmt: skip
-            figures[model] = "; ".join(texts)
-        decided = verdict_at({str(each): every(*(found[model, each][1] for model in models)) for each in exposures})
-        if decided in (NOT_CONFIRMED, UNDECIDED) and len(models) > 1:
+        known = {name: [] if name in compared else distinct(rows, name) for name in (column, "exposure")}
+        models, exposures = [model for model in both if model in known[column]] or both[1:], known["exposure"] or [None]
+        found: dict[tuple[str, Any], tuple[str, Holds]] = {}
+        for model, exposure in product(models, exposures):
+            where = {column: model} if model in known[column] else {}
+            found[model, exposure] = self._found(choose_rows(rows, where if exposure is None else where | {
+                "exposure": exposure}))  # fmt: skip
+        figures = {
+            model: "; ".join(
+                found[model, each][0] if len(exposures) == 1 else f"{each}: {found[model, each][0]}"
+                for each in exposures
+            )
+            for model in models
+        }
+        places = {str(each): every(*(found[model, each][1] for model in models)) for each in exposures}
+        holding = [name for name, holds in places.items() if holds]
+        undecided = [name for name, holds in places.items() if holds is None]
+        if 0 < len(holding) < len(places):
+            rest = f", {UNDECIDED} at {' and '.join(undecided)}" if undecided else ""
+            decided = f"confirmed only at {' and '.join(holding)}{rest}"
+        else:  # undecided at one place and failing at another: the claim may still hold at the first
+            decided = CONFIRMED if holding else UNDECIDED if undecided else NOT_CONFIRMED
+        if not holding and len(models) > 1:
             by_model = {model: every(*(found[model, each][1] for each in exposures)) for model in models}
-            holding = [model for model, holds in by_model.items() if holds]
-            rest = [f", {other} {UNDECIDED}" for other, holds in by_model.items() if holds is None]
-            decided = f"confirmed only {holding[0]}{''.join(rest)}" if holding else decided
-        return Claim(claim, self.paper, figures[both[0]], figures[both[1]], decided)
+            rest = "".join(f", {other} {UNDECIDED}" for other, holds in by_model.items() if holds is None)
+            decided = next((f"confirmed only {model}{rest}" for model, holds in by_model.items() if holds), decided)
+        return Claim(claim, self.paper, *(figures.get(model, "") for model in both), decided)
 
     def _found(self, rows: DataFrame) -> tuple[str, Holds]:
         if not self.every:
@@ -236,31 +251,7 @@ class Statement:
 
 
 @dataclass(frozen=True)
-class _Range(Statement):
-    """Claim that a quantity of a ``column`` lies in a range [``unit``]."""
-
-    _: KW_ONLY
-    column: str = "psnr_db"
-    unit: str = "dB"
-    at_least: float = -math.inf
-    at_most: float = math.inf
-
-    def _decide(self, text: str, mean: Mean) -> tuple[str, Holds, float]:
-        margin = min(mean.value - self.at_least, self.at_most - mean.value)
-        return text, within(mean, self.at_least, self.at_most), margin
-
-
-@dataclass(frozen=True)
-class Level(_Range):
-    """Claim that the mean of a ``column`` lies in a range from ``at_least`` to ``at_most`` [``unit``]."""
-
-    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        mean = mean_of(rows, self.column)
-        return self._decide(with_unit(mean, self.unit), mean)
-
-
-@dataclass(frozen=True)
-class Gain(_Range):
+class Gain(Level):
     """Claim that some images exceed others by an amount in a range, compared print by print.
 
     Attributes
@@ -283,35 +274,27 @@ class Gain(_Range):
     apart: bool = False
     other_error: str = ""
 
-    @property
-    def _compared(self) -> frozenset[str]:
-        return frozenset({*_chosen(self.one), *_chosen(self.other)})
+    def sides(self, rows: DataFrame) -> tuple[DataFrame, ...]:
+        return choose_rows(rows, self.one), choose_rows(rows, self.other)
 
-    def judge(self, results: Results) -> list[Claim]:
-        one, other, _ = self._parts(choose_rows(results.frame, self.where))
-        return [] if self.optional and (one.empty or other.empty) else super().judge(results)
-
-    def _parts(self, rows: DataFrame) -> tuple[DataFrame, DataFrame, str]:
-        return choose_rows(rows, self.one), choose_rows(rows, self.other), self.other_column or self.column
-
-    def _judge(self, rows: DataFrame, claim: str) -> Claim:
-        judged = super()._judge(rows, claim)
+    def _judge(self, rows: DataFrame, claim: str, compared: Collection[str] = ()) -> Claim:
+        judged = super()._judge(rows, claim, {*_chosen(self.one), *_chosen(self.other)})
         if not self.apart:
             return judged
-        one, other, other_column = self._parts(rows)
-        before = mean_of(other, other_column, error_column=self.other_error)
+        one, other = self.sides(rows)
+        before = mean_of(other, self.other_column or self.column, error_column=self.other_error)
         after = with_unit(mean_of(one, self.column), self.unit)
         return replace(judged, idealised=with_unit(before, self.unit), rendered=after)
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
-        one, other, other_column = self._parts(rows)
+        (one, other), other_column = self.sides(rows), self.other_column or self.column
         gain = mean_of(one, self.column, other, other_column)
         means = with_unit(mean_of(one, self.column), self.unit), with_unit(mean_of(other, other_column), self.unit)
         return self._decide(f"{' against '.join(means)}, {with_unit(gain, self.unit, '+')}", gain)
 
 
 @dataclass(frozen=True)
-class Judged(Statement):
+class Judged(Level):
     """Claim that a function decides from the rows of one model and exposure."""
 
     decide: Callable[[DataFrame], tuple[str, Any]]

@@ -11,7 +11,7 @@ import importlib.util
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from itertools import product
@@ -74,9 +74,6 @@ class Setup:
         new = {**dict(self.parameters), **{name: f"{value}" for name, value in parameters.items()}}
         return replace(self, parameters=tuple(sorted(new.items())))
 
-    def with_print(self, picture: str | None) -> Setup:
-        return replace(self, picture=picture)
-
 
 @dataclass(frozen=True)
 class Point:
@@ -88,15 +85,6 @@ class Point:
     @classmethod
     def of(cls, setup: Setup, **values: Value) -> Point:
         return cls(setup, tuple(values.items()))
-
-    @classmethod
-    def grid(cls, setups: Iterable[Setup], columns: str, **varied: Sequence[Value]) -> list[Point]:
-        """Return all combinations of the ``varied`` values at each setup, the last value fastest; ``columns`` orders
-        the names.
-        """
-        names = columns.split()
-        chosen = [dict(zip(varied, values, strict=True)) for values in product(*varied.values())]
-        return [cls.of(setup, **{name: values[name] for name in names}) for setup in setups for values in chosen]
 
     def __getitem__(self, name: str) -> Any:
         return dict(self.values)[name]
@@ -187,20 +175,29 @@ class Axes:
     kept: Callable[[Mapping[str, Value]], bool] | None = None
 
     def __call__(self, scope: Scope) -> list[Point]:
-        scene, values = ({name: self._values(name, all_, scope) for name, all_ in axis.items()} for axis in
-                         (self.scene, self.values))  # fmt: skip
-        prints = self._values("picture", self.prints, scope) if self.prints else scope.pictures
+        def chosen(name: str, everything: Sequence[Any]) -> tuple[Any, ...]:
+            return scope.choose(everything, self.quick.get(name, everything))
+
+        def combinations(axes: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+            each = product(*(chosen(name, values) for name, values in axes.items()))
+            return [dict(zip(axes, values, strict=True)) for values in each]
+
+        prints = chosen("picture", self.prints or scope.pictures)
         prints = scope.choose(prints, prints[: self.quick_prints])
-        parameters = [dict(zip(scene, chosen, strict=True)) for chosen in product(*scene.values())]
         own = self.default is None or scope.pictures == (None,)
         setup = scope.setup if own else replace(scope.setup, scene=str(self.default))
-        setups = [setup.with_parameters(**each).with_print(name) for each in parameters for name in prints]
-        varied = {"seed": scope.repeats if self.repeats else scope.seeds, **values}
-        points = Point.grid(setups, " ".join([*values, "seed"]), **varied)
+        setups = [
+            replace(setup, picture=name).with_parameters(**parameters)
+            for parameters in combinations(self.scene)
+            for name in prints
+        ]
+        points = [
+            Point.of(each, **values, seed=seed)
+            for each in setups
+            for seed in (scope.repeats if self.repeats else scope.seeds)
+            for values in combinations(self.values)
+        ]
         return [point for point in points if self.kept is None or self.kept(dict(point.values))]
-
-    def _values(self, name: str, everything: Sequence[Any], scope: Scope) -> tuple[Any, ...]:
-        return scope.choose(everything, self.quick.get(name, everything))
 
 
 # -------- Results
@@ -262,10 +259,6 @@ class Claim:
     idealised: str
     rendered: str
     verdict: str
-
-    def figures_text(self, heads: tuple[str, str, str]) -> str:
-        figures = zip((self.paper, self.idealised, self.rendered), heads, strict=True)
-        return ", ".join(f"{head.lower()} {figure}" for figure, head in figures if figure)
 
 
 @dataclass(frozen=True)

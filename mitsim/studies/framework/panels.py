@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -20,32 +20,19 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.files import write_text
-from mitsim.devices.patterns import FAMILIES
 from mitsim.report import label
 from mitsim.report.pages import DASH, Mean, page_figure, render_page
 from mitsim.studies.framework.claims import (
-    CONFIRMED,
-    NOT_CONFIRMED,
     Where,
     choose_rows,
     distinct,
     mean_of,
     measured,
+    tally,
     value_name,
     with_unit,
-)  # fmt: skip
-from mitsim.studies.framework.experiment import (
-    HEADS,
-    IMAGE,
-    KNOBS,
-    TEST_IMAGES,
-    TRUTH,
-    Claim,
-    Results,
-    Scope,
-    Setup,
-    Study,
-)  # fmt: skip
+)
+from mitsim.studies.framework.experiment import HEADS, IMAGE, KNOBS, TEST_IMAGES, TRUTH, Claim, Results, Setup, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,11 +95,9 @@ class Panel:
         for key in ((column, value), value):
             if not isinstance(self.names, str) and key in self.names:
                 return self.names[key]
-        if column == "patterns" and str(value).partition(":")[0] in FAMILIES:
-            return label(str(value))
         if value is None:
             return "scene" if column == "picture" else ""
-        return value_name(column, value)
+        return value_name(column, value, label)
 
     def combinations(self, rows: DataFrame, by: Columns) -> list[dict[str, Any]]:
         columns = [by] if isinstance(by, str) else list(by)
@@ -127,6 +112,17 @@ class Panel:
         chosen = self.combinations(rows, by) if by else [{}]
         return {self.joined(each): (choose_rows(rows, each), "") for each in chosen}
 
+    def cells(self, rows: DataFrame, first: Columns, second: Columns, column: str) -> dict[str, dict[str, Mean]]:
+        """Return the means of a ``column`` by the combinations of two lists of columns."""
+        return {
+            name: {
+                inner: mean_of(line, shown, error_column=self.errors.get(shown, ""))
+                for inner, (line, third) in self.parts(own, second).items()
+                if (shown := third or other or column) in line and line[shown].notna().any()
+            }
+            for name, (own, other) in self.parts(rows, first).items()
+        }
+
     def joined(self, values: Mapping[str, Any]) -> str:
         return ", ".join(filter(None, (self.name(*item) for item in values.items())))
 
@@ -136,7 +132,7 @@ def is_number(value: Any) -> bool:
         float(str(value))
     except ValueError:
         return False
-    return not isinstance(value, bool)
+    return True
 
 
 @dataclass(frozen=True)
@@ -166,30 +162,24 @@ class Lines(Panel):
     log: bool = False
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
+        from pandas import to_numeric
+
         from mitsim.report.plots import curves
 
         if rows.empty:
             return None
-        first = None if self.shared is None else choose_rows(rows, self.shared)
+        begin = rows[:0] if self.shared is None else choose_rows(rows, self.shared)
         shown: dict[str, dict[str, dict[float, Mean]]] = {}
-        for facet, (own, column) in self.parts(rows, self.facet).items():
-            begin = own[own.index.isin([] if first is None else first.index)]
-            shown[facet] = {
-                colour: self._means(begin, other or column or self.y) | self._means(line, other or column or self.y)
-                for colour, (line, other) in self.parts(own.drop(begin.index), self.colour).items()
-            }
+        for facet, (own, other) in self.parts(rows, self.facet).items():
+            shown[facet], first = {}, own.index.intersection(begin.index)
+            for colour, (line, third) in self.parts(own.drop(first), self.colour).items():
+                column, line = third or other or self.y, own.loc[first.append(line.index)]
+                line = line[to_numeric(line[column], errors="coerce").notna()] if column in line else line[:0]
+                shown[facet][colour] = {
+                    float(x): mean_of(choose_rows(line, {self.x: x}), column, error_column=self.errors.get(column, ""))
+                    for x in distinct(line, self.x)
+                }
         return curves(shown, self.x_label, self.y_label, log=self.log, title=self.title)
-
-    def _means(self, rows: DataFrame, column: str) -> dict[float, Mean]:
-        from pandas import to_numeric
-
-        if column not in rows:
-            return {}
-        rows = rows[to_numeric(rows[column], errors="coerce").notna()]
-        return {
-            float(value): mean_of(choose_rows(rows, {self.x: value}), column, error_column=self.errors.get(column, ""))
-            for value in distinct(rows, self.x)
-        }
 
 
 @dataclass(frozen=True)
@@ -216,17 +206,7 @@ class Bars(Panel):
 
         if rows.empty:
             return None
-        groups: dict[str, dict[str, Mean]] = {}
-        for group, (own, column) in self.parts(rows, self.rows).items():
-            parts = (
-                (bar, line, other or column or self.x) for bar, (line, other) in self.parts(own, self.colour).items()
-            )
-            groups[group] = {
-                bar: mean_of(line, shown, error_column=self.errors.get(shown, ""))
-                for bar, line, shown in parts
-                if shown in line and line[shown].notna().any()
-            }
-        groups = {group: bars for group, bars in groups.items() if bars}
+        groups = {group: bars for group, bars in self.cells(rows, self.rows, self.colour, self.x).items() if bars}
         if self.ordered:
             groups = dict(sorted(groups.items(), key=lambda item: -next(iter(item[1].values())).value))
         return grouped_bars(groups, self.x_label, self.title) if groups else None
@@ -242,21 +222,21 @@ class Pivot(Panel):
     value: str = "psnr_db"
 
     def parts_of(self, results: Results) -> list[Part]:
-        chosen, found = choose_rows(results.frame, self.where), []
+        chosen, found = choose_rows(results.frame, self.where), list[Part]()
+        shown = {name: column for column, name in self.columns.items()} if isinstance(self.columns, Mapping) else {}
+
+        def text(mean: Mean, head: str) -> str:
+            return with_unit(mean, "dB" if shown.get(head, self.value).endswith("_db") else "").removesuffix(" dB")
+
         for value in distinct(chosen, self.each) if self.each else [None]:
             own = choose_rows(chosen, {} if value is None else {self.each: value})
-            heads, lines = list(self.parts(own, self.columns)), []
-            for name, (line, _) in self.parts(own, self.rows).items():
-                cells, texts = self.parts(line, self.columns), []
-                for head in heads:
-                    rows, column = cells.get(head, (line[:0], ""))
-                    column = column or self.value
-                    known = column in rows and bool(rows[column].notna().any())
-                    unit = "dB" if column.endswith("_db") else ""
-                    texts.append(with_unit(mean_of(rows, column), unit).removesuffix(" dB") if known else DASH)
-                lines.append((name, *texts))
+            heads = list(self.parts(own, self.columns))
+            lines = tuple(
+                (name, *(text(cells[head], head) if head in cells else DASH for head in heads))
+                for name, cells in self.cells(own, self.rows, self.columns, self.value).items()
+            )
             title = ", ".join(filter(None, (self.title, "" if value is None else self.name(self.each, value))))
-            found += [Part(title, "", ("", *heads), tuple(lines))] if lines else []
+            found += [Part(title, "", ("", *heads), lines)] if lines else []
         return found
 
 
@@ -288,66 +268,64 @@ class Images(Panel):
     caption: str = "{psnr_db:.1f} dB"
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
+        from mitsim.report.plots import image_grid
+
         kept = {key for key, _ in results.arrays}
         rows = rows[rows["point"].isin(kept)] if "point" in rows else rows[:0]
-        shown: list[tuple[dict[str, Any], str, str]] = [({}, name, "") for name in self.before]
-        titles = list(self.before.values())
+        shown: list[tuple[dict[str, Any], str, str, str]] = [
+            ({}, name, "", title) for name, title in self.before.items()
+        ]
+        left_out = 0
         if isinstance(self.across, Mapping):
-            shown += [({}, name, caption) for name, (_, caption) in self.across.items()]
-            titles += [title for title, _ in self.across.values()]
-            count = len(titles)
+            shown += [({}, name, caption, title) for name, (title, caption) in self.across.items()]
         else:
             chosen = self.combinations(rows, self.across)
             if self.columns is not None:
                 chosen = [{str(self.across): value} for value in self.columns]
-            shown += [(each, self.array, self.caption) for each in _few(chosen)]
-            titles += [self.joined(each) for each in _few(chosen)]
-            count = len(self.before) + len(chosen)
+            shown += [(each, self.array, self.caption, self.joined(each)) for each in _few(chosen)]
+            left_out = len(chosen) - len(_few(chosen))
         groups = {self.joined(each): choose_rows(rows, each) for each in self.combinations(rows, self.down)}
-        grid = {name: [cell for each in shown for cell in _cells(results, own, *each)] for name, own in groups.items()}
-        grid = {name: cells for name, cells in grid.items() if len(cells) == len(titles)}
+        grid = {
+            name: [cell for each in shown for cell in self._cell(results, own, *each[:3])]
+            for name, own in groups.items()
+        }
+        grid = {name: cells for name, cells in grid.items() if len(cells) == len(shown)}
         if not grid:
             return None
-        sides = {"columns": (len(titles), count), "rows": (min(len(grid), _MOST_SHOWN), len(grid))}
+        sides = {"columns": (len(shown), len(shown) + left_out), "rows": (min(len(grid), _MOST_SHOWN), len(grid))}
         cut = ", ".join(f"{few} of {all_} {side}" for side, (few, all_) in sides.items() if few < all_)
-        title = f"{self.title}{f' ({cut})' if cut else ''}"
-        return grid_with_truths({name: grid[name] for name in _few(list(grid))}, titles, title)
+        title, titles = f"{self.title}{f' ({cut})' if cut else ''}", [each[3] for each in shown]
+        grid = {name: grid[name] for name in _few(list(grid))}
+        truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
+        alone = {name: [(image, caption) for image, _, caption in cells] for name, cells in grid.items()}
+        if any(len(truths[name]) < len(cells) for name, cells in grid.items()):
+            return image_grid(alone, titles, title)
+        if all(np.array_equal(own[0], other) for own in truths.values() for other in own):
+            beside = {name: [(truths[name][0], ""), *cells] for name, cells in alone.items()}
+            return image_grid(beside, ["truth", *titles], title)
+        above = {}
+        for name, cells in alone.items():
+            above[", ".join(filter(None, ("truth", name)))] = [(truth, "") for truth in truths[name]]
+            above[name or "image"] = cells
+        return image_grid(above, titles, title)
 
-
-Cell = tuple[FloatArray, FloatArray | None, str]
-
-
-def _cells(results: Results, rows: DataFrame, where: Where, array: str, caption: str) -> list[Cell]:
-    for row in choose_rows(rows, where).to_dict("records"):
-        image = results.array(row, array.format(**row))
-        if image is not None:
-            known = all(measured(row.get(name)) for _, name, kind, _ in Formatter().parse(caption) if kind and name)
-            text = caption.format(**row) if known else ""
-            flag = "\nflagged" if caption and row.get("flagged") is True else ""
-            return [(image, results.array(row, TRUTH) if array == IMAGE else None, text + flag)]
-    return []
+    def _cell(
+        self, results: Results, rows: DataFrame, where: Where, array: str, caption: str
+    ) -> Iterator[tuple[FloatArray, FloatArray | None, str]]:
+        """Yield image, truth and caption of the first row that has an image, if any."""
+        for row in choose_rows(rows, where).to_dict("records"):
+            image = results.array(row, array.format(**row))
+            if image is not None:
+                known = all(measured(row.get(name)) for _, name, kind, _ in Formatter().parse(caption) if kind and name)
+                text = caption.format(**row) if known else ""
+                flag = "\nflagged" if caption and row.get("flagged") is True else ""
+                yield image, results.array(row, TRUTH) if array == IMAGE else None, text + flag
+                return
 
 
 def _few(items: Sequence[Any]) -> list[Any]:
     count = min(len(items), _MOST_SHOWN)
     return [items[int(place)] for place in np.linspace(0, len(items) - 1, count).round()]
-
-
-def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], title: str) -> Figure:
-    from mitsim.report.plots import image_grid
-
-    truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
-    alone = {name: [(image, caption) for image, _, caption in cells] for name, cells in grid.items()}
-    if any(len(truths[name]) < len(cells) for name, cells in grid.items()):
-        return image_grid(alone, titles, title)
-    if all(np.array_equal(own[0], other) for own in truths.values() for other in own):
-        beside = {name: [(truths[name][0], ""), *cells] for name, cells in alone.items()}
-        return image_grid(beside, ["truth", *titles], title)
-    rows: dict[str, list[tuple[FloatArray, str]]] = {}
-    for name, cells in alone.items():
-        rows[", ".join(filter(None, ("truth", name)))] = [(truth, "") for truth in truths[name]]
-        rows[name or "image"] = cells
-    return image_grid(rows, titles, title)
 
 
 # -------- The page of a study
@@ -368,13 +346,15 @@ class Part:
         begins = re.compile(r"[+-]?\d|nothing$")
         return tuple(any(cells) and all(not cell or begins.match(cell) for cell in cells) for cells in columns)
 
-
-def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    table = [head, *rows] if rows else []
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    sides = [">" if right else "<" for right in Part("", rows=tuple(map(tuple, rows))).numeric]
-    return ["  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)).rstrip()
-            for row in table]  # fmt: skip
+    def lines(self) -> list[str]:
+        """Return the table as text, and the notes."""
+        table = [self.head, *self.rows] if self.rows else []
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        sides = [">" if right else "<" for right in self.numeric]
+        rows = [
+            [f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)] for row in table
+        ]
+        return [*("  ".join(row).rstrip() for row in rows), *self.notes]
 
 
 @dataclass(frozen=True)
@@ -402,20 +382,31 @@ def section_of(
     study: Study, name: str, claims: Sequence[Claim], figures: Mapping[str, Figure], results: Results
 ) -> Section:
     """Return the section of a study's page; ``name`` is the study's on the command line."""
-    scope = results.scope
+    scope, setup = results.scope, results.scope.setup
     prints = sorted({str(row.get("picture")) for row in results.rows} & set(TEST_IMAGES))
     of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
-    command = ["mitsim study", name, *([] if any(scope.pictures) else [scope.setup.scene]), *_options(scope)]
     accuracies = sorted({point.setup.accuracy for point in study.points(scope)} if study.traced else ())
     named = " or ".join(f"{each:g}" for each in accuracies)
     good = f"; frames before noise asked to be good to {named} (relative rms)" if accuracies else ""
-    images_first = sorted(figures, key=lambda file: not file.startswith("images"))
+    given: list[tuple[str, Any]] = [
+        ("--camera", setup.camera), ("--projector", setup.projector),
+        *(("-D", f"{name}={value}") for name, value in setup.parameters),
+        *(("--over", f"{name}={','.join(values)}") for name, values in scope.sweep),
+        ("--measure", ",".join(scope.measures)),
+        ("--patterns", scope.patterns if scope.patterns != type(scope).patterns else None),
+        ("--recipe", scope.recipe), ("--data", scope.data), ("--seed", scope.seeds[0]),
+        ("--variant", setup.variant if setup.variant != Setup.variant else None),
+    ]  # fmt: skip
+    flags = {"--allow-outside-files": setup.outside, "--quick": scope.quick}
+    options = [*(f"{option} {value}" for option, value in given if value), *(flag for flag, on in flags.items() if on)]
     return Section(
         study.name,
         title=study.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
         message=tally(claims),
         detail=study.question,
-        pictures={file: page_figure(figures[file]) for file in images_first},
+        pictures={
+            file: page_figure(figures[file]) for file in sorted(figures, key=lambda file: not file.startswith("images"))
+        },
         parts=tuple(study.parts(results)),
         claims=tuple(claims),
         heads=study.heads,
@@ -423,28 +414,16 @@ def section_of(
         note=study.note,
         about=study.about,
         count=f"{len(results.rows)} measurements{of}{good}",
-        command=" ".join(command),
+        command=" ".join(["mitsim study", name, *([] if any(scope.pictures) else [setup.scene]), *options]),
         quick=scope.quick,
         prints=len(prints),
     )
 
 
-def tally(claims: Sequence[Claim]) -> str:
-    part, open_ = "confirmed in part", "not decided"
-    counts = Counter(
-        each if each in (CONFIRMED, NOT_CONFIRMED) else part if each.startswith(CONFIRMED) else open_
-        for each in (claim.verdict for claim in claims)
-    )
-    kinds = [f"{counts[kind]} {kind}" for kind in (CONFIRMED, part, NOT_CONFIRMED, open_) if counts[kind]]
-    return f"{len(claims)} claim{'s' * (len(claims) > 1)}: {', '.join(kinds)}" if claims else ""
-
-
-_IMAGE = "point", "psnr_db", "exposure", "model", "picture", "condition", "method", "weight"
-
-
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     # An image may have many rows, such as a transfer function's.
-    rows = {tuple(map(row.get, _IMAGE)): row for row in results.rows if row.get("flagged") is not None}
+    image = "point", "psnr_db", "exposure", "model", "picture", "condition", "method", "weight"
+    rows = {tuple(map(row.get, image)): row for row in results.rows if row.get("flagged") is not None}
     found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]
     if not found:
         return ()
@@ -462,18 +441,3 @@ def write_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     page = render_page("study.html", title=title, message=message or title, sections=sections, versions=versions())
     write_text(path, page)
     return path
-
-
-def _options(scope: Scope) -> list[str]:
-    setup = scope.setup
-    given: list[tuple[str, Any]] = [
-        ("--camera", setup.camera), ("--projector", setup.projector),
-        *(("-D", f"{name}={value}") for name, value in setup.parameters),
-        *(("--over", f"{name}={','.join(values)}") for name, values in scope.sweep),
-        ("--measure", ",".join(scope.measures)),
-        ("--patterns", scope.patterns if scope.patterns != Scope.patterns else None),
-        ("--recipe", scope.recipe), ("--data", scope.data), ("--seed", scope.seeds[0]),
-        ("--variant", setup.variant if setup.variant != Setup.variant else None),
-    ]  # fmt: skip
-    flags = {"--allow-outside-files": setup.outside, "--quick": scope.quick}
-    return [f"{option} {value}" for option, value in given if value] + [flag for flag, on in flags.items() if on]

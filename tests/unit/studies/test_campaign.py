@@ -18,7 +18,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.studies.framework import campaign
-from mitsim.studies.framework.campaign import Shard, StudyResult, Where, merge, run_experiment
+from mitsim.studies.framework.campaign import StudyResult, Where, merge, run_experiment, shard_of
 from mitsim.studies.framework.experiment import Scope, Setup
 from mitsim.studies.framework.panels import write_page
 
@@ -103,7 +103,7 @@ def test_what_is_there_is_not_measured_again(run: Run, tmp_path: Path, whole: Wh
 def test_shards_share_the_points_and_merge_to_the_same(run: Run, tmp_path: Path, whole: Whole, count: int) -> None:
     parts = [tmp_path / f"part{number}" for number in range(count)]
     for number, part in enumerate(parts, start=1):
-        found = run(part.name, shard=Shard(number, count))
+        found = run(part.name, shard=(number, count))
         assert found.missing == 12 - found.points and not found.claims and "merge" in found.lines()[1]
     assert begun(tmp_path) == sorted(ALL), "each point in one part"
     joined = merge(parts, tmp_path / "joined", TOY)
@@ -119,7 +119,7 @@ def test_all_studies_are_sharded_and_merged_too(
     monkeypatch.setattr(campaign, "PAPER", (TOY,))
     parts = [tmp_path / f"part{number}" for number in (1, 2)]
     for number, part in enumerate(parts, start=1):
-        found = run_experiment("all", SCOPE, part, where=Where(Shard(number, 2), jobs=1))
+        found = run_experiment("all", SCOPE, part, where=Where((number, 2), jobs=1))
         assert found.missing == 6 and not (part / "all.html").exists()
     joined = merge(parts, tmp_path / "whole", TOY)
     assert not joined.missing and begun(tmp_path) == sorted(ALL)
@@ -280,8 +280,8 @@ def test_bad_folders_are_refused(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "a/b", "1/2/3", "-1/2", "1/0"])
 def test_a_shard_is_part_i_of_n(text: str) -> None:
     with pytest.raises(MitsimError, match="give I/N"):
-        Shard.of(text)
-    assert Shard.of("2/4") == Shard(2, 4)
+        shard_of(text)
+    assert shard_of("2/4") == (2, 4)
 
 
 @pytest.mark.slow

@@ -19,10 +19,8 @@ from mitsim.studies.framework.claims import (
     Level,
     choose_rows,
     distinct,
-    every,
     mean_of,
     measured,
-    verdict_at,
     within,
 )
 from mitsim.studies.framework.experiment import IMAGE, TRUTH, Axes, Results, Scope, Setup
@@ -189,15 +187,6 @@ def test_pairs_are_of_prints_or_of_seeds_of_one_print() -> None:
     assert mean_of(Results(one[:2]).frame, "x") == Mean(11.0, pytest.approx(1.0), 2)
     with pytest.raises(MitsimError, match="nothing was measured of x"):
         mean_of(Results(one[:2]).frame, "x", Results(other[2:]).frame)
-
-
-def test_a_claim_of_parts_and_of_places() -> None:
-    """(Planted: an undecided part passed over.)"""
-    assert [every(True, True), every(True, None), every(None, False)] == [True, None, False]
-    assert verdict_at({"peak": True, "frame": None}) == f"confirmed only at peak, {UNDECIDED} at frame"
-    assert verdict_at({"peak": True, "frame": False}) == "confirmed only at peak"
-    assert verdict_at({"peak": None, "frame": False}) == UNDECIDED
-    assert verdict_at({"peak": False, "frame": False}) == NOT_CONFIRMED
 
 
 def test_false_verdicts_are_rare() -> None:

@@ -15,7 +15,7 @@ from mitsim.learn import verbs
 from mitsim.reconstruct.shifted_codes import Pose
 from mitsim.report.pages import Value
 from mitsim.studies import learned_study, twin_study
-from mitsim.studies.framework.campaign import Shard, batches
+from mitsim.studies.framework.campaign import batches
 from mitsim.studies.framework.experiment import Point, Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.learned_study import (
@@ -163,7 +163,6 @@ def test_points_share_files_and_not_a_process() -> None:
     points = [Point.of(Setup(), number=number) for number in range(5)]
     assert [len(batch) for batch in batches(points)] == [5]
     assert [len(batch) for batch in batches(points, kept=True)] == [1] * 5
-    assert [len(Shard(number, 2).part(points, kept=True)) for number in (1, 2)] == [3, 2]
 
 
 def test_points_of_a_whole_and_of_a_quick_study(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

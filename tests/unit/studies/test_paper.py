@@ -14,7 +14,7 @@ from mitsim.report import MODELS
 from mitsim.report.pages import Value
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, batches, run_experiment
-from mitsim.studies.framework.claims import UNDECIDED, Judged, Statement, stated
+from mitsim.studies.framework.claims import UNDECIDED, Judged, Level, stated
 from mitsim.studies.framework.experiment import (
     Claim,
     Point,
@@ -77,7 +77,7 @@ def test_claims_and_panels_fit_the_rows_of_their_study(name: str, quick: bool) -
     assert experiment.draw(results) or name == "reflectivity"
 
 
-def judged(claim: Statement, **means: float) -> Claim:
+def judged(claim: Level, **means: float) -> Claim:
     """The ``claim``, judged by two prints a tenth of a decibel apart of each ``model__exposure``."""
     rows: list[dict[str, Value]] = [
         {"model": name.split("__")[0], "exposure": name.split("__")[1], "psnr_db": mean + side, "picture": f"{side}"}
