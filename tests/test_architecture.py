@@ -564,7 +564,7 @@ SIZES = {
     "scene": (6, 1407),
     "sensor": (5, 1189),
     "sessions": (4, 811),
-    "studies": (22, 5289),
+    "studies": (22, 5225),
     "transport": (17, 4158),
     "verbs": (1, 309),
     "version": (1, 1),
