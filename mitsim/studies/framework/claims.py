@@ -234,7 +234,7 @@ class Level:
             by_model = {model: every(*(found[model, each][1] for each in exposures)) for model in models}
             rest = "".join(f", {other} {UNDECIDED}" for other, holds in by_model.items() if holds is None)
             decided = next((f"confirmed only {model}{rest}" for model, holds in by_model.items() if holds), decided)
-        return Claim(claim, self.paper, *(figures.get(model, "") for model in both), decided)
+        return Claim(claim, self.paper, figures.get(both[0], ""), figures.get(both[1], ""), decided)
 
     def _found(self, rows: DataFrame) -> tuple[str, Holds]:
         if not self.every:
