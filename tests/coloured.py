@@ -11,7 +11,7 @@ import numpy as np
 
 from mitsim.core.colour_files import MosaicManifest
 from mitsim.core.manifests import AmbientFile, Digital, Patterns, RunManifest
-from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, frame_name
+from mitsim.core.runs import AMBIENT, LineTruth, MosaicCapture, Recorder, frame_name
 from mitsim.devices.framelist import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.colour import chart
@@ -105,7 +105,7 @@ def mosaic_folders(
     files = [frame_name(index) for index in range(len(lights))]
     ambient = AmbientFile(file=AMBIENT, shots=16) if lamp else None
     held = RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files), ambient_frame=ambient)
-    shots = Capture.from_recorder(memory, held)
+    shots = memory.finish(held)
     named = MosaicManifest.model_validate({**manifest("mosaic-run"), "mosaic": "BGGR", "weights": WEIGHTS})
     known = {name: LineTruth(image, np.full(image.shape, 1e-4), 0.99) for name, image in images.items()}
     run, calibration = place / "run", place / "cal"

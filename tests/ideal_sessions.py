@@ -79,9 +79,7 @@ class Bench:
         digital = Digital(
             exposure_s=gain, gain_dn_per_e=GAIN, black_level_dn=BLACK, dark_current_e_per_s=DARK / gain, **noise
         )
-        return Capture.from_recorder(
-            memory, RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files))
-        )
+        return memory.finish(RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files)))
 
     def calibrated(self, seed: int, error: float = CALIBRATION_ERROR) -> Factors:
         """Factors as a session finds them: each with independent noise of that relative ``error``."""

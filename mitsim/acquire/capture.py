@@ -274,7 +274,7 @@ def _run(
     foreign = _foreign(light, totals, request)
     if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run
         warnings.warn(foreign, stacklevel=5)
-    return Capture.from_recorder(recorder, manifest)
+    return recorder.finish(manifest)
 
 
 @contextmanager

@@ -282,8 +282,7 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
     """Open an HDF5 file that replaces ``path`` on leaving, or is removed after an error; MitsimError on a full disk."""
     import h5py  # here: it takes 50 ms to import, and most work writes none
 
-    with whole_file(path) as part, open(part, "w+b", buffering=0) as disk:
-        kept = _FirstErrorFile(disk)
+    with whole_file(path) as part, _FirstErrorFile(part, "w+") as kept:
         try:
             with h5py.File(kept, "w", track_order=True) as file:
                 yield file
@@ -360,39 +359,32 @@ def hdf5_errors(path: Path) -> Iterator[None]:
         raise MitsimError(f"{path}: damaged, or no HDF5 file ({reason_of(error)}); write or copy it again") from error
 
 
-class _FirstErrorFile:
-    """Binary file that keeps its first writing error as ``error`` and then drops all data."""
+class _FirstErrorFile(FileIO):
+    """Unbuffered file that keeps its first writing error as ``error`` and then drops all data."""
 
-    def __init__(self, disk: FileIO) -> None:
-        self._disk = disk
-        self.error: OSError | None = None
-        self.tell, self.seek, self.read = disk.tell, disk.seek, disk.read  # by which h5py knows an open file
+    error: OSError | None = None
 
     def write(self, data: Any) -> int:
         view = memoryview(data).cast("B")
         length = len(view)
         try:
             while view and self.error is None:
-                view = view[self._disk.write(view) :]
+                view = view[super().write(view) :]
         except OSError as error:
             self.error = error
         return length
 
-    def truncate(self, size: int) -> int:
+    def truncate(self, size: int | None = None) -> int:
         try:
-            if self.error is None:
-                self._disk.truncate(size)
+            return self.tell() if self.error else super().truncate(size)
         except OSError as error:
             self.error = error
-        return size
-
-    def flush(self) -> None:
-        """Nothing waits: it is not buffered here."""
+        return size or 0
 
     def readinto(self, buffer: Any) -> int:
         """Fill a ``buffer``, with zeros where nothing was written."""
         view = memoryview(buffer).cast("B")
-        found = self._disk.readinto(view) or 0
+        found = super().readinto(view) or 0
         view[found:] = bytes(len(view) - found)
         return len(view)
 
@@ -401,20 +393,7 @@ class _FirstErrorFile:
 
 LARGEST_VARIABLE = (1 << 31) - 1
 """Largest array in a MATLAB file of version 5 [bytes]."""
-_NUMBERS = [
-    "double",
-    "single",
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "logical",
-    "char",
-]
+_NUMBERS = {"double", "single", "logical", "char"} | {f"{sign}int{8 << k}" for sign in ("", "u") for k in range(4)}
 _MOST_VARIABLES = 10_000
 _COPIES = 3
 """Arrays of a variable's size held at once: as stored, in its class, and as used here."""

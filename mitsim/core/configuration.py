@@ -62,7 +62,14 @@ def refusal(model: type[BaseModel], error: ValidationError, where: str, data: An
             except (KeyError, IndexError, TypeError):  # the name of a union's alternative
                 place = place[:end] or place
                 break
-        fields = getattr(_model_at(model, place[:-1]), "model_fields", {})
+        fields = model.model_fields
+        for name in place[:-1]:
+            if isinstance(name, str) and name in fields:
+                kinds = [fields[name].annotation]
+                for each in kinds:  # grows, because a part may be in a tuple, or optional
+                    kinds += get_args(each)
+                parts = (each for each in kinds if isinstance(each, type) and issubclass(each, BaseModel))
+                fields = getattr(next(parts, None), "model_fields", {})
         if kind == "value_error":  # a validator of ours, whose message has the value
             text = str(one["ctx"]["error"])
         elif kind == "missing":
@@ -73,20 +80,10 @@ def refusal(model: type[BaseModel], error: ValidationError, where: str, data: An
             text = f"got {value}, no such field; {known_names(str(place[-1]), fields) if fields else 'remove it'}"
             meant |= {(*place[:-1], name) for name in fields if f"did you mean {name}?" in text}
         else:
-            text = f"got {value}; {rule_of(one['msg'], fields.get(place[-1] if place else ''))}"
+            text = f"got {value}; {rule_of(one['msg'], fields.get(str(place[-1]) if place else ''))}"
         name = ".".join(cut(str(part)) for part in place)
         found.setdefault(place, f"{name}: {text}" if name else text if kind == "value_error" else f"contents: {text}")
     return refuse_together(where, [*found.values()])
-
-
-def _model_at(model: type[BaseModel] | None, place: Place) -> type[BaseModel] | None:
-    for name in place:
-        if model is not None and isinstance(name, str) and name in model.model_fields:
-            kinds = [model.model_fields[name].annotation]
-            for kind in kinds:  # grows, because a part may be in a tuple, or optional
-                kinds += get_args(kind)
-            model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
-    return model
 
 
 def refuse_together(where: str, mistakes: Sequence[str]) -> MitsimError:
@@ -257,10 +254,6 @@ def option(default: Any, help: str, *names: str, kind: Any = None, **shown: Any)
 class _Refused(ValueError):
     """MitsimError wrapped as a ValueError, so that pydantic collects it."""
 
-    def of(self, name: str) -> ArgumentError:
-        (error,) = self.args
-        return error if isinstance(error, ArgumentError) else ArgumentError(name, re.sub(f"^{name}:? ", "", str(error)))
-
 
 def validated_by(check: Callable[[Any], Any]) -> AfterValidator:
     """Return a field validator from ``check``, which raises MitsimError and returns a new value or None."""
@@ -306,9 +299,12 @@ class Options(BaseModel):
             found, fields = dict[str, ArgumentError](), type(self).model_fields
             problems = error.errors(include_url=False)
             for one in sorted(problems, key=lambda one: one["type"] != "extra_forbidden"):
-                name, original = str(one["loc"][0]), one.get("ctx", {}).get("error")
-                if isinstance(original, _Refused):
-                    found.setdefault(name, original.of(name))
+                name, wrapped = str(one["loc"][0]), one.get("ctx", {}).get("error")
+                if isinstance(wrapped, _Refused):
+                    (refused,) = wrapped.args
+                    if not isinstance(refused, ArgumentError):
+                        refused = ArgumentError(name, re.sub(f"^{name}:? ", "", str(refused)))
+                    found.setdefault(name, refused)
                 elif one["type"] == "extra_forbidden" and len(one["loc"]) == 1:
                     found[name] = unknown_option(name, self.VERB, fields)
                 elif one["type"] == "missing":

@@ -89,7 +89,10 @@ _KINDS: dict[str, Kind] = {
     "Iterable": ("several values", lambda value: isinstance(value, Iterable)),
     "Sequence": ("a list", lambda value: isinstance(value, (list, tuple))),
     "Progress": ("a function", callable),
-    "FloatArray": ("an array of real numbers, none of them masked", lambda value: _is_real_array(value)),
+    "FloatArray": (
+        "an array of real numbers, none of them masked",
+        lambda value: _is_real(value) and not is_masked(value) and getattr(value, "ndim", 0) > 0,
+    ),
 }
 
 
@@ -121,10 +124,13 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
 def plain_number(value: object) -> object:
     """Convert a NumPy scalar to Python's without importing NumPy."""
-    if type(value).__module__ != "numpy" or getattr(value, "shape", None) != ():
-        return value
-    kind = getattr(getattr(value, "dtype", None), "kind", "")
-    return value.item() if kind in tuple("biuf") else value  # type: ignore[attr-defined]
+    is_scalar = type(value).__module__ == "numpy" and getattr(value, "shape", None) == () and _is_real(value)
+    return value.item() if is_scalar else value  # type: ignore[attr-defined]
+
+
+def _is_real(value: object) -> bool:
+    """Return True for real or boolean NumPy arrays and scalars; NumPy is not imported."""
+    return getattr(getattr(value, "dtype", None), "kind", "") in tuple("biuf")
 
 
 def checked_fields(made: C) -> C:
@@ -172,12 +178,6 @@ def _is_number(value: object) -> bool:
         return not isinstance(value, bool) and isinstance(value, Real) and float(value) is not None
     except OverflowError:
         return False
-
-
-def _is_real_array(value: object) -> bool:
-    """Return True if ``value`` is a real or boolean NumPy array without a mask; NumPy is not imported."""
-    real = getattr(getattr(value, "dtype", None), "kind", "") in tuple("biuf")
-    return real and not is_masked(value) and getattr(value, "ndim", 0) > 0
 
 
 def is_masked(value: object) -> bool:

@@ -119,7 +119,11 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
         except OSError as error:
             raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
         if occupied and not overwrite:
-            remedy = "go on with resume=True" if _is_unfinished(path) else "choose a new one or empty it"
+            remedy = "choose a new one or empty it"
+            with suppress(MitsimError, ValueError, RecursionError, AttributeError):  # a killed work left its manifest
+                manifest = path / (PAIRS if (path / PAIRS).is_file() else "manifest.json")
+                if json.loads(read_text(manifest, _LONGEST_HEAD)).get("status") == "incomplete":
+                    remedy = "go on with resume=True"
             raise MitsimError(f"output {path}: the folder holds files already; {remedy}")
     # Permission bits do not show everything (root, read-only mounts, quotas): only a file that was really written does.
     try:
@@ -246,16 +250,6 @@ def _lock(path: Path, name: Path) -> Iterator[None]:
     finally:
         name.unlink(missing_ok=True)  # before the lock is given back: who waits for it looks for the name
         lock.release()
-
-
-def _is_unfinished(folder: Path) -> bool:
-    """Return True if a killed work left its manifest in a ``folder``, so that it can be resumed."""
-    try:
-        path = folder / (PAIRS if (folder / PAIRS).is_file() else "manifest.json")
-        manifest = json.loads(read_text(path, _LONGEST_HEAD))
-    except (MitsimError, ValueError, RecursionError):
-        return False
-    return isinstance(manifest, dict) and manifest.get("status") == "incomplete"
 
 
 # -------- JSON files

@@ -323,7 +323,9 @@ class Preparer:
             flat = plain.mean(base / how.flat, wanted)
             for name, other in (("dark", dark), ("flat_dark", under)):
                 if other is not None and other.shape != flat.shape:
-                    raise MitsimError(f"{base / how.flat}: is {_size(flat)}, but {name} {_size(other)}; give one size")
+                    raise MitsimError(
+                        f"{base / how.flat}: is {size_of(flat)}, but {name} {size_of(other)}; give one size"
+                    )
             light = flat - (plain.level if under is None else under)
             mean = plain.plane(light).mean()
             if not mean > 0:
@@ -359,7 +361,7 @@ class Preparer:
         for path in image_files(source, wanted):
             for values in read_images(path, wanted):
                 if count and values.shape != total.shape:
-                    raise MitsimError(f"{path}: is {_size(values)}, but others are {_size(total)}; give one size")
+                    raise MitsimError(f"{path}: is {size_of(values)}, but others are {size_of(total)}; give one size")
                 total, count = total + values / (self.how.divide_by or 1), count + 1
         return np.asarray(total / count, dtype=np.float64)
 
@@ -382,7 +384,7 @@ class Preparer:
         full = None if self.end is None else values >= self.end
         for name, other in (("dark", self.dark), ("flat", self.response)):
             if other is not None and other.shape != values.shape:
-                raise MitsimError(f"{path}: is {_size(values)}, but {name} frames {_size(other)}; give one size")
+                raise MitsimError(f"{path}: is {size_of(values)}, but {name} frames {size_of(other)}; give one size")
         light = values.astype(np.float64)
         if self.dark is not None or self.response is not None:
             light -= self.level if self.dark is None else self.dark
@@ -404,7 +406,7 @@ class Preparer:
             if not (crop.row < end[0] <= rows and crop.column < end[1] <= columns):
                 kind = "its plane" if self.how.channel else "it"
                 raise MitsimError(
-                    f"{path}: {kind} is {_size(values)}, and crop takes rows {crop.row} to {end[0] - 1} and columns "
+                    f"{path}: {kind} is {size_of(values)}, and crop takes rows {crop.row} to {end[0] - 1} and columns "
                     f"{crop.column} to {end[1] - 1}; correct the crop"
                 )
         if self.how.turn_deg:
@@ -420,7 +422,7 @@ class Preparer:
             if (seen < -_EDGE).any() or (seen > last + _EDGE).any():
                 raise MitsimError(
                     f"{path}: turned by {self.how.turn_deg:g} degrees about its {self.how.turn_about}, a part of it "
-                    f"lies beyond its {_size(values)} pixels; give a smaller crop"
+                    f"lies beyond its {size_of(values)} pixels; give a smaller crop"
                 )
             values = affine_transform(values, matrix, offset, order=1, mode="nearest")
         return values[first[0] : end[0], first[1] : end[1]]
@@ -455,7 +457,7 @@ class CommonFactor:
         return likely if self.high / likely <= end else 1
 
 
-def _size(values: npt.NDArray[np.generic]) -> str:
+def size_of(values: npt.NDArray[np.generic]) -> str:
     return "x".join(map(str, values.shape))
 
 

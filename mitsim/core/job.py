@@ -161,11 +161,14 @@ class Cost:
                 f"{what}: would take about {size_text(self.memory_bytes)} of memory; allowed are {size_text(allowed)}; "
                 "ask for fewer pixels or patterns, or free memory"
             )
-        if output is not None and not self.disk_bytes <= (left := free_disk(output)):
-            raise MitsimError(
-                f"{what}: would write about {size_text(self.disk_bytes)}, but {output} has {size_text(left)} left; "
-                "choose another place or fewer frames"
-            )
+        if output is not None:
+            existing = next(place for place in (output.absolute(), *output.absolute().parents) if place.exists())
+            left = float(shutil.disk_usage(existing).free)
+            if not self.disk_bytes <= left:
+                raise MitsimError(
+                    f"{what}: would write about {size_text(self.disk_bytes)}, but {output} has {size_text(left)} left; "
+                    "choose another place or fewer frames"
+                )
 
 
 # ---- A job ----
@@ -264,11 +267,6 @@ def running_seconds() -> float:
     # proc(5): in ticks since boot. psutil adds the time of boot, which Linux rounds to seconds.
     began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
     return max(time.clock_gettime(time.CLOCK_BOOTTIME) - began, 0.0)
-
-
-def free_disk(path: Path) -> float:
-    existing = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
-    return float(shutil.disk_usage(existing).free)
 
 
 def size_text(count: float) -> str:

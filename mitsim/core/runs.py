@@ -22,7 +22,7 @@ from mitsim.core.colour_files import MosaicManifest
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder, remove_page
-from mitsim.core.images import card, from_above, normalise, span
+from mitsim.core.images import CommonFactor, card, from_above, normalise, size_of, span
 from mitsim.core.manifests import MANIFEST, ClosingKind, Digital, RunHead, RunManifest
 
 if TYPE_CHECKING:
@@ -35,8 +35,6 @@ _EVERY = 8
 _CLIPPED, _UNLIKELY, _LEVELS = 10, 20.0, 16
 """Clipping needs 10 readings at a frame's largest number, with -log of the chance probability above 20 (2e-9), compared
 with at most 16 numbers below."""
-_SAMPLE = 1024
-"""Numbers that are tested first for a common factor; by chance all are even once in 2^1024."""
 
 
 class Capture:
@@ -59,11 +57,6 @@ class Capture:
         """Make a capture from a folder, or from channels and metadata by file name in ``memory``."""
         self.manifest, self.folder = manifest, folder
         self._memory = memory or {}
-
-    @classmethod
-    @check_arguments
-    def from_recorder(cls, recorder: Recorder, manifest: RunManifest) -> Capture:
-        return cls(recorder.finish(manifest), recorder.folder, dict(sorted(recorder.files.items())))
 
     @property
     def name(self) -> str:
@@ -159,8 +152,8 @@ class Capture:
             dn = self._channel(shot.file, "DN")
             if dn.shape != (shape or dn.shape):
                 raise MitsimError(
-                    f"{(self.folder or Path()) / shot.file}: the frame is {_size(dn.shape)}, but the calibration's are "
-                    f"{_size(shape or ())}; calibrate this camera"
+                    f"{(self.folder or Path()) / shot.file}: the frame is {size_of(dn)}, but the calibration's are "
+                    f"{'x'.join(map(str, shape or ()))}; calibrate this camera"
                 )
             light = digital.rate(dn)
             own = light * shot.sign if shot.sign else self._projector_part(light)
@@ -182,7 +175,7 @@ class Capture:
         ambient = self.ambient.rate
         if ambient.shape != light.shape:
             raise MitsimError(
-                f"{self.name}: the ambient frame is {_size(ambient.shape)}, but the frames are {_size(light.shape)}; "
+                f"{self.name}: the ambient frame is {size_of(ambient)}, but the frames are {size_of(light)}; "
                 "take it with the same camera"
             )
         return light - ambient
@@ -341,17 +334,6 @@ def load_run(folder: Path | str) -> Capture:
     return Capture(manifests.read_manifest(Path(folder), RunManifest), Path(folder))
 
 
-def _common_factor(dn: FloatArray) -> int:
-    """Return the largest whole number that divides all numbers ``dn``; 1 if they are not whole."""
-    for part in (dn.ravel()[:_SAMPLE], dn.ravel()):  # nearly always the first few tell
-        if not np.array_equal(part, np.rint(part)):
-            return 1
-        factor = int(np.gcd.reduce(part.astype(np.int64)))
-        if factor == 1:
-            break
-    return factor
-
-
 def _clipped_readings(dn: FloatArray, top: float, digital: Digital) -> int:
     """Return the number of readings at the largest number, ``top``, if noise makes so many unlikely; else 0.
 
@@ -362,7 +344,8 @@ def _clipped_readings(dn: FloatArray, top: float, digital: Digital) -> int:
         return 0
     variance = float(digital.variance(digital.rate(np.array(top))))
     deviation = math.sqrt(max(variance, 0.0)) * digital.exposure_s * digital.gain_dn_per_e
-    step = max(digital.step_dn, float(_common_factor(dn))) if digital.step_dn else 0.0
+    (common := CommonFactor()).add(dn)
+    step = max(digital.step_dn, float(common.factor)) if digital.step_dn else 0.0
     levels = _LEVELS if not step else min(int(deviation / step), _LEVELS)
     below = int(np.count_nonzero(dn > top - (levels + 0.5) * (step or deviation / _LEVELS))) - count
     share, least = count / (count + below), 1 / (1 + levels)
@@ -371,10 +354,6 @@ def _clipped_readings(dn: FloatArray, top: float, digital: Digital) -> int:
     # The binomial tail after Chernoff (1952).
     unlikely = count * math.log(share / least) + (below * math.log((1 - share) / (1 - least)) if below else 0.0)
     return count if unlikely > _UNLIKELY else 0
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return "x".join(map(str, shape))
 
 
 # -------- Measurements from the shots of one pattern
@@ -587,9 +566,8 @@ class Recorder:
         channels = {name: values.astype(np.float32) for name, values in known.items() if values is not None}
         self.write(TRUTH, channels, {"board_reflectance": board})
 
-    def finish(self, manifest: RunManifest) -> RunManifest:
-        """Return the ``manifest`` of the finished run, with checksums if there are files."""
-        return manifest
+    def finish(self, manifest: RunManifest) -> Capture:
+        return Capture(manifest, None, dict(sorted(self.files.items())))
 
 
 class RunFolder(Recorder):
@@ -636,11 +614,11 @@ class RunFolder(Recorder):
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
         super().write_frame(index, channels, {**self._identity(index, channels), **metadata})
 
-    def finish(self, manifest: RunManifest) -> RunManifest:
+    def finish(self, manifest: RunManifest) -> Capture:
         checksums = dict(sorted(self._checksums.items()))
         manifest = manifest.model_copy(update={"status": "complete", "checksums": checksums})
         manifests.write_manifest(self.folder, manifest)
-        return manifest
+        return Capture(manifest, self.folder)
 
     def _note(self, name: str, value: str) -> None:
         with self._lock:

@@ -31,8 +31,7 @@ def recorded(to: Recorder, patterns: str = "hadamard:2") -> Capture:
         assert not to.keeps(index)
         to.write_frame(index, {"DN": dn, "electrons": electrons}, metadata)
     head = RunHead.of(CONFIGURATION)
-    return Capture.from_recorder(
-        to,
+    return to.finish(
         RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,

@@ -50,7 +50,7 @@ def capture(name: str, sensor: tuple[int, int], saturation: float | None = None)
         digital=digital,
         patterns=Patterns.of(family, files),
     )
-    return Capture.from_recorder(memory, manifest), scene[light.window]
+    return memory.finish(manifest), scene[light.window]
 
 
 def test_dots_find_the_scene_and_uniform_light_all_that_the_sensor_sees() -> None:

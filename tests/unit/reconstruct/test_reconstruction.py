@@ -48,8 +48,7 @@ def shots(factors: Factors) -> Capture:
     memory.write_truth(scene, 0.99)
     head = RunHead.of({"seed": 2})
     files = [frame_name(index) for index in range(len(family.shots))]
-    return Capture.from_recorder(
-        memory,
+    return memory.finish(
         RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,
