@@ -30,6 +30,7 @@ from mitsim.bench.request import (
     check_image,
     family_of,
 )
+from mitsim.core import environment
 from mitsim.core.colour_files import BANDS, LINES, RUN, bands_of
 from mitsim.core.colour_files import MOSAIC as MOSAIC_RUN
 from mitsim.core.configuration import (
@@ -51,7 +52,8 @@ from mitsim.core.configuration import (
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.job import Job
-from mitsim.devices.patterns import pattern_names
+from mitsim.devices.framelist import capacity_of, load_flats
+from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
 from mitsim.studies import OF_CAPTURES, OF_NO_SCENE, find_files
@@ -82,8 +84,6 @@ def doctor(variant: str = DEFAULT_VARIANT) -> list[Check]:
     variant
         Variant of Mitsuba in which a test image is rendered.
     """
-    from mitsim.core import environment
-
     environment.check_variant(variant)
     return environment.doctor(variant)
 
@@ -374,7 +374,6 @@ def scope_of(
 
     MitsimError for options that the study does not have, or that cannot be.
     """
-    from mitsim.devices.patterns import read_name
     from mitsim.studies.framework.experiment import check_drifts, check_sweep, measures_of
 
     if name == "sweep":
@@ -460,7 +459,6 @@ def characterise(
     >>> import mitsim as ms
     >>> found = ms.characterise("imx249", pixels=64, steps=50, frames=16)  # doctest: +SKIP
     """
-    from mitsim.devices.framelist import capacity_of, load_flats
     from mitsim.studies.framework.campaign import check_study_folder
 
     asked = Procedure(**options)

@@ -10,7 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import mitsim
-from mitsim.bench.request import AUTO, NO, AnyColour, LitScene, Opening, Planned, Request, Task, by_line
+from mitsim.bench.request import (
+    AUTO,
+    NO,
+    AnyColour,
+    LitScene,
+    Opening,
+    Planned,
+    Request,
+    Task,
+    by_line,
+    check_samples,
+    check_view,
+)
 from mitsim.cli.commands import (
     Common,
     KnownPlan,
@@ -29,7 +41,9 @@ from mitsim.cli.commands import (
 from mitsim.core.colour_files import MONO, RUN, read_colours
 from mitsim.core.configuration import OUTPUT, QUALITY, WHAT, option
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import MANIFEST
+from mitsim.core.files import PAIRS, check_apart, check_output, output_file
+from mitsim.core.job import compiled_kernels, memory_from_here, memory_since, running_seconds
+from mitsim.core.manifests import MANIFEST, resumable
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.requests import PairOptions, PairsRequest
@@ -89,7 +103,18 @@ def run_(asked: Running) -> int:
     $ mitsim run --from out/image -o figure.toml
     """
     if asked.repeated is not None:
-        return _repeat(asked, asked.repeated)
+        folder = asked.repeated
+        if asked.session is not None:
+            raise MitsimError(f"--from {folder}: writes a session file, and {asked.session} is one; give one of both")
+        others = "values", "resume", "no_pictures", "variant", "max_seconds", "max_memory"
+        asked.refuse(others, "with --from, which runs nothing")
+        if asked.output is not None:
+            check_output(asked.output, kind="file")
+        found = mitsim.session_of(folder)
+        written = None if asked.output is None else str(found.save(asked.output))
+        payload = {"session": found.text, "output": written, "warnings": found.warnings}
+        lines = [found.text.rstrip()] if written is None else [f"Session file: {written}"]
+        return asked.finish(payload, lines, found.warnings)
     if asked.session is None:
         raise MitsimError("run: give a session file, or --from FOLDER to write one")
     texts = {}
@@ -108,23 +133,6 @@ def run_(asked: Running) -> int:
     return asked.call(mitsim.run, asked.session, asked.output or "session-output", values, **options)
 
 
-def _repeat(asked: Running, folder: Path) -> int:
-    """Print the session file that repeats a folder, or write it."""
-    if asked.session is not None:
-        raise MitsimError(f"--from {folder}: writes a session file, and {asked.session} is one; give one of both")
-    others = "values", "resume", "no_pictures", "variant", "max_seconds", "max_memory"
-    asked.refuse(others, "with --from, which runs nothing")
-    from mitsim.core.files import check_output
-
-    if asked.output is not None:
-        check_output(asked.output, kind="file")
-    found = mitsim.session_of(folder)
-    written = None if asked.output is None else str(found.save(asked.output))
-    payload = {"session": found.text, "output": written, "warnings": found.warnings}
-    lines = [found.text.rstrip()] if written is None else [f"Session file: {written}"]
-    return asked.finish(payload, lines, found.warnings)
-
-
 class Viewing(OfScene, Opening, Common):
     """Options of `mitsim view`."""
 
@@ -140,9 +148,6 @@ def view(asked: Viewing) -> int:
     $ mitsim view cookie_bag
     $ mitsim view photograph -D sheet_z=420 -o bench.html
     """
-    from mitsim.bench.request import check_view
-    from mitsim.core.files import check_apart, check_output, output_file
-
     check_output(check_view(asked.output), overwrite=True, kind="file")
     asked.check(asked.scene)
     with output_file(asked.output, overwrite=True) as place, asked.job() as job:
@@ -226,9 +231,6 @@ def plan(asked: Planning) -> int:
     $ mitsim plan photograph --accuracy 1e-4 -D sheet_z=380
     $ mitsim plan cookie_bag -o plan.json
     """
-    from mitsim.core.files import check_apart, output_file
-    from mitsim.core.job import compiled_kernels, running_seconds
-
     output = asked.output
     asked.check(asked.scene, asked.patterns, None, asked.colour)
     with nullcontext() if output is None else output_file(output, asked.overwrite) as place, asked.job() as job:
@@ -313,8 +315,6 @@ def capture(asked: Capturing) -> int:
     $ mitsim capture cookie_bag -o bag --patterns hadamard:8 --seconds 20
     $ mitsim capture photograph -o again --plan plan.json
     """
-    from mitsim.core.job import memory_from_here, memory_since
-
     asked.refuse_idle()
     given, colour, output = asked.given_of(Request), asked.colour, asked.output
     if asked.plan is None and "patterns" not in given:
@@ -353,9 +353,6 @@ def check_work(output: Path, resume: bool, kind: str, several: bool = False) -> 
     several
         Whether the folder is to hold several such folders.
     """
-    from mitsim.core.files import check_output
-    from mitsim.core.manifests import MANIFEST, resumable
-
     begun = (output / MANIFEST).is_file()
     if resume and begun and not several:
         resumable(output, kind)
@@ -452,9 +449,6 @@ def render(asked: Rendering) -> int:
     $ mitsim render photograph -o frame.exr --spp 16
     $ mitsim render photograph -o fast.exr --estimator factored
     """
-    from mitsim.bench.request import check_samples
-    from mitsim.core.files import check_apart, check_output, output_file
-
     output, method = asked.output, cast(Literal["reference", "factored"], asked.estimator)  # which is checked below
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
@@ -497,8 +491,6 @@ def transport(asked: Tracing) -> int:
 
     $ mitsim transport photograph -o light.h5
     """
-    from mitsim.core.files import check_apart, output_file
-
     given = asked.given_of(Planned)
     known = asked.read(given, True)
     patterns = asked.patterns if known is None else known.known_request.patterns
@@ -540,8 +532,6 @@ def pairs(asked: Pairing) -> int:
     $ mitsim pairs photograph --count 500 -o pairs
     $ mitsim pairs photograph --count 500 --pictures photos -o mine
     """
-    from mitsim.core.files import PAIRS, check_output
-
     asked.refuse_idle()
     output = asked.output
     wanted = PairsRequest(capture=asked.part(Request), **asked.given_of(PairOptions))

@@ -11,14 +11,17 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitsim.bench.request import NO, Coloured, Exposure, Opening, Request, SessionRequest, Task
+from mitsim.bench.request import NO, Coloured, Exposure, Opening, Request, SessionRequest, Task, check_psnr
 from mitsim.cli.bench_verbs import check_work, memory_line, payload_of_lines
 from mitsim.cli.commands import LimitedPictured, Resumed, command, option_name, scene_named, to_make
 from mitsim.core.colour_files import CALIBRATION, is_coloured
 from mitsim.core.configuration import OUTPUT, WHAT, option
 from mitsim.core.errors import MitsimError
+from mitsim.core.files import check_output, output_file, prepare_output, write_text
+from mitsim.core.job import memory_from_here, memory_since
 from mitsim.core.worker import RESUME, advise
-from mitsim.devices.session import load_recipe
+from mitsim.devices.framelist import load_frames, load_known
+from mitsim.devices.session import FITTED, Modelling, load_recipe, recipe_text
 from mitsim.verbs import calibrate_in, open_as
 
 if TYPE_CHECKING:
@@ -121,9 +124,6 @@ def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memo
 
 def _simulated(asked: Calibrating, folder: Path) -> int:
     """Calibrate by a simulated session."""
-    from mitsim.core.files import check_output
-    from mitsim.core.job import memory_from_here, memory_since
-
     recipe, colour, kept = asked.recipe or load_recipe(), asked.colour, asked.write_frames
     if kept is not None or colour != NO:
         recipe.of_one_depth()
@@ -148,9 +148,6 @@ def _simulated(asked: Calibrating, folder: Path) -> int:
 
 def _frames(asked: Calibrating, folder: Path) -> int:
     """Calibrate by the frames of a real session."""
-    from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.devices.framelist import load_frames
-
     session = load_frames(Path(str(asked.frames)))  # refused before the estimator is imported
     from mitsim.reconstruct.captured_session import calibrate_frames, calibrate_planes
 
@@ -165,10 +162,6 @@ def _frames(asked: Calibrating, folder: Path) -> int:
 
 def _known(asked: Calibrating, folder: Path) -> int:
     """Calibrate by captures of known pictures."""
-    from mitsim.core.files import check_output
-    from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.devices.framelist import load_known
-
     captures = load_known(Path(str(asked.known)))  # refused before the fit is imported
     check_output(folder)
     from mitsim.reconstruct.known_pictures import calibrate_known
@@ -201,10 +194,6 @@ def _known(asked: Calibrating, folder: Path) -> int:
 
 def _plan(asked: Calibrating, _: Path) -> int:
     """Plan a session that an image of a given PSNR needs."""
-    from mitsim.bench.request import check_psnr
-    from mitsim.core.files import output_file, prepare_output, write_text
-    from mitsim.devices.session import recipe_text
-
     if asked.scene is None or asked.psnr is None:
         raise MitsimError("--plan: give a scene, and the PSNR that the image is to have, such as --psnr 35")
     recipe, output = asked.recipe or load_recipe(), asked.output
@@ -228,10 +217,6 @@ def _plan(asked: Calibrating, _: Path) -> int:
 
 def _fit(asked: Calibrating, folder: Path) -> int:
     """Model the factors, with devices that are fitted to a few frames."""
-    from mitsim.core.files import check_output
-    from mitsim.devices.framelist import load_frames
-    from mitsim.devices.session import FITTED, Modelling
-
     fitted = FITTED if asked.fit is None else tuple(name.strip() for name in asked.fit.split(","))
     count = {} if asked.frames_used is None else {"frames": asked.frames_used}
     model: Any = asked.model  # checked there

@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -43,7 +44,7 @@ from typer.core import TyperCommand, TyperGroup
 from mitsim.bench.request import Variant
 from mitsim.core.configuration import LIMITS, OUTPUT, PANELS, WHAT, Options, option, shipped_files
 from mitsim.core.errors import ArgumentError, MitsimError, printable
-from mitsim.core.files import PICTURES
+from mitsim.core.files import PICTURES, plain
 from mitsim.core.job import Limits, progress, running_seconds
 
 if TYPE_CHECKING:
@@ -275,14 +276,39 @@ def command(function: Callable[[M], int]) -> Callable[..., int]:
     declared = {name: base for base in reversed(model.__mro__) for name in inspect.get_annotations(base)}
     listed = [name for base in model.__mro__ for name in inspect.get_annotations(base) if declared[name] is base]
     names = [name for name in dict.fromkeys([*first, *listed]) if name in model.model_fields and name not in hidden]
-    readers, parameters = {}, [inspect.Parameter("context", _NAMED, annotation=typer.Context)]
+    readers, named = dict[str, Callable[[Any], Any]](), inspect.Parameter.KEYWORD_ONLY
+    parameters = [inspect.Parameter("context", named, annotation=typer.Context)]
     for name in names:
-        described: Any = model.model_fields[name].json_schema_extra
+        field = model.model_fields[name]
+        described: Any = field.json_schema_extra
         extra = {"panel": getattr(declared[name], "PANEL", WHAT), **described}
         extra |= getattr(model, "CHANGES", {}).get(name, {})
-        if extra["kind"] is not False:
-            readers[name] = _reader(model, name, extra.get("read"))
-            parameters.append(_parameter(model, name, extra))
+        if extra["kind"] is False:
+            continue
+        kinds, complete = _kinds(field.annotation), extra.get("complete")
+        kind = extra["kind"] or (kinds[0] if len(kinds) == 1 and kinds[0] in (bool, int, float, str, Path) else str)
+        shown: dict[str, Any] = {
+            "help": extra.get("help", field.description),
+            "metavar": extra.get("metavar") or next((_METAVARS[one] for one in _kinds(kind) if one in _METAVARS), None),
+            "autocompletion": complete and _completion(complete),
+            **{key: extra[key] for key in ("show_default", "min", "max") if key in extra},
+        }
+        if extra.get("positional"):
+            mark = typer.Argument(**shown)
+        else:
+            spelled = f"--{name.replace('_', '-')}"
+            spellings = extra["names"] or ((spelled,) if kind is bool else ())
+            if spellings and spelled not in spellings:
+                _SPELLED[name] = spellings[0]
+            mark = typer.Option(*spellings, rich_help_panel=extra["panel"] or None, **shown)
+        default = inspect.Parameter.empty if field.is_required() else extra.get("default", field.default)
+        if isinstance(default, (dict, tuple)):
+            default = "" if kind is str else None
+        hint = kind if default is not None else kind | None
+        parameters.append(inspect.Parameter(name, named, default=default, annotation=Annotated[hint, mark]))
+        words = [each for each in kinds if isinstance(each, str)]
+        number = partial(_number_or_word, name, words) if float in kinds and words else None
+        readers[name] = extra.get("read") or number or (lambda value: value)
 
     @functools.wraps(function)
     def call(context: typer.Context, **values: Any) -> int:
@@ -295,33 +321,15 @@ def command(function: Callable[[M], int]) -> Callable[..., int]:
     return call
 
 
-_NAMED = inspect.Parameter.KEYWORD_ONLY
+def _completion(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    return lambda incomplete: [word for word in words() if word.startswith(incomplete)]
 
 
-def _parameter(model: type[Options], name: str, extra: Mapping[str, Any]) -> inspect.Parameter:
-    """Return typer's parameter of a field of a ``model``, which is shown as ``extra`` states."""
-    declared = model.model_fields[name]
-    kinds, words = _kinds(declared.annotation), extra.get("complete")
-    kind = extra["kind"] or (kinds[0] if len(kinds) == 1 and kinds[0] in (bool, int, float, str, Path) else str)
-    shown: dict[str, Any] = {
-        "help": extra.get("help", declared.description),
-        "metavar": extra.get("metavar") or next((_METAVARS[each] for each in _kinds(kind) if each in _METAVARS), None),
-        "autocompletion": words and (lambda incomplete: [word for word in words() if word.startswith(incomplete)]),
-        **{key: extra[key] for key in ("show_default", "min", "max") if key in extra},
-    }
-    if extra.get("positional"):
-        mark = typer.Argument(**shown)
-    else:
-        spelled = f"--{name.replace('_', '-')}"
-        names = extra["names"] or ((spelled,) if kind is bool else ())
-        if names and spelled not in names:
-            _SPELLED[name] = names[0]
-        mark = typer.Option(*names, rich_help_panel=extra["panel"] or None, **shown)
-    default = inspect.Parameter.empty if declared.is_required() else extra.get("default", declared.default)
-    if isinstance(default, (dict, tuple)):
-        default = "" if kind is str else None
-    hint = kind if default is not None else kind | None
-    return inspect.Parameter(name, _NAMED, default=default, annotation=Annotated[hint, mark])
+def _number_or_word(name: str, words: Sequence[str], text: str) -> float | str:
+    try:
+        return text if text in words else float(text)
+    except ValueError:
+        raise ArgumentError(name, f"{text!r}: give a number or {' or '.join(words)}") from None
 
 
 def _kinds(annotation: Any) -> list[Any]:
@@ -331,22 +339,6 @@ def _kinds(annotation: Any) -> list[Any]:
     if get_origin(annotation) is Annotated:
         return _kinds(get_args(annotation)[0])
     return [] if annotation is NoneType else [annotation]
-
-
-def _reader(model: type[Options], name: str, read: Callable[[Any], Any] | None) -> Callable[[Any], Any]:
-    """Return the function that makes the value of a field of the word on the command line: ``read``, if it is given."""
-    kinds = _kinds(model.model_fields[name].annotation)
-    words = [kind for kind in kinds if isinstance(kind, str)]
-    if read or not (float in kinds and words):
-        return read or (lambda value: value)
-
-    def number(text: str) -> float | str:
-        try:
-            return text if text in words else float(text)
-        except ValueError:
-            raise ArgumentError(name, f"{text!r}: give a number or {' or '.join(words)}") from None
-
-    return number
 
 
 def command_line() -> str | None:
@@ -397,7 +389,10 @@ class Verb(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options, by panels."""
-        rows = ((_heading(each), each.get_help_record(ctx)) for each in self.get_params(ctx))
+        rows = []
+        for each in self.get_params(ctx):
+            panel: str = getattr(each, "rich_help_panel", None) or OUTPUT
+            rows.append((panel if each.param_type_name == "option" else "Arguments", each.get_help_record(ctx)))
         _write_panels(formatter, (row for row in rows if row[1]))
 
 
@@ -408,11 +403,6 @@ class Program(TyperGroup):
         """Write verbs and options."""
         verbs = ((verb.rich_help_panel, (name, verb.short_help)) for name, verb in self.commands.items())  # type: ignore[attr-defined]
         _write_panels(formatter, [*verbs, *(("Options", each.get_help_record(ctx)) for each in self.get_params(ctx))])
-
-
-def _heading(parameter: Any) -> str:
-    is_option = parameter.param_type_name == "option"
-    return (getattr(parameter, "rich_help_panel", None) or OUTPUT) if is_option else "Arguments"
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -432,34 +422,23 @@ def wrap_text(text: str, indent: str = "") -> list[str]:
 def print_result(as_json: bool, payload: Any, lines: Iterable[str], warnings: Sequence[str]) -> int:
     """Print a result as one JSON object, the ``payload``, or as ``lines`` of text.
 
-    Return exit status 1 if there are ``warnings``, which go to stderr in either case.
+    Return exit status 1 if there are ``warnings``, which go to stderr in either case. If nobody reads standard output
+    any more, end the program quietly as SIGPIPE does; raise MitsimError if it cannot be written for another reason,
+    such as a full disk.
     """
-    with write_at_end():
+    try:
         if as_json:
-            from mitsim.core.files import plain
-
             print(json.dumps(plain(payload), allow_nan=False))
         for line in () if as_json else lines:
             for part in printable(line).split("\n"):
                 # Columns of a table stay one below the other.
                 print(*([part] if "  " in part.strip() else wrap_text(part)), sep="\n")
-    for warning in warnings:
-        print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
-    return 1 if warnings else 0
-
-
-@contextmanager
-def write_at_end() -> Iterator[None]:
-    """Write the output of this context at its end.
-
-    If nobody reads standard output any more, end the program quietly as SIGPIPE does; raise MitsimError if it cannot be
-    written for another reason, such as a full disk.
-    """
-    try:
-        yield
         sys.stdout.flush()
     except OSError as error:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - what the exit writes has to go somewhere
         if isinstance(error, BrokenPipeError):
             sys.exit(128 + signal.SIGPIPE)
         raise MitsimError(f"standard output: cannot be written ({error.strerror}); give it another place") from None
+    for warning in warnings:
+        print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
+    return 1 if warnings else 0

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mitsim
-from mitsim.bench.request import Irradiance, Procedure
+from mitsim.bench.request import Irradiance, Procedure, check_ending, check_image
 from mitsim.cli.commands import (
     Common,
     Limited,
@@ -21,16 +21,21 @@ from mitsim.cli.commands import (
     to_make,
 )
 from mitsim.core.colour_files import MOSAIC, RUN, SpectralFolder, is_coloured, open_lines
-from mitsim.core.configuration import CAMERA, DEVICES, OUTPUT, WHAT, option, shipped_names
+from mitsim.core.configuration import CAMERA, DEVICES, OUTPUT, WHAT, locate, option, shipped_names
 from mitsim.core.errors import MitsimError
+from mitsim.core.files import check_apart, check_output, output_file
+from mitsim.core.job import memory_from_here, memory_since
+from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.worker import RESUME, advise
+from mitsim.devices.framelist import load_chart
 from mitsim.devices.patterns import pattern_names
+from mitsim.devices.sensor import load_sensor
 from mitsim.exchange.capture_list import FrameFacts
-from mitsim.exchange.formats import Exported, Pictures
+from mitsim.exchange.formats import READERS, Exported, Pictures
 from mitsim.learn.requests import METHODS, Schedule, Training
 from mitsim.learn.verbs import load_network
 from mitsim.learn.verbs import train as train_model
-from mitsim.reconstruct.request import MODEL, ImageRequest
+from mitsim.reconstruct.request import MODEL, ImageRequest, check_joint, check_parallax, holds_image
 
 if TYPE_CHECKING:
     from mitsim.report.folder_page import ColourImage
@@ -85,8 +90,6 @@ class Reconstructing(ImageRequest, Pictured):
         if not lines.colours:
             self.refuse(["chart"], f"on {run}, which is not coloured")
         elif lines.filters:
-            from mitsim.reconstruct.request import check_joint
-
             check_joint(self.lam)
             for name, value in self.given_of(ImageRequest).items():
                 if name != "lam" and value != ImageRequest.model_fields[name].default:
@@ -106,11 +109,6 @@ def reconstruct(asked: Reconstructing) -> int:
     $ mitsim reconstruct run --calibration cal --method markov -o smooth
     $ mitsim reconstruct run --calibration cal --focus auto -o sharp
     """
-    from mitsim.core.files import check_output
-    from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-    from mitsim.reconstruct.request import check_parallax, holds_image
-
     # All of it is refused before the solver is imported, which takes half a second.
     run, output, lines = asked.run, asked.output or asked.run / "reconstruction", open_lines(asked.run, RUN, MOSAIC)
     calibration: Any = asked.calibration
@@ -124,8 +122,6 @@ def reconstruct(asked: Reconstructing) -> int:
             if asked.focus is not None:
                 check_parallax(manifest.parallax, str(calibration / name))
     if asked.chart is not None:
-        from mitsim.devices.framelist import load_chart
-
         chart = load_chart(asked.chart)
     # An image of the same inputs may be replaced, and which inputs a folder has is looked into later.
     check_output(output, overwrite=is_coloured(output) if lines.colours else holds_image(output))
@@ -260,11 +256,6 @@ def sense(asked: Sensing) -> int:
     $ mitsim sense frame.exr --camera imx249 -o frame.png
     $ mitsim sense photo.exr --camera imx249 --f-number 2.8 -o photo.png
     """
-    from mitsim.bench.request import check_ending, check_image
-    from mitsim.core.configuration import locate
-    from mitsim.core.files import check_apart, output_file
-    from mitsim.devices.sensor import load_sensor
-
     asked.refuse_idle()
     sensor = load_sensor(locate(asked.camera, "calibration", ".toml", CAMERA))
     check_ending(asked.output, sensor)
@@ -325,8 +316,6 @@ def import_(asked: Importing) -> int:
     $ mitsim import hand.png -o hand --list diffusercam
     $ mitsim import run.h5 -o copy
     """
-    from mitsim.exchange.formats import READERS
-
     source, output, calibration, facts = (
         asked.source,
         asked.output,

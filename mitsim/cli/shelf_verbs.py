@@ -16,6 +16,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel
 
+from mitsim.bench.effects import DISCRETISED, EFFECTS
 from mitsim.cli.commands import Common, argument, command, to_make
 from mitsim.core.configuration import (
     CAMERA,
@@ -30,6 +31,13 @@ from mitsim.core.configuration import (
     toml_value,
 )
 from mitsim.core.errors import MitsimError, near_name
+from mitsim.core.files import output_file, whole_folder, write_text
+from mitsim.devices.patterns import FAMILIES
+from mitsim.devices.sensor import load_sensor
+from mitsim.devices.session import load_recipe
+from mitsim.exchange.capture_list import CaptureList
+from mitsim.learn.requests import METHODS
+from mitsim.studies import EXPERIMENTS, SHARED
 
 # ---- What is shipped -------------------------------------------------------------------------------------------------
 
@@ -44,8 +52,6 @@ class Entry:
 
 
 def _cameras() -> Iterator[Entry]:
-    from mitsim.devices.sensor import load_sensor
-
     for name, path in shipped_files("calibration", ".toml", CAMERA).items():
         sensor = load_sensor(path)
         verbs = "capture, sense, characterise" if sensor.states_efficiency else "capture in colour, characterise"
@@ -57,13 +63,11 @@ def _cameras() -> Iterator[Entry]:
 def _masks() -> Iterator[Entry]:
     from mitsim.devices.mask_profile import KINDS as MASKS
 
-    return (Entry(name, what) for name, what in MASKS.items())
+    return (Entry(*each) for each in MASKS.items())
 
 
 def _studies() -> Iterator[Entry]:
     """Read the studies from their source, because importing all of them takes three seconds."""
-    from mitsim.studies import EXPERIMENTS, SHARED
-
     for name in EXPERIMENTS:
         tree = _source(f"mitsim.studies.{SHARED.get(name, f'{name}_study')}")
         calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and len(node.args) > 2)
@@ -71,30 +75,16 @@ def _studies() -> Iterator[Entry]:
         yield Entry(name, ast.literal_eval(named.args[2]))
 
 
-def _effects() -> Iterator[Entry]:
-    from mitsim.bench.effects import DISCRETISED, EFFECTS
-
-    known = {**DISCRETISED, **{name: effect.what for name, effect in EFFECTS.items()}}
-    return (Entry(name, what) for name, what in known.items())
-
-
 def _methods() -> Iterator[Entry]:
     """Iterate over the solver's methods and the learned ones, read from the source because torch may be missing."""
-    from mitsim.learn.requests import METHODS
     from mitsim.reconstruct.solvers import SOLVERS
 
     for name, solver in SOLVERS.items():
         yield Entry(name, _clause(str(type(solver).__doc__)))
     classes = {node.name: node for node in _source("mitsim.learn.methods").body if isinstance(node, ast.ClassDef)}
-    words = {name.lower(): _clause(_first_line(node)) for name, node in classes.items()}
+    words = {name.lower(): _clause(ast.get_docstring(node) or "") for name, node in classes.items()}
     for name in METHODS:
         yield Entry(name, f"{words[name.replace('-', '')]}; to be trained")
-
-
-def _patterns() -> Iterator[Entry]:
-    from mitsim.devices.patterns import FAMILIES
-
-    return (Entry(", ".join(each.forms), _clause(str(each.factor.__doc__))) for each in FAMILIES.values())
 
 
 KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
@@ -108,9 +98,11 @@ KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
     ),
     "masks": _masks,
     "studies": _studies,
-    "effects": _effects,
+    "effects": lambda: (
+        Entry(*each) for each in {**DISCRETISED, **{name: effect.what for name, effect in EFFECTS.items()}}.items()
+    ),
     "methods": _methods,
-    "patterns": _patterns,
+    "patterns": lambda: (Entry(", ".join(each.forms), _clause(str(each.factor.__doc__))) for each in FAMILIES.values()),
 }
 """Entries of each kind that `mitsim list` knows, as the files and modules state them."""
 
@@ -119,10 +111,6 @@ def _source(module: str) -> ast.Module:
     found = importlib.util.find_spec(module)
     assert found is not None and found.origin is not None, module
     return ast.parse(Path(found.origin).read_text(encoding="utf-8"))
-
-
-def _first_line(node: ast.Module | ast.ClassDef) -> str:
-    return " ".join((ast.get_docstring(node) or "").partition("\n\n")[0].split())
 
 
 def _clause(text: str) -> str:
@@ -215,9 +203,6 @@ def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
     """Iterate over the lines of a file of a ``kind``, as the shipped file ``like``; a mask is of the kind ``mask``."""
     from mitsim.devices.mask_profile import MaskProfile
     from mitsim.devices.projector import ProjectorModel
-    from mitsim.devices.sensor import load_sensor
-    from mitsim.devices.session import load_recipe
-    from mitsim.exchange.capture_list import CaptureList
 
     def begun(model: BaseModel, **more: str) -> Iterator[str]:
         source = f"as the shipped {like.stem}, to be replaced"
@@ -272,9 +257,6 @@ def new(asked: Beginning) -> int:
     $ mitsim new mask noise --like random
     $ mitsim new study tilt -o studies/tilt.py
     """
-    from mitsim.core.files import output_file, whole_folder, write_text
-    from mitsim.devices.sensor import load_sensor
-
     kind, name, like = asked.kind, asked.name, asked.like
     if kind not in _STARTERS:
         raise MitsimError(f"new {kind}: no such kind; {near_name(kind, _STARTERS)}use {', '.join(_STARTERS)}")

@@ -36,8 +36,10 @@ from mitsim.core.files import (
 )
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+from mitsim.devices.framelist import load_chart
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, check_export, export
+from mitsim.learn.verbs import load_network
 from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.sessions.session_file import (
     FOLDERS,
@@ -388,8 +390,6 @@ class _Steps:
             colour = capture.values.get("colour", NO) if capture else NO
             coloured, mosaic = colour != NO, colour == "mosaic"
         if str(options.get("method", "")).endswith(MODEL):
-            from mitsim.learn.verbs import load_network
-
             options["method"] = load_network(options["method"])
         if mosaic and (others := options.keys() - {"lam"}):
             raise ArgumentError(min(others), "has no effect on frames behind colour filters; leave it out")
@@ -404,8 +404,6 @@ class _Steps:
             check_image(load_run(run), load_calibration(calibration), ImageRequest(**options))
         chart = None
         if "chart" in values:
-            from mitsim.devices.framelist import load_chart
-
             if not coloured:
                 raise ArgumentError("chart", f"{values['chart']}: the frames are not coloured; leave it out")
             chart = load_chart(values["chart"])

@@ -169,9 +169,9 @@ def test_output_that_nobody_reads_ends_as_by_a_signal(monkeypatch: pytest.Monkey
         flush = write
 
     monkeypatch.setattr(screen.sys, "stdout", Full(32))
-    with pytest.raises(SystemExit) as ended, screen.write_at_end():
-        print("result")
+    with pytest.raises(SystemExit) as ended:
+        screen.print_result(False, {}, ["result"], ())
     assert ended.value.code == 141
     monkeypatch.setattr(screen.sys, "stdout", Full(28))
-    with pytest.raises(MitsimError, match="standard output: cannot be written"), screen.write_at_end():
-        print("result")
+    with pytest.raises(MitsimError, match="standard output: cannot be written"):
+        screen.print_result(False, {}, ["result"], ())
