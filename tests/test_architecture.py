@@ -549,8 +549,8 @@ SIZES = {
     "api": (2, 223),
     "bench": (6, 1218),
     "calibrate": (6, 1288),
-    "cli": (6, 1462),
-    "core": (13, 3025),
+    "cli": (6, 1433),
+    "core": (13, 2990),
     "devices": (9, 2101),
     "exchange": (7, 1406),
     "learn": (7, 1306),
@@ -566,7 +566,7 @@ SIZES = {
     "sessions": (4, 811),
     "studies": (22, 5225),
     "transport": (17, 4158),
-    "verbs": (1, 309),
+    "verbs": (1, 308),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
