@@ -77,8 +77,14 @@ learned
 
 scope
 physics
+effects
+masks
+colour
+sensor
+calibration
 rare_light
 reconstruction
+validation
 ```
 
 ```{toctree}

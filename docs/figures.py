@@ -52,7 +52,8 @@ class Stated:
         return value.removesuffix("%").replace("e-0", "e-")
 
 
-PHYSICS, IMAGES_PAGE, BENCH, STUDIES = "docs/physics.md", "docs/reconstruction.md", "docs/bench.md", "docs/studies.md"
+PHYSICS, EFFECTS, COLOUR = "docs/physics.md", "docs/effects.md", "docs/colour.md"
+IMAGES_PAGE, BENCH, STUDIES = "docs/reconstruction.md", "docs/bench.md", "docs/studies.md"
 STATED = (
     Stated("README.md", "# {}, as above", "tour.psnr_db", ".2f"),
     Stated(BENCH, "captures and calibrates itself it is {} dB", "tour.psnr_db", ".1f"),
@@ -61,19 +62,19 @@ STATED = (
     Stated(BENCH, "and {} (green)", "walks.correlation_gr", ".2f"),
     Stated(BENCH, "(green) and {} (blue)", "walks.correlation_b", ".2f"),
     Stated(STUDIES, "`, {} dB under 49 dots, seed 0", "tour.psnr_db", ".2f"),
-    Stated(PHYSICS, "off by a Delta E of {} in the mean", "closed.delta_e_floor", ".2f"),
-    Stated(PHYSICS, "in the mean, {} at most", "closed.delta_e_floor_most", ".1f"),
+    Stated(COLOUR, "off by a Delta E of {} in the mean", "closed.delta_e_floor", ".2f"),
+    Stated(COLOUR, "in the mean, {} at most", "closed.delta_e_floor_most", ".1f"),
     Stated(STUDIES, "three lines without a camera, is {} (red", "closed.delta_e_floor", ".2f"),
-    Stated(PHYSICS, "from the geometric one by {} % (450 nm)", "closed.diffraction_450_nm", ".0%"),
-    Stated(PHYSICS, "(450 nm) to {} % (640 nm)", "closed.diffraction_640_nm", ".0%"),
+    Stated(EFFECTS, "from the geometric one by {} % (450 nm)", "closed.diffraction_450_nm", ".0%"),
+    Stated(EFFECTS, "(450 nm) to {} % (640 nm)", "closed.diffraction_640_nm", ".0%"),
     Stated(PHYSICS, "One anchor leaves {} on the photograph", "plan.anchors", ".1e"),
     Stated(PHYSICS, "under `dots:7` and {} under uniform light", "plan.anchors_uniform", ".1e"),
     Stated(PHYSICS, "falls with $1/c^2$: {} for $c = 1$", "plan.cells", ".1e"),
-    Stated(PHYSICS, "Neutral: the geometric shadow, {} off for", "plan.diffraction", ".1e"),
-    Stated(PHYSICS, "photograph and `dots:7`, {} for `uniform`", "plan.diffraction_uniform", ".1e"),
-    Stated(PHYSICS, "infinite contrast ({} off for `dots:7`)", "plan.black_level", ".1e"),
-    Stated(PHYSICS, "three lines has $C = {}$ lit at once", "closed.speckle_white", ".3f"),
-    Stated(PHYSICS, "lit at once and {} with a beam of", "closed.speckle_white_beam", ".4f"),
+    Stated(EFFECTS, "Neutral: the geometric shadow, {} off for", "plan.diffraction", ".1e"),
+    Stated(EFFECTS, "photograph and `dots:7`, {} for `uniform`", "plan.diffraction_uniform", ".1e"),
+    Stated(EFFECTS, "infinite contrast ({} off for `dots:7`)", "plan.black_level", ".1e"),
+    Stated(EFFECTS, "three lines has $C = {}$ lit at once", "closed.speckle_white", ".3f"),
+    Stated(EFFECTS, "lit at once and {} with a beam of", "closed.speckle_white_beam", ".4f"),
     Stated(IMAGES_PAGE, "| cookie_bag (`dots:7x16`) | {} dB |", "pictures.each_depth_psnr_db", ".1f"),
     Stated(IMAGES_PAGE, "| {} dB | 27.2 dB | 0.3 mm |", "pictures.one_depth_psnr_db", ".1f"),
     Stated(IMAGES_PAGE, "pixels in tan-angle. {} pixels from 363", "closed.parallax_cookie_bag", ".1f"),

@@ -39,7 +39,7 @@ FIRST_SCREEN = 40
 MOST_WORDS_OF_README = 1200
 """What one reads in five minutes; chosen."""
 
-ELSEWHERE = {"--check", "--closed-form", "--install-completion", "--regimes", "--strict"}
+ELSEWHERE = {"--check", "--cover", "--closed-form", "--install-completion", "--regimes", "--strict"}
 """Options in the docs that are of no verb: of scenes/generate.py, benchmarks/coverage.py, mitsim itself and mypy."""
 
 ELSEWHERE_RUN = {"docs/bench.md", "docs/extending.md"}
