@@ -36,13 +36,22 @@ from mitsim.devices.session import SIDES, Drift, SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Estimate, Factors, decibels
 from mitsim.report.lit_scene import SPECKLE, IdealCamera, LitScene
 from mitsim.report.pages import Value
-from mitsim.studies import causes
-from mitsim.studies.causes import Ablation, Noise, Scatter
+from mitsim.studies.causes import Noise, Scatter
 from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, squared_error
 from mitsim.studies.framework.claims import Judged, measured
 from mitsim.studies.framework.experiment import Found, Point, Results, Scope, Study
 from mitsim.studies.framework.panels import Bars, Part
 from mitsim.studies.framework.studio import Studio
+from mitsim.studies.waterfall_study import (
+    BLACK_LEVEL,
+    DEPTH,
+    DETAIL,
+    GLOSS,
+    INTERREFLECTION,
+    MIRRORS,
+    OCCLUSION,
+    Ablation,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -55,13 +64,13 @@ CAPTURE, SCENE, SOLVER, UNEXPLAINED = "capture", "scene", "solver", "unexplained
 RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
 ERROR_SOURCES = MappingProxyType(
     {
-        causes.DETAIL: "detail inside projector pixels",
-        causes.DEPTH: "depth beside the board's",
-        causes.OCCLUSION: "edges that hide pixels from part of the sensor",
-        causes.INTERREFLECTION: "light over several surfaces",
-        causes.MIRRORS: "light over mirrors",
-        causes.GLOSS: "gloss over the sensor",
-        causes.BLACK_LEVEL: "light that black pixels leak",
+        DETAIL: "detail inside projector pixels",
+        DEPTH: "depth beside the board's",
+        OCCLUSION: "edges that hide pixels from part of the sensor",
+        INTERREFLECTION: "light over several surfaces",
+        MIRRORS: "light over mirrors",
+        GLOSS: "gloss over the sensor",
+        BLACK_LEVEL: "light that black pixels leak",
     }
 )
 """Effects that factors lack, in the order of their removal."""
@@ -117,7 +126,7 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[LossRow]:
     for name, more in stand.fixed.items():
         parts[CAPTURE, name] = _square(error + more) - _square(error), 0.0
         error = error + more
-    parts[SCENE, ERROR_SOURCES[causes.DETAIL]] = 0.0, 0.0
+    parts[SCENE, ERROR_SOURCES[DETAIL]] = 0.0, 0.0
     for name, before, after in zip(removed, seen, seen[1:], strict=False):
         moved = scatter.common(sampled, before - after) / pixels
         parts[SCENE, ERROR_SOURCES[name]] = _square(before - scene) - _square(after - scene), moved

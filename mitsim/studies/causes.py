@@ -1,23 +1,7 @@
-"""Effects of causes on light and on images: light without some of its effects, and expected errors of changed frames.
+"""Expected image of changed frames, its noise, and the scatter of its squared error (:class:`LinearImage`).
 
-**Light without effects** (:class:`Ablation`). Light without any effect is the paper's idealised model: an evenly lit
-sheet at the aligned distance that shows the truth, under the geometric shadow of the mask. Without
-
-- *falloff*, every projector pixel is as bright on a white board as their mean, in matt scenes all over the sensor;
-- *diffraction*, *black level*, *speckle*, values are neutral (:data:`mitsim.bench.effects.EFFECTS`);
-- *keystone*, light lies where its projector pixel would, if the window filled its bounding box evenly;
-- *depth*, light lies where its ray from the projector meets the aligned plane;
-- *occlusion* or *gloss*, every point of the sensor sees the mean over the sensor;
-- *detail*, the light of a projector pixel is even over the pixel, or over its points that send light;
-- *interreflection*, *mirrors*, *ambient*, light over several surfaces, over mirrors, or from lamps is absent;
-- *defocus*, a pinhole replaces the projector's lens, and pixels are sharp;
-- *render noise*, each projector pixel has the flux that the truth states.
-
-The truth is the same for all. Glare and light of sharp lobes are not moved, and indirect light stays where it is seen.
-
-**Images of changed frames** (:class:`LinearImage`). With lambda fixed the solver is linear, so that the expected
-squared error follows from the factors. With B_L = [Phi_L diag(p_i)]_i = U_L S_L V_L^T (row blocks U_Li of U_L), and the
-same on the right, the image of frames Y_ij is
+With lambda fixed the solver is linear, so that the expected squared error follows from the factors. With B_L = [Phi_L
+diag(p_i)]_i = U_L S_L V_L^T (row blocks U_Li of U_L), and likewise on the right, the image of frames Y_ij is
 
     X^ = V_L [F o W] V_R^T,  W = sum_ij U_Li^T Y_ij U_Rj,  F = s_L s_R^T / (s_L^2 s_R^2^T + lambda).
 
@@ -52,280 +36,15 @@ C b. In the coefficients above, e = F o dW:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
-from types import MappingProxyType
+import operator
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass, fields
+from functools import cached_property
 
 import numpy as np
-from scipy import sparse
 
-from mitsim.bench.apparatus import Apparatus
-from mitsim.core.arrays import FloatArray, Labels, integer
-from mitsim.devices.patterns import Lighting, PatternFamily
-from mitsim.light.light import SampledLight, Truth, traced_again
-from mitsim.light.passes import FOLLOWED, PASSES, LightEstimate, Simulation, TracedPass, expected_of
-from mitsim.light.settings import Settings
-from mitsim.optics.frames import ExpectedFrames
-from mitsim.scene.load import straightening
-from mitsim.transport.connect import CanvasMap
-from mitsim.transport.plugins.base import rows_columns, turn_and_origin
-from mitsim.transport.records import DIRECT, DeviceAccumulator, DeviceSums, PathSamples
-
-FALLOFF, DIFFRACTION, KEYSTONE, DEPTH, OCCLUSION, DETAIL, INTERREFLECTION, MIRRORS = (
-    "falloff", "diffraction", "keystone", "depth", "occlusion", "detail", "interreflection", "mirrors",
-)  # fmt: skip
-GLOSS, AMBIENT, BLACK_LEVEL, DEFOCUS, SPECKLE, RENDER_NOISE = (
-    "gloss", "ambient", "black level", "defocus", "speckle", "render noise",
-)  # fmt: skip
-REGISTERED = MappingProxyType(
-    {
-        DIFFRACTION: frozenset({"diffraction"}),
-        INTERREFLECTION: frozenset({"interreflection"}),
-        MIRRORS: frozenset({"mirrors"}),
-        AMBIENT: frozenset({"ambient"}),
-        BLACK_LEVEL: frozenset({"black-level"}),
-        DEFOCUS: frozenset({"aperture", "blur"}),
-        SPECKLE: frozenset({"speckle"}),
-    }
-)
-"""Effects of :data:`mitsim.bench.effects.EFFECTS` by name."""
-_MOVED = frozenset({KEYSTONE, DEPTH, DETAIL, DEFOCUS})
-_FURTHER = frozenset({"interreflection", "mirrors", "ambient"})
-_WHOLE = "pixels that are lit all over"
-_POINTS = 2
-"""Points per side of a cell that represent even light."""
-_SIMULATIONS = 4
-_IN_PLACE = 1e-3
-"""Tolerated distance from the aligned plane [projector pixels], because float32 leaves 1e-4."""
-
-
-# -------- Light without some of its effects
-
-
-class Ablation:
-    """Light from which any of its effects can be removed; retraced light is kept."""
-
-    def __init__(self, light: SampledLight) -> None:
-        truth, bench, simulation = light.apparent, light.bench, light.simulation
-        board, settings, physics = truth.board_flux, simulation.settings, simulation.physics
-        self.light, self._exact = light, truth.reflectance.ravel() * board  # direct light by the truth [W m^-2]
-        self._even = np.divide(board.mean(), board, out=np.ones_like(board), where=board > 0)
-        self._kept: dict[tuple[bool, frozenset[str]], SampledLight] = {}
-        self._simulated = lru_cache(maxsize=_SIMULATIONS)(lambda settings: Simulation(bench, settings))
-        samples = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
-        pixel = np.array([(last - first) / bench.n for first, last in bench.windows])
-        aside = np.abs(_Place(bench).parallax(samples)) / pixel[:, None]
-        present = {
-            FALLOFF: True,
-            DIFFRACTION: physics.spectrum is not None,
-            KEYSTONE: bench.loaded.pixels.keystone > 0,
-            DEPTH: bool(aside.size and aside.max() > _IN_PLACE),
-            OCCLUSION: bool(settings.with_own_anchors),
-            DETAIL: settings.subdivision > 1,
-            INTERREFLECTION: physics.interreflection and any(group["indirect"].nnz for group in light.groups),
-            MIRRORS: physics.mirrors,
-            GLOSS: bench.loaded.glossy and (settings.anchors > 1 or settings.sharp is not None),
-            AMBIENT: bool(physics.lamps),
-            BLACK_LEVEL: physics.black_level > 0,
-            DEFOCUS: not physics.projector.ideal,
-            SPECKLE: physics.speckle > 0,
-            RENDER_NOISE: True,
-        }
-        self.effects = tuple(name for name, there in present.items() if there)
-
-    def without(self, off: frozenset[str]) -> SampledLight:
-        off &= frozenset(self.effects)
-        if not off:
-            return self.light
-        bench, moved = self.light.bench, off & _MOVED
-        brightness = self._even if FALLOFF in off else np.ones_like(self._even)
-        absent = _FURTHER.union(*(REGISTERED.get(name, frozenset()) for name in off))
-        # Light over mirrors lies among direct light, and only tracing separates them.
-        direct = self._trace(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
-        share = self.light.simulation.physics.projector.share  # the truth has no glare
-        flux = share * self._exact if RENDER_NOISE in off else self.light.flux
-        by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
-        groups = tuple(_scale(group, np.append(by_pixel * brightness, 0.0)) for group in direct.groups)
-        if GLOSS in off:
-            sharp = (_even_lobes(group["sharp"], direct.simulation) for group in groups)
-            groups = tuple(group.with_light({"sharp": own}) for group, own in zip(groups, sharp, strict=True))
-        settings = direct.simulation.settings
-        formed = replace(
-            settings, effects=settings.effects - absent, occluded=() if OCCLUSION in off else settings.occluded,
-            anchors=1 if (GLOSS if bench.loaded.glossy else FALLOFF) in off else settings.anchors, followed_anchors=1,
-        )  # fmt: skip
-        own = {field.name: getattr(self.light, field.name) for field in fields(SampledLight)}
-        own |= {"groups": groups, "simulation": self._simulated(formed)}
-        return AblatedLight(**own, whole=self.light, rest=self._rest(off, brightness))
-
-    def _rest(self, off: frozenset[str], brightness: FloatArray) -> SampledLight | None:
-        light, settings = self.light, self.light.simulation.settings
-        effects = settings.effects - frozenset[str]().union(*(REGISTERED.get(name, frozenset()) for name in off))
-        if not effects & _FURTHER:
-            return None
-        brightness = np.append(brightness, 1.0)
-        if MIRRORS in self.effects:
-            light = self._trace(direct=False, off=off & {MIRRORS})
-            groups = tuple(_scale(group, brightness) for group in light.groups)
-        else:
-            lamps = np.append(np.zeros(len(brightness) - 1), 1.0)
-            groups = tuple(
-                _scale(group, brightness).with_light({"fine": _weigh(group["fine"], lamps)}) for group in light.groups
-            )
-        plain = replace(settings, anchors=1, sharp=None, occluded=(), effects=effects)
-        return replace(light, groups=groups, simulation=self._simulated(plain))
-
-    def _trace(self, direct: bool, off: frozenset[str]) -> SampledLight:
-        if (direct, off) not in self._kept:
-            settings, bench = self.light.simulation.settings, self.light.bench
-            own = off
-            if DETAIL in off and off >= {DEPTH, DEFOCUS} & frozenset(self.effects):
-                own |= {_WHOLE}
-            absent = frozenset[str]().union(*(REGISTERED.get(name, frozenset()) for name in off))
-            if direct:
-                absent |= _FURTHER
-                settings = replace(settings, followed_anchors=1)
-            if DEPTH in off:
-                settings = replace(settings, depth=bench.geometry.scene_distance, layers=())
-            settings = replace(settings, effects=settings.effects - absent)
-            self._kept[direct, off] = traced_again(self.light, _AblationSimulation(bench, settings, direct, own))
-        return self._kept[direct, off]
-
-
-@dataclass(frozen=True, eq=False)
-class AblatedLight(SampledLight):
-    whole: SampledLight | None = None
-    rest: SampledLight | None = None
-
-    def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
-        parts = [(each.simulation, each.groups) for each in (self, self.rest) if each is not None]
-        return expected_of(parts, self.rows_of(lighting), lighting, seed, leaking)
-
-    @cached_property
-    def apparent(self) -> Truth:
-        assert self.whole is not None
-        return self.whole.apparent
-
-
-class _AblationSimulation(Simulation):
-    def __init__(self, bench: Apparatus, settings: Settings, direct: bool, off: frozenset[str]) -> None:
-        super().__init__(bench, settings)
-        self._only_direct, self._off, self._place = direct, off, _Place(bench)
-
-    @cached_property
-    def passes(self) -> Mapping[str, TracedPass]:
-        return {
-            name: each for name, each in super().passes.items() if (each.row.effects >= FOLLOWED) != self._only_direct
-        }
-
-    def accumulator(self, name: str, labels: Labels, lines: int) -> DeviceAccumulator | None:
-        # Light that is accumulated on the device lies where it was traced.
-        moved = self._off & {DEPTH, KEYSTONE} and PASSES[name].anchors
-        return None if moved else super().accumulator(name, labels, lines)
-
-    def accumulate(self, name: str, found: PathSamples | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
-        if isinstance(found, DeviceSums) or not (name == "direct" or PASSES[name].anchors):
-            return super().accumulate(name, found, labels, samples)
-        if name != "direct":
-            return super().accumulate(name, self._place.move(found, self._off), labels, samples)
-        if _WHOLE in self._off:
-            seen = self._place.whole(found, _POINTS * self.settings.subdivision, KEYSTONE in self._off)
-        else:
-            even = _even(found, self.bench.n**2) if DETAIL in self._off else found
-            seen = self._place.move(even, self._off)
-        return replace(super().accumulate(name, seen, labels, samples), flux=self.flux(found, samples))
-
-
-class _Place:
-    def __init__(self, bench: Apparatus) -> None:
-        loaded, grid = bench.loaded, bench.loaded.pixels
-        turn, origin = turn_and_origin(loaded.camera.world_transform())
-        x, y, self._z = (CanvasMap.of(loaded.projector).origin - origin) @ turn
-        self._row, self._column = (float(value) for value in rows_columns(x, y))
-        self._plane = 1 / bench.geometry.scene_distance
-        self._n, self._windows = grid.n, bench.windows
-        self._straight = straightening(
-            str(loaded.path), loaded.projector, loaded.camera, grid, bench.geometry.scene_distance
-        )
-
-    def move(self, path_samples: PathSamples, off: frozenset[str]) -> PathSamples:
-        if not off & {DEPTH, KEYSTONE}:
-            return path_samples
-        row, column, inverse = path_samples.row, path_samples.column, path_samples.inverse_depth
-        on_plane = self._on_plane(row, inverse, self._row), self._on_plane(column, inverse, self._column)
-        straight = _project(self._straight, *on_plane) if KEYSTONE in off else on_plane
-        if DEPTH in off:
-            return replace(
-                path_samples, row=straight[0], column=straight[1], inverse_depth=np.full_like(row, self._plane)
-            )
-        row, column = row + straight[0] - on_plane[0], column + straight[1] - on_plane[1]
-        return replace(path_samples, row=row, column=column)
-
-    def whole(self, path_samples: PathSamples, side: int, straight: bool) -> PathSamples:
-        """Return the light of each projector pixel from ``side`` x ``side`` even points; ``straight`` omits the
-        keystone.
-        """
-        n = self._n
-        part = (np.arange(n * side) + 0.5) / side
-        lines = [first + (last - first) * part / n for first, last in self._windows]
-        row, column = (np.asarray(places.ravel(), np.float64) for places in np.meshgrid(*lines, indexing="ij"))
-        pixel = np.add.outer(part.astype(np.int64) * n, part.astype(np.int64)).ravel()
-        if not straight:
-            row, column = _project(np.asarray(np.linalg.inv(self._straight), np.float64), row, column)
-        value = np.bincount(path_samples.pixel, path_samples.value, n * n)[pixel] / side**2
-        first = np.zeros_like(pixel)
-        depth, kind = np.full_like(row, self._plane), np.full(len(pixel), DIRECT, dtype=np.int16)
-        return PathSamples(pixel, first, first, row, column, depth, value, kind).where(value > 0)
-
-    def parallax(self, path_samples: PathSamples) -> FloatArray:
-        """Return the tan-angles (2, m) between ``path_samples`` and their places on the plane."""
-        inverse, row, column = path_samples.inverse_depth, path_samples.row, path_samples.column
-        on_plane = self._on_plane(row, inverse, self._row), self._on_plane(column, inverse, self._column)
-        return np.stack([row - on_plane[0], column - on_plane[1]])
-
-    def _on_plane(self, tangent: FloatArray, inverse: FloatArray, origin: float) -> FloatArray:
-        # A ray from (o, o_z) with slope s is seen at tangent s (1 - o_z / z) + o / z at depth z.
-        slope = (tangent - origin * inverse) / (1 - self._z * inverse)
-        return np.asarray(slope * (1 - self._z * self._plane) + origin * self._plane)
-
-
-def _project(homography: FloatArray, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-    first, second, scale = homography @ np.stack([row, column, np.ones_like(row)])
-    return first / scale, second / scale
-
-
-def _even(path_samples: PathSamples, pixels: int) -> PathSamples:
-    count, total = (np.bincount(path_samples.pixel, weights, pixels) for weights in (None, path_samples.value))
-    return replace(path_samples, value=(total / np.maximum(count, 1))[path_samples.pixel])
-
-
-def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_array:
-    if simulation.settings.sharp is None:
-        return sharp
-    bundle = simulation.grids["sharp"].bundle
-    weights = simulation.mean_weights(bundle.anchors)
-    rows, columns = bundle.cells
-    layer, place = np.divmod(np.arange(bundle.size), bundle.anchors**2 * rows * columns)
-    line, spot = np.divmod(place, bundle.anchors * columns)
-    (first, row), (second, column) = np.divmod(line, rows), np.divmod(spot, columns)
-    one = (layer * rows + row) * columns + column
-    entries = weights[first] * weights[second], (np.arange(bundle.size), one)
-    mean = sparse.csr_array(entries, shape=(bundle.size, bundle.size // bundle.anchors**2))
-    return bundle.repeat(sparse.csr_array(sharp @ mean))
-
-
-def _scale(light: LightEstimate, by: FloatArray) -> LightEstimate:
-    return light.with_light({name: _weigh(each, by) for name, each in light.light.items()})
-
-
-def _weigh(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
-    scaled = sparse.csr_array(sparse.diags_array(by) @ rows)
-    scaled.eliminate_zeros()
-    return scaled
-
-
-# -------- The image that is expected of changed frames
+from mitsim.core.arrays import FloatArray
+from mitsim.devices.patterns import PatternFamily
 
 Terms = Sequence[tuple[FloatArray, FloatArray]]
 Gains = Sequence[float | FloatArray]
@@ -351,13 +70,11 @@ class Axis:
     def total(self) -> FloatArray:
         return np.asarray(self.slabs.sum(axis=0))
 
-    def terms_of(self, factor: FloatArray) -> FloatArray:
-        """Return the terms of G (K, r, n) of a ``factor``."""
+    def terms_of(self, factor: FloatArray, even: bool = False) -> FloatArray:
+        """Return the terms of G (K, r, n) of a ``factor``, under the patterns or in ``even`` light."""
+        if even:
+            return np.asarray(np.einsum("kmr,mn->krn", self.slabs, factor, optimize=True))
         return np.asarray(np.einsum("kmr,mn,nk->krn", self.slabs, factor, self.patterns, optimize=True))
-
-    def seen_evenly(self, factor: FloatArray) -> FloatArray:
-        """Return the terms of G (K, r, n) of a ``factor`` in uniform light."""
-        return np.asarray(np.einsum("kmr,mn->krn", self.slabs, factor, optimize=True))
 
     @cached_property
     def noise(self) -> FloatArray:
@@ -431,10 +148,10 @@ class Noise:
     right_light: float = 0.0
 
     def __add__(self, other: Noise) -> Noise:
-        return Noise(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
+        return Noise(*map(operator.add, astuple(self), astuple(other)))
 
     def __sub__(self, other: Noise) -> Noise:
-        return Noise(*(getattr(self, each.name) - getattr(other, each.name) for each in fields(self)))
+        return Noise(*map(operator.sub, astuple(self), astuple(other)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -448,19 +165,17 @@ class LinearImage:
     centre: bool = False
 
     def expected_image(self, scene: FloatArray, changed: Changed | None = None, noise: Noise | None = None) -> Expected:
-        changed, noise = changed or Changed(), noise or Noise()
-        left, right = self.axes
+        changed, (left, right) = changed or Changed(), self.axes
         cameras = [(self.left, self.right), *changed.terms]  # U has no means where frames are to lose theirs
         weights = np.zeros_like(self.filter)
         gain, apart = (np.broadcast_to(each, self._count) for each in (changed.gain, changed.gain_apart))
-        seen = [(left.terms_of(first), right.terms_of(second)) for first, second in cameras]
-        for row, column in np.ndindex(gain.shape):
-            weights += gain[row, column] * _together(seen, row, column, scene)
-        even = [(left.seen_evenly(first), right.seen_evenly(second)) for first, second in cameras]
-        lit = 1 + 2 * changed.leak
+        seen = self._terms(cameras)
+        for shot in np.ndindex(gain.shape):
+            weights += gain[shot] * _together(seen, shot, scene)
         if self.family.signed and apart.any():
-            for row, column in np.ndindex(gain.shape):
-                weights += apart[row, column] * lit * _together(even, row, column, scene)
+            even = self._terms(cameras, even=True)
+            for shot in np.ndindex(gain.shape):
+                weights += apart[shot] * (1 + 2 * changed.leak) * _together(even, shot, scene)
         if changed.response is not None:
             weights += self._by_response(changed.response, cameras, scene, gain)
         if changed.leak and not self.family.signed:
@@ -469,7 +184,7 @@ class LinearImage:
         if changed.added is not None and not self.family.signed:
             weights += changed.added_gain * left.total.T @ changed.added @ right.total
         variance = sum(self._energy(np.square(term)) for term in self._by_gains(scene, changed))
-        variance += self.variance(scene, noise)
+        variance += self.variance(scene, noise or Noise())
         return Expected(left.basis @ (self.filter * weights) @ right.basis.T, variance)
 
     def _by_gains(self, scene: FloatArray, changed: Changed) -> Iterator[FloatArray]:
@@ -477,12 +192,11 @@ class LinearImage:
         cameras = [(self.left, self.right), *changed.terms]
         lit = 1 + 2 * changed.leak
         for rms in changed.flicker:
-            varied = [(left.terms_of(_by_row(rms) * first), right.terms_of(second)) for first, second in cameras]
-            evenly = [(left.seen_evenly(_by_row(rms) * first), right.seen_evenly(second)) for first, second in cameras]
-            for row, column in np.ndindex(self._count):
-                term = _together(varied, row, column, scene)
+            varied, evenly = self._terms(cameras, rms=rms), self._terms(cameras, even=True, rms=rms)
+            for shot in np.ndindex(self._count):
+                term = _together(varied, shot, scene)
                 if self.family.signed:  # the gains of two frames
-                    uniform = lit * _together(evenly, row, column, scene)
+                    uniform = lit * _together(evenly, shot, scene)
                     yield (uniform + term) / 2
                     yield (uniform - term) / 2
                 else:
@@ -497,6 +211,10 @@ class LinearImage:
         if not self.family.signed:
             for rms in changed.added_common:
                 yield left.total.T @ (_by_row(rms) * changed.added) @ right.total
+
+    def _terms(self, cameras: Terms, even: bool = False, rms: float | FloatArray = 1.0) -> Terms:
+        left, right = self.axes
+        return [(left.terms_of(_by_row(rms) * first, even), right.terms_of(second, even)) for first, second in cameras]
 
     def _by_response(self, response: FloatArray, cameras: Terms, scene: FloatArray, gain: FloatArray) -> FloatArray:
         left, right = self.axes
@@ -553,9 +271,9 @@ def _by_row(rms: float | FloatArray) -> FloatArray:
     return np.reshape(np.asarray(rms, dtype=np.float64), (-1, 1))
 
 
-def _together(seen: Terms, row: int, column: int, scene: FloatArray) -> FloatArray:
+def _together(seen: Terms, shot: tuple[int, ...], scene: FloatArray) -> FloatArray:
     """Return the part of W (r, r') of one frame from terms of G, (K, r, n) and (K', r', n')."""
-    return np.asarray(sum(first[row] @ scene @ second[column].T for first, second in seen))
+    return np.asarray(sum(first[shot[0]] @ scene @ second[shot[1]].T for first, second in seen))
 
 
 _KINDS = tuple(each.name for each in fields(Noise))
@@ -578,10 +296,10 @@ class Scatter:
 
     def common(self, noise: Noise, error: FloatArray) -> float:
         """Return the standard deviation of the cross term 2 b . e of ``noise`` and ``error``."""
-        return math.sqrt(float(self._beside(error) @ _amounts(noise)))
+        return math.sqrt(float(self._beside(error) @ astuple(noise)))
 
     def _variance(self, noise: Noise, error: FloatArray) -> float:
-        amounts = _amounts(noise)
+        amounts = np.array(astuple(noise))
         return float(amounts @ self._own @ amounts + self._beside(error) @ amounts)
 
     def _beside(self, error: FloatArray) -> FloatArray:
@@ -598,10 +316,17 @@ class Scatter:
 
     @cached_property
     def _own(self) -> FloatArray:
+        """Return tr(C^2) (kinds, kinds) per unit variance of both kinds, doubled."""
         found, gain = 2 * self._energies @ self._energies.T, self.solver.filter
-        for (side, axis, seen), weights in zip(self._sides, (gain, gain.T), strict=True):
-            for name, square in zip((side, f"{side}_light"), _squares(axis, seen, weights), strict=True):
-                found[_KINDS.index(name), _KINDS.index(name)] = 2 * square
+        for (side, axis, seen), filters in zip(self._sides, (gain, gain.T), strict=True):
+            square, light, together = 0.0, axis.basis * axis.singular, np.zeros((len(seen), len(seen)))
+            for row, weights in enumerate(filters):
+                passed, variance = seen * weights, axis.noise[row]  # seen (n, r') is a_x
+                kernel = passed @ passed.T
+                square += float(variance @ np.square(kernel) @ variance)
+                together += np.outer(light[:, row], light[:, row]) * kernel
+            for name, each in ((side, square), (f"{side}_light", float(np.square(together).sum()))):
+                found[_KINDS.index(name), _KINDS.index(name)] = 2 * each
         return np.asarray(found)
 
     @cached_property
@@ -615,19 +340,3 @@ class Scatter:
         left, right = self.solver.axes
         through_right = self.scene @ (right.basis * right.singular)
         return ("left", left, through_right), ("right", right, self.scene.T @ (left.basis * left.singular))
-
-
-def _amounts(noise: Noise) -> FloatArray:
-    return np.array([getattr(noise, name) for name in _KINDS])
-
-
-def _squares(axis: Axis, seen: FloatArray, gain: FloatArray) -> tuple[float, float]:
-    """Return tr(C^2) of unit noise in the numbers of a factor and in its columns' gains; ``seen`` (n, r') is a_x."""
-    square, light = 0.0, axis.basis * axis.singular
-    together = np.zeros((len(seen), len(seen)))
-    for row, weights in enumerate(gain):
-        passed, variance = seen * weights, axis.noise[row]
-        kernel = passed @ passed.T
-        square += float(variance @ np.square(kernel) @ variance)
-        together += np.outer(light[:, row], light[:, row]) * kernel
-    return square, float(np.square(together).sum())

@@ -1,42 +1,316 @@
 """From the paper's idealised model of a scene to its rendered frames, one effect at a time: the cost of each in dB.
 
 An effect is added *alone* to the idealised model, *in order* after all effects before it, or *left out* of the whole.
-Effects of the scene are removed from its light (:mod:`mitsim.studies.causes`). Shot noise, read noise and dark current
+Effects of the scene are removed from its light (:class:`Ablation`). Shot noise, read noise and dark current
 are always on, because the paper's model has them. The exposure is that of equal peak. Images are made with the *model
 assumed*, the exact factors of the idealised camera. The last image is made again with the *model calibrated*, the
 factors of a session (:mod:`mitsim.studies.calibration_study` shares out what this image still loses).
+
+**Light without effects** (:class:`Ablation`). Light without any effect is the paper's idealised model: an evenly lit
+sheet at the aligned distance that shows the truth, under the geometric shadow of the mask. Without
+
+- *falloff*, every projector pixel is as bright on a white board as their mean, in matt scenes all over the sensor;
+- *diffraction*, *black level*, *speckle*, values are neutral (:data:`mitsim.bench.effects.EFFECTS`);
+- *keystone*, light lies where its projector pixel would, if the window filled its bounding box evenly;
+- *depth*, light lies where its ray from the projector meets the aligned plane;
+- *occlusion* or *gloss*, every point of the sensor sees the mean over the sensor;
+- *detail*, the light of a projector pixel is even over the pixel, or over its points that send light;
+- *interreflection*, *mirrors*, *ambient*, light over several surfaces, over mirrors, or from lamps is absent;
+- *defocus*, a pinhole replaces the projector's lens, and pixels are sharp;
+- *render noise*, each projector pixel has the flux that the truth states.
+
+The truth is the same for all. Glare and light of sharp lobes are not moved, and indirect light stays where it is seen.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from scipy import sparse
 
 from mitsim.acquire.capture import capture
 from mitsim.acquire.spectral import SpectralBench
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
+from mitsim.core.arrays import FloatArray, Labels, integer
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import SensorModel
+from mitsim.light.light import SampledLight, Truth, traced_again
+from mitsim.light.passes import FOLLOWED, PASSES, LightEstimate, Simulation, TracedPass, expected_of
+from mitsim.light.settings import Settings
 from mitsim.metrics import psnr
+from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene
-from mitsim.studies import causes
-from mitsim.studies.causes import Ablation
+from mitsim.scene.load import straightening
 from mitsim.studies.framework.claims import TOLERANCE_DB, Gain
 from mitsim.studies.framework.experiment import QUICK_IMAGES, TRUTH, Found, Point, Scope, Study
 from mitsim.studies.framework.panels import Bars, Images
 from mitsim.studies.framework.studio import Studio, flags_of, single_precision
+from mitsim.transport.connect import CanvasMap
+from mitsim.transport.plugins.base import rows_columns, turn_and_origin
+from mitsim.transport.records import DIRECT, DeviceAccumulator, DeviceSums, PathSamples
 
-SATURATION, QUANTISATION = "saturation", "quantisation"
 EFFECTS = (
-    causes.FALLOFF, causes.DIFFRACTION, causes.KEYSTONE, causes.DEPTH, causes.OCCLUSION, causes.DETAIL,
-    causes.INTERREFLECTION, causes.MIRRORS, causes.GLOSS, causes.AMBIENT, causes.BLACK_LEVEL,
-    causes.DEFOCUS, causes.SPECKLE, SATURATION, QUANTISATION, causes.RENDER_NOISE,
+    FALLOFF, DIFFRACTION, KEYSTONE, DEPTH, OCCLUSION, DETAIL, INTERREFLECTION, MIRRORS, GLOSS, AMBIENT, BLACK_LEVEL,
+    DEFOCUS, SPECKLE, SATURATION, QUANTISATION, RENDER_NOISE,
+) = (
+    "falloff", "diffraction", "keystone", "depth", "occlusion", "detail", "interreflection", "mirrors", "gloss",
+    "ambient", "black level", "defocus", "speckle", "saturation", "quantisation", "render noise",
 )  # fmt: skip
+REGISTERED: Mapping[str, set[str]] = {
+    DIFFRACTION: {"diffraction"}, INTERREFLECTION: {"interreflection"}, MIRRORS: {"mirrors"}, AMBIENT: {"ambient"},
+    BLACK_LEVEL: {"black-level"}, DEFOCUS: {"aperture", "blur"}, SPECKLE: {"speckle"},
+}  # fmt: skip
+"""Effects of :data:`mitsim.bench.effects.EFFECTS` by name."""
+_MOVED = frozenset({KEYSTONE, DEPTH, DETAIL, DEFOCUS})
+_FURTHER = frozenset({"interreflection", "mirrors", "ambient"})
+_WHOLE = "pixels that are lit all over"
+_POINTS = 2
+"""Points per side of a cell that represent even light."""
+_SIMULATIONS = 4
+_IN_PLACE = 1e-3
+"""Tolerated distance from the aligned plane [projector pixels], because float32 leaves 1e-4."""
+
+
+# -------- Light without some of its effects
+
+
+class Ablation:
+    """Light from which any of its effects can be removed; retraced light is kept."""
+
+    def __init__(self, light: SampledLight) -> None:
+        truth, bench, simulation = light.apparent, light.bench, light.simulation
+        board, settings, physics = truth.board_flux, simulation.settings, simulation.physics
+        self.light, self._exact = light, truth.reflectance.ravel() * board  # direct light by the truth [W m^-2]
+        self._even = np.divide(board.mean(), board, out=np.ones_like(board), where=board > 0)
+        self._kept: dict[tuple[bool, frozenset[str]], SampledLight] = {}
+        self._simulated = lru_cache(maxsize=_SIMULATIONS)(lambda settings: Simulation(bench, settings))
+        samples = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
+        pixel = np.array([(last - first) / bench.n for first, last in bench.windows])
+        aside = np.abs(_Place(bench).parallax(samples)) / pixel[:, None]
+        present = {
+            FALLOFF: True,
+            DIFFRACTION: physics.spectrum is not None,
+            KEYSTONE: bench.loaded.pixels.keystone > 0,
+            DEPTH: bool(aside.size and aside.max() > _IN_PLACE),
+            OCCLUSION: bool(settings.with_own_anchors),
+            DETAIL: settings.subdivision > 1,
+            INTERREFLECTION: physics.interreflection and any(group["indirect"].nnz for group in light.groups),
+            MIRRORS: physics.mirrors,
+            GLOSS: bench.loaded.glossy and (settings.anchors > 1 or settings.sharp is not None),
+            AMBIENT: bool(physics.lamps),
+            BLACK_LEVEL: physics.black_level > 0,
+            DEFOCUS: not physics.projector.ideal,
+            SPECKLE: physics.speckle > 0,
+            RENDER_NOISE: True,
+        }
+        self.effects = tuple(name for name, there in present.items() if there)
+
+    def without(self, off: frozenset[str]) -> SampledLight:
+        off &= frozenset(self.effects)
+        if not off:
+            return self.light
+        bench, moved = self.light.bench, off & _MOVED
+        brightness = self._even if FALLOFF in off else np.ones_like(self._even)
+        absent = _FURTHER | _registered(off)
+        # Light over mirrors lies among direct light, and only tracing separates them.
+        direct = self._trace(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
+        share = self.light.simulation.physics.projector.share  # the truth has no glare
+        flux = share * self._exact if RENDER_NOISE in off else self.light.flux
+        by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
+        groups = tuple(_scale(group, np.append(by_pixel * brightness, 0.0)) for group in direct.groups)
+        if GLOSS in off:
+            sharp = (_even_lobes(group["sharp"], direct.simulation) for group in groups)
+            groups = tuple(group.with_light({"sharp": own}) for group, own in zip(groups, sharp, strict=True))
+        settings = direct.simulation.settings
+        formed = replace(
+            settings, effects=settings.effects - absent, occluded=() if OCCLUSION in off else settings.occluded,
+            anchors=1 if (GLOSS if bench.loaded.glossy else FALLOFF) in off else settings.anchors, followed_anchors=1,
+        )  # fmt: skip
+        own = {field.name: getattr(self.light, field.name) for field in fields(SampledLight)}
+        own |= {"groups": groups, "simulation": self._simulated(formed)}
+        return AblatedLight(**own, whole=self.light, rest=self._rest(off, brightness))
+
+    def _rest(self, off: frozenset[str], brightness: FloatArray) -> SampledLight | None:
+        light, settings = self.light, self.light.simulation.settings
+        effects = settings.effects - _registered(off)
+        if not effects & _FURTHER:
+            return None
+        brightness = np.append(brightness, 1.0)
+        if MIRRORS in self.effects:
+            light = self._trace(direct=False, off=off & {MIRRORS})
+            groups = tuple(_scale(group, brightness) for group in light.groups)
+        else:
+            lamps = np.append(np.zeros(len(brightness) - 1), 1.0)
+            groups = tuple(
+                _scale(group, brightness).with_light({"fine": _weigh(group["fine"], lamps)}) for group in light.groups
+            )
+        plain = replace(settings, anchors=1, sharp=None, occluded=(), effects=effects)
+        return replace(light, groups=groups, simulation=self._simulated(plain))
+
+    def _trace(self, direct: bool, off: frozenset[str]) -> SampledLight:
+        if (direct, off) not in self._kept:
+            settings, bench = self.light.simulation.settings, self.light.bench
+            own = off
+            if DETAIL in off and off >= {DEPTH, DEFOCUS} & frozenset(self.effects):
+                own |= {_WHOLE}
+            absent = _registered(off)
+            if direct:
+                absent |= _FURTHER
+                settings = replace(settings, followed_anchors=1)
+            if DEPTH in off:
+                settings = replace(settings, depth=bench.geometry.scene_distance, layers=())
+            settings = replace(settings, effects=settings.effects - absent)
+            self._kept[direct, off] = traced_again(self.light, _AblationSimulation(bench, settings, direct, own))
+        return self._kept[direct, off]
+
+
+@dataclass(frozen=True, eq=False)
+class AblatedLight(SampledLight):
+    whole: SampledLight | None = None
+    rest: SampledLight | None = None
+
+    def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
+        parts = [(each.simulation, each.groups) for each in (self, self.rest) if each is not None]
+        return expected_of(parts, self.rows_of(lighting), lighting, seed, leaking)
+
+    @cached_property
+    def apparent(self) -> Truth:
+        assert self.whole is not None
+        return self.whole.apparent
+
+
+class _AblationSimulation(Simulation):
+    def __init__(self, bench: Apparatus, settings: Settings, direct: bool, off: frozenset[str]) -> None:
+        super().__init__(bench, settings)
+        self._only_direct, self._off, self._place = direct, off, _Place(bench)
+
+    @cached_property
+    def passes(self) -> Mapping[str, TracedPass]:
+        return {
+            name: each for name, each in super().passes.items() if (each.row.effects >= FOLLOWED) != self._only_direct
+        }
+
+    def accumulator(self, name: str, labels: Labels, lines: int) -> DeviceAccumulator | None:
+        # Light that is accumulated on the device lies where it was traced.
+        moved = self._off & {DEPTH, KEYSTONE} and PASSES[name].anchors
+        return None if moved else super().accumulator(name, labels, lines)
+
+    def accumulate(self, name: str, found: PathSamples | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
+        if isinstance(found, DeviceSums) or not (name == "direct" or PASSES[name].anchors):
+            return super().accumulate(name, found, labels, samples)
+        if name != "direct":
+            return super().accumulate(name, self._place.move(found, self._off), labels, samples)
+        if _WHOLE in self._off:
+            seen = self._place.whole(found, _POINTS * self.settings.subdivision, KEYSTONE in self._off)
+        else:
+            even, pixels = found, self.bench.n**2
+            if DETAIL in self._off:
+                count, total = (np.bincount(found.pixel, weights, pixels) for weights in (None, found.value))
+                even = replace(found, value=(total / np.maximum(count, 1))[found.pixel])
+            seen = self._place.move(even, self._off)
+        return replace(super().accumulate(name, seen, labels, samples), flux=self.flux(found, samples))
+
+
+class _Place:
+    def __init__(self, bench: Apparatus) -> None:
+        loaded, grid = bench.loaded, bench.loaded.pixels
+        turn, origin = turn_and_origin(loaded.camera.world_transform())
+        x, y, self._z = (CanvasMap.of(loaded.projector).origin - origin) @ turn
+        self._row, self._column = (float(value) for value in rows_columns(x, y))
+        self._plane = 1 / bench.geometry.scene_distance
+        self._n, self._windows = grid.n, bench.windows
+        self._straight = straightening(
+            str(loaded.path), loaded.projector, loaded.camera, grid, bench.geometry.scene_distance
+        )
+
+    def move(self, path_samples: PathSamples, off: frozenset[str]) -> PathSamples:
+        if not off & {DEPTH, KEYSTONE}:
+            return path_samples
+        row, column, on_plane = path_samples.row, path_samples.column, self._on_plane(path_samples)
+        straight = _project(self._straight, *on_plane) if KEYSTONE in off else on_plane
+        if DEPTH in off:
+            return replace(
+                path_samples, row=straight[0], column=straight[1], inverse_depth=np.full_like(row, self._plane)
+            )
+        row, column = row + straight[0] - on_plane[0], column + straight[1] - on_plane[1]
+        return replace(path_samples, row=row, column=column)
+
+    def whole(self, path_samples: PathSamples, side: int, straight: bool) -> PathSamples:
+        """Return the light of each projector pixel from ``side`` x ``side`` even points; ``straight`` omits the
+        keystone.
+        """
+        n = self._n
+        part = (np.arange(n * side) + 0.5) / side
+        lines = [first + (last - first) * part / n for first, last in self._windows]
+        row, column = (np.asarray(places.ravel(), np.float64) for places in np.meshgrid(*lines, indexing="ij"))
+        pixel = np.add.outer(part.astype(np.int64) * n, part.astype(np.int64)).ravel()
+        if not straight:
+            row, column = _project(np.asarray(np.linalg.inv(self._straight), np.float64), row, column)
+        value = np.bincount(path_samples.pixel, path_samples.value, n * n)[pixel] / side**2
+        first = np.zeros_like(pixel)
+        depth, kind = np.full_like(row, self._plane), np.full(len(pixel), DIRECT, dtype=np.int16)
+        return PathSamples(pixel, first, first, row, column, depth, value, kind).where(value > 0)
+
+    def parallax(self, path_samples: PathSamples) -> FloatArray:
+        """Return the tan-angles (2, m) between ``path_samples`` and their places on the plane."""
+        row, column = self._on_plane(path_samples)
+        return np.stack([path_samples.row - row, path_samples.column - column])
+
+    def _on_plane(self, path_samples: PathSamples) -> tuple[FloatArray, FloatArray]:
+        inverse, places = path_samples.inverse_depth, list[FloatArray]()
+        for tangent, origin in ((path_samples.row, self._row), (path_samples.column, self._column)):
+            # A ray from (o, o_z) with slope s is seen at tangent s (1 - o_z / z) + o / z at depth z.
+            slope = (tangent - origin * inverse) / (1 - self._z * inverse)
+            places.append(np.asarray(slope * (1 - self._z * self._plane) + origin * self._plane))
+        return places[0], places[1]
+
+
+def _project(homography: FloatArray, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
+    first, second, scale = homography @ np.stack([row, column, np.ones_like(row)])
+    return first / scale, second / scale
+
+
+def _registered(off: frozenset[str]) -> frozenset[str]:
+    return frozenset().union(*(REGISTERED.get(name, ()) for name in off))
+
+
+def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_array:
+    if simulation.settings.sharp is None:
+        return sharp
+    bundle = simulation.grids["sharp"].bundle
+    weights = simulation.mean_weights(bundle.anchors)
+    rows, columns = bundle.cells
+    layer, place = np.divmod(np.arange(bundle.size), bundle.anchors**2 * rows * columns)
+    line, spot = np.divmod(place, bundle.anchors * columns)
+    (first, row), (second, column) = np.divmod(line, rows), np.divmod(spot, columns)
+    one = (layer * rows + row) * columns + column
+    entries = weights[first] * weights[second], (np.arange(bundle.size), one)
+    mean = sparse.csr_array(entries, shape=(bundle.size, bundle.size // bundle.anchors**2))
+    return bundle.repeat(sparse.csr_array(sharp @ mean))
+
+
+def _scale(light: LightEstimate, by: FloatArray) -> LightEstimate:
+    return light.with_light({name: _weigh(each, by) for name, each in light.light.items()})
+
+
+def _weigh(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
+    scaled = sparse.csr_array(sparse.diags_array(by) @ rows)
+    scaled.eliminate_zeros()
+    return scaled
+
+
+# -------- Images with some of the effects
+
 _ROOM = 1024.0
 """Full wells of a sensor without saturation: a power of two changes no other number."""
 _LARGEST_ADC, _CODES = 24, 2**32

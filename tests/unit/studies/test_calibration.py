@@ -22,7 +22,6 @@ from mitsim.devices.session import SIDES, load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import calibration_study as module
-from mitsim.studies import causes
 from mitsim.studies.calibration_study import (
     ERROR_SOURCES,
     LAMBDA,
@@ -43,6 +42,7 @@ from mitsim.studies.causes import LinearImage, Noise, Scatter
 from mitsim.studies.drift_study import AMBIENT, SESSION
 from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.panels import flag_warnings
+from mitsim.studies.waterfall_study import DEPTH, GLOSS
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 N = 4
@@ -158,8 +158,8 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
         ("capture", RENDERING): Noise(light=3e-4),
         ("session", RENDERING): Noise(left_light=4e-4),
     }
-    effects = "falloff", causes.GLOSS, causes.DEPTH
-    errors = {(): 0.1, (causes.DEPTH,): 0.08, (causes.DEPTH, causes.GLOSS): 0.05}
+    effects = "falloff", GLOSS, DEPTH
+    errors = {(): 0.1, (DEPTH,): 0.08, (DEPTH, GLOSS): 0.05}
     off = {names: size * RNG.standard_normal((N, N)) for names, size in errors.items()}
     ablation = SimpleNamespace(effects=effects, without=lambda names: tuple(sorted(names)))
     monkeypatch.setattr(module, "Ablation", lambda light: ablation)
@@ -184,11 +184,11 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     squares = [float(np.mean(step**2)) for step in (*steps, *off.values())]
     for name, before, after in zip(fixed, squares, squares[1:], strict=False):
         assert found["capture", name].squared_error == pytest.approx(after - before)
-    for name, before, after in zip((causes.DEPTH, causes.GLOSS), squares[3:], squares[4:], strict=False):
+    for name, before, after in zip((DEPTH, GLOSS), squares[3:], squares[4:], strict=False):
         assert found["scene", ERROR_SOURCES[name]].squared_error == pytest.approx(before - after)
     sampled = Noise(light=3e-4, left_light=4e-4)
-    moved = scatter.common(sampled, off[()] - off[causes.DEPTH,]) / N**2
-    assert found["scene", ERROR_SOURCES[causes.DEPTH]].deviation == pytest.approx(moved)
+    moved = scatter.common(sampled, off[()] - off[DEPTH,]) / N**2
+    assert found["scene", ERROR_SOURCES[DEPTH]].deviation == pytest.approx(moved)
     bias = float(np.mean((exact.expected_image(scene).image - scene) ** 2))
     assert found["solver", LAMBDA].squared_error == pytest.approx(bias)
     assert found["scene", REST].squared_error == pytest.approx(

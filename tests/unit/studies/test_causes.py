@@ -14,8 +14,8 @@ from mitsim.light.passes import GRIDS, Simulation
 from mitsim.light.settings import SharpPixels
 from mitsim.report import IDEALISED
 from mitsim.report.lit_scene import LitScene
-from mitsim.studies import causes
-from mitsim.studies.causes import Ablation
+from mitsim.studies import waterfall_study as waterfall
+from mitsim.studies.waterfall_study import Ablation
 from mitsim.transport.records import DIRECT, PathSamples
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -60,22 +60,22 @@ def turned(shared_scene: Callable[..., Path], variant: str) -> SampledLight:
 def test_nothing_taken_out_is_the_light_itself(far: SampledLight) -> None:
     ablated = Ablation(far)
     assert ablated.without(frozenset()) is far
-    assert ablated.without(frozenset({"ambient", causes.KEYSTONE, causes.GLOSS})) is far, "which it does not have"
+    assert ablated.without(frozenset({"ambient", waterfall.KEYSTONE, waterfall.GLOSS})) is far, "which it does not have"
     assert ablated.effects == (
-        causes.FALLOFF,
-        causes.DIFFRACTION,
-        causes.DEPTH,
-        causes.DETAIL,
-        causes.BLACK_LEVEL,
-        causes.DEFOCUS,
-        causes.SPECKLE,
-        causes.RENDER_NOISE,
+        waterfall.FALLOFF,
+        waterfall.DIFFRACTION,
+        waterfall.DEPTH,
+        waterfall.DETAIL,
+        waterfall.BLACK_LEVEL,
+        waterfall.DEFOCUS,
+        waterfall.SPECKLE,
+        waterfall.RENDER_NOISE,
     )
 
 
 def test_the_same_paths_are_traced_again(far: SampledLight) -> None:
     """To the renderer's float32. (Planted: another purpose's streams.)"""
-    again = traced_again(far, causes._AblationSimulation(far.bench, far.simulation.settings, True, frozenset()))
+    again = traced_again(far, waterfall._AblationSimulation(far.bench, far.simulation.settings, True, frozenset()))
     for own, other in zip(far.groups, again.groups, strict=True):
         for grid in GRIDS:
             assert abs(own[grid] - other[grid]).sum() <= 1e-6 * own["fine"].sum()
@@ -91,7 +91,7 @@ def test_without_all_it_is_the_idealised_model(scene: str, request: pytest.Fixtu
     wanted = np.stack([frame.irradiance for frame in lit.expected_frames(IDEALISED, light.bench.family(FAMILY))])
     whole = frozenset(ablated.effects)
     assert apart(frames(ablated.without(whole)), wanted) < 5e-5
-    for effect in whole - {causes.SPECKLE, causes.DETAIL}:
+    for effect in whole - {waterfall.SPECKLE, waterfall.DETAIL}:
         assert apart(frames(ablated.without(whole - {effect})), wanted) > 1e-4, effect
     assert apart(frames(light), wanted) > 0.05
 
@@ -116,22 +116,22 @@ def pixel_of(light: SampledLight, path_samples: PathSamples) -> FloatArray:
 def test_depth_is_parallax(far: SampledLight) -> None:
     """The projector, 60 mm aside (x = 60, column -60), 20 mm before the plane: light is seen 60 (1/380 - 1/400) aside,
     0.35 pixels, and without depth in its pixel on the plane. (Planted: the projector on the other side.)"""
-    path_samples, place = sharp_path_samples(far), causes._Place(far.bench)
+    path_samples, place = sharp_path_samples(far), waterfall._Place(far.bench)
     aside = place.parallax(path_samples)
     assert np.allclose(aside[1], -60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
     assert (pixel_of(far, path_samples) != path_samples.pixel).mean() > 0.2
-    back = place.move(path_samples, frozenset({causes.DEPTH}))
+    back = place.move(path_samples, frozenset({waterfall.DEPTH}))
     assert np.allclose(back.inverse_depth, 1 / 400) and np.array_equal(pixel_of(far, back), path_samples.pixel)
-    assert causes.DEPTH in Ablation(far).effects
+    assert waterfall.DEPTH in Ablation(far).effects
 
 
 def test_without_keystone_light_lies_in_its_pixel(turned: SampledLight) -> None:
     """(Planted: the homography the other way round.)"""
     ablated = Ablation(turned)
-    assert causes.KEYSTONE in ablated.effects and causes.DEPTH not in ablated.effects
+    assert waterfall.KEYSTONE in ablated.effects and waterfall.DEPTH not in ablated.effects
     path_samples = sharp_path_samples(turned)
     assert (pixel_of(turned, path_samples) != path_samples.pixel).mean() > 0.2
-    straight = causes._Place(turned.bench).move(path_samples, frozenset({causes.KEYSTONE}))
+    straight = waterfall._Place(turned.bench).move(path_samples, frozenset({waterfall.KEYSTONE}))
     assert np.array_equal(pixel_of(turned, straight), path_samples.pixel)
     assert np.array_equal(straight.inverse_depth, path_samples.inverse_depth)
 
@@ -145,7 +145,7 @@ def test_light_that_moves_keeps_its_glare(shared_scene: Callable[..., Path], var
     path = shared_scene("glare", reflectance=PRINT)
     light = ms.open_bench(path, variant, projector=device).light(FAMILY, accuracy=1e-2)
     assert 0.15 < light.bench.projector.glare < 0.25
-    for effect in (causes.DEFOCUS, causes.RENDER_NOISE):
+    for effect in (waterfall.DEFOCUS, waterfall.RENDER_NOISE):
         assert frames(Ablation(light).without(frozenset({effect}))).sum() == pytest.approx(
             frames(light).sum(), rel=0.02
         )
@@ -165,7 +165,7 @@ def test_black_level_adds_a_part_of_uniform_light(far: SampledLight) -> None:
     """b + (1 - b) w of every pixel: frames are (1 - b) of those without, and b of the uniform frame. (Planted: 1 for
     1 - b.)"""
     ablated, leak = Ablation(far), 1 / 100
-    without = ablated.without(frozenset({causes.BLACK_LEVEL}))
+    without = ablated.without(frozenset({waterfall.BLACK_LEVEL}))
     (uniform,) = without.frames(far.bench.family("uniform").lighting, 0)
     assert apart(frames(far), (1 - leak) * frames(without) + leak * uniform.irradiance) < 1e-9
 
@@ -174,7 +174,7 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
     """The same flux of each pixel, spread evenly over its cells: c x c of them have the same light. (Planted: the mean
     over all pixels.)"""
     ablated = Ablation(far)
-    off = frozenset({causes.DETAIL, causes.DEFOCUS, causes.DEPTH})
+    off = frozenset({waterfall.DETAIL, waterfall.DEFOCUS, waterfall.DEPTH})
     even = ablated.without(off)
     cells = sum(group["fine"] for group in even.groups)[:-1]
     per_pixel = even.simulation.settings.subdivision**2
@@ -182,7 +182,7 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
     for pixel in (0, 37, 255):
         lit = np.sort(cells[[pixel]].toarray()[0])[::-1][:per_pixel]
         assert lit.min() > 0.9 * lit.max() and lit.sum() > 0.999 * cells[[pixel]].sum()
-    uneven = sum(group["fine"] for group in ablated.without(off - {causes.DETAIL}).groups)[:-1]
+    uneven = sum(group["fine"] for group in ablated.without(off - {waterfall.DETAIL}).groups)[:-1]
     assert np.allclose(uneven.sum(axis=1), cells.sum(axis=1), rtol=1e-9)
     spread = [np.ptp(np.sort(light[[37]].toarray()[0])[::-1][:per_pixel]) for light in (cells, uneven)]
     assert spread[1] > 10 * spread[0]
@@ -197,8 +197,8 @@ def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..
     path.write_text(text.replace('name="reflectance" type="bitmap"', 'name="diffuse_reflectance" type="bitmap"'))
     light = ms.open_bench(path, variant).light(FAMILY, accuracy=1e-3)
     ablated = Ablation(light)
-    assert causes.GLOSS in ablated.effects
-    plain = ablated.without(frozenset({causes.GLOSS}))
+    assert waterfall.GLOSS in ablated.effects
+    plain = ablated.without(frozenset({waterfall.GLOSS}))
     assert plain.simulation.settings.anchors == 1
     whole, mean = frames(light), frames(plain)
     assert 1e-4 < apart(mean, whole) < 0.1
@@ -216,11 +216,13 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     labels = np.arange(far.bench.n**2)
     bundle = simulation.grids["sharp"].bundle
     accumulated, weights = bundle.accumulate(path_samples, labels, 1), simulation.mean_weights(bundle.anchors)
-    mean = causes._even_lobes(accumulated, simulation)
+    mean = waterfall._even_lobes(accumulated, simulation)
     weight = weights[2] * weights[1]
     again = bundle.repeat(replace(bundle, anchors=1).accumulate(path_samples.average(weights), labels, 1))
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
-    assert causes._even_lobes(accumulated, far.simulation) is accumulated, "nothing to average where nothing is sharp"
+    assert waterfall._even_lobes(accumulated, far.simulation) is accumulated, (
+        "nothing is sharp"
+    )
 
 
 def test_what_is_moved_is_added_up_on_the_host(far: SampledLight) -> None:
@@ -228,6 +230,6 @@ def test_what_is_moved_is_added_up_on_the_host(far: SampledLight) -> None:
     traced. (Planted: sums on the device.)"""
     settings = replace(far.simulation.settings, anchors=3, samples={"anchor_residual": 1e4})
     labels = np.arange(far.bench.n**2)
-    for off, held in ((frozenset[str](), True), (frozenset({causes.DEPTH}), False)):
-        accumulating = causes._AblationSimulation(far.bench, settings, True, off)
+    for off, held in ((frozenset[str](), True), (frozenset({waterfall.DEPTH}), False)):
+        accumulating = waterfall._AblationSimulation(far.bench, settings, True, off)
         assert (accumulating.accumulator("anchor_residual", labels, 1) is not None) == held

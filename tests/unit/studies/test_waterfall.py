@@ -13,12 +13,13 @@ from mitsim.light.passes import Simulation
 from mitsim.metrics import psnr
 from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED
 from mitsim.report.lit_scene import LitScene
-from mitsim.studies.causes import DEPTH, FALLOFF
 from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.waterfall_study import (
     ALONE,
+    DEPTH,
     EFFECTS,
+    FALLOFF,
     IN_ORDER,
     LEFT_OUT,
     QUANTISATION,
