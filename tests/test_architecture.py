@@ -564,7 +564,7 @@ SIZES = {
     "scene": (6, 1407),
     "sensor": (5, 1189),
     "sessions": (4, 811),
-    "studies": (22, 5225),
+    "studies": (22, 5222),
     "transport": (17, 4158),
     "verbs": (1, 308),
     "version": (1, 1),

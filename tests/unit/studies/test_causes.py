@@ -220,9 +220,7 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     weight = weights[2] * weights[1]
     again = bundle.repeat(replace(bundle, anchors=1).accumulate(path_samples.average(weights), labels, 1))
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
-    assert waterfall._even_lobes(accumulated, far.simulation) is accumulated, (
-        "nothing is sharp"
-    )
+    assert waterfall._even_lobes(accumulated, far.simulation) is accumulated, "nothing is sharp"
 
 
 def test_what_is_moved_is_added_up_on_the_host(far: SampledLight) -> None:
