@@ -375,7 +375,7 @@ def patterns(asked: Drawing) -> int:
     )
     if session := payload["session"]:
         after = f"Copy {session} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
-    from mitsim.exchange.png_files import describe_cells
+    from mitsim.exchange.other_programs import describe_cells
 
     where = payload["projector"]
     lines = [

@@ -1,4 +1,4 @@
-"""Runs and factors for MATLAB, PyTorch and xarray, and a real FlatCam's calibration from its MATLAB file.
+"""Runs and factors for MATLAB, PyTorch, xarray and as PNG files, and a real FlatCam's calibration from its MATLAB file.
 
 PyTorch and xarray are extras (`pip install mitsim[torch,xarray]`), imported when they are used.
 """
@@ -8,22 +8,30 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, read_variables, write_variables
 from mitsim.core.colour_files import ALL, CALIBRATION, WAVELENGTHS_NM, lines_of_planes
+from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
 from mitsim.core.exr import Channel
-from mitsim.core.files import whole_file
-from mitsim.core.manifests import SIDES, CalibrationManifest
+from mitsim.core.files import whole_file, whole_folder, write_json
+from mitsim.core.job import Cost, Limits
+from mitsim.core.manifests import SIDES, CalibrationManifest, ClosingKind, Patterns, RunManifest
 from mitsim.core.runs import TRUTH, Capture
-from mitsim.exchange.capture_list import TURNED
+from mitsim.devices.framelist import FrameList
+from mitsim.devices.patterns import parse_patterns, stripe_signs
+from mitsim.devices.projector import ProjectorModel
+from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
+from mitsim.devices.session import UNIFORM, halves_in_order
+from mitsim.exchange.formats import TURNED
 from mitsim.exchange.packed import FACTORS, Calibration, Content, Loaded, Packed, Run, as_channel, shots_of
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
@@ -255,3 +263,232 @@ def _scene_places(factors: Factors) -> Labels:
         said = _attributes("mm", f"place of the scene's {axis} at {parallax.depth_mm:g} mm, from the frame's middle")
         found[f"scene_{letter}"] = f"scene_{axis}", parallax.depth_mm * (near + (far - near) * parts), said
     return found
+
+
+# -------- Pictures of patterns in a projector's own resolution
+
+PATTERNS = "patterns.json"
+"""Describes each picture, and the grid's place in it."""
+SESSION = "session.json"
+"""List of a session's frames, as `mitsim calibrate --frames` reads it."""
+SQUARE = 0.01
+"""Largest logarithm of a cell's width over its height that counts as square; not visible in an image."""
+_SECONDS_PER_PIXEL, _PIXEL_BYTES = 2e-8, 3
+"""Measured: 6e-9 s for dots:7 in 720 x 1920 pixels, tripled for slow disks. Bytes of cells, picture and file."""
+_WHITE = 255
+"""Only white and black (0) are shown, so that the projector's gamma has no effect."""
+_LARGEST = 2**16 - 1
+
+
+class Raster(NamedTuple):
+    """A projector's pixels; ``aspect`` is a pixel's width on the scene over its height."""
+
+    rows: int
+    columns: int
+    aspect: float = 1.0
+
+
+def raster_of(projector: str | None, recorded: Any = None) -> Raster:
+    """Return the raster of a ``projector``, by name or file, or else of a run's ``recorded`` model."""
+    if projector:
+        path = locate(projector, "calibration", ".toml", PROJECTOR)
+        recorded = load_model(path, ProjectorModel).model_dump()
+    if not isinstance(recorded, dict) or not recorded:
+        raise ArgumentError("projector", "is not known of a run of imported frames; give its name or file")
+    rows, columns = recorded.get("rows"), recorded.get("columns")
+    if not (isinstance(rows, int) and isinstance(columns, int)):
+        raise ArgumentError("projector", "does not say its rows and columns; give one that does")
+    return Raster(rows, columns, float(recorded.get("pixel_aspect", 1.0)))
+
+
+def draw_family(
+    folder: Path, name: str, n: int, projector: str, seed: int = 0, closing: ClosingKind | None = None
+) -> dict[str, Any]:
+    """Draw every shot of a family to a new folder, `patterns/` and `patterns.json`, whole or not at all.
+
+    ``closing`` adds a picture for the closing frame. Returns `patterns`, `n`, `pictures`, `projector` and `output`.
+    MitsimError for an unknown family, or a projector of unknown or too few pixels.
+    """
+    family = parse_patterns(name, n, seed)
+    patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
+    where = grid_in(raster_of(projector), (n, n), f"projector {projector}")
+    with whole_folder(folder) as place:
+        count = draw(place, patterns_light(patterns, f"patterns {name}", closing), where, describe(patterns), closing)
+    return {"patterns": name, "n": n, "pictures": count, "projector": where, "output": str(folder)}
+
+
+def draw_stripes(
+    folder: Path, n: int, projector: str, camera: str, exposure_s: float, signed_capture: str
+) -> dict[str, Any]:
+    """Draw every shot of a calibration session to a new folder, with a list of its frames.
+
+    The order is that of `mitsim calibrate --frames`. Returns and raises as :func:`draw_family`; MitsimError also for
+    invalid values, and if no Hadamard matrix has so many rows.
+    """
+    sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
+    digital = digital_of(sensor, check_exposure(exposure_s)).model_dump(exclude_none=True)
+    stated = {"camera": {"name": sensor.name}, "n": n, "signed_capture": signed_capture, "digital": digital}
+    listed = validate(FrameList, stated, "stripes")
+    signs, light, shots = stripe_signs(n), list[npt.NDArray[Any]](), list[dict[str, Any]]()
+    for number, (side, index, sign) in enumerate(halves_in_order(signs.shape[1], signed_capture == "pair")):
+        stripes = signs[:, index, None] if side == "horizontal" else signs[None, :, index]
+        light.append(np.broadcast_to(np.ones((1, 1)) if sign == UNIFORM else (1 + sign * stripes) / 2, (n, n)))
+        shots.append({**named(number), "side": side, "index": index, "sign": sign})
+    where = grid_in(raster_of(projector), (n, n), f"projector {projector}")
+    with whole_folder(folder) as place:
+        draw(place, light, where, {"shots": shots})
+        write_json(place / SESSION, listed.model_dump(mode="json", exclude_defaults=True))
+    return {"patterns": "stripes", "n": n, "pictures": len(light), "projector": where, "output": str(folder)}
+
+
+def frame_name(index: int) -> str:
+    return f"frame_{index:05d}.png"
+
+
+def named(index: int) -> dict[str, str]:
+    """Return the names of a shot's frame and of its picture."""
+    return {"file": frame_name(index), "pattern": f"patterns/pattern_{index:05d}.png"}
+
+
+def draw(folder: Path, light: Iterable[npt.NDArray[Any]], where: Any, about: Any, closing: str | None = None) -> int:
+    """Write a picture for each of the shots in ``about``, and a black and a white one, to `patterns/` in a folder.
+
+    ``light`` yields (n, n') of 0 and 1, shown ``where`` :func:`grid_in` says; `patterns.json` has both. Returns the
+    number of pictures. MitsimError if they exceed a day or the free memory.
+    """
+    pixels, count = where["rows"] * where["columns"], len(about["shots"]) + bool(closing)
+    cost = Cost(count * pixels * _SECONDS_PER_PIXEL, _PIXEL_BYTES * pixels)
+    cost.check(f"{count} pictures of {where['rows']} x {where['columns']} pixels", Limits())
+    (folder / "patterns").mkdir()
+    shot, level = np.zeros(()), {"black": 0, "white": 1}
+    for index, shot in enumerate(light):
+        _draw_picture(folder / named(index)["pattern"], shot, where)
+    for name in level:
+        _draw_picture(folder / "patterns" / f"{name}.png", np.full(shot.shape, level[name]), where)
+    write_json(folder / PATTERNS, {"projector": where, **about})
+    return count
+
+
+def _draw_picture(path: Path, light: npt.NDArray[Any], where: Mapping[str, Any]) -> None:
+    cells = (_WHITE * light).astype(np.uint8).repeat(where["cell"], axis=0).repeat(where["cell_columns"], axis=1)
+    picture = np.zeros((where["rows"], where["columns"]), np.uint8)
+    picture[where["first_row"] :, where["first_column"] :][: cells.shape[0], : cells.shape[1]] = cells
+    write_png(path, picture)
+
+
+def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any]:
+    """Return the place of the patterns' grid in a projector's raster: whole pixels a cell, centred.
+
+    The largest cells that are square on the scene to :data:`SQUARE` are used, or else the squarest. MitsimError if a
+    cell would have no pixel.
+
+    Returns
+    -------
+    dict
+        `rows`, `columns` of the raster; `cell`, `cell_columns`: rows and columns of a cell [pixels]; `cell_shape`: its
+        width on the scene over its height; `first_row`, `first_column` of the first cell.
+    """
+    most = raster.rows // sides[0], raster.columns // sides[1]
+    if min(most) < 1:
+        raise MitsimError(
+            f"{place}: patterns of {sides[0]} x {sides[1]} pixels do not fit a projector of {raster.rows} rows x "
+            f"{raster.columns} columns; give a larger projector"
+        )
+    sizes = [(rows, min(max(round(rows / raster.aspect), 1), most[1])) for rows in range(most[0], 0, -1)]
+
+    def off(size: tuple[int, int]) -> float:
+        return abs(math.log(size[1] * raster.aspect / size[0]))
+
+    rows, columns = next((size for size in sizes if off(size) <= SQUARE), min(sizes, key=off))
+    return {
+        "rows": raster.rows,
+        "columns": raster.columns,
+        "cell": rows,
+        "cell_columns": columns,
+        "cell_shape": columns * raster.aspect / rows,
+        "first_row": (raster.rows - rows * sides[0]) // 2,
+        "first_column": (raster.columns - columns * sides[1]) // 2,
+    }
+
+
+def describe_cells(where: Mapping[str, Any]) -> str:
+    rows, columns, shape = where["cell"], where["cell_columns"], where["cell_shape"]
+    size = f"{rows} pixels a side" if rows == columns else f"{rows} x {columns} pixels"
+    if abs(math.log(shape)) > SQUARE:
+        return f"{size}, {shape:.3g} times as wide as high on the scene, but square in an image"
+    return size if rows == columns else f"{size}, square on the scene"
+
+
+def patterns_light(patterns: Patterns, place: str, closing: ClosingKind | None = None) -> Iterator[npt.NDArray[Any]]:
+    """Yield the projector's light for each shot and for a ``closing`` frame, (n, n') of 0 and 1.
+
+    MitsimError for values between, because a projector's gamma would change them.
+    """
+    left, right = patterns.matrices
+    if not np.isin(np.concatenate([left.ravel(), right.ravel()]), (-1, 0, 1)).all():
+        raise MitsimError(
+            f"{place}: patterns have values other than 0, 1 and -1, whose light a projector's gamma changes"
+        )
+    first = None
+    for shot in patterns.captures:
+        pattern = np.outer(left[:, shot.row], right[:, shot.column])
+        light = (1 + shot.sign * pattern) / 2 if shot.sign else pattern
+        if not np.isin(light, (0, 1)).all():
+            raise MitsimError(f"{place}: {shot.file} shows light other than 0 and 1, which a projector's gamma changes")
+        first = light if first is None else first
+        yield light
+    if closing is not None and first is not None:
+        yield first if closing == "first" else np.ones_like(first)
+
+
+def describe(patterns: Patterns) -> dict[str, Any]:
+    shown = [shot.model_dump(include={"row", "column", "sign"}) for shot in patterns.captures]
+    shots = [{**named(index), **shot} for index, shot in enumerate(shown)]
+    return {**patterns.model_dump(include={"family", "n", "P_L", "P_R"}), "shots": shots}
+
+
+def write_png(path: Path, values: npt.NDArray[Any]) -> None:
+    from PIL import Image
+
+    with whole_file(path) as part:
+        Image.fromarray(values).save(part, format="png")
+
+
+def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[str, ...]:
+    """Write the frames of a run, and its patterns as pictures, to a new folder, whole or not at all.
+
+    Returns notes on reading frames and on the size of cells. MitsimError for digital numbers above 16 bits, patterns of
+    other values than 0, 1 and -1, or a projector of unknown or too few pixels.
+    """
+    shots = run.parts[""]
+    manifest, source = shots.manifest, str(shots.place)
+    where, closing = check_pictures(manifest, projector, source), manifest.closing_frame
+    again = f"--patterns {folder / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
+    with whole_folder(folder) as place:
+        kind = closing.kind if closing else None
+        draw(place, patterns_light(manifest.patterns, source, kind), where, describe(manifest.patterns), kind)
+        (place / "frames").mkdir()
+        frames = ((shot.file, channels["DN"]) for shot, channels, _ in shots_of(shots))
+        last = [(closing.file, shots.read(closing.file)[0]["DN"])] if closing else []
+        for index, (file, dn) in enumerate(chain(frames, last)):
+            if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
+                raise MitsimError(
+                    f"{shots.place / file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up "
+                    f"to {_LARGEST}; use the format hdf5"
+                )
+            write_png(place / "frames" / frame_name(index), dn.astype(np.uint16))
+        if (ambient := manifest.ambient_frame) is not None:
+            with whole_file(place / "ambient.npy") as part, part.open("wb") as stream:
+                np.save(stream, shots.read(ambient.file)[0]["DN"])
+            again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {ambient.shots}"
+        if closing is not None:
+            again += f" --closing-frame {closing.kind} --closing-exposure {closing.exposure_s!r}"
+    note = f"Read again by: mitsim import {folder / 'frames'} {again} --camera NAME --calibration CAL -o RUN"
+    return note, f"Patterns in cells of {describe_cells(where)}"
+
+
+def check_pictures(manifest: RunManifest, projector: str | None, place: str) -> dict[str, Any]:
+    left, right = manifest.patterns.matrices
+    where = grid_in(raster_of(projector, manifest.configuration.get("projector_model")), (len(left), len(right)), place)
+    next(patterns_light(manifest.patterns, place), None)
+    return where

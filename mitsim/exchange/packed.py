@@ -92,10 +92,6 @@ class Content(colour_files.Coloured, Generic[Manifest]):
     text: str = ""
     truths: Mapping[str, tuple[Channels, Metadata]] = field(default_factory=dict)
 
-    def of_line(self, name: str) -> Packed[Manifest]:
-        """Return the folder of a line, which behind filters is the folder of all lines."""
-        return self.parts.get(name) or self.parts[""]
-
     def fill(self, folder: Path) -> None:
         for name, part in self.parts.items():
             (folder / name).mkdir(exist_ok=True)
@@ -131,18 +127,14 @@ def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
     return Packed(manifest, read_text(folder / manifests.MANIFEST, MOST_BYTES), FACTORS, read, folder)
 
 
-def run_content(folder: Path) -> Run:
-    lines = colour_files.open_lines(folder, colour_files.RUN, colour_files.MOSAIC)
+def read_content(folder: Path, *kinds: str) -> Content[Any]:
+    """Return a CAL folder if ``kinds`` of several lines are of calibrations, else a RUN folder."""
+    lines = colour_files.open_lines(folder, *kinds)
+    pack: Any = pack_calibration if colour_files.CALIBRATION in kinds else pack_run
     files = {name: folder / name / TRUTH for name in (lines.names if lines.filters else ())}
     truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
     text = read_text(folder / colour_files.COLOUR, MOST_BYTES) if lines.colours else ""
-    return Content({name: pack_run(part) for name, part in lines.parts.items()}, lines.colours, text, truths)
-
-
-def calibration_content(folder: Path) -> Calibration:
-    lines = colour_files.open_lines(folder, colour_files.CALIBRATION)
-    text = read_text(folder / colour_files.COLOUR, MOST_BYTES) if lines.colours else ""
-    return Content({name: pack_calibration(part) for name, part in lines.parts.items()}, lines.colours, text)
+    return Content({name: pack(part) for name, part in lines.parts.items()}, lines.colours, text, truths)
 
 
 def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Metadata]]:
@@ -166,40 +158,7 @@ def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Met
         yield shot, channels, metadata
 
 
-# -------- Texts and arrays of exchanged files
-
-
-def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
-    """Return the manifest in ``text``; MitsimError if it is invalid, or names files that a folder cannot have."""
-    try:
-        if len(text) > MOST_BYTES:
-            raise ValueError(f"it has {len(text)} letters; at most {MOST_BYTES} are allowed")
-        data = parse_json(text)
-    except ValueError as error:
-        raise MitsimError(f"{place}: its manifest is not valid JSON ({error}); export it again") from error
-    manifest = manifests.checked_manifest(data, model, place)
-    run: Any = manifest
-    if model is RunManifest:
-        for name in (*(shot.file for shot in run.patterns.captures), *run.others.values()):
-            if name in (".", "..", manifests.MANIFEST, files.LOCK, TRUTH) or not name.isprintable():
-                raise MitsimError(f"{place}: a frame is called {cut(name)!r}; give it a name of its own")
-    return manifest
-
-
-def unpack_colours(text: str, kind: str, place: Path, beside: Sequence[str] = ()) -> ColourManifest:
-    """Return lines and filters from the ``text`` of a colour.json; ``beside`` are names beside the lines' folders.
-
-    MitsimError if the text is invalid, not of that ``kind``, or names an impossible folder.
-    """
-    try:
-        data = parse_json(text)
-    except ValueError as error:
-        raise MitsimError(f"{place}: its {colour_files.COLOUR} is not valid JSON ({error}); export it again") from error
-    colours = colour_files.checked_colours(data, kind, place)
-    taken = {colour_files.COLOUR, files.LOCK, *((manifests.MANIFEST, *beside) if kind == colour_files.MOSAIC else ())}
-    for name in taken.intersection(colours.names):
-        raise MitsimError(f"{place}: a line is called {name}; give it a name of its own")
-    return colours
+# -------- HDF5 files: shots are chunks of their own, so that one is read without the others
 
 
 def as_channel(values: object, name: str, place: Path) -> Channel:
@@ -212,8 +171,6 @@ def as_channel(values: object, name: str, place: Path) -> Channel:
         )
     return np.ascontiguousarray(array)
 
-
-# -------- HDF5 files: shots are chunks of their own, so that one is read without the others
 
 _LINES = "lines"
 """Group of the lines' groups."""
@@ -300,8 +257,8 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
                 run, factors = Content(own), _calibration_in(file, path) if "calibration" in file else None
                 calibration = Content({"": factors}) if factors else None
             else:
-                text, group = _text_in(file, kind, path), hdf5_item(file, _LINES, path, "Group")
-                colours = unpack_colours(text, kind, path, own[""].names if own else ())
+                text, colours = _colours_in(file, kind, path, own[""].names if own else ())
+                group = hdf5_item(file, _LINES, path, "Group")
                 lines = {name: hdf5_item(group, name, path, "Group") for name in colours.names}
                 truths = {name: line for name, line in lines.items() if "truth" in line and own}
                 run = Content(
@@ -312,8 +269,7 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
                 )
                 calibration = None
                 if colour_files.CALIBRATION in file:
-                    text = _text_in(file, colour_files.CALIBRATION, path)
-                    colours = unpack_colours(text, colour_files.CALIBRATION, path)
+                    text, colours = _colours_in(file, colour_files.CALIBRATION, path)
                     for name in colours.names:
                         if "calibration" not in lines.get(name, ()):
                             raise MitsimError(f"{path}: has no calibration of {name}; export it again")
@@ -324,8 +280,11 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
 
 def _run_in(place: h5py.Group, path: Path) -> Packed[RunManifest]:
     group = hdf5_item(place, "run", path, "Group")
-    text = _text_in(group, "manifest", path)
-    manifest = unpack(text, RunManifest, path)
+    text, data = _json_in(group, "manifest", path)
+    manifest = manifests.checked_manifest(data, RunManifest, path)
+    for name in (*(shot.file for shot in manifest.patterns.captures), *manifest.others.values()):
+        if name in (".", "..", manifests.MANIFEST, files.LOCK, TRUTH) or not name.isprintable():
+            raise MitsimError(f"{path}: a frame is called {cut(name)!r}; give it a name of its own")
     captures, stacks = manifest.patterns.captures, hdf5_item(group, "shots", path, "Group")
     channels = {name: hdf5_item(stacks, name, path) for name in stacks}
     shapes = {values.shape for values in channels.values()}
@@ -351,22 +310,37 @@ def _run_in(place: h5py.Group, path: Path) -> Packed[RunManifest]:
 
 def _calibration_in(place: h5py.Group, path: Path) -> Packed[CalibrationManifest]:
     group = hdf5_item(place, "calibration", path, "Group")
-    text = _text_in(group, "manifest", path)
+    text, data = _json_in(group, "manifest", path)
 
     def read(name: str) -> tuple[Channels, Metadata]:
         with hdf5_errors(path):
             return _frame_in(group, Path(name).stem, path)
 
-    return Packed(unpack(text, CalibrationManifest, path), text, FACTORS, read, path)
+    return Packed(manifests.checked_manifest(data, CalibrationManifest, path), text, FACTORS, read, path)
 
 
-def _text_in(group: h5py.Group, name: str, path: Path) -> str:
-    text = hdf5_item(group, name, path)
-    if text.dtype != np.uint8 or text.size > MOST_BYTES:
+def _colours_in(place: h5py.Group, kind: str, path: Path, beside: Sequence[str] = ()) -> tuple[str, ColourManifest]:
+    """Return text and content of a colour.json of that ``kind``; ``beside`` are names beside the lines' folders."""
+    text, data = _json_in(place, kind, path)
+    colours = colour_files.checked_colours(data, kind, path)
+    taken = {colour_files.COLOUR, files.LOCK, *((manifests.MANIFEST, *beside) if kind == colour_files.MOSAIC else ())}
+    for name in taken.intersection(colours.names):
+        raise MitsimError(f"{path}: a line is called {name}; give it a name of its own")
+    return text, colours
+
+
+def _json_in(group: h5py.Group, name: str, path: Path) -> tuple[str, Any]:
+    """Return a text that is stored as bytes, and the data in it; MitsimError if it is invalid or too long."""
+    held = hdf5_item(group, name, path)
+    if held.dtype != np.uint8 or held.size > MOST_BYTES:
         raise MitsimError(
-            f"{path}: {text.name} is {text.dtype} of shape {text.shape}; a text of at most {MOST_BYTES} bytes is needed"
+            f"{path}: {held.name} is {held.dtype} of shape {held.shape}; a text of at most {MOST_BYTES} bytes is needed"
         )
-    return str(text[()].tobytes().decode("utf-8"))
+    text = str(held[()].tobytes().decode("utf-8"))
+    try:
+        return text, parse_json(text)
+    except ValueError as error:
+        raise MitsimError(f"{path}: {held.name} is not valid JSON ({error}); export it again") from error
 
 
 def _frame_in(place: h5py.Group, name: str, path: Path) -> tuple[Channels, Metadata]:

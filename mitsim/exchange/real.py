@@ -24,7 +24,7 @@ from mitsim.core.manifests import AmbientFile, ClosingFile, Patterns, RunHead, R
 from mitsim.core.runs import AMBIENT, CLOSING, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns, shot_orders
 from mitsim.devices.sensor import PITCH_TOLERANCE
-from mitsim.exchange.capture_list import Electronics, RealCapture
+from mitsim.exchange.formats import Electronics, RealCapture
 from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
 
 _SECONDS_PER_PIXEL = 1e-7
@@ -145,7 +145,7 @@ class _Plane:
         self.identity: dict[str, Any] = {}
         self.shape: tuple[int, ...] | None = None
         n = known.listed.n
-        scene = (n, n)
+        scene: tuple[Any, ...] = (n, n)
         if known.calibration is not None:
             calibration = pack_calibration(known.calibration / name)
             self.identity = dict(calibration.manifest.camera)
@@ -166,7 +166,27 @@ class _Plane:
                     f"{camera.name}: has pixels of {ours:g} um, but the calibration's camera of {theirs:g} um; give "
                     "the camera of the calibration, or a calibration of this camera",
                 )
-        self.patterns = _patterns(known, cast("tuple[int, int]", scene))
+        if known.patterns.endswith(".json"):
+            data = read_json(known.patterns)
+            if not isinstance(data, dict) or "shots" not in data:
+                raise MitsimError(f"{known.patterns}: has no shots; give patterns.json of `mitsim export --format png`")
+            shots = data["shots"] if isinstance(data["shots"], list) else []
+            captures = [
+                {**{key: shot.get(key) for key in ("row", "column", "sign")}, "file": frame_name(index)}
+                for index, shot in enumerate(shots)
+                if isinstance(shot, dict)
+            ]
+            named = {key: data[key] for key in ("family", "n", "P_L", "P_R") if key in data}
+            self.patterns = validate(Patterns, {**named, "captures": captures}, known.patterns)
+        else:
+            left, right = (parse_patterns(known.patterns, side, known.listed.seed) for side in scene)
+            family = PatternFamily(known.patterns, left.left, right.right)
+            self.patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
+        sides = tuple(len(matrix) for matrix in self.patterns.matrices)
+        if sides != scene:
+            raise MitsimError(
+                f"{known.patterns}: is for {_size(sides)} projector pixels, but {_size(scene)} are calibrated or stated"
+            )
 
     def pack(
         self,
@@ -190,12 +210,26 @@ class _Plane:
         names = (
             *(shot.file for shot in captures), *((AMBIENT,) if ambient else ()), *((CLOSING,) if closing else ()),
         )  # fmt: skip
-        own = (
-            camera.identity
-            if known.listed.prepare.channel == how.channel
-            else {**camera.identity, "channel": how.channel}
-        )
-        head = RunHead.of(_configuration(known, camera, how, files))
+        own = camera.identity | ({} if listed.prepare.channel == how.channel else {"channel": how.channel})
+        more = () if listed.ambient is None else image_files(Path(listed.ambient), known.wanted)
+        corrected = {
+            name: {path.name: checksum(path) for path in image_files(Path(place), known.wanted)}
+            for name in CORRECTIONS
+            if (place := getattr(how, name)) is not None
+        }
+        configuration = {
+            "imported": {path.name: checksum(path) for path in files},
+            "ambient": {path.name: checksum(path) for path in more},
+            "patterns": known.patterns,
+            **camera.stated,
+            "exposure_s": camera.digital.exposure_s,
+            "black_level_dn": known.black_level_dn,
+            "channel": how.channel,
+            "prepare": {**how.model_dump(mode="json", exclude_defaults=True), **corrected},
+            "seed": listed.seed,
+            **listed.model_dump(include={"closing_frame", "closing_exposure_s", "order"}, exclude_none=True),
+        }
+        head = RunHead.of(configuration)
         manifest = RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,
@@ -262,54 +296,6 @@ class _Plane:
         if stated is not None and count != 1:
             raise ArgumentError("ambient_shots", f"{stated}: {source} holds {count} frames; leave it out")
         return (total / count).astype(np.float32), stated or count
-
-
-def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
-    if known.in_file:
-        data = read_json(known.patterns)
-        if not isinstance(data, dict) or "shots" not in data:
-            raise MitsimError(f"{known.patterns}: has no shots; give patterns.json of `mitsim export --format png`")
-        shots = data["shots"] if isinstance(data["shots"], list) else []
-        captures = [
-            {**{key: shot.get(key) for key in ("row", "column", "sign")}, "file": frame_name(index)}
-            for index, shot in enumerate(shots)
-            if isinstance(shot, dict)
-        ]
-        named = {key: data[key] for key in ("family", "n", "P_L", "P_R") if key in data}
-        patterns = validate(Patterns, {**named, "captures": captures}, known.patterns)
-    else:
-        left, right = (parse_patterns(known.patterns, side, known.listed.seed) for side in scene)
-        family = PatternFamily(known.patterns, left.left, right.right)
-        patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
-    sides = tuple(len(matrix) for matrix in patterns.matrices)
-    if sides != scene:
-        raise MitsimError(
-            f"{known.patterns}: is for {_size(sides)} projector pixels, but {_size(scene)} are calibrated or stated"
-        )
-    return patterns
-
-
-def _configuration(
-    known: RealCapture, camera: Electronics, how: Preparation, files: tuple[Path, ...]
-) -> dict[str, Any]:
-    more = () if known.listed.ambient is None else image_files(Path(known.listed.ambient), known.wanted)
-    corrected = {
-        name: {path.name: checksum(path) for path in image_files(Path(place), known.wanted)}
-        for name in CORRECTIONS
-        if (place := getattr(how, name)) is not None
-    }
-    return {
-        "imported": {path.name: checksum(path) for path in files},
-        "ambient": {path.name: checksum(path) for path in more},
-        "patterns": known.patterns,
-        **camera.stated,
-        "exposure_s": camera.digital.exposure_s,
-        "black_level_dn": known.black_level_dn,
-        "channel": how.channel,
-        "prepare": {**how.model_dump(mode="json", exclude_defaults=True), **corrected},
-        "seed": known.listed.seed,
-        **known.listed.model_dump(include={"closing_frame", "closing_exposure_s", "order"}, exclude_none=True),
-    }
 
 
 def _size(shape: tuple[int, ...]) -> str:

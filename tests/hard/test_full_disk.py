@@ -14,7 +14,7 @@ from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json, write_text
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.exchange.formats import export, import_file
-from mitsim.exchange.png_files import draw_family
+from mitsim.exchange.other_programs import draw_family
 from mitsim.studies.framework.campaign import Store
 from mitsim.studies.framework.experiment import Found, Point, Setup
 from tests.exchanged import Made, made

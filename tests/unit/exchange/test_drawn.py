@@ -12,7 +12,7 @@ from PIL import Image
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
-from mitsim.exchange.png_files import SQUARE, Raster, describe_cells, draw_family, draw_stripes, grid_in, session_of
+from mitsim.exchange.other_programs import SQUARE, Raster, describe_cells, draw_family, draw_stripes, grid_in
 from mitsim.reconstruct.captured_session import calibrate_frames
 from tests.real_session import RealSession, write_image
 
@@ -57,7 +57,7 @@ def lights(folder: Path) -> list[np.ndarray]:
 def test_frames_of_the_stripes_give_the_cameras_factors(mode: str, devices: tuple[str, str], tmp_path: Path) -> None:
     """The list that comes with them is theirs: the camera that sees them is found again, to its noise. (Planted:
     rows for columns, the negative half first, no uniform frame, another exposure in the list.)"""
-    result = draw_stripes(tmp_path / "stripes", devices[0], session_of(devices[1], 0.02, N, mode))
+    result = draw_stripes(tmp_path / "stripes", N, *devices, 0.02, mode)
     shown, session = lights(tmp_path / "stripes"), RealSession()
     assert result["pictures"] == len(shown) == (16 if mode == "pair" else 10)
     cell = {"cell": 3, "cell_columns": 3, "cell_shape": 1.0}
@@ -142,5 +142,5 @@ def test_what_cannot_be_drawn_is_refused_and_leaves_nothing(devices: tuple[str, 
             draw_family(place, name, n, projector)
     for words, exposure, n, mode in (("'pair' or 'uniform'", 0.02, N, "both"), ("exposure 0:", 0.0, N, "pair")):
         with pytest.raises(MitsimError, match=words):
-            session_of(devices[1], exposure, n, mode)
+            draw_stripes(place, n, *devices, exposure, mode)
     assert not place.exists()

@@ -22,8 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.exchange import real
-from mitsim.exchange.capture_list import CaptureList, RealCapture
-from mitsim.exchange.formats import export
+from mitsim.exchange.formats import CaptureList, RealCapture, export
 from mitsim.exchange.real import LEFT_OUT, import_capture
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Status, Verdict
