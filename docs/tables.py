@@ -35,7 +35,7 @@ from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe
-from mitsim.exchange.formats import CaptureList
+from mitsim.exchange.capture_list import CaptureList
 from mitsim.learn.pair_store import ModelManifest, PairsManifest, Shard
 from mitsim.learn.requests import Variation
 from mitsim.light.plan import PlanFile

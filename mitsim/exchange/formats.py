@@ -1,39 +1,23 @@
 """Export of RUN and CAL folders to files of other programs, import of such files and of real frames, and pictures.
 
-Each format is a row of :data:`FORMATS`; its module is imported when it is used, after the request was checked. Facts
-about a real camera's frames come from a list or from options, and are checked before any frame is opened.
+Each format is a row of :data:`FORMATS`; its module is imported when it is used, after the request was checked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, model_validator
-
 from mitsim.core import colour_files, configuration, manifests
-from mitsim.core.colour_files import (
-    CORRECTIONS,
-    ColourManifest,
-    Crop,
-    Preparation,
-    Raw,
-    Wanted,
-    check_channel,
-    image_files,
-)
-from mitsim.core.configuration import Configuration, FilePath, Options, Positive, option, takes, validate
+from mitsim.core.configuration import FilePath, Options, option, takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, check_root
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
-from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital, RunManifest
-from mitsim.devices.framelist import Identity
+from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest
 from mitsim.devices.patterns import read_name, takes_seed
-from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
+from mitsim.exchange.capture_list import CAMERAS, PROJECTORS, TURNED, FrameFacts, said
 
 if TYPE_CHECKING:
     from mitsim.core.job import Job
@@ -62,13 +46,6 @@ def _function(name: str) -> Callable[..., Any]:
     return found
 
 
-_LISTS, _CAMERAS, _PROJECTORS = (
-    partial(configuration.shipped_names, field)
-    for field in (configuration.LIST, configuration.CAMERA, configuration.PROJECTOR)
-)
-"""Names of shipped files, for completion."""
-
-
 class Exported(Options):
     """Options of an export."""
 
@@ -82,7 +59,7 @@ class Exported(Options):
     )
     overwrite: bool = option(False, "replace the file")
     projector: str | None = option(
-        None, "projector: name or TOML file", panel=configuration.DEVICES, metavar="NAME|FILE", complete=_PROJECTORS
+        None, "projector: name or TOML file", panel=configuration.DEVICES, metavar="NAME|FILE", complete=PROJECTORS
     )
 
 
@@ -173,298 +150,6 @@ def check_format(
         raise MitsimError(f"output {output}: {ending} is not of {format}; rename it")
 
 
-# ---- Facts about a real camera's frames ----
-
-_OTHERS = {
-    "full_well_e": "a camera's file; give it to --camera, and the list of a capture to --list",
-    "signed_capture": "the list of a calibration's frames; `mitsim calibrate --frames` reads it, in their folder",
-}
-"""Kinds of files that are no capture list, by a field that each of them has."""
-TURNED = "turn_deg"
-"""Field of a calibration's configuration with the angle by which its frames are turned."""
-
-
-class CaptureList(Configuration):
-    """Facts of a real capture, and preparation of its files.
-
-    Options of `mitsim import` replace them.
-    """
-
-    camera: Identity | None = None
-    """Identity that a calibration must share: a name, or any value as in a run's manifest; none: by --camera or
-    --calibration."""
-    digital: Digital | None = None
-    """Conversion of digital numbers to electrons a second, as in a run's manifest; none: by --camera and --exposure."""
-    bits: int | None = Field(default=None, ge=1, le=32)
-    """Bits of the camera's whole numbers; none: real numbers, or as in the camera file."""
-    patterns: str | None = None
-    """Name of the family, or patterns.json of `mitsim export --format png`, a path from the list's folder."""
-    n: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
-    """Scene pixels a side, without a calibration."""
-    seed: int = Field(default=0, ge=0, lt=2**64)
-    """Seed of patterns of a `random` family."""
-    ambient: str | None = None
-    """Frame with the projector off, or a folder of such frames; a path from the list's folder."""
-    ambient_shots: int | None = Field(default=None, ge=1)
-    """Number of shots averaged in a single ambient frame."""
-    closing_frame: ClosingKind | None = None
-    """`first` or `uniform`: the last frame checks lamp, camera and scene, and shows the first shot again, or all
-    projector pixels lit; none: no such frame."""
-    closing_exposure_s: Positive | None = None
-    """Exposure of the closing frame [s]; none: that of all frames."""
-    order: str | None = None
-    """Order in which the shots were taken, such as `column-major`; none: row-major, of signed ones + before -."""
-    raw: Raw | None = None
-    """Layout of files without a header; none: there are no such files."""
-    centre: bool | None = None
-    """True if calibrations of these frames remove row and column means (FlatCam masks); none: as the calibration
-    states."""
-    prepare: Preparation = Preparation()
-    """Table: preparation of the files' numbers."""
-    source: str | None = None
-    """Source of these facts."""
-
-    @model_validator(mode="after")
-    def _is_whole(self) -> CaptureList:
-        if self.digital is not None and self.camera is None:
-            raise ValueError("digital is of a camera; give camera, its name, too")
-        if self.bits is not None and self.digital is None:
-            raise ValueError("bits are of digital's numbers; give digital too, or leave both to --camera")
-        if self.ambient_shots is not None and self.ambient is None:
-            raise ValueError("ambient_shots are of an ambient frame; give ambient too")
-        if self.closing_exposure_s is not None and self.closing_frame is None:
-            raise ValueError("closing_exposure_s is of a closing frame; give closing_frame too")
-        return self
-
-
-def load_capture_list(name: Path | str) -> CaptureList:
-    path = configuration.locate(name, "calibration", ".toml", configuration.LIST)
-    data = configuration.read_table(path, "list")
-    for name_of_field, kind in _OTHERS.items():
-        if name_of_field in data:
-            raise MitsimError(f"list {path}: is {kind}")
-    listed = validate(CaptureList, data, f"list {path}")
-
-    def from_folder(holder: Configuration, *names: str) -> dict[str, str]:
-        return {name: str(path.parent / each) for name in names if (each := getattr(holder, name)) is not None}
-
-    prepare = listed.prepare.model_copy(update=from_folder(listed.prepare, *CORRECTIONS))
-    in_file = ("patterns",) if listed.patterns is not None and listed.patterns.endswith(".json") else ()
-    return listed.model_copy(update={"prepare": prepare, **from_folder(listed, "ambient", *in_file)})
-
-
-@dataclass(frozen=True)
-class Electronics:
-    name: str
-    identity: dict[str, Any]
-    digital: Digital
-    largest: int | None
-    stated: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class RealCapture:
-    """Facts about a real capture; None: as ``listed`` states.
-
-    ``calibration`` is a CAL folder of the same camera, coloured for all planes, which states identity and projector
-    pixels.
-    """
-
-    listed: CaptureList
-    camera: str | None = None
-    exposure_s: float | None = None
-    calibration: Path | None = None
-    black_level_dn: float | None = None
-
-    @property
-    def patterns(self) -> str:
-        """Return the name of the family, or the file of patterns; ArgumentError if none is stated."""
-        if self.listed.patterns is None:
-            raise ArgumentError("patterns", "is not given, and frames do not say it; give it")
-        return self.listed.patterns
-
-    @property
-    def wanted(self) -> Wanted:
-        return Wanted(raw=self.listed.raw)
-
-    @property
-    def colours(self) -> ColourManifest | None:
-        """Return all planes as lines of a coloured folder; None for a single plane, or a picture without mosaic."""
-        prepare = self.listed.prepare
-        if prepare.channel != colour_files.ALL:
-            return None
-        return colour_files.lines_of_planes(colour_files.RUN, prepare.wavelengths_nm)
-
-    def electronics(self) -> tuple[Electronics, Preparation]:
-        """Return camera and preparation with its mosaic; MitsimError if neither file nor list has them."""
-        listed = self.listed
-        prepare = listed.prepare
-        if self.camera is not None:
-            if self.exposure_s is None:
-                raise ArgumentError("exposure", "is not given, and frames do not say it; give it")
-            sensor = load_sensor(configuration.locate(self.camera, "calibration", ".toml", configuration.CAMERA))
-            digital, name, largest = digital_of(sensor, check_exposure(self.exposure_s)), sensor.name, sensor.largest_dn
-            if prepare.mosaic is None and prepare.channel is not None and sensor.mosaic is not None:
-                prepare = prepare.model_copy(update={"mosaic": sensor.mosaic})
-            identity = {"name": name}
-            stated = {"sensor": sensor.model_dump(mode="json", exclude={"full_well_e"})}
-        elif listed.digital is not None and listed.camera is not None:
-            seconds = check_exposure(self.exposure_s or listed.digital.exposure_s)
-            digital, identity = listed.digital.model_copy(update={"exposure_s": seconds}), dict(listed.camera)
-            name, largest = str(identity.get("name", "named")), None if listed.bits is None else 2**listed.bits - 1
-            stated = {"sensor": {"name": name, "digital": listed.digital.model_dump(mode="json"), "bits": listed.bits}}
-        else:
-            raise ArgumentError("camera", "is not given, and frames do not say it; give it")
-        if self.black_level_dn is not None:
-            changed = {**digital.model_dump(), "black_level_dn": self.black_level_dn}
-            digital = validate(Digital, changed, "black_level")
-        return Electronics(name, identity, digital, largest, stated), prepare
-
-    def check(self, source: Path) -> None:
-        """Raise MitsimError for invalid values, and a ``source`` without frames, before any frame is opened."""
-        listed, prepare = self.listed, self.listed.prepare
-        if listed.closing_exposure_s is not None:
-            check_exposure(listed.closing_exposure_s)
-            if prepare.dark is not None:
-                said = f"{listed.closing_exposure_s:g}: is of no use beside dark frames of another; leave it out"
-                raise ArgumentError("closing_exposure", said)
-        self.electronics()
-        folder, colours = self.calibration, self.colours
-        if folder is None and listed.n is None:
-            needed = "is not given, and patterns need its projector; give it, or --projector-pixels"
-            raise ArgumentError("calibration", needed)
-        if folder is not None and colours is not None:
-            colour_files.read_colours(folder, colour_files.CALIBRATION)
-            colour_files.check_lines(colours, "channel all", folder)
-        for part in [] if folder is None else [folder / line for line in (colours.names if colours else ("",))]:
-            manifest = manifests.read_manifest(part, CalibrationManifest)
-            if listed.centre not in (None, manifest.centre):
-                raise MitsimError(
-                    f"calibration {part}: its centre is {str(manifest.centre).lower()}, and the list's "
-                    f"{str(listed.centre).lower()}: it takes other means off frames; calibrate as the list says"
-                )
-            turned = manifest.configuration.get(TURNED, prepare.turn_deg)
-            if turned != prepare.turn_deg:
-                raise MitsimError(
-                    f"calibration {part}: is of frames turned by {turned} degrees, not by {prepare.turn_deg:g}; "
-                    f"give --turn {turned}"
-                )
-        if self.patterns.endswith(".json"):
-            check_plain(self.patterns)
-        else:
-            read_name(self.patterns, listed.n)
-        for place in (source, *(getattr(prepare, name) for name in CORRECTIONS)):
-            if place is not None:
-                image_files(Path(place), self.wanted)
-
-
-# ---- Options in place of a list ----
-
-_LISTED = {
-    **{name: name for name in ("patterns", "closing_frame", "order", "seed", "ambient_shots")},
-    "closing_exposure": "closing_exposure_s",
-    "ambient_frame": "ambient",
-    "projector_pixels": "n",
-}
-_PREPARED = {
-    "channel": "channel",
-    "mosaic": "mosaic",
-    "divide": "divide_by",
-    "turn": "turn_deg",
-    "orientation": "orientation",
-    "dark_frame": "dark",
-    "flat_frame": "flat",
-    "flat_dark_frame": "flat_dark",
-}
-"""Fields of a list, and of its preparation, by the option that takes the place of each."""
-_said = partial(option, None)
-
-
-class FrameFacts(Options):
-    """Facts about a real camera's frames that replace a list's; None if unknown."""
-
-    VERB = "import_frames"
-
-    list: FilePath | None = _said(
-        "of frames: list of what is known of them; options take its place", metavar="NAME|FILE", complete=_LISTS
-    )
-    patterns: str | None = _said("of frames: the family, or patterns.json of export", metavar="NAME|FILE")
-    camera: FilePath | None = _said(
-        "of frames: camera electronics, name or TOML file", metavar="NAME|FILE", complete=_CAMERAS
-    )
-    exposure: float | None = _said("of frames: seconds of each", metavar="SECONDS")
-    calibration: FilePath | None = _said("of frames: calibration of the same camera, for its identity", metavar="CAL")
-    projector_pixels: int | None = _said("of frames: projector pixels a side, without a calibration", metavar="N")
-    black_level: float | None = _said("of frames: number of a pixel without charge; the camera's if not given")
-    ambient_frame: FilePath | None = _said("frame, or folder of frames, with the projector off", metavar="PATH")
-    ambient_shots: int | None = _said("shots that a single such frame is the mean of", metavar="N")
-    closing_frame: Literal["first", "uniform"] | None = _said(
-        "the last frame checks lamp, camera and scene: the first one again, or a uniform one", metavar="first|uniform"
-    )
-    closing_exposure: float | None = _said("seconds of that frame; those of all if not given", metavar="SECONDS")
-    order: str | None = _said(
-        "in which the shots were taken, such as column-major; row-major if not given", metavar="NAME"
-    )
-    shape: str | tuple[int, int] | None = _said("of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS")
-    bits: int | None = _said("of a number in such a file", metavar="N")
-    byte_order: str | None = _said("of such a file: little or big", metavar="ORDER")
-    channel: str | None = _said(
-        "plane of a colour sensor, as FlatCam names it, or all of them", metavar="r|gb|gr|b|all"
-    )
-    mosaic: str | None = _said(
-        "of frames: filters of the first 2 x 2 pixels; the camera's if not given", metavar="RGGB|BGGR|GRBG|GBRG"
-    )
-    divide: int | None = _said("of frames: factor that all numbers have; found if not given", metavar="N")
-    dark_frame: FilePath | None = _said("frame, or folder of frames, without any light", metavar="PATH")
-    flat_frame: FilePath | None = _said("the same of even light without a mask", metavar="PATH")
-    flat_dark_frame: FilePath | None = _said("the same without light, of the flat's exposure", metavar="PATH")
-    orientation: int | None = _said("of frames: turned as Exif numbers it", min=1, max=8, metavar="1..8")
-    turn: float | None = _said("of frames: turned counter-clockwise after that", metavar="DEGREES")
-    crop: str | tuple[int, ...] | None = _said(
-        "of frames: part that is taken in the end", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
-    )
-    seed: int | None = _said("root of every random stream", panel=configuration.QUALITY)
-
-    def of(self, source: Path) -> RealCapture:
-        bare = any(
-            path.suffix.lower() in colour_files.BARE
-            for path in (source, *(source.iterdir() if source.is_dir() else ()))
-        )
-        if self.shape is None or not bare:
-            self.refuse(("shape", "bits", "byte_order"), "on files that have a header, or without a shape")
-        listed = CaptureList() if self.list is None else load_capture_list(self.list)
-        known, prepare = (
-            {name: getattr(each, name) for name in each.model_fields_set} for each in (listed, listed.prepare)
-        )
-        given = {name: str(each) if isinstance(each, Path) else each for name, each in self if each is not None}
-        prepare |= {field: given[name] for name, field in _PREPARED.items() if name in given}
-        if self.channel is not None:
-            check_channel(self.channel)
-        if self.crop is not None:
-            prepare["crop"] = Crop.of(_text_of(self.crop, ","))
-        if self.turn is not None:
-            prepare["turn_about"] = "centre"
-        if self.ambient_frame is not None:
-            known.pop("ambient_shots", None)
-        if self.calibration is not None:
-            known.pop("n", None)
-        if self.shape is not None:
-            known["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little")
-        known |= {field: given[name] for name, field in _LISTED.items() if name in given}
-        known["prepare"] = validate(Preparation, prepare, "import")
-        calibration = None if self.calibration is None else Path(self.calibration)
-        listed = validate(CaptureList, known, "import")
-        capture = RealCapture(listed, given.get("camera"), self.exposure, calibration, self.black_level)
-        if not takes_seed(capture.patterns):
-            self.refuse(("seed",), "on patterns that are not drawn at random")
-        capture.check(source)
-        return capture
-
-
-def _text_of(parts: str | tuple[int, ...], sign: str) -> str:
-    return parts if isinstance(parts, str) else sign.join(map(str, parts))
-
-
 # ---- Import ----
 
 
@@ -506,7 +191,7 @@ def import_file(
         raise ArgumentError("source", f"{source}: give a file that ends in {', '.join(READERS)}, or use import_frames")
     check_plain(source)  # refused before numpy is imported
     if channel is not None:
-        check_channel(channel)
+        colour_files.check_channel(channel)
     with _function(READERS[source.suffix.lower()])(source, channel) as (run, calibration):
         wanted = {
             "run": ("output", output, run),
@@ -565,7 +250,7 @@ def import_frames(source: Path | str, output: Path | str, job: Job | None = None
         a place that holds something.
     """
     facts = FrameFacts(**known).of(Path(source))
-    from mitsim.exchange.real import import_capture
+    from mitsim.exchange.packed import import_capture
 
     return import_capture(Path(source), Path(output), facts, None if job is None else job.command)
 
@@ -583,20 +268,20 @@ class Pictures(Options):
     VERB = "pattern_pictures"
 
     projector: FilePath = option(
-        "mp_cl1", "projector of known rows and columns: name or TOML file", metavar="NAME|FILE", complete=_PROJECTORS
+        "mp_cl1", "projector of known rows and columns: name or TOML file", metavar="NAME|FILE", complete=PROJECTORS
     )
     projector_pixels: int = option(128, "projector pixels a side of the patterns", min=1, max=MOST_PIXELS, metavar="N")
-    seed: int | None = _said("root of every random stream", panel=configuration.QUALITY)
-    closing_frame: Literal["first", "uniform"] | None = _said(
+    seed: int | None = said("root of every random stream", panel=configuration.QUALITY)
+    closing_frame: Literal["first", "uniform"] | None = said(
         "last picture, to check lamp, camera and scene: the first one again, or a uniform one",
         metavar="first|uniform",
         panel=configuration.WHAT,
     )
-    camera: FilePath | None = _said(
-        "of stripes: camera electronics, name or TOML file", metavar="NAME|FILE", complete=_CAMERAS
+    camera: FilePath | None = said(
+        "of stripes: camera electronics, name or TOML file", metavar="NAME|FILE", complete=CAMERAS
     )
-    exposure: float | None = _said("of stripes: seconds of each frame", metavar="SECONDS")
-    signed_capture: Literal["pair", "uniform"] | None = _said(
+    exposure: float | None = said("of stripes: seconds of each frame", metavar="SECONDS")
+    signed_capture: Literal["pair", "uniform"] | None = said(
         "of stripes: both halves of each, or one and a uniform frame", metavar="pair|uniform"
     )
 

@@ -31,7 +31,7 @@ from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
 from mitsim.devices.session import UNIFORM, halves_in_order
-from mitsim.exchange.formats import TURNED
+from mitsim.exchange.capture_list import TURNED
 from mitsim.exchange.packed import FACTORS, Calibration, Content, Loaded, Packed, Run, as_channel, shots_of
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction

@@ -22,7 +22,7 @@ from mitsim.devices.patterns import read_name
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
-from mitsim.exchange.formats import load_capture_list
+from mitsim.exchange.capture_list import load_capture_list
 from mitsim.learn.requests import METHODS as LEARNED
 from mitsim.reconstruct.request import METHODS
 from mitsim.sessions.session_file import read_session

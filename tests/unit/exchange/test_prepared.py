@@ -39,8 +39,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.images import Preparer, read_image, read_images
 from mitsim.core.manifests import Digital
 from mitsim.devices.framelist import load_frames
-from mitsim.exchange.formats import CaptureList, RealCapture, load_capture_list
-from mitsim.exchange.real import import_capture
+from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
+from mitsim.exchange.packed import import_capture
 from mitsim.reconstruct.captured_session import calibrate_frames
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, made
 from tests.real_session import RealSession, write_list

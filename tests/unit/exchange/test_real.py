@@ -21,9 +21,10 @@ from mitsim.core.colour_files import Preparation, Raw, Wanted
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.manifests import CalibrationManifest
-from mitsim.exchange import real
-from mitsim.exchange.formats import CaptureList, RealCapture, export
-from mitsim.exchange.real import LEFT_OUT, import_capture
+from mitsim.exchange import packed
+from mitsim.exchange.capture_list import CaptureList, RealCapture
+from mitsim.exchange.formats import export
+from mitsim.exchange.packed import LEFT_OUT, import_capture
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Status, Verdict
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, made
@@ -218,7 +219,7 @@ def test_a_stack_of_many_pages_is_read_page_after_page(tmp_path: Path, monkeypat
     dn = ms.load_run(bench.run).dn
     tifffile.imwrite(tmp_path / "stack.tif", dn.astype(np.uint16))
     seen: list[int] = []
-    looked = real.read_images
+    looked = packed.read_images
 
     def counted(path: Path, wanted: Wanted) -> Iterator[np.ndarray]:
         """Pages, each noted as it is read."""
@@ -226,7 +227,7 @@ def test_a_stack_of_many_pages_is_read_page_after_page(tmp_path: Path, monkeypat
             seen.append(1)
             yield page
 
-    monkeypatch.setattr(real, "read_images", counted)
+    monkeypatch.setattr(packed, "read_images", counted)
     import_capture(tmp_path / "stack.tif", tmp_path / "run 2", known(bench))
     assert len(seen) == 2 * len(dn)
     assert np.array_equal(ms.load_run(tmp_path / "run 2").dn, dn)
