@@ -552,7 +552,7 @@ SIZES = {
     "cli": (6, 1433),
     "core": (13, 2990),
     "devices": (9, 2101),
-    "exchange": (7, 1406),
+    "exchange": (5, 1313),
     "learn": (7, 1306),
     "light": (6, 1721),
     "metrics": (1, 81),
