@@ -29,9 +29,8 @@ from mitsim.core.manifests import (
     RunManifest,
     ShotFile,
 )
-from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.framelist import ChartPlace, DarkFile, FrameList, KnownCapture, KnownList, StripeFile
-from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe

@@ -99,7 +99,7 @@ def peak_irradiance(expected: ExpectedFrames) -> float:
 
 
 def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str]:
-    if sensor.has_defects:
+    if sensor.hot_pixels or sensor.dead_pixels:
         own = specimen(sensor, (shape[0], shape[1]))
         yield (
             f"defect pixels: {own.hot} are hot and {own.dead} dead, and frames have them as they are read; an image "

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from mitsim.core.manifests import Parallax
-    from mitsim.devices.camera import CameraGeometry, Devices
-    from mitsim.devices.mask_profile import MaskProfile
+    from mitsim.devices.camera import CameraGeometry, Devices, MaskProfile
     from mitsim.devices.patterns import PatternFamily
     from mitsim.devices.projector import CountedLamps, Lines, ProjectorModel, Spectrum
     from mitsim.devices.sensor import SensorModel
@@ -407,8 +406,7 @@ def open_apparatus(
 
     sensor = load_sensor(sensor_path)
     # What imports numpy comes after what does not.
-    from mitsim.devices.camera import Devices
-    from mitsim.devices.mask_profile import load_mask
+    from mitsim.devices.camera import Devices, load_mask
     from mitsim.devices.projector import ProjectorModel
 
     mask = load_mask(sensor_path)
@@ -446,7 +444,7 @@ def open_apparatus(
 
 def reopen(bench: Opened, variant: str) -> Opened:
     """Load the ``bench`` anew in a ``variant``, which is set from then on."""
-    from mitsim.devices.mask_profile import load_mask
+    from mitsim.devices.camera import load_mask
 
     camera = Path(bench.devices.camera_file)
     given = {} if bench.loaded.sensor_note is None else {"sensor": bench.sensor}

@@ -385,7 +385,7 @@ def mask_fault(bench: Apparatus) -> Fault | None:
     residual = min(_beyond_one(seen), _beyond_one(centred))
     if residual <= _SEPARABLE:
         return None
-    own = 0.0 if isinstance(mask, Mask) else mask.residual
+    own = 0.0 if isinstance(mask, Mask) else min(mask.residuals)
     if own > residual / 2:
         problem = f"the mask ({geometry.mask_words}) has no two factors: frames can be captured, but the best separable"
         remedy = "use a mask of the kind separable, flatcam or mura"

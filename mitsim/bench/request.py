@@ -366,7 +366,7 @@ class Opening(LitScene):
     @property
     def models(self) -> list[Path]:
         """Return the files of the camera and its mask, and of the projector, that are named."""
-        from mitsim.devices.mask_profile import load_mask  # here: it imports numpy
+        from mitsim.devices.camera import load_mask  # here: it imports numpy
 
         named = (self.camera, CAMERA), (self.projector, PROJECTOR)
         files = [locate(each, "calibration", ".toml", field) for each, field in named if each]

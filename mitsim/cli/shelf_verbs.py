@@ -61,7 +61,7 @@ def _cameras() -> Iterator[Entry]:
 
 
 def _masks() -> Iterator[Entry]:
-    from mitsim.devices.mask_profile import KINDS as MASKS
+    from mitsim.devices.camera import KINDS as MASKS
 
     return (Entry(*each) for each in MASKS.items())
 
@@ -201,7 +201,7 @@ def _shipped(kind: str) -> Mapping[str, Path]:
 
 def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
     """Iterate over the lines of a file of a ``kind``, as the shipped file ``like``; a mask is of the kind ``mask``."""
-    from mitsim.devices.mask_profile import MaskProfile
+    from mitsim.devices.camera import MaskProfile
     from mitsim.devices.projector import ProjectorModel
 
     def begun(model: BaseModel, **more: str) -> Iterator[str]:

@@ -115,11 +115,7 @@ class DarkFile(Configuration):
     """Its exposure [s]; none: as for other frames."""
 
 
-def _with_name(camera: Any) -> Any:
-    return {"name": camera} if isinstance(camera, str) else camera
-
-
-Identity = Annotated[Plain, BeforeValidator(_with_name)]
+Identity = Annotated[Plain, BeforeValidator(lambda camera: {"name": camera} if isinstance(camera, str) else camera)]
 """A camera: a name, or anything as a run's manifest has it."""
 
 

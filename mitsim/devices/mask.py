@@ -11,7 +11,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
-from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -95,8 +94,6 @@ class Mask(ByValue):
     bits: npt.NDArray[np.int8]
     blur_mm: ClassVar[float] = 0.0
     """Standard deviation of its edges, which are sharp."""
-    even: ClassVar[bool] = True
-    """Features are squares of one size."""
     flaws: ClassVar[Flaws] = NO_FLAWS
     irradiance: ClassVar[bool] = False
     many: ClassVar[bool] = False
@@ -258,17 +255,8 @@ class Plate(ByValue):
         return self.flaws.blur_mm
 
     @property
-    def even(self) -> bool:
-        return not self.blur_mm
-
-    @property
     def plain(self) -> bool:
         return self.flaws == NO_FLAWS
-
-    @property
-    def open_part(self) -> float:
-        width = np.diff(self.lines) / self.extent_mm
-        return float(width @ self.values @ width)
 
     @cached_property
     def opening_mm(self) -> float:
@@ -293,26 +281,18 @@ class Plate(ByValue):
             terms.append((1.0, rest[:, column].copy(), rest[row] / pivot))
             rest -= np.outer(terms[-1][1], terms[-1][2])
 
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        return self._terms_and_rest[0]
-
-    @property
-    def left_out(self) -> float:
-        return self._terms_and_rest[1]
-
     @cached_property
-    def _terms_and_rest(self) -> tuple[tuple[Term, ...], float]:
+    def terms(self) -> tuple[Term, ...]:
         if self.crosses is not None:
-            return self.crosses, 0.0
+            return self.crosses
         if self.irradiance:
             found = self.largest
             if found.left_out > RASTER_LEFT_OUT:
                 found = LargestTerms(self.values, self.averaged, sizes=(len(self.values),))
-            return found.terms(), found.left_out
+            return found.terms()
         if self.many:
             patterns, which = np.unique(self.values, axis=0, return_inverse=True)
-            return tuple((1.0, (which.ravel() == k) * 1.0, pattern) for k, pattern in enumerate(patterns)), 0.0
+            return tuple((1.0, (which.ravel() == k) * 1.0, pattern) for k, pattern in enumerate(patterns))
         (rows, columns), weights, weighted = _distinct(self.values)
         if self.symmetric:
             singular, left = np.linalg.eigh(weighted)
@@ -323,8 +303,7 @@ class Plate(ByValue):
         left, right = left / weights[0], right / weights[1]
         beyond = np.sqrt(np.cumsum(np.square(singular[::-1]))[::-1])  # what the terms from each on hold
         count = int(np.count_nonzero(beyond > LEFT_OUT * beyond[0]))
-        terms = tuple((float(singular[k]), left[rows, k], right[k, columns]) for k in range(count))
-        return terms, float(beyond[count] / beyond[0]) if count < len(beyond) else 0.0
+        return tuple((float(singular[k]), left[rows, k], right[k, columns]) for k in range(count))
 
     @cached_property
     def most_terms(self) -> int:
@@ -366,10 +345,6 @@ class Plate(ByValue):
     def centred(self) -> bool:
         plain, without = self.residuals
         return without < plain
-
-    @property
-    def residual(self) -> float:
-        return min(self.residuals)
 
     @cached_property
     def amplitude(self) -> Plate:
@@ -514,42 +489,3 @@ class LargestTerms:
         places = np.arange(len(self._values))
         first, beyond = (np.searchsorted(self._starts, places - less, "right") for less in (self._averaged, 0))
         return np.asarray((below[beyond] - below[first]) / self._averaged)
-
-
-# -------- A drawing or scan of a mask
-
-_DRAWING = Wanted("mask drawing", most=LARGEST, bits=(1, 2, 4, 8, 16, 32))
-"""2 and 4 bits are read as 8, in which white is the same."""
-_PICTURES = ".png", ".tif", ".tiff"
-"""Files whose whole numbers are parts of white; other files hold transmissions."""
-
-
-def read_drawing(path: Path) -> FloatArray:
-    """Return the (rows, columns) transmissions, 0 to 1, of the drawing ``path``; pictures are linear in transmission.
-
-    Row 0 is at the top and column 0 at the left for a viewer from the sensor. Raises MitsimError for a file that is no
-    PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
-    """
-    rows, columns = image_size(path, _DRAWING)
-    if (rows - columns) % 2 and 2 * max(rows, columns) > LARGEST:
-        problem = f"{rows} x {columns} pixels: about its centre the shorter side needs half a pixel, so features become"
-        allowed = f"half as large, of which {LARGEST} a side are allowed"
-        raise _DRAWING.refusal(path, f"{problem} {allowed}; make its sides differ by an even number")
-    values = read_image(path, _DRAWING)
-    white = own_end(values) if path.suffix.lower() in _PICTURES else None
-    transmissions = np.asarray(values, dtype=np.float64) / (white or 1.0)
-    if transmissions.min() < 0 or transmissions.max() > 1:
-        raise _DRAWING.refusal(path, "has values outside 0 to 1; give transmissions")
-    return transmissions
-
-
-def make_square(values: FloatArray, feature_mm: float) -> tuple[float, FloatArray]:
-    """Return the side of the pixels, and a drawing with opaque margins that make it square about its centre.
-
-    Pixels are halved if margins of half a pixel are needed.
-    """
-    if (values.shape[0] - values.shape[1]) % 2:
-        values, feature_mm = values.repeat(2, axis=0).repeat(2, axis=1), feature_mm / 2
-    side = max(values.shape)
-    margins = [((side - own) // 2,) * 2 for own in values.shape]
-    return feature_mm, np.pad(values, margins)

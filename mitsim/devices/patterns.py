@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import product
+from itertools import count, product
 from typing import TYPE_CHECKING, Literal
 
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -131,20 +131,18 @@ def way_to(order: int) -> Way:
     """
     way = _way(order)
     if way is None:
-        below, above = hadamard_orders(order)[-1:] or [1], next(o for o in range(order + 1, 4 * order + 5) if _way(o))
-        raise MitsimError(f"order {order} has no Hadamard matrix; use {below[0]} or {above}")
+        below, above = (next(filter(_way, orders)) for orders in (range(max(order, 1), 0, -1), count(order + 1)))
+        raise MitsimError(f"order {order} has no Hadamard matrix; use {below} or {above}")
     return way
 
 
-def hadamard_orders(limit: int) -> list[int]:
-    return [order for order in range(1, limit + 1) if _way(order)]
+def stripe_signs(n: int) -> PatternFactor:
+    """Return the (``n``, N) first rows of the smallest Hadamard matrix, for a calibration's stripes."""
+    return hadamard_matrix(stripe_count(n))[:n]
 
 
 def stripe_count(n: int) -> int:
-    found = next(filter(_way, range(n, 2 * n + 1)), None)  # with a power of two among them
-    if found is None:
-        raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
-    return found
+    return next(filter(_way, range(n, 2 * n + 1)))  # a power of two is among them
 
 
 @cache
@@ -171,45 +169,26 @@ def hadamard_matrix(order: int) -> PatternFactor:
     """Return the (``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones."""
     import numpy as np
 
-    matrix = _construct(order)
-    return (matrix * matrix[:, :1]).astype(np.int8)
-
-
-def _construct(order: int) -> npt.NDArray[np.int64]:
-    import numpy as np
-
     how, number = way_to(order)
+    if how == "product":
+        return np.kron(hadamard_matrix(number), hadamard_matrix(order // number))
     if how == "doubled":
-        # scipy.linalg.hadamard is avoided because its import takes longer than the rest of a refusal.
-        doubled = np.ones((1, 1), dtype=np.int64)
-        while len(doubled) < order:
-            doubled = np.kron([[1, 1], [1, -1]], doubled)
-        return doubled
-    if how == "skew":
-        return _conference(number) + np.eye(order, dtype=np.int64)
-    if how == "symmetric":
-        symmetric, eye = _conference(number), np.eye(number + 1, dtype=np.int64)
-        return np.kron(symmetric, [[1, 1], [1, -1]]) + np.kron(eye, [[1, -1], [-1, -1]])
-    return np.kron(_construct(number), _construct(order // number))
-
-
-def _conference(q: int) -> npt.NDArray[np.int64]:
-    """Return the (q + 1, q + 1) Paley conference matrix of a prime q: skew for q = 3 mod 4, symmetric for 1 mod 4."""
-    import numpy as np
-
-    squares = set((np.arange(1, q) ** 2 % q).tolist())
-    character = np.array([0] + [1 if value in squares else -1 for value in range(1, q)])
-    jacobsthal = character[(np.arange(q)[:, None] - np.arange(q)[None, :]) % q]
-    matrix = np.zeros((q + 1, q + 1), dtype=np.int64)
-    matrix[0, 1:] = 1
-    matrix[1:, 0] = 1 if q % 4 == 1 else -1
-    matrix[1:, 1:] = jacobsthal
-    return matrix
-
-
-def stripe_signs(n: int) -> PatternFactor:
-    """Return the (``n``, N) first rows of the smallest Hadamard matrix, for a calibration's stripes."""
-    return hadamard_matrix(stripe_count(n))[:n]
+        places = np.arange(order)
+        matrix = np.where(np.bitwise_count(places[:, None] & places) % 2, -1, 1)
+    else:
+        # Paley's conference matrix of a prime: skew for 3 mod 4, symmetric for 1 mod 4.
+        squares = np.arange(1, number) ** 2 % number
+        character = np.where(np.isin(np.arange(number), squares), 1, -1)
+        character[0] = 0
+        conference = np.zeros((number + 1, number + 1), dtype=np.int64)
+        conference[0, 1:], conference[1:, 0] = 1, -1 if how == "skew" else 1
+        conference[1:, 1:] = character[(np.arange(number)[:, None] - np.arange(number)) % number]
+        eye = np.eye(number + 1, dtype=np.int64)
+        if how == "skew":
+            matrix = conference + eye
+        else:
+            matrix = np.kron(conference, [[1, 1], [1, -1]]) + np.kron(eye, [[1, -1], [-1, -1]])
+    return (matrix * matrix[:, :1]).astype(np.int8)
 
 
 # ---- Families ----

@@ -16,6 +16,8 @@ from mitsim.core.colour_files import MOST_LINES
 from mitsim.core.configuration import Configuration
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
+from mitsim.core.manifests import MOST_LINES
+from mitsim.devices.sensor import SensorModel
 
 _FIELDS = 4
 """Of a chessboard, a side (IEC 61947-1, ANSI IT7.228)."""
@@ -322,38 +324,30 @@ class Response(ByValue):
         self._hold(counts=np.array(self.counts, dtype=np.float64))
 
     @classmethod
-    def of(cls, sensor: SensorModel) -> Response:
-        """Return the response of a ``sensor`` without a mosaic; one number of efficiency counts at every wavelength.
+    def of_each(cls, sensor: SensorModel) -> tuple[Response, ...]:
+        """Return the response of a ``sensor`` under each of its filters; one number of efficiency counts everywhere.
 
         Raises MitsimError for a sensor without a known efficiency in :data:`SPECTRA_NM`.
         """
-        curve = sensor.quantum_efficiency_curve
-        if curve is None:
-            return cls(sensor.efficiency(SPECTRA_NM[0]) * np.linspace(*SPECTRA_NM, _PLACES), SPECTRA_NM)
-        return cls._along(curve, sensor)
-
-    @classmethod
-    def of_each(cls, sensor: SensorModel) -> tuple[Response, ...]:
-        if sensor.mosaic is None:
-            return (cls.of(sensor),)
-        colours = {name: getattr(sensor.mosaic_curves, name) for name in dict.fromkeys(sensor.mosaic)}
-        planes = {name: tuple(plane for plane in _PLANES if sensor.mosaic[plane] == name) for name in colours}
-        return tuple(cls._along(curve, sensor, planes[name]) for name, curve in colours.items())
-
-    @classmethod
-    def _along(cls, curve: EfficiencyCurve, sensor: SensorModel, planes: tuple[int, ...] = _PLANES) -> Response:
-        wavelengths = np.linspace(*SPECTRA_NM, _PLACES)
-        known, efficiency = np.array(curve.wavelengths_nm), np.array(curve.efficiency)
-        first, last = max(SPECTRA_NM[0], known[0]), min(SPECTRA_NM[1], known[-1])
-        if not first < last:
-            curve_nm, lamps_nm = f"{known[0]:g} to {known[-1]:g} nm", f"{SPECTRA_NM[0]:g} to {SPECTRA_NM[1]:g} nm"
-            problem = f"sensor {sensor.name!r}: its curve of quantum efficiency is of {curve_nm}"
-            raise MitsimError(f"{problem}, and lamps' spectra are of {lamps_nm}; switch lamps off with -ambient")
-        counts = np.interp(wavelengths, known, efficiency) * wavelengths
-        farther = np.linspace(SPECTRA_NM[1], max(SPECTRA_NM[1], known[-1]), _PLACES)
-        unseen = np.interp(farther, known, efficiency) * farther
-        beyond = float(np.trapezoid(unseen, farther) / unseen[0]) if unseen[0] > 0 else 0.0
-        return cls(counts, (float(first), float(last)), beyond, planes)
+        wavelengths, found = np.linspace(*SPECTRA_NM, _PLACES), list[Response]()
+        if sensor.mosaic is None and sensor.quantum_efficiency_curve is None:
+            return (cls(sensor.efficiency(SPECTRA_NM[0]) * wavelengths, SPECTRA_NM),)
+        filters = sensor.mosaic or " " * len(_PLANES)
+        for name in dict.fromkeys(filters):
+            curve = getattr(sensor.mosaic_curves, name, sensor.quantum_efficiency_curve)
+            known, efficiency = np.array(curve.wavelengths_nm), np.array(curve.efficiency)
+            first, last = max(SPECTRA_NM[0], known[0]), min(SPECTRA_NM[1], known[-1])
+            if not first < last:
+                curve_nm, lamps_nm = f"{known[0]:g} to {known[-1]:g} nm", f"{SPECTRA_NM[0]:g} to {SPECTRA_NM[1]:g} nm"
+                problem = f"sensor {sensor.name!r}: its curve of quantum efficiency is of {curve_nm}"
+                raise MitsimError(f"{problem}, and lamps' spectra are of {lamps_nm}; switch lamps off with -ambient")
+            counts = np.interp(wavelengths, known, efficiency) * wavelengths
+            farther = np.linspace(SPECTRA_NM[1], max(SPECTRA_NM[1], known[-1]), _PLACES)
+            unseen = np.interp(farther, known, efficiency) * farther
+            beyond = float(np.trapezoid(unseen, farther) / unseen[0]) if unseen[0] > 0 else 0.0
+            planes = tuple(plane for plane in _PLANES if filters[plane] == name)
+            found.append(cls(counts, (float(first), float(last)), beyond, planes))
+        return tuple(found)
 
     @property
     def part(self) -> float:

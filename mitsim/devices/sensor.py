@@ -7,7 +7,7 @@ import os
 from bisect import bisect_left
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, cast
 
 from pydantic import Field, field_validator, model_validator
 
@@ -227,8 +227,8 @@ class SensorModel(Configuration, defer_build=True):
         """
         if self.mosaic is None:
             raise MitsimError(f"sensor {self.name!r}: has no mosaic of colour filters; use a camera that has one")
-        filters: dict[str, Plane] = {"R": "R", "G": "G", "B": "B"}
-        return tuple(tuple(self.efficiency(nm, filters[name]) for nm in wavelengths_nm) for name in self.mosaic)
+        mosaic = cast("Sequence[Plane]", self.mosaic)
+        return tuple(tuple(self.efficiency(nm, plane) for nm in wavelengths_nm) for plane in mosaic)
 
     @property
     def states_efficiency(self) -> bool:
@@ -257,11 +257,8 @@ class SensorModel(Configuration, defer_build=True):
 
     @property
     def has_fixed_pattern(self) -> bool:
-        return any((*self.offset_parts, *self.response_parts, self.dark_current_spread_e_per_s, self.has_defects))
-
-    @property
-    def has_defects(self) -> bool:
-        return self.hot_pixels > 0 or self.dead_pixels > 0
+        parts = *self.offset_parts, *self.response_parts, self.dark_current_spread_e_per_s
+        return any((*parts, self.hot_pixels, self.dead_pixels))
 
     @property
     def offset_parts(self) -> tuple[float, float, float]:
@@ -301,10 +298,6 @@ class SensorModel(Configuration, defer_build=True):
             remedy = "give line_time_us, with its source, or leave ripples out"
             raise MitsimError(f"{problem} of the light falls on no known rows; {remedy}")
         return self.line_time_us * 1e-6
-
-    @property
-    def superpixel_crosstalk(self) -> float:
-        return self.crosstalk / self.binning
 
     @property
     def superpixel_row_noise_e(self) -> float:
@@ -362,12 +355,7 @@ def check_exposure(seconds: float) -> float:
 
 
 def load_sensor(path: Path | str) -> SensorModel:
-    """Return the sensor in a TOML file; a MitsimError names the file, field, value and rule."""
-    return validate(SensorModel, sensor_table(path), f"file {path}")
-
-
-def sensor_table(path: Path | str) -> dict[str, Any]:
-    """Return the fields of the sensor in a TOML file without its table ``[mask]``.
+    """Return the sensor in a TOML file without its table ``[mask]``; a MitsimError names file, field, value and rule.
 
     A line ``base`` names a shipped camera, or a file beside it, whose fields are inherited. Raises MitsimError if there
     is no such base.
@@ -395,7 +383,7 @@ def sensor_table(path: Path | str) -> dict[str, Any]:
             below = {name: below[name] for name in below.keys() - set().union(*others)}
         table = {**below, **table}
     table.pop("mask", None)
-    return table
+    return validate(SensorModel, table, f"file {path}")
 
 
 # -------- How digital numbers become electrons a second

@@ -64,28 +64,21 @@ class BoardShape(Configuration):
 LARGEST_ROTATION_MRAD = 10.0
 """Beyond it, the neglected cosine moves a mask's edge 3 mm off the axis by 0.15 um."""
 LARGEST_TILT_MRAD = 50.0
-DRIFT_UNITS: Mapping[str, str] = MappingProxyType({
-    "mask_rows_um": "um", "mask_columns_um": "um", "mask_axis_um": "um", "mask_rotation_mrad": "mrad",
-    "mask_tilt_rows_mrad": "mrad", "mask_tilt_columns_mrad": "mrad", "vibration_um": "um rms", "temperature_k": "K",
-    "exposure": "1", "power": "1", "power_ramp": "1", "power_flicker": "1 rms", "power_ripple": "1",
-    "session_ramp": "1", "session_flicker": "1 rms", "lamp": "1", "lamp_flicker": "1 rms", "lamp_ripple": "1",
-    "projector_rows": "pixels", "projector_columns": "pixels", "black_level_dn": "DN",
+DRIFTS: Mapping[str, tuple[str, str]] = MappingProxyType({
+    "mask_rows_um": ("um", "mask down the rows"), "mask_columns_um": ("um", "mask along the columns"),
+    "mask_axis_um": ("um", "mask away from the sensor"), "mask_rotation_mrad": ("mrad", "mask turns in its plane"),
+    "mask_tilt_rows_mrad": ("mrad", "mask tilts down the rows"),
+    "mask_tilt_columns_mrad": ("mrad", "mask tilts along the columns"),
+    "vibration_um": ("um rms", "vibration of the mask"), "temperature_k": ("K", "temperature"),
+    "exposure": ("1", "exposure time"), "power": ("1", "projector's power"),
+    "power_ramp": ("1", "power over the capture"), "power_flicker": ("1 rms", "power from frame to frame"),
+    "power_ripple": ("1", "ripple of the power"), "session_ramp": ("1", "power over the session"),
+    "session_flicker": ("1 rms", "power from frame to frame of the session"),
+    "lamp": ("1", "lamp after its frame"), "lamp_flicker": ("1 rms", "lamp from frame to frame"),
+    "lamp_ripple": ("1", "ripple of the lamp"), "projector_rows": ("pixels", "picture down the rows"),
+    "projector_columns": ("pixels", "picture along the columns"), "black_level_dn": ("DN", "black level"),
 })  # fmt: skip
-"""Unit of each kind of drift: every field of :class:`Drift` that moves something by itself."""
-
-DRIFT_WORDS: Mapping[str, str] = MappingProxyType({
-    "mask_rows_um": "mask down the rows", "mask_columns_um": "mask along the columns",
-    "mask_axis_um": "mask away from the sensor", "mask_rotation_mrad": "mask turns in its plane",
-    "mask_tilt_rows_mrad": "mask tilts down the rows", "mask_tilt_columns_mrad": "mask tilts along the columns",
-    "vibration_um": "vibration of the mask", "temperature_k": "temperature", "exposure": "exposure time",
-    "power": "projector's power", "power_ramp": "power over the capture",
-    "power_flicker": "power from frame to frame", "power_ripple": "ripple of the power",
-    "session_ramp": "power over the session", "session_flicker": "power from frame to frame of the session",
-    "lamp": "lamp after its frame", "lamp_flicker": "lamp from frame to frame", "lamp_ripple": "ripple of the lamp",
-    "projector_rows": "picture down the rows", "projector_columns": "picture along the columns",
-    "black_level_dn": "black level",
-})  # fmt: skip
-"""What each kind of drift is, for people."""
+"""Unit and description of each kind of drift: every field of :class:`Drift` that moves something by itself."""
 DRIFT_PARAMETERS = "gap_um_per_k", "power_ripple_hz", "lamp_ripple_hz"
 """Fields of :class:`Drift` that move nothing by themselves: they say what a kind does."""
 
@@ -173,14 +166,14 @@ class Drift(Configuration):
 
     def alone(self, kind: str, amount: float | None = None) -> Drift:
         """Return one ``kind`` of drift alone; MitsimError for an unknown kind, or an amount that is not allowed."""
-        if kind not in DRIFT_UNITS:
-            raise MitsimError(f"drift {kind!r}: there is no such kind; use {', '.join(DRIFT_UNITS)}")
+        if kind not in DRIFTS:
+            raise MitsimError(f"drift {kind!r}: there is no such kind; use {', '.join(DRIFTS)}")
         chosen = getattr(self, kind) if amount is None else float(amount)
         return validate(Drift, {kind: chosen, **{name: getattr(self, name) for name in DRIFT_PARAMETERS}}, "drift")
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        return tuple(kind for kind in DRIFT_UNITS if getattr(self, kind))
+        return tuple(kind for kind in DRIFTS if getattr(self, kind))
 
     @property
     def mask_mm(self) -> tuple[float, float, float]:
@@ -197,11 +190,6 @@ class Drift(Configuration):
         if not (self.mask_rotation_mrad or self.vibration_um):
             return None
         return MaskMotion(rotation_mrad=self.mask_rotation_mrad, vibration_um=self.vibration_um)
-
-
-def amount_in_words(kind: str, amount: float) -> str:
-    unit = DRIFT_UNITS[kind]
-    return f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"
 
 
 # -------- How a calibration session is run

@@ -420,7 +420,7 @@ def geometric_samplers(geometry: CameraGeometry) -> list[SampledTerm]:
 
 def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SampledTerm]:
     def sampler(profile: FloatArray, at: float) -> Sampler:
-        if mask.even:
+        if not mask.blur_mm:
             return ProfileSampler(profile, mask.feature_mm, centre_mm=at)
         steps = Steps.between(profile, mask.lines + at, mask.blur_mm)
         return lambda s, width: steps.over(s, np.abs(width) / 2)

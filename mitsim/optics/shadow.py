@@ -390,7 +390,7 @@ def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Direction
                     thick[term, :, j] = clear.box_means(crossings[:, j], shadow.half_pixel, half_cell)
             return thick
         boxes, feature = (shadow.on_tilted_mask(directions), shadow.half_pixel, half_cell), shadow.mask.feature_mm
-        if not shadow.mask.even or boxes[1] + boxes[2] > _MOST_FEATURES * feature:
+        if shadow.mask.blur_mm or boxes[1] + boxes[2] > _MOST_FEATURES * feature:
             return np.stack([profile.box_means(*boxes) for profile in shadow.clear(profiles, 0.0)])
         in_features = [np.asarray(each / feature) for each in boxes]
         return np.stack([trapezoid_mean(profile, *in_features) for profile in profiles])

@@ -27,7 +27,7 @@ from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.runs import Capture
-from mitsim.devices.mask_profile import load_psf
+from mitsim.devices.camera import load_psf
 from mitsim.reconstruct.point_spread import Array, PointSpreadFit, ShiftedLight, minimise, reduce_frame
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
 from mitsim.reconstruct.request import TIKHONOV, TV, Bounds, ImageRequest
@@ -205,7 +205,7 @@ def reconstruct_psf(
     shots
         Capture in memory, or of :func:`mitsim.core.runs.load_run`.
     psf
-        Light (k, k') of a scene pixel, or a picture of it (:func:`mitsim.devices.mask_profile.load_psf`), of the same
+        Light (k, k') of a scene pixel, or a picture of it (:func:`mitsim.devices.camera.load_psf`), of the same
         pixels as the frames.
     reduce
         Pixels a side, of frames and of the picture, that become one.

@@ -33,8 +33,8 @@ from mitsim.core.images import png
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.runs import load_mosaic, load_run
+from mitsim.devices.camera import load_psf
 from mitsim.devices.framelist import ChartPlace
-from mitsim.devices.mask_profile import load_psf
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.optics.terms import best_term
 from mitsim.reconstruct.colour import PLANES, JointMosaic

@@ -204,7 +204,7 @@ def mean_electrons(
     dark: FloatArray | float = model.superpixel_dark_current_e_per_s * exposure_s
     if model.crosstalk:
         _frame_shape(light.shape, model)
-        light = neighbours(light, model.superpixel_crosstalk)
+        light = neighbours(light, model.crosstalk / model.binning)
     if not model.has_fixed_pattern:
         return light, dark
     own = specimen(model, _frame_shape(light.shape, model))

@@ -34,7 +34,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily, read_name, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.sensor import load_sensor
-from mitsim.devices.session import DRIFT_UNITS, DRIFT_WORDS, SIDES, Drift, SessionRecipe, amount_in_words, load_recipe
+from mitsim.devices.session import DRIFTS, SIDES, Drift, SessionRecipe, load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
@@ -358,11 +358,12 @@ def _points(scope: Scope) -> Sequence[Point]:
     found = [
         Point.of(
             scope.setup if own else lamp if kind in _LAMPS else sheet,
-            recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=DRIFT_UNITS[kind], amount=amount, seed=seed,
-            what=f"{DRIFT_WORDS[kind]}, {amount_in_words(kind, amount)}",
+            recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=unit, amount=amount, seed=seed,
+            what=f"{words}, " + (f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"),
         )
         for seed in scope.choose(range(first, first + _SEEDS), scope.seeds)
         for kind, each in amounts.items()
+        for unit, words in [DRIFTS[kind]]
         for amount in each
     ]  # fmt: skip
     return group_by_setup(found)

@@ -35,7 +35,7 @@ from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray, integer, single_threaded_blas, stream
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.devices.mask_profile import load_psf
+from mitsim.devices.camera import load_psf
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import load_recipe

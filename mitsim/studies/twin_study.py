@@ -34,7 +34,7 @@ from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import Preparer, grey_png, read_image
 from mitsim.core.manifests import Digital
-from mitsim.devices.mask_profile import load_psf
+from mitsim.devices.camera import load_psf
 from mitsim.reconstruct.shifted_codes import Codes, Exposure, Pose, Shape, find_pose, fit_codes, plane_offsets
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.report.pages import Value

@@ -13,9 +13,8 @@ import pytest
 from scipy.special import fresnel
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.mask import mls_mask
-from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves
 from mitsim.optics.image_formation import FrameOptics

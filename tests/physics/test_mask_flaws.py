@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage, special
 
-from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.mask import Plate, mls_mask
-from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import SampledTerm, geometric_samplers, wave_samplers
 from mitsim.optics.shadow import Directions

@@ -19,9 +19,8 @@ from mitsim.api.bench import open_bench
 from mitsim.bench.effects import EFFECTS, Physics
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
-from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.mask import Flaws, Plate
-from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.light.cost_model import cells_to_choose
 from mitsim.optics import fft_shadow as rasters

@@ -17,8 +17,7 @@ from mitsim import psnr, reconstruct
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
-from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.plan import Plan

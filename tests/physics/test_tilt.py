@@ -15,8 +15,7 @@ from scipy.special import fresnel
 
 from mitsim.api.bench import open_bench
 from mitsim.core.configuration import shipped_path
-from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms

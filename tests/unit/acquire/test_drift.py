@@ -17,7 +17,7 @@ from mitsim.core.arrays import stream
 from mitsim.core.configuration import load_model, shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry, Devices
-from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.camera import CameraGeometry, Devices, MaskProfile
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import load_sensor

@@ -11,7 +11,7 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.layout import layout_of, mask_fault, obstacles, shortage
-from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.camera import MaskProfile
 
 pytestmark = pytest.mark.usefixtures("variant")
 

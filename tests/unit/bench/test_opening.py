@@ -14,7 +14,6 @@ from mitsim.api.bench import open_bench
 from mitsim.bench import apparatus as opening
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
-from mitsim.devices import mask_profile
 
 PITCHES = 0.01172, 0.01172
 """Of the shipped camera's pixels, binned 2 x 2 [mm]."""
@@ -44,7 +43,7 @@ class Loader:
 def loader(monkeypatch: pytest.MonkeyPatch) -> Iterator[Loader]:
     found = Loader()
     monkeypatch.setattr(opening, "_load", found.loaded)
-    monkeypatch.setattr(mask_profile, "load_mask", lambda path: found.mask)
+    monkeypatch.setattr("mitsim.devices.camera.load_mask", lambda path: found.mask)
     yield found
 
 

@@ -16,8 +16,8 @@ from mitsim.bench.effects import SWITCHES
 from mitsim.cli import app
 from mitsim.cli.shelf_verbs import KINDS
 from mitsim.core.configuration import load_model, shipped_path
-from mitsim.devices.mask_profile import KINDS as MASK_KINDS
-from mitsim.devices.mask_profile import load_mask
+from mitsim.devices.camera import KINDS as MASK_KINDS
+from mitsim.devices.camera import load_mask
 from mitsim.devices.patterns import read_name
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import load_sensor

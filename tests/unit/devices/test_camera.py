@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms

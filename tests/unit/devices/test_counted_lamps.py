@@ -30,7 +30,7 @@ def test_lines_behind_filters_share_a_count_as_their_power() -> None:
 def test_a_curve_that_goes_on_beyond_spectra_says_how_far() -> None:
     """Efficiency 0.5 at 830 nm, falling to 0 at 1030 nm: integral of eta lambda over eta lambda there."""
     curve = {"wavelengths_nm": [400.0, 830.0, 1030.0], "efficiency": [0.5, 0.5, 0.0]}
-    response = Response.of(sensor(quantum_efficiency=None, quantum_efficiency_curve=curve))
+    response = Response.of_each(sensor(quantum_efficiency=None, quantum_efficiency_curve=curve))[0]
     at = np.linspace(830, 1030, 20001)
     exact = np.trapezoid(0.5 * (1030 - at) / 200 * at, at) / (0.5 * 830)
     assert response.range_nm == (400.0, 830.0) and response.beyond_nm == pytest.approx(exact, rel=1e-6)
@@ -42,7 +42,7 @@ def test_a_camera_that_sees_no_spectrum_is_refused() -> None:
     with pytest.raises(
         MitsimError, match="of 900 to 1700 nm, and lamps' spectra are of 360 to 830 nm; switch lamps off"
     ):
-        Response.of(blind)
+        Response.of_each(blind)[0]
     half = {"wavelengths_nm": [400.0, 500.0, 700.0], "efficiency": [0.5, 0.0, 0.0]}
     with pytest.raises(MitsimError, match="is blind at 600 nm, a line of the projector"):
         line_units(sensor(quantum_efficiency=None, quantum_efficiency_curve=half), Lines((600.0,), (1.0,)))
@@ -68,7 +68,7 @@ def test_each_colour_of_filters_counts_in_its_own_pixels() -> None:
         assert each.counts == pytest.approx(at * np.interp(at, [first, 500, last], [0.1, 0.6, 0.2]), rel=1e-12)
     assert [each.beyond_nm for each in found[:2]] == [0, 0] and found[2].beyond_nm > 50
     (bare,) = Response.of_each(sensor(quantum_efficiency=0.5))
-    assert bare == Response.of(sensor(quantum_efficiency=0.5)) and bare.planes == (0, 1, 2, 3) and bare.part == 1
+    assert bare.planes == (0, 1, 2, 3) and bare.part == 1
 
 
 def test_lamps_have_four_rows_of_each_response() -> None:

@@ -9,7 +9,7 @@ import pytest
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.session import DRIFT_UNITS, Drift, MaskMotion, load_recipe
+from mitsim.devices.session import DRIFTS, Drift, MaskMotion, load_recipe
 
 
 def test_one_kind_alone() -> None:
@@ -36,7 +36,7 @@ def test_a_ripple_has_a_frequency_and_keeps_it() -> None:
 def test_the_shipped_drift_is_of_the_shipped_session(tmp_path: Path) -> None:
     """All kinds move in it; its session is that of session.toml. (Planted: another exposure there.)"""
     recipe = load_recipe(shipped_path("calibration", "drift.toml"))
-    assert recipe.drift.kinds == tuple(DRIFT_UNITS)
+    assert recipe.drift.kinds == tuple(DRIFTS)
     bare = {"drift": Drift(), "source": ""}
     assert recipe.model_copy(update=bare) == load_recipe().model_copy(update=bare)
     bad = tmp_path / "bad.toml"

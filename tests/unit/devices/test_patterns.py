@@ -14,7 +14,6 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import (
     FAMILIES,
     hadamard_matrix,
-    hadamard_orders,
     parse_patterns,
     pattern_family,
     shot_count,
@@ -97,7 +96,7 @@ def test_hadamard_repeats_its_matrix_and_the_halves_complement() -> None:
     assert np.array_equal(family.light(first) + family.light(second), np.ones((10, 10)))
 
 
-@pytest.mark.parametrize("order", hadamard_orders(68))
+@pytest.mark.parametrize("order", [1, 2, *(order for order in range(4, 69, 4) if order != 52)])
 def test_hadamard_matrices_are_hadamard(order: int) -> None:
     matrix = hadamard_matrix(order).astype(int)
     assert np.isin(matrix, (-1, 1)).all()

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.mask_profile import load_psf
+from mitsim.devices.camera import load_psf
 
 
 def drawn(path: Path, background: int, colours: bool) -> np.ndarray:

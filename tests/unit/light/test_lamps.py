@@ -213,7 +213,7 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
     spectra = tuple(Spectrum(np.array(at), np.full(len(at), 1 / len(at))) for at in nm)
     lamp = '<emitter type="constant"/>'
     bench = open_bench(small_scene(extra=lamp), variant, None, "mp_cl1")
-    response = Response.of(bench.sensor)
+    response = Response.of_each(bench.sensor)[0]
     bench = replace(bench, counted_lamps=CountedLamps((response,), response.bands(4), spectra, np.full(4, 0.25)))
     settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
     simulation, labels = Simulation(bench, settings), np.zeros(bench.n**2, dtype=np.int64)

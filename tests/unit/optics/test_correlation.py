@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.mask import RASTER_LEFT_OUT, Plate
-from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.optics import fft_shadow as rasters
 from mitsim.optics import image_formation
@@ -37,9 +36,7 @@ def summed(camera: CameraGeometry, depth: float, light: np.ndarray) -> np.ndarra
     """The frame of ``light`` by as many terms as the raster has rows."""
     plate = rasters.raster(camera, depth)
     terms = [(1.0, row, values) for row, values in zip(np.eye(len(plate.values)), plate.values, strict=True)]
-    rows = SimpleNamespace(
-        terms=terms, lines=plate.lines, blur_mm=plate.blur_mm, even=plate.even, feature_mm=plate.feature_mm
-    )
+    rows = SimpleNamespace(terms=terms, lines=plate.lines, blur_mm=plate.blur_mm, feature_mm=plate.feature_mm)
     shadow = replace(ShadowGeometry.of(camera, depth), mask=rows)
     return camera.pixel_fill_factor * sum(
         left @ light @ right.T for left, right in geometric_terms(shadow, ROWS, COLUMNS)

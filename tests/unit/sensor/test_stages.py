@@ -233,7 +233,6 @@ def test_crosstalk_shares_light_with_four_neighbours_and_keeps_it() -> None:
     np.testing.assert_allclose(neighbours(np.full((4, 6), 3.0), 0.4), 3.0)
     # Of a superpixel's light that of the pixels at its sides is shared: 1/b of it.
     model = camera(binning=4, crosstalk=0.2, dark_current_e_per_s=0.0)
-    assert model.superpixel_crosstalk == pytest.approx(0.05)
     assert chain.mean_electrons(spot, 1.0, model)[0][2, 2] == pytest.approx(95)
 
 

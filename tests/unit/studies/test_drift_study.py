@@ -15,7 +15,7 @@ import pytest
 from mitsim.acquire.exposure import drift_mask, drift_projector
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
-from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe
+from mitsim.devices.session import DRIFTS, Drift, load_recipe
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
 from mitsim.studies.drift_study import SESSION, DriftStand, Outcome
@@ -192,7 +192,7 @@ def test_points_are_every_kind_alone() -> None:
     sheet.)"""
     experiment = find_experiment("drift")
     points, few = (experiment.points(Scope(Setup(), ("astronaut", "page"), quick=quick)) for quick in (False, True))
-    assert {point["kind"] for point in points} == set(DRIFT_UNITS) and len(points) == 4 * len(DRIFT_UNITS)
+    assert {point["kind"] for point in points} == set(DRIFTS) and len(points) == 4 * len(DRIFTS)
     assert len({point.key for point in points}) == len(points) and {p.key for p in few} <= {p.key for p in points}
     drift = load_recipe(shipped_path("calibration", "drift.toml")).drift
     assert all(point["amount"] == getattr(drift, point["kind"]) for point in points)
