@@ -466,7 +466,7 @@ class Bench(Apparatus):
         depth
             Distance of the board's middle [mm]; None: on the aligned plane.
         """
-        from mitsim.bench.board import before_board
+        from mitsim.bench.layout import before_board
 
         return before_board(self, reflectance, shape, depth)
 

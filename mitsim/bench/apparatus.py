@@ -178,17 +178,10 @@ class Apparatus:
         check_depth(depth)
         if depth == self.geometry.scene_distance:
             return self.windows
-        if depth not in self._windows:
-            from mitsim.scene.load import window_at
+        from mitsim.scene.load import window_at
 
-            loaded = self.loaded
-            found = window_at(str(loaded.path), loaded.projector, loaded.camera, loaded.pixels, depth)
-            self._windows[depth] = found
-        return self._windows[depth]
-
-    @cached_property
-    def _windows(self) -> dict[float, tuple[tuple[float, float], tuple[float, float]]]:
-        return {}
+        loaded = self.loaded
+        return window_at(str(loaded.path), loaded.projector, loaded.camera, loaded.pixels, depth)
 
     @property
     def parallax(self) -> Parallax:

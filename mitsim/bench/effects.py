@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -136,34 +137,22 @@ class Effect:
     def present(self, bench: Apparatus) -> bool:
         """Return True if ``bench`` has the effect."""
         physics = Physics.of(bench)
-        return any(_value(physics, name) != value for name, value in self.neutral.items())
+        return any(attrgetter(name)(physics) != value for name, value in self.neutral.items())
 
     def without(self, physics: Physics) -> Physics:
         """Return ``physics`` with the neutral values of the effect."""
         for name, value in self.neutral.items():
-            owner, _, last = name.rpartition(".")
-            if not owner:
-                physics = _with_value(physics, name, value)
-            else:
-                physics = _with_value(physics, owner, _with_value(getattr(physics, owner), last, value))
+            physics = _with_value(physics, name, value)
         return physics
 
 
-def _value(physics: Physics, name: str) -> object:
-    value: object = physics
-    for part in name.split("."):
-        value = getattr(value, part)
-    return value
-
-
 def _with_value(owner: Any, name: str, value: object) -> Any:
-    if getattr(owner, name) == value:
+    name, _, part = name.partition(".")
+    own = getattr(owner, name)
+    value = _with_value(own, part, value) if part else value
+    if own == value:
         return owner  # with what it remembers
     return owner.model_copy(update={name: value}) if isinstance(owner, BaseModel) else replace(owner, **{name: value})
-
-
-def _always(*light: str) -> Callable[[Physics], frozenset[str]]:
-    return lambda physics: frozenset(light)
 
 
 def _diffraction(bench: Apparatus) -> str:
@@ -202,7 +191,7 @@ _TABLE = (
         {"mirrors": False},
         what="light over mirrors and through glass, in single directions, and of a projector in view",
         absent="no surface reflects or transmits light in single directions",
-        retraced=_always(FOLLOWED),
+        retraced=lambda physics: frozenset({FOLLOWED}),
         first_pilot_run=True,
         followed=True,
         in_reference=True,
@@ -238,7 +227,7 @@ _TABLE = (
         {"geometry.pixel_fill_factor": 1.0, "geometry.angular_exponent": 0.0},
         what="pixels that see less at their edges, and of slanting light",
         absent="pixels are fully sensitive, whatever the angle",
-        retraced=_always(DIRECT, FOLLOWED),
+        retraced=lambda physics: frozenset({DIRECT, FOLLOWED}),
         in_reference=True,
         in_truth=True,
     ),
@@ -248,7 +237,7 @@ _TABLE = (
         what="the projector's lens, which is sharp at one distance alone",
         absent="the projector is a pinhole: sharp at all distances",
         note=_lens,
-        retraced=_always(DIRECT, FOLLOWED),
+        retraced=lambda physics: frozenset({DIRECT, FOLLOWED}),
         first_pilot_run=True,
         in_truth=True,
     ),
@@ -257,7 +246,7 @@ _TABLE = (
         {"projector.blur": 0.0},
         what="projector pixels that run into their neighbours",
         absent="the projector's pixels are sharp",
-        retraced=_always(DIRECT, FOLLOWED),
+        retraced=lambda physics: frozenset({DIRECT, FOLLOWED}),
         first_pilot_run=True,
         in_truth=True,
     ),
@@ -267,7 +256,7 @@ _TABLE = (
         what="light that the projector's lens scatters over its picture",
         absent="the projector file gives no ANSI contrast",
         note=lambda bench: f"the projector's lens scatters {1 - bench.projector_optics.share:.2g} of its light",
-        retraced=_always(DIRECT, FOLLOWED),
+        retraced=lambda physics: frozenset({DIRECT, FOLLOWED}),
     ),
     Effect("black-level", {"black_level": 0.0}, what="light of black pixels", absent="the projector's black is black"),
     Effect(
@@ -311,8 +300,3 @@ def parse_switches(text: str) -> dict[str, bool]:
             raise ArgumentError("effects", f"{text!r}: {word[1:]} is switched both on and off; keep one")
         switches[word[1:]] = word[0] == "+"
     return switches
-
-
-def check_switches(switches: Mapping[str, bool]) -> dict[str, bool]:
-    """Return ``switches`` {name: on}; raise MitsimError for a name that is no effect."""
-    return parse_switches(",".join(f"{'+' if on else '-'}{name}" for name, on in switches.items()))

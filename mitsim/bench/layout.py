@@ -1,12 +1,13 @@
-"""Positions of a bench's parts before the camera, whether its frames can give an image, and two pictures of it.
+"""Positions of a bench's parts, boards put before it, whether its frames can give an image, and two pictures of it.
 
 Positions are in the camera's frame [mm]: +z to the scene, +y up, +x to the left of a viewer along +z.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -14,13 +15,15 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.board import camera_place
+from mitsim.bench.apparatus import Apparatus, Opened, check_depth
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.mask import Mask
 from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.session import BoardShape
 from mitsim.optics.shadow import Directions, ShadowGeometry
+from mitsim.scene.check import Unfit
 from mitsim.scene.load import why_dark
 from mitsim.transport.connect import PinholeRays
 from mitsim.transport.direct import DirectTracer
@@ -148,15 +151,7 @@ def layout_of(bench: Apparatus) -> Layout:
         else:
             continue
         lamps[f"{name}, line {tag.line}"] = (place - origin) @ turn
-    surfaces = _surfaces(bench, turn, origin)
-    return Layout(surfaces, projector, window, lamps, seen, depths, (row, column), obstacles(bench))
-
-
-# -------- Surfaces as triangles
-
-
-def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[Surface, ...]:
-    tags, shapes, found = bench.loaded.shapes, bench.loaded.scene.shapes(), []
+    tags, shapes, surfaces = loaded.shapes, loaded.scene.shapes(), list[Surface]()
     areas = [float(np.array(shape.surface_area()).ravel()[0]) if shape.is_mesh() else 0.0 for shape in shapes]
     for number, shape in enumerate(shapes):
         name = shape.id()
@@ -164,14 +159,16 @@ def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[S
             kind = tags[number].attributes.get("type", "shape") if tags else shape.class_name().lower()
             name = f"{kind} {number + 1}"
         if shape.is_mesh():
-            points, triangles, reflectance = _triangles_of_mesh(
-                shape, _TRIANGLES * areas[number] / max(sum(areas), 1e-30)
-            )
+            wanted = _TRIANGLES * areas[number] / max(sum(areas), 1e-30)
+            points, triangles, reflectance = _triangles_of_mesh(shape, wanted)
         else:
             points, triangles, reflectance = _triangles_without_faces(shape)
         if len(triangles):
-            found.append(Surface(name, (points - origin) @ turn, triangles, reflectance, bool(shape.is_emitter())))
-    return tuple(found)
+            surfaces.append(Surface(name, (points - origin) @ turn, triangles, reflectance, bool(shape.is_emitter())))
+    return Layout(tuple(surfaces), projector, window, lamps, seen, depths, (row, column), obstacles(bench))
+
+
+# -------- Surfaces as triangles
 
 
 def _triangles_of_mesh(mesh: mi.Mesh, wanted: float) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
@@ -268,25 +265,17 @@ def previews(bench: Apparatus, layout: Layout) -> tuple[Preview, Preview]:
     left = np.cross([0.0, 1.0, 0.0], ahead)
     left /= np.linalg.norm(left)
     aside[:3, :3] = np.stack([left, np.cross(ahead, left), ahead], axis=1)
-    places = [layout.window, *map(layout.window_at, layout.depths or ())]
-    lit = np.concatenate(places)
+    lit = np.concatenate([layout.window, *map(layout.window_at, layout.depths or ())])
     local = (lit - aside[:3, 3]) @ aside[:3, :3]
     wide = 2 * float(np.degrees(np.arctan(_MARGIN * np.abs(local[:, :2] / local[:, 2:]).max())))
-    first, second = (
-        Preview(
-            _picture(bench.loaded.scene, world @ place, angle),
-            np.asarray(np.linalg.inv(place), dtype=np.float64),
-            float(np.tan(np.radians(angle / 2))),
-        )
-        for place, angle in ((np.eye(4), bench.geometry.fov), (aside, wide))
-    )
-    return first, second
+    scene = bench.loaded.scene
+    return _preview(scene, world, np.eye(4), bench.geometry.fov), _preview(scene, world, aside, wide)
 
 
-def _picture(scene: mi.Scene, place: FloatArray, angle: float) -> FloatArray:
+def _preview(scene: mi.Scene, world: FloatArray, place: FloatArray, angle: float) -> Preview:
     kind = "luminance" if mi.is_monochromatic else "rgb"
     film = {"type": "hdrfilm", "width": _PIXELS, "height": _PIXELS, "pixel_format": kind, "rfilter": {"type": "box"}}
-    pose = mi.ScalarAffineTransform4f(place.tolist())
+    pose = mi.ScalarAffineTransform4f((world @ place).tolist())
     lens = {"type": "perspective", "fov": angle, "near_clip": _NEAR, "far_clip": _FAR, "to_world": pose}
     sensor = mi.load_dict({**lens, "film": {**film, "sample_border": False}})
     integrator = mi.load_dict({"type": "path", "max_depth": _TURNS, "hide_emitters": True})
@@ -306,7 +295,137 @@ def _picture(scene: mi.Scene, place: FloatArray, angle: float) -> FloatArray:
     empty = 1 - full
     white = float(np.percentile(light[light > 0], _WHITE)) if light.any() else 1.0
     shown = np.clip(light / white, 0, 1) * (1 - _FILL) + _FILL * by_lamp if light.any() else by_lamp
-    return np.asarray(shown * (1 - empty) + empty)
+    return Preview(shown * (1 - empty) + empty, np.linalg.inv(place), float(np.tan(np.radians(angle / 2))))
+
+
+# -------- Surfaces that are put before a bench: the white board of a calibration, and pictures on its prints
+
+_BEYOND = 1.1
+"""Half side of a board without a stated size, relative to what the sensor's edge sees."""
+_GRAZING = 0.05
+"""Least cosine by which a board without a stated size recedes from a ray."""
+_CELLS = 64
+"""Facets per side of a bowed board, within 1/4096 of the bow of the paraboloid."""
+_INSIDE = 1e-3
+"""Distance in projector pixels from a pixel's corners to the rays that are tried."""
+
+
+def before_board(
+    bench: Opened, reflectance: float, shape: BoardShape | None = None, depth: float | None = None
+) -> Opened:
+    """Return the devices of a bench before a diffuse board; see :meth:`mitsim.api.bench.Bench.with_board`."""
+    if not 0 <= reflectance <= 1:
+        raise ArgumentError("reflectance", f"{reflectance:g}: give a number from 0 to 1")
+    where, shape = bench.geometry.scene_distance if depth is None else check_depth(depth), shape or BoardShape()
+    geometry, loaded = bench.geometry, bench.loaded
+    half = _BEYOND * (geometry.tan_half_fov * where + geometry.half_width)
+    slope = [-math.tan(math.radians(tilt)) for tilt in (shape.tilt_column_deg, shape.tilt_row_deg)]
+    steep, turned, camera = math.hypot(*slope[::-1]), np.eye(4), np.eye(4)
+    if shape.size_mm is not None:
+        half = shape.size_mm / 2
+    elif steep:  # along the slope a ray of tan-angle u meets the board at u z / (cos - u sin) from its middle
+        angle, corner = math.atan(steep), math.sqrt(2) * half / where
+        half = half * math.sqrt(2) / max(math.cos(angle) - corner * math.sin(angle), _GRAZING)
+    if steep:
+        # The smallest rotation with the board's slopes, so that no axis comes first: its plane is
+        # z = tan(tilt_row) s_row + tan(tilt_column) s_column, with s_row = -y and s_column = -x.
+        steepest = float(np.linalg.norm(slope))
+        angle, uphill = math.atan(steepest), np.array(slope) / steepest
+        # Rodrigues' formula about the level line: points uphill of the middle move away along z.
+        axis = np.array([uphill[1], -uphill[0], 0.0])
+        cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+        turned[:3, :3] = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    bsdf = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
+    camera[:3, :3], camera[:3, 3] = camera_place(bench)
+    place = mi.ScalarAffineTransform4f().translate([0, 0, where]) @ mi.ScalarAffineTransform4f(turned.tolist())
+    world = mi.ScalarAffineTransform4f(camera.tolist())
+    to_world = world @ place.rotate([0, 1, 0], 180).scale([half, half, 1])
+    board: Any = {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+    if shape.bow_mm:
+        board = _bowed_mesh(shape, half, np.array((world @ place).matrix, dtype=np.float64), bsdf)
+    scene = mi.load_dict({"type": "scene", "camera": loaded.camera, "projector": loaded.projector, "board": board})
+    bare = replace(loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False, in_view=False)
+    alone = replace(bare, unfit=Unfit(), shapes=(), coloured=(), parting=())
+    stated = {"reflectance": reflectance, "depth_mm": where, **shape.model_dump()}
+    return replace(bench, loaded=alone, board=stated)
+
+
+def _bowed_mesh(shape: BoardShape, half: float, place: FloatArray, bsdf: dict[str, Any]) -> mi.Mesh:
+    """Return the mesh of a bowed board, z = bow (x^2 + y^2) / half^2 in its own frame, the camera towards -z."""
+    line = np.linspace(-half, half, _CELLS + 1)
+    x, y = np.meshgrid(line, line)
+    part = shape.bow_mm / half**2
+    points = np.stack([x, y, part * (x**2 + y**2)], axis=-1)
+    normals = np.stack([2 * part * x, 2 * part * y, -np.ones_like(x)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    side = _CELLS + 1
+    corner = (np.arange(_CELLS)[:, None] * side + np.arange(_CELLS)).reshape(-1, 1)
+    # Both triangles of a facet turn their front to -z, where the camera is.
+    faces = np.concatenate([corner + [0, side, 1], corner + [1, side, side + 1]])
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("board", side * side, len(faces), has_vertex_normals=True, props=properties)
+    arrays = mi.traverse(mesh)
+    arrays["vertex_positions"] = (points.reshape(-1, 3) @ place[:3, :3].T + place[:3, 3]).ravel()
+    arrays["vertex_normals"] = (normals.reshape(-1, 3) @ place[:3, :3].T).ravel()
+    arrays["faces"] = faces.ravel()
+    arrays.update()
+    return mesh
+
+
+@keep_scenes()
+def missed_pixels(bench: Apparatus) -> int:
+    """Return the projector pixels that do not light a whole piece of the board as the camera sees it."""
+    n = bench.n
+    rays, eye = PinholeRays(bench.projector_optics, [None]), camera_place(bench)[1]
+    row, column = np.divmod(np.arange(n * n), n)
+    missed = np.zeros(n * n, dtype=bool)
+    for down, right in itertools.product((_INSIDE, 1 - _INSIDE), repeat=2):
+        directions = rays.directions(np.stack([row + down, column + right], axis=1))
+        ray = mi.Ray3f(mi.Point3f(rays.origin.tolist()), mi.Vector3f(directions.T.astype(np.float32)))
+        met = bench.loaded.scene.ray_intersect(ray)
+        facing = (dr.dot(met.n, -ray.d) > 0) & (dr.dot(met.n, mi.Point3f(eye.tolist()) - met.p) > 0)
+        missed |= ~host_values(met.is_valid() & facing, n * n)
+    return int(np.count_nonzero(missed))
+
+
+def camera_place(bench: Apparatus) -> tuple[FloatArray, FloatArray]:
+    """Return the (3, 3) rotation and (3,) position [mm] of the camera in the world."""
+    return turn_and_origin(bench.loaded.camera.world_transform())
+
+
+_PARALLEL = 1e-6
+"""Sine of a sheet's tilt that counts as rounding."""
+
+
+@keep_scenes()
+def show_white(bench: Apparatus) -> None:
+    """Make the print of a bench reflect all light.
+
+    MitsimError if the light of a picture is not that of the white print times the picture. Light of a flat diffuse
+    sheet that stands alone is linear in the reflectance of each point, and comes directly from there to the sensor.
+    Light over several surfaces contains products of reflectances.
+    """
+    loaded, shapes, why = bench.loaded, bench.loaded.scene.shapes(), ""
+    sheet, held = shapes[0], mi.traverse(shapes[0])
+    diffuse = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
+    normal = np.array(sheet.sample_position(0.0, mi.Point2f(0.5)).n, dtype=np.float64).ravel()
+    names = [name for name in held.keys() if name.endswith(("reflectance.data", "reflectance.value"))]  # noqa: SIM118
+    if len(shapes) != 1:
+        why = f"the scene has {len(shapes)} surfaces, which light each other"
+    elif sheet.class_name() != "Rectangle" or sheet.bsdf().flags() & ~diffuse or not names:
+        why = "the scene's surface is no flat diffuse sheet with a reflectance"
+    elif np.linalg.norm(np.cross(normal, camera_place(bench)[0][:, 2])) > _PARALLEL:
+        why = "the sheet is not parallel to the sensor, so cells of light lie across the picture's pixels"
+    elif len(loaded.lamps) > len(loaded.small_lamps):
+        why = "the camera may see a lamp of the scene itself"
+    if why:
+        raise MitsimError(f"{loaded.path}: {why}; pairs are made of one flat diffuse sheet that faces the sensor")
+    for name in names:
+        before = np.asarray(held[name])
+        white = np.full(before.shape, 255 if before.dtype == np.uint8 else 1, before.dtype)
+        held[name] = type(held[name])(white) if name.endswith(".data") else 1.0
+    held.update()
 
 
 # -------- Whether frames can give an image, from geometry alone and before any light is simulated

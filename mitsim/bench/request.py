@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mitsim.bench.effects import check_switches, parse_switches
 from mitsim.core.colour_files import BANDS, LINES, bands_of, spectral_of
+from mitsim.bench.effects import parse_switches
 from mitsim.core.configuration import (
     CAMERA,
     DEVICES,
@@ -154,10 +155,11 @@ def check_samples(estimator: str, spp: int | None) -> None:
 
 def _switches(effects: object) -> dict[str, bool]:
     """Return effects that are switched on or off, by name; MitsimError for anything else."""
-    found = parse_switches(effects) if isinstance(effects, str) else effects
-    if not isinstance(found, Mapping) or not all(isinstance(value, bool) for value in found.values()):
+    if isinstance(effects, Mapping) and all(isinstance(value, bool) for value in effects.values()):
+        effects = ",".join(f"{'+' if on else '-'}{name}" for name, on in effects.items())
+    if not isinstance(effects, str):
         raise ArgumentError("effects", f"{short_text(effects)}: give +NAME,-NAME, or True or False by name")
-    return check_switches(dict(found))
+    return parse_switches(effects)
 
 
 def family_of(patterns: str) -> str:
@@ -393,16 +395,10 @@ class Coloured(Options):
     )
 
 
-def _known_or_auto(colour: str) -> None:
-    """Refuse a word of ``colour`` that is neither known nor auto."""
-    if colour != AUTO:
-        _known_colour(colour)
-
-
 class AnyColour(Coloured):
     """Which of the projector's light is told apart, or auto."""
 
-    colour: Annotated[str, validated_by(_known_or_auto)] = option(
+    colour: Annotated[str, validated_by(lambda colour: None if colour == AUTO else _known_colour(colour))] = option(
         NO,
         "as of calibrate: no, lines, bands:K or mosaic; auto: no if that keeps half of the accuracy, else lines",
         metavar="no|lines|bands:K|mosaic|auto",
@@ -448,10 +444,6 @@ class Procedure(Lit, Seeded):
     steps: int = option(50, "steps of light, from dark to beyond saturation", ge=20, le=1000)
     frames: int = option(100, "frames of each stack", kind=False, ge=2, le=10_000)
     wavelength: float = option(550.0, "of the light, for a curve of quantum efficiency [nm]", ge=1, le=1e6)
-
-    @property
-    def wavelength_nm(self) -> float:
-        return self.wavelength
 
     @property
     def stated(self) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Pairs to learn from: pictures on the print of a bench, their frames and truths.
 
 The light of a picture is that of a white print times the reflectance of each cell's pixel, for light from one flat
-sheet straight to the sensor (:func:`mitsim.bench.board.show_white`). Other scenes are refused.
+sheet straight to the sensor (:func:`mitsim.bench.layout.show_white`). Other scenes are refused.
 
 Pictures are square, of eight bits, drawn from a seed or cut from files. Drawn pictures have the statistics of natural
 ones: leaves that hide each other (the dead leaves of Matheron, 1968), whose sizes follow a power law, with soft edges,
@@ -29,7 +29,7 @@ from mitsim.acquire.exposure import ambient_shots, camera_warnings, drift_mask, 
 from mitsim.acquire.spectral import plan_request
 from mitsim.api.bench import Bench
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.board import show_white
+from mitsim.bench.layout import show_white
 from mitsim.bench.request import Task
 from mitsim.core.arrays import FloatArray, Labels, integer, stream
 from mitsim.core.environment import deciding_versions, versions

@@ -13,8 +13,8 @@ import pytest
 from pydantic import ValidationError
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.board import missed_pixels
 from mitsim.bench.effects import EFFECTS
+from mitsim.bench.layout import missed_pixels
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.session import BoardShape
 from mitsim.light.light import trace_light

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import pytest
 import mitsim
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench import effects
-from mitsim.bench.effects import _TABLE, EFFECTS, Physics, _value
+from mitsim.bench.effects import _TABLE, EFFECTS, Physics
 from mitsim.devices.patterns import Lighting
 from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import Settings
@@ -100,7 +101,7 @@ def test_a_simulation_has_what_is_on(everything: Bench) -> None:
         on = {
             other
             for other, effect in EFFECTS.items()
-            if any(_value(physics, f) != v for f, v in effect.neutral.items())
+            if any(attrgetter(f)(physics) != v for f, v in effect.neutral.items())
         }
         assert on == {name}
 
