@@ -178,7 +178,7 @@ def _replaced(tag: str, plugin: str) -> Iterator[tuple[str, str]]:
 
 def cases() -> list[tuple[str, str]]:
     """(tag, plugin) of all that the guard allows."""
-    return [(tag, plugin) for tag, all in PLUGINS.items() for plugin in all.split()]
+    return [(tag, plugin) for tag, all in PLUGINS.items() for plugin in all]
 
 
 def outcome(path: Path, variant: str) -> dict[str, str]:

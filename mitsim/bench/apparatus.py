@@ -23,7 +23,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import plain
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import read_name
-from mitsim.scene.outline import Outline, SceneFiles, lit_side
+from mitsim.scene.outline import Outline, lit_side
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -368,7 +368,7 @@ def check_scene(
         has.
     """
     path = locate(scene, "scenes", "scene.xml")
-    pictures = Outline(path, defines, SceneFiles(path, outside)).projected
+    pictures = Outline(path, defines, outside).projected
     n = lit_side(pictures[0]) if len(pictures) == 1 else None
     for family in patterns:
         read_name(family, n)

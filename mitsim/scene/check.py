@@ -10,7 +10,6 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
@@ -20,10 +19,7 @@ from mitsim.core.configuration import limits_of
 from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.devices.camera import PIXELS, CameraGeometry
 from mitsim.scene.headers import FARTHEST, MOST_TEXELS, check_image, check_obj, check_ply
-from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Tag
-
-if TYPE_CHECKING:
-    from mitsim.scene.outline import Outline
+from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
 
 _LARGEST = 1e20
 """Largest number: its square is far from the end of single precision (3.4e38)."""
@@ -102,21 +98,24 @@ TABLES = ("value", "values", "color", "color0", "color1", "scale")
 
 _TEXTURES = "bitmap blackbody checkerboard d65 irregular mesh_attribute rawconstant regular srgb uniform"
 PLUGINS = {
-    "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask mitsim_glass mitsim_grating normalmap "
-    "null plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic "
-    "thindielectric twosided",
-    "emitter": "area constant directional envmap mitsim_projector point projector spot",
-    "film": "hdrfilm specfilm",
-    "integrator": "direct path ptracer volpath volpathmis",
-    "medium": "homogeneous",
-    "phase": "blendphase hg isotropic rayleigh",
-    "rfilter": "box catmullrom gaussian lanczos mitchell tent",
-    "sampler": "independent ldsampler multijitter orthogonal stratified",
-    "sensor": "irradiancemeter mitsim_lensless orthographic perspective radiancemeter thinlens",
-    "shape": "cube cylinder disk instance merge obj ply rectangle shapegroup sphere",
-    "spectrum": _TEXTURES,
-    "texture": _TEXTURES,
-    "volume": "constvolume",
+    tag: names.split()
+    for tag, names in {
+        "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask mitsim_glass mitsim_grating normalmap "
+        "null plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic "
+        "thindielectric twosided",
+        "emitter": "area constant directional envmap mitsim_projector point projector spot",
+        "film": "hdrfilm specfilm",
+        "integrator": "direct path ptracer volpath volpathmis",
+        "medium": "homogeneous",
+        "phase": "blendphase hg isotropic rayleigh",
+        "rfilter": "box catmullrom gaussian lanczos mitchell tent",
+        "sampler": "independent ldsampler multijitter orthogonal stratified",
+        "sensor": "irradiancemeter mitsim_lensless orthographic perspective radiancemeter thinlens",
+        "shape": "cube cylinder disk instance merge obj ply rectangle shapegroup sphere",
+        "spectrum": _TEXTURES,
+        "texture": _TEXTURES,
+        "volume": "constvolume",
+    }.items()
 }
 """Allowed plugins by tag, beside ``<scene>``."""
 _SPECTRAL_ALONE = "only spectral variants have it; use --variant {spectral}, or --colour lines or mosaic"
@@ -136,6 +135,12 @@ def references_of(props: mi.Properties) -> list[str]:
 
 def references(props: mi.Properties) -> list[int]:
     return [props[name].index() for name in references_of(props)]
+
+
+def nodes_below(nodes: Sequence[mi.parser.SceneNode], node: mi.parser.SceneNode) -> Iterator[mi.parser.SceneNode]:
+    for child in (nodes[index] for index in references(node.props)):
+        yield child
+        yield from nodes_below(nodes, child)
 
 
 # -------- Estimators, and what they cannot render
@@ -181,18 +186,13 @@ class Unfit:
 def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
     """Return the refusals of a checked tree by each estimator, and the light that is lost."""
 
-    def below(node: mi.parser.SceneNode) -> Iterator[mi.parser.SceneNode]:
-        for child in (nodes[index] for index in references(node.props)):
-            yield child
-            yield from below(child)
-
     def plugin(node: mi.parser.SceneNode) -> str:
         return str(node.props.plugin_name())
 
     # All references to an object. The scene, and materials without a shape, are ignored because they only list.
-    materials = PLUGINS["bsdf"].split()
+    materials = PLUGINS["bsdf"]
     users = [node for node in nodes[1:] if plugin(node) not in materials]
-    used = [inner for node in users for inner in below(node) if plugin(inner) in materials]
+    used = [inner for node in users for inner in nodes_below(nodes, node) if plugin(inner) in materials]
     links = [
         (node, name, nodes[node.props[name].index()]) for node in (*users, *used) for name in references_of(node.props)
     ]
@@ -218,12 +218,12 @@ def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
             why = "its sharp transmission is defined for light from the camera alone, so only the reference renders it"
             rule = f"{why}; remove it, or use diff_trans, a thindielectric or render's reference"
             factored = outline.tag(sheet, "spec_trans").refusal("spec_trans", "a transmission", rule)
-    medium = first(PLUGINS["medium"].split())
+    medium = first(PLUGINS["medium"])
     if medium is not None:
         rule = "only the reference estimator follows light through media; remove it, or render by it with volpath"
         factored = outline.tag(medium[0]).refusal(medium[1], "a medium", rule)
     # ---- The scene's integrator, the reference, loses light
-    integrator = next((node for node in nodes if plugin(node) in PLUGINS["integrator"].split()), None)
+    integrator = next((node for node in nodes if plugin(node) in PLUGINS["integrator"]), None)
     kind = "path" if integrator is None else plugin(integrator)  # Mitsuba's own default
     cause = medium or first(STRAIGHT)
     if kind == "ptracer":
@@ -235,7 +235,7 @@ def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
         reference = outline.tag(integrator or nodes[0]).refusal("integrator", repr(kind), rule)
     # ---- Materials under bumps, which Mitsuba treats as opaque or turns about the normal
     for bumps in (child for *_, child in links if plugin(child) in BUMPS):
-        for inner in (each for each in below(bumps) if plugin(each) in materials):
+        for inner in (each for each in nodes_below(nodes, bumps) if plugin(each) in materials):
             if plugin(inner) in STRAIGHT:
                 why = (
                     f"inside of a {plugin(bumps)} Mitsuba takes it for opaque wherever it connects a surface to a light"
@@ -267,7 +267,7 @@ def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
         rule = f"{estimator} finds no light of it {brought}; {remedy}"
         lost.append(str(outline.tag(light).refusal("light", repr(plugin(light)), rule)))
     groups = (node for node in nodes if plugin(node) == "shapegroup")
-    hidden = next((inner for node in groups for inner in below(node) if plugin(inner) in MIRRORS), None)
+    hidden = next((inner for node in groups for inner in nodes_below(nodes, node) if plugin(inner) in MIRRORS), None)
     instances = None
     if hidden is not None:
         why = "inside of an instance glass is no pane and a mirror casts no glint"
@@ -318,7 +318,6 @@ class CheckedScene:
     outline: Outline
     config: mi.parser.ParserConfig
     state: mi.parser.ParserState
-    scene_files: SceneFiles
     nodes: list[mi.parser.SceneNode]
     unfit: Unfit
     limits: dict[str, Range] = field(default_factory=lambda: dict(LIMITS))
@@ -337,11 +336,11 @@ class CheckedScene:
     @property
     def own(self) -> dict[str, str]:
         """Return the parameters by which a user names files, by the path of the file."""
-        return {str(path): name for path, name in self.scene_files.own.items() if name in PREPARED}
+        return {str(path): name for path, name in self.outline.files.own.items() if name in PREPARED}
 
     @property
     def files(self) -> tuple[Path, ...]:
-        return tuple(self.scene_files.used)
+        return tuple(self.outline.files.used)
 
 
 def check_file(
@@ -356,8 +355,7 @@ def check_file(
     MitsimError
         ``file:line: name: got VALUE in <tag ...>; what is allowed``, or without a line if none is at fault.
     """
-    files = SceneFiles(path, outside)
-    outline = Outline(path, defines, files)
+    outline = Outline(path, defines, outside)
     config = mi.parser.ParserConfig("scalar_rgb")  # any: parsing does not look at it
     # Optimisation is off because it merges rectangles of one material into a mesh without their boxes and names.
     config.parallel = config.merge_equivalent = config.merge_meshes = False
@@ -365,7 +363,7 @@ def check_file(
         state = mi.parser.parse_file(config, str(path), **outline.defines)
         mi.parser.transform_all(config, state)
     nodes = [mi.parser.SceneNode(node) for node in state.nodes]
-    checked = CheckedScene(outline, config, state, files, nodes, Unfit())
+    checked = CheckedScene(outline, config, state, nodes, Unfit())
     for node in nodes:
         _check_node(checked, node, variant)
     for tag in checked.tags_of(_ON_SHAPES):
@@ -392,7 +390,7 @@ def looking_beside(outline: Outline) -> Iterator[None]:
 
 def _check_node(checked: CheckedScene, node: mi.parser.SceneNode, variant: str | None) -> None:
     tag, plugin, props = checked.outline.tag(node), node.props.plugin_name(), node.props
-    allowed = PLUGINS.get(tag.name, "scene").split()
+    allowed = PLUGINS.get(tag.name, ["scene"])
     if plugin not in allowed or (tag.name == "scene" and "version" not in tag.attributes):
         rule = f"{near_name(cut(plugin), allowed)}allowed are {', '.join(sorted(allowed))}"
         raise tag.refusal("type", repr(plugin), rule)
@@ -443,7 +441,7 @@ def _check_property(checked: CheckedScene, node: mi.parser.SceneNode, name: str)
     elif kind == _Type.ResolvedReference:
         inner = nodes[node.props[name].index()]
         within = inner.props.plugin_name()
-        shape, emitter = (PLUGINS[kind].split() for kind in ("shape", "emitter"))
+        shape, emitter = (PLUGINS[kind] for kind in ("shape", "emitter"))
         if plugin in shape and within in emitter and within not in _ON_SHAPES:
             rule = f"a shape holds {' or '.join(_ON_SHAPES)} only; put other lamps beside the shapes"
             raise outline.tag(inner).refusal("type", repr(within), rule)
@@ -493,7 +491,7 @@ def _check_resource(checked: CheckedScene, node: mi.parser.SceneNode) -> None:
     if name is None:
         got = "no text" if "filename" in node.props else "nothing"
         raise tag.refusal("filename", got, f"a {plugin} reads one file")
-    path = checked.scene_files.find(tag, name)
+    path = checked.outline.files.find(tag, name)
     if str(path) in checked.own:
         return  # mitsim reads it itself, and makes a file of it that is as Mitsuba needs it
     try:
@@ -518,7 +516,7 @@ def _check_resource(checked: CheckedScene, node: mi.parser.SceneNode) -> None:
 def _check_camera(checked: CheckedScene, node: mi.parser.SceneNode) -> None:
     for below in references(node.props):
         props = checked.nodes[below].props
-        if props.plugin_name() in PLUGINS["sampler"].split() and "sample_count" in props:
+        if props.plugin_name() in PLUGINS["sampler"] and "sample_count" in props:
             checked.samples = int(props["sample_count"])
     values = {name: node.props[name] for name in CameraGeometry.model_fields if name in node.props}
     try:

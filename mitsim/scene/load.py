@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,11 +22,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.images import fit_square, read_reflectance
 from mitsim.scene import tree
 from mitsim.scene.check import PICTURE, PLUGINS, SMALL_LAMPS, CheckedScene, Range, Unfit, check_file, looking_beside
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.sensor import PITCH_TOLERANCE, SensorModel
+from mitsim.scene import check
 from mitsim.scene.headers import check_obj, check_ply
-from mitsim.scene.outline import Tag
-
-if TYPE_CHECKING:
-    from mitsim.devices.sensor import SensorModel
+from mitsim.scene.outline import Outline, Tag
 
 # -------- The projector's pixel grid: n x n pixels of a stock ``projector`` emitter and the directions that they light
 #
@@ -194,7 +194,7 @@ class LoadedScene:
     lamps: tuple[mi.Emitter, ...]
     mirrors: bool
     glossy: bool
-    unfit: Unfit
+    unfit: check.Unfit
     shapes: tuple[Tag, ...]
     small_lamps: tuple[tuple[mi.Emitter, Tag], ...]
     coloured: tuple[Tag, ...]
@@ -252,15 +252,15 @@ def load_scene(
 
     Raises MitsimError of one line that names the file, for any fault.
     """
-    checked = check_file(path, defines or {}, outside, mi.variant())
+    checked = check.check_file(path, defines or {}, outside, mi.variant())
     if needs_projector and checked.unfit.factored is not None:
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
-    sensor_note = None if sensor is None else tree.fit_film(checked, sensor)
-    with with_own_files(checked), looking_beside(checked.outline):
-        tree.move_to_camera(checked.outline, checked.state)
-        tree.check_thin_shapes(checked.outline, checked.state.nodes)
-        tree.put_wrappers(checked.state)
+    sensor_note = None if sensor is None else fit_film(checked, sensor)
+    with with_own_files(checked), check.looking_beside(checked.outline):
+        move_to_camera(checked.outline, checked.state)
+        check_thin_shapes(checked.outline, checked.state.nodes)
+        put_wrappers(checked.state)
         scene = mi.parser.instantiate(checked.config, checked.state)
     for mesh, materials in checked.unread.items():
         if materials:
@@ -287,7 +287,7 @@ def load_scene(
             if needs_projector:
                 raise
     # Groups are in the scene only by their instances.
-    tags = checked.tags_of(set(PLUGINS["shape"].split()) - {"shapegroup"})
+    tags = checked.tags_of(set(check.PLUGINS["shape"]) - {"shapegroup"})
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
     flags = [shape.bsdf().flags() for shape in shapes if shape.bsdf()]
     polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
@@ -307,7 +307,7 @@ def load_scene(
         glossy=hidden or any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags),
         unfit=checked.unfit,
         shapes=tuple(tags) if len(tags) == len(shapes) else (),
-        small_lamps=tuple(zip(small, checked.tags_of(SMALL_LAMPS), strict=True)),
+        small_lamps=tuple(zip(small, checked.tags_of(check.SMALL_LAMPS), strict=True)),
         coloured=tuple(checked.coloured),
         parting=tuple(checked.parting),
         samples=checked.samples,
@@ -327,11 +327,195 @@ def holds_hair(flags: Any) -> Any:
     return (flags & both) == both
 
 
+# -------- Changes to the tree of a checked scene that let Mitsuba render what the scene describes
+#
+# Mitsuba makes objects in single precision, but its parser's tree is in double precision. Therefore objects are moved
+# in the tree, and refused where single precision would lose their position, width or brightness.
+
+_CENTRES = {"sphere": "center", "cylinder": "p0"}
+_PLACED = ("point", "spot", "projector", "mitsim_projector")
+"""Lamps with a position."""
+_SINGLE = ("projector", "obj", "ply", "instance")
+"""Objects whose numbers are of single precision already."""
+_SINGLE_ROUNDING = 2.0**-24
+"""Relative rounding of single precision."""
+_COARSEST = 5e-6
+"""Largest rounding over distance [rad]: 1/400 pixel of 128 over 17 degrees, which changes frames by 1e-3."""
+
+
+def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> None:
+    """Move all objects of a checked tree so that its first ``mitsim_lensless`` is at the origin; directions are kept.
+
+    Single precision leaves 0.03 mm at 300 m, 2e-2 of frames. Raises MitsimError for a projector or mesh whose origin is
+    too far from the camera.
+    """
+    nodes = state.nodes
+    cameras = [node for node in nodes if node.props.plugin_name() == "mitsim_lensless"]
+    away, reach = np.eye(4), float(CameraGeometry.model_fields["scene_distance"].default)
+    if cameras:
+        away[:3, 3] = -placement_of(cameras[0].props)[:3, 3]
+        reach = float(cameras[0].props.get("scene_distance", reach))
+    for index in standing(nodes):
+        props = nodes[index].props
+        plugin, place = props.plugin_name(), away @ placement_of(props)
+        distance = float(np.linalg.norm(place[:3, 3]))
+        if plugin in _SINGLE and distance * _SINGLE_ROUNDING > _COARSEST * reach:
+            farthest = f"its origin may be {_COARSEST / _SINGLE_ROUNDING * reach:.0f} mm away"
+            rule = f"single precision loses places {reach:g} mm before the camera; {farthest}"
+            tag = outline.tag(mi.parser.SceneNode(nodes[index]), "to_world")
+            raise tag.refusal("to_world", f"{distance:.0f} mm from the camera", rule)
+        if not away[:3, 3].any():
+            continue
+        if plugin == "cylinder" and "p0" in props:
+            last = np.array(props.get("p1", (0, 0, 1)), dtype=np.float64)  # its default
+            props["p1"] = mi.ScalarPoint3d(last - np.array(props["p0"], dtype=np.float64))
+        if _CENTRES.get(plugin, "to_world") in props and plugin in _CENTRES:
+            props[_CENTRES[plugin]] = mi.ScalarPoint3d(0)
+        elif "position" in props:
+            props["position"] = mi.ScalarPoint3d(place[:3, 3])
+            continue
+        props["to_world"] = mi.ScalarAffineTransform4d(place)
+
+
+def standing(nodes: Sequence[mi.parser.SceneNode], at: int = 0) -> Iterator[int]:
+    """Yield the indices of nodes that have a place in the world, below node ``at``; a merged shape has its parts'."""
+    for index in check.references(nodes[at].props):
+        plugin = nodes[index].props.plugin_name()
+        if plugin == "merge":
+            yield from standing(nodes, index)
+        elif plugin != "shapegroup" and plugin in (*check.PLUGINS["shape"], *check.PLUGINS["sensor"], *_PLACED):
+            yield index
+
+
+def placement_of(props: mi.Properties, centred: bool = True) -> FloatArray:
+    name = _CENTRES.get(props.plugin_name(), "position")
+    matrix = np.array(props["to_world"].matrix, dtype=np.float64) if "to_world" in props else np.eye(4)
+    if centred and name in props:
+        shift = np.eye(4)
+        shift[:3, 3] = np.array(props[name], dtype=np.float64)
+        return matrix @ shift
+    return matrix
+
+
+# -------- Thin cylinders and small lamps
+#
+# Mitsuba solves a quadratic in single precision for the point where a ray meets a cylinder. With radius r at distance
+# D its discriminant errs by 6e-8 (D / r)^2, by 100 % for 0.15 mm at 400 mm, which loses 3 to 7 % of the light.
+# Triangles keep the rounding of their corners, 3e-8 D. Specular chains meet cylinders in double precision. Spheres are
+# met from the ray's nearest point, which loses 5e-4 of the light for r = 1e-5 D. Mitsuba draws points of an emitting
+# sphere by the cosine of its visible radius, 1 - (r / D)^2 / 2, which single precision resolves only to 1.2e-7
+# (D / r)^2: its light on surfaces is 3 % too much for 0.5 mm at 300 mm, and zero for 0.05 mm.
+
+_SLENDER, _POLISHED_SLENDER, _SMALL_LAMP, _SMALL_BALL = 400.0, 1e5, 64.0, 1e6
+"""Ratios of distance to radius at which a cylinder loses 8e-4 of its light, a lamp 5e-4, and a sphere 5e-3."""
+_POLISHED = ("conductor", "dielectric", "mitsim_glass", "thindielectric")
+
+
+def check_thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> None:
+    """Raise MitsimError for cylinders and spheres that are too thin for their distance from what they light."""
+    projectors = [node.props for node in nodes if node.props.plugin_name() == "projector"]
+    eyes = [np.zeros(3), *(placement_of(props)[:3, 3] for props in projectors)]
+    places = [placement_of(nodes[index].props)[:3, 3] for index in standing(nodes)]
+    found = [(index, np.eye(4)) for index in standing(nodes)]
+    for instance in [nodes[index].props for index in standing(nodes) if nodes[index].props.plugin_name() == "instance"]:
+        for group in check.references(instance):
+            found += [(index, placement_of(instance)) for index in standing(nodes, group)]
+    for index, to_world in found:
+        props, kind = nodes[index].props, nodes[index].props.plugin_name()
+        below = {inner.props.plugin_name() for inner in check.nodes_below(nodes, nodes[index])}
+        if kind not in _CENTRES:
+            continue
+        lamp = kind == "sphere" and "area" in below
+        most = _SMALL_LAMP if lamp else _SMALL_BALL
+        local, ends = to_world @ placement_of(props, centred=False), [(to_world @ placement_of(props))[:3, 3]]
+        if kind == "cylinder":
+            most = _SLENDER if below.isdisjoint(_POLISHED) else _POLISHED_SLENDER
+            ends.append(local[:3, :3] @ np.array(props.get("p1", (0, 0, 1)), dtype=np.float64) + local[:3, 3])
+        radius = float(np.linalg.svd(local[:3, :3], compute_uv=False)[0]) * float(props.get("radius", 1.0))
+        distance = max(float(np.linalg.norm(a - b)) for a in ends for b in eyes + (places if lamp else []))
+        if distance > most * radius:
+            rule = (
+                f"single precision holds {distance / most:.2g} mm there; take a larger radius, or a mesh of its shape"
+            )
+            tag = outline.tag(mi.parser.SceneNode(nodes[index]), "radius")
+            raise tag.refusal("radius", f"{radius:g} mm at a distance of {distance:.4g} mm", rule)
+
+
+# -------- Materials made of others, and lamps that are meshes
+
+
+def put_wrappers(state: mi.parser.ParserState) -> None:
+    """Replace materials of Mitsuba by wrappers that return all light, forward and backward.
+
+    Mitsuba's own materials lose light of mirrors, or are correct only for light from the camera
+    (:mod:`mitsim.transport.plugins.wrappers`). A choice between materials without mirrors or holes is correct in
+    Mitsuba and stays.
+
+    Emitting meshes emit by their faces. Mitsuba draws points of a mesh with the normals of its vertices, and weighs the
+    light by their cosine instead of the face's: of normals 30 and 60 degrees off it keeps 0.85 and 0.47.
+    """
+    nodes = state.nodes
+    below = [{inner.props.plugin_name() for inner in check.nodes_below(nodes, node)} for node in nodes]
+    for node, inner in zip(nodes, below, strict=True):
+        plugin = str(node.props.plugin_name())
+        inside = {*check.references(node.props)}
+        sides = [index for index in inside if nodes[index].props.plugin_name() in check.PLUGINS["bsdf"]]
+        sharp = not inner.isdisjoint((*check.MIRRORS, *check.STRAIGHT)) and (plugin != "twosided" or len(sides) > 1)
+        if plugin in check.DIRECTED or (plugin in check.CHOICES and sharp):
+            node.props.set_plugin_name(f"mitsim_{plugin}")
+        if plugin in ("obj", "ply") and "area" in inner:
+            node.props["face_normals"] = True
+
+
+# -------- The film of a camera file
+#
+# The scene's film and ``pixel_pitch`` are defaults, which the sensor of a camera file replaces.
+_FILMS = check.PLUGINS["film"]
+_WINDOW = "crop_offset_x", "crop_offset_y", "crop_width", "crop_height"
+_PITCH = float(CameraGeometry.model_fields["pixel_pitch"].default)
+
+
+def fit_film(checked: check.CheckedScene, sensor: SensorModel) -> str:
+    """Give the cameras of a scene the pitch and format of a camera file; return a sentence if something changes.
+
+    A pitch within :data:`PITCH_TOLERANCE` stays. Raises MitsimError for a camera without a film whose size can be
+    set.
+    """
+    nodes, changed = checked.state.nodes, False
+    (own_row, own_column), shape = sensor.pitches_mm, sensor.frame_shape
+    for node in nodes:
+        if node.props.plugin_name() != "mitsim_lensless":
+            continue
+        films = [nodes[at].props for at in check.references(node.props) if nodes[at].props.plugin_name() in _FILMS]
+        if not films:
+            tag = checked.outline.tag(mi.parser.SceneNode(node))
+            raise tag.refusal("film", "none", "the camera file's rows and columns are its size; give it a <film>")
+        column = float(node.props.get("pixel_pitch", _PITCH))
+        row = float(node.props.get("row_pitch", column))
+        if abs(own_column - column) > PITCH_TOLERANCE * column or abs(own_row - row) > PITCH_TOLERANCE * row:
+            changed, node.props["pixel_pitch"] = True, own_column
+            if "row_pitch" in node.props:
+                del node.props["row_pitch"]
+            if own_row != own_column:
+                node.props["row_pitch"] = own_row
+        if shape is not None:
+            window = [name for name in _WINDOW if name in films[0]]
+            changed |= bool(window) or (films[0].get("height", 576), films[0].get("width", 768)) != tuple(shape)
+            films[0]["height"], films[0]["width"] = shape
+            for name in window:
+                del films[0][name]
+    if not changed:
+        return ""
+    size = "" if shape is None else f"{shape[0]} x {shape[1]} "
+    pitch = f"{own_row * 1e3:g} x {own_column * 1e3:g} um"
+    return f"sensor {sensor.name!r}: {size}pixels of {pitch}, as its camera file says, in place of the scene's own"
+
+
 # -------- Values of a loaded scene's bitmaps and meshes
 # OpenEXR files and colours of vertices may hold NaN, infinity, negative numbers and reflectances above 1, which
 # Mitsuba accepts. The renderer would spread one such texel over every frame.
 
-_ANY = Range(-np.inf, np.inf)
+_ANY = check.Range(-np.inf, np.inf)
 _ROUNDING = 1e-5
 
 
@@ -370,7 +554,7 @@ def _add_up_normals(scene: mi.Scene, without_normals: set[str]) -> None:
     parameters.update()
 
 
-def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> None:
+def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, check.Range]) -> None:
     """Raise MitsimError for bitmaps and meshes with values outside ``limits`` by use, or that are not finite.
 
     The message has the file or mesh, the texel and its value.
@@ -415,7 +599,7 @@ _CODE_ROUNDING = 1e-9
 
 
 @contextmanager
-def with_own_files(checked: CheckedScene) -> Iterator[None]:
+def with_own_files(checked: check.CheckedScene) -> Iterator[None]:
     """Prepare the files that the user named; the prepared files exist within the context.
 
     Raises MitsimError for a picture that is no reflectance, a mesh without faces or with normals that point inwards,
@@ -426,7 +610,7 @@ def with_own_files(checked: CheckedScene) -> Iterator[None]:
             name = str(node.props["filename"]) if "filename" in node.props else ""
             if name not in checked.own:
                 continue
-            if checked.own[name] != PICTURE:
+            if checked.own[name] != check.PICTURE:
                 checked.unread[name] = _place_object(node.props, Path(name))
                 continue
             square = fit_square(read_reflectance(Path(name)))
@@ -475,7 +659,7 @@ def _place_object(props: mi.Properties, path: Path) -> str:
     middle = (low + high) / 2
     upright = np.diag([1 / longest, 1 / longest, 1 / longest, 1.0])
     upright[:3, 3] = -np.array([middle[0], low[1], middle[2]]) / longest
-    props["to_world"] = mi.ScalarAffineTransform4d(tree.placement_of(props) @ upright)
+    props["to_world"] = mi.ScalarAffineTransform4d(placement_of(props) @ upright)
     return unread
 
 

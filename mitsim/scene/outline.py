@@ -14,7 +14,7 @@ import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 from xml.parsers import expat
 
 from mitsim.core.errors import MitsimError, cut, near_name
@@ -66,8 +66,8 @@ class Outline:
     has parameters that are missing, unknown or not plain.
     """
 
-    def __init__(self, path: Path, defines: Mapping[str, str], files: SceneFiles) -> None:
-        self._files = files
+    def __init__(self, path: Path, defines: Mapping[str, str], outside: bool = False) -> None:
+        self.files = SceneFiles(path, outside)
         self._values, self._given = dict(defines), defines
         self.defines = dict(defines)
         self._defaults: set[str] = set()
@@ -80,7 +80,7 @@ class Outline:
             if "$" in value or "\\" in value or not value.isprintable():
                 problem = f"parameter {cut(name)}={cut(value)!r}: give a plain value without $"
                 raise MitsimError(f"{problem}, backslash or line breaks")
-        self._read(files.scene(path), path.parent, ())
+        self._read(self.files.scene(path), path.parent, ())
         known = ", ".join(sorted(self._defaults)) or "none"
         unknown = [
             f"parameter {cut(name)}={cut(value)}: {path} has no <default name={cut(name)!r}>; "
@@ -112,36 +112,30 @@ class Outline:
         parser = expat.ParserCreate()
         open_tags: list[int] = []
 
-        def refuse(what: str) -> MitsimError:
-            return MitsimError(f"{path}:{parser.CurrentLineNumber}: {what}")
+        def refuse(what: str) -> NoReturn:
+            raise MitsimError(f"{path}:{parser.CurrentLineNumber}: {what}")
 
         def declare(version: str, encoding: str | None, standalone: int) -> None:
             if encoding is not None and encoding.lower() not in ("utf-8", "us-ascii"):
-                raise refuse(f"encoding: got {cut(encoding)!r}; write the scene in UTF-8")
-
-        def doctype(*_: object) -> None:
-            raise refuse("DTDs and entities are not allowed in a scene; remove <!DOCTYPE ...>")
-
-        def instruction(target: str, _: str) -> None:
-            raise refuse(f"processing instructions are not allowed in a scene; remove <?{cut(target)} ...?>")
+                refuse(f"encoding: got {cut(encoding)!r}; write the scene in UTF-8")
 
         def start(name: str, attributes: dict[str, str]) -> None:
             self._elements += 1
             if len(open_tags) >= DEEPEST:
-                raise refuse(f"elements are nested over {DEEPEST} deep (<{cut(name)}>); flatten the scene")
+                refuse(f"elements are nested over {DEEPEST} deep (<{cut(name)}>); flatten the scene")
             if self._elements > MOST_ELEMENTS:
-                raise refuse(f"over {MOST_ELEMENTS} elements with all includes; make the scene smaller")
+                refuse(f"over {MOST_ELEMENTS} elements with all includes; make the scene smaller")
             tag = Tag(path, parser.CurrentLineNumber, name, attributes)
             own = attributes.get("value", "")
             if (name, attributes.get("name")) == ("string", "filename") and own[:1] == "$" and own[1:] in self._given:
-                path_of_own = str(self._files.find_named(own[1:], self._given[own[1:]]))
+                path_of_own = str(self.files.find_named(own[1:], self._given[own[1:]]))
                 self.defines[own[1:]] = self._values[own[1:]] = path_of_own
             texts = {key: self._with_parameters(tag, text) for key, text in attributes.items()}
             if texts.get("name") == "" and name != "default":
                 raise tag.refusal("name", "''", "give a name; only objects may go without the attribute")
             if not open_tags:
                 if name != "scene" and not above:
-                    raise refuse(f"the root element is <{cut(name)}>; a Mitsuba scene starts with <scene>")
+                    refuse(f"the root element is <{cut(name)}>; a Mitsuba scene starts with <scene>")
                 version = attributes.get("version", "")
                 if not _VERSION.fullmatch(version):
                     rule = 'give the scene version="3.0.0"; 2 and 3 are read'
@@ -165,7 +159,7 @@ class Outline:
                 self._defaults.add(parameter)
                 self._values.setdefault(parameter, value)
             elif name == "include":
-                inner, open_files = self._files.include(tag, texts.get("filename", "")), (*above, path.resolve())
+                inner, open_files = self.files.include(tag, texts.get("filename", "")), (*above, path.resolve())
                 if inner.resolve() in open_files:
                     raise tag.refusal("include", inner.name, "it comes back to itself; remove one of the two")
                 if self._opened > _MOST_INCLUDES or len(open_files) > _DEEPEST_INCLUDE:
@@ -173,17 +167,19 @@ class Outline:
                     raise tag.refusal("include", inner.name, rule)
                 self._read(inner, path.parent, open_files)
             elif name == "spectrum" and "filename" in texts:
-                self._files.spectrum(tag, beside, texts["filename"])
+                self.files.spectrum(tag, beside, texts["filename"])
             elif name in _NUMBERS:
                 _check_numbers(tag, texts)
             elif (name, texts.get("name")) == ("string", "filename"):
                 outer = (self._tags[file, at, ""].attributes for at in open_tags[:-1])
                 if any(attributes.get("type") == "projector" for attributes in outer):
-                    self.projected.append(self._files.folder / texts.get("value", ""))
+                    self.projected.append(self.files.folder / texts.get("value", ""))
 
         parser.XmlDeclHandler = declare
-        parser.StartDoctypeDeclHandler = doctype
-        parser.ProcessingInstructionHandler = instruction
+        parser.StartDoctypeDeclHandler = lambda *_: refuse("a scene has no DTDs and entities; remove <!DOCTYPE ...>")
+        parser.ProcessingInstructionHandler = lambda target, _: refuse(
+            f"processing instructions are not allowed in a scene; remove <?{cut(target)} ...?>"
+        )
         parser.StartElementHandler = start
         parser.EndElementHandler = lambda _: open_tags.pop()
         try:

@@ -169,9 +169,7 @@ def scene_changed(content: str, chance: random.Random) -> str:
             lines[at] = ""
         elif kind == 5 and all:
             found = chance.choice(all)
-            lines[at] = (
-                lines[at][: found.start(2)] + chance.choice(PLUGINS[found[1]].split()) + lines[at][found.end(2) :]
-            )
+            lines[at] = lines[at][: found.start(2)] + chance.choice(PLUGINS[found[1]]) + lines[at][found.end(2) :]
         else:
             lines.insert(chance.randrange(2, len(lines) - 2), lines[at])
     return "\n".join(lines)

@@ -13,6 +13,7 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import read_reflectance
 from mitsim.scene.outline import Outline, SceneFiles
+from mitsim.scene.outline import Outline
 
 TETRAHEDRON = "v 0 0 0\nv 10 0 0\nv 5 20 3\nv 4 2 9\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 BOARD = 0.99
@@ -78,7 +79,7 @@ def test_where_a_named_file_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.chdir(tmp_path / "here")
 
     def found(name: str) -> str:
-        return Outline(path, {"picture": name}, SceneFiles(path)).defines["picture"]
+        return Outline(path, {"picture": name}).defines["picture"]
 
     assert found("mine.png") == found("./mine.png") == str(tmp_path / "here" / "mine.png")
     assert found("own.png") == str(tmp_path / "scene" / "own.png")

@@ -143,7 +143,7 @@ GLASS = fresnel(COSINE, 1.5)
     ],
 )
 def test_each_material_sends_on_its_part(bsdf: dict, part: float) -> None:
-    """Choices between materials are those that :mod:`mitsim.scene.tree` puts in place of Mitsuba's."""
+    """Choices between materials are those that :mod:`mitsim.scene.load` puts in place of Mitsuba's."""
     full = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
     assert full > 0
     # The reflectance of glass changes by less than 1e-4 over the window's small part that meets the sensor.
