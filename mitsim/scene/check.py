@@ -100,9 +100,9 @@ _TEXTURES = "bitmap blackbody checkerboard d65 irregular mesh_attribute rawconst
 PLUGINS = {
     tag: names.split()
     for tag, names in {
-        "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask mitsim_glass mitsim_grating normalmap "
-        "null plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic "
-        "thindielectric twosided",
+        "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask mitsim_glass mitsim_grating "
+        "normalmap null plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric "
+        "roughplastic thindielectric twosided",
         "emitter": "area constant directional envmap mitsim_projector point projector spot",
         "film": "hdrfilm specfilm",
         "integrator": "direct path ptracer volpath volpathmis",

@@ -60,36 +60,32 @@ def check_image(path: Path) -> tuple[int, bool]:
     elif start[:2] in (b"PF", b"Pf"):
         (width, height), grey = _two_numbers(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s.*", start), start[:2] == b"Pf"
     else:
-        (width, height), grey = _pillow_size(path, start)
+        from PIL.Image import Exif
+        from PIL.JpegImagePlugin import JpegImageFile
+        from PIL.PngImagePlugin import PngImageFile
+
+        reader = {b"\x89PN": PngImageFile, b"\xff\xd8\xff": JpegImageFile}.get(start[:3])
+        if reader is None:
+            raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
+        try:
+            opened = reader(path)
+        except (SyntaxError, OSError, ValueError):
+            raise ValueError("is a damaged PNG or JPEG image; save it again") from None
+        with opened as image:
+            exif = Exif()  # not by getexif, which looks for it behind a PNG's pixels too, and decodes them
+            try:
+                exif.load(image.info.get("exif", b""))
+                turned = exif.get(_ORIENTATION, 1)
+            except Exception:  # of a damaged one, whatever its reader stumbles over
+                raise ValueError("has damaged Exif data; save it again") from None
+            if turned != 1:
+                raise ValueError(f"has the orientation {turned}, which Mitsuba ignores; save it turned as it is seen")
+            if getattr(image, "custom_mimetype", None) == "image/apng":
+                raise ValueError("is animated, and Mitsuba shows its first picture alone; save that")
+            (width, height), grey = image.size, image.mode in _GREY
     if width * height == 0 or width * height > MOST_TEXELS:
         raise ValueError(f"has {width}x{height} texels; 1 to {MOST_TEXELS} are allowed")
     return width * height, grey
-
-
-def _pillow_size(path: Path, start: bytes) -> tuple[tuple[int, int], bool]:
-    from PIL.Image import Exif
-    from PIL.JpegImagePlugin import JpegImageFile
-    from PIL.PngImagePlugin import PngImageFile
-
-    reader = {b"\x89PN": PngImageFile, b"\xff\xd8\xff": JpegImageFile}.get(start[:3])
-    if reader is None:
-        raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
-    try:
-        opened = reader(path)
-    except (SyntaxError, OSError, ValueError):
-        raise ValueError("is a damaged PNG or JPEG image; save it again") from None
-    with opened as image:
-        exif = Exif()  # not by getexif, which looks for it behind a PNG's pixels too, and decodes them
-        try:
-            exif.load(image.info.get("exif", b""))
-            turned = exif.get(_ORIENTATION, 1)
-        except Exception:  # of a damaged one, whatever its reader stumbles over
-            raise ValueError("has damaged Exif data; save it again") from None
-        if turned != 1:
-            raise ValueError(f"has the orientation {turned}, which Mitsuba passes over; save it turned as it is seen")
-        if getattr(image, "custom_mimetype", None) == "image/apng":
-            raise ValueError("is animated, and Mitsuba shows its first picture alone; save that")
-        return image.size, image.mode in _GREY
 
 
 def _two_numbers(pattern: bytes, header: bytes) -> tuple[int, int]:
@@ -115,7 +111,16 @@ def check_ply(path: Path) -> tuple[bool, str]:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary")
     # A text is an array of words, all of which are read as double precision.
     words = body.split() if order is None else []
-    types = {name: _row_type(properties, order) for name, (_, properties) in parts.items()}
+    types = dict[str, np.dtype[np.void]]()
+    for part, (_, properties) in parts.items():
+        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+        for name, kind in properties:
+            if " " in kind:
+                length, item = ("f8", "f8") if order is None else [order + each for each in kind.split()]
+                fields += [(_CORNERS, length), (_INDICES, item, (3,))]
+            else:
+                fields.append((name, "f8" if order is None else order + kind))
+        types[part] = np.dtype(fields)
     widths = [types[name].itemsize // (8 if order is None else 1) for name in parts]
     starts = np.cumsum([0, *(count * width for (count, _), width in zip(parts.values(), widths, strict=True))]).tolist()
     held, count = len(words if order is None else body), parts["vertex"][0]
@@ -152,17 +157,6 @@ def check_ply(path: Path) -> tuple[bool, str]:
 
 
 _Properties = list[tuple[str, str]]
-
-
-def _row_type(properties: _Properties, order: str | None) -> np.dtype[np.void]:
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    for name, kind in properties:
-        if " " in kind:
-            length, item = ("f8", "f8") if order is None else [order + each for each in kind.split()]
-            fields += [(_CORNERS, length), (_INDICES, item, (3,))]
-        else:
-            fields.append((name, "f8" if order is None else order + kind))
-    return np.dtype(fields)
 
 
 def _ply_header(header: bytes) -> tuple[str | None, dict[str, tuple[int, _Properties]]]:

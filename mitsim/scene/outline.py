@@ -80,7 +80,13 @@ class Outline:
             if "$" in value or "\\" in value or not value.isprintable():
                 problem = f"parameter {cut(name)}={cut(value)!r}: give a plain value without $"
                 raise MitsimError(f"{problem}, backslash or line breaks")
-        self._read(self.files.scene(path), path.parent, ())
+        if not path.is_file():
+            raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
+        self.files.used[path] = None
+        # Mitsuba searches the folder "plugins" beside the scene and in the working folder before its own.
+        for folder in (path.parent, Path()):
+            _check_native(path, folder)
+        self._read(path, path.parent, ())
         known = ", ".join(sorted(self._defaults)) or "none"
         unknown = [
             f"parameter {cut(name)}={cut(value)}: {path} has no <default name={cut(name)!r}>; "
@@ -107,7 +113,22 @@ class Outline:
         return MitsimError(f"{file}:{line}: Mitsuba refuses {what}: {message[places[-1].end() :]}")
 
     def _read(self, path: Path, beside: Path, above: tuple[Path, ...]) -> None:
-        content = _content(path)
+        try:
+            with open(path, "rb") as opened:
+                content = opened.read(_MOST_BYTES + 1)
+        except OSError as error:
+            raise MitsimError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+        if len(content) > _MOST_BYTES:
+            problem = f"{path}: over {_MOST_BYTES >> 20} MiB"
+            raise MitsimError(f"{problem}; a scene is smaller, its meshes have files of their own")
+        try:
+            content.decode("utf-8")
+            wrong = content.find(b"\0")  # where Mitsuba's parser would end
+        except UnicodeDecodeError as error:
+            wrong = error.start
+        if wrong >= 0:
+            line = content.count(b"\n", 0, wrong) + 1
+            raise MitsimError(f"{path}:{line}: not well-formed XML (no UTF-8, or a zero byte); write it in UTF-8")
         file, self._opened = self._opened, self._opened + 1
         parser = expat.ParserCreate()
         open_tags: list[int] = []
@@ -159,7 +180,9 @@ class Outline:
                 self._defaults.add(parameter)
                 self._values.setdefault(parameter, value)
             elif name == "include":
-                inner, open_files = self.files.include(tag, texts.get("filename", "")), (*above, path.resolve())
+                inner = self.files.find(tag, texts.get("filename", ""), path.parent)
+                open_files = *above, path.resolve()
+                _check_native(path, inner.parent)
                 if inner.resolve() in open_files:
                     raise tag.refusal("include", inner.name, "it comes back to itself; remove one of the two")
                 if self._opened > _MOST_INCLUDES or len(open_files) > _DEEPEST_INCLUDE:
@@ -167,7 +190,9 @@ class Outline:
                     raise tag.refusal("include", inner.name, rule)
                 self._read(inner, path.parent, open_files)
             elif name == "spectrum" and "filename" in texts:
-                self.files.spectrum(tag, beside, texts["filename"])
+                name = texts["filename"]
+                if self.files.find(tag, name, beside).stat().st_size > _MOST_SPECTRUM:
+                    raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
             elif name in _NUMBERS:
                 _check_numbers(tag, texts)
             elif (name, texts.get("name")) == ("string", "filename"):
@@ -201,26 +226,6 @@ class Outline:
             return self._values[match[1]]
 
         return text if tag.name == "default" else _PARAMETER.sub(value, text)
-
-
-def _content(path: Path) -> bytes:
-    try:
-        with open(path, "rb") as file:
-            content = file.read(_MOST_BYTES + 1)
-    except OSError as error:
-        raise MitsimError(f"{path}: cannot be read ({error.strerror}); check the file") from None
-    if len(content) > _MOST_BYTES:
-        problem = f"{path}: over {_MOST_BYTES >> 20} MiB"
-        raise MitsimError(f"{problem}; a scene is smaller, its meshes have files of their own")
-    try:
-        content.decode("utf-8")
-        wrong = content.find(b"\0")  # where Mitsuba's parser would end
-    except UnicodeDecodeError as error:
-        wrong = error.start
-    if wrong >= 0:
-        line = content.count(b"\n", 0, wrong) + 1
-        raise MitsimError(f"{path}:{line}: not well-formed XML (no UTF-8, or a zero byte); write the scene in UTF-8")
-    return content
 
 
 def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
@@ -264,25 +269,6 @@ class SceneFiles:
         self.outside = outside
         self.own: dict[Path, str] = {}
         self.used: dict[Path, None] = {}
-
-    def scene(self, path: Path) -> Path:
-        """Return ``path``; raise MitsimError unless it is a plain file without native code beside it."""
-        if not path.is_file():
-            raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
-        self.used[path] = None
-        # Mitsuba searches the folder "plugins" beside the scene and in the working folder before its own.
-        for folder in (path.parent, Path()):
-            _check_native(path, folder)
-        return path
-
-    def include(self, tag: Tag, name: str) -> Path:
-        path = self.find(tag, name, tag.path.parent)
-        _check_native(tag.path, path.parent)
-        return path
-
-    def spectrum(self, tag: Tag, folder: Path, name: str) -> None:
-        if self.find(tag, name, folder).stat().st_size > _MOST_SPECTRUM:
-            raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
 
     def find_named(self, parameter: str, name: str) -> Path:
         """Return the path of the file that a user names for a scene ``parameter``.
