@@ -14,9 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from mitsim.bench.effects import check_switches, parse_switches
-from mitsim.core.colour_files import BANDS, LINES, bands_of, spectral_of
 from mitsim.bench.effects import parse_switches
+from mitsim.core.colour_files import BANDS, LINES, bands_of, spectral_of
 from mitsim.core.configuration import (
     CAMERA,
     DEVICES,

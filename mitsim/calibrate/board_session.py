@@ -17,10 +17,8 @@ import numpy as np
 
 from mitsim.acquire.exposure import camera_warnings, levels
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.layout import MOST_LOST, mask_fault
-from mitsim.core.arrays import FloatArray, in_threads
 from mitsim.bench.layout import MOST_LOST, before_board, mask_fault, missed_pixels
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, in_threads
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Cost, Job
 from mitsim.devices.camera import CameraGeometry, side_of

@@ -17,9 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import ByValue, FloatArray, single_threaded_blas, stream
-from mitsim.core.colour_files import Wanted
 from mitsim.core.errors import MitsimError
-from mitsim.core.images import image_size, own_end, read_image
 
 MaskKind = Literal["separable", "flatcam", "open"]
 CameraMask = Literal["separable", "flatcam", "open", "plate"]

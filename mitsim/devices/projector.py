@@ -15,8 +15,6 @@ from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.colour_files import MOST_LINES
 from mitsim.core.configuration import Configuration
 from mitsim.core.errors import MitsimError
-from mitsim.devices.sensor import EfficiencyCurve, SensorModel
-from mitsim.core.manifests import MOST_LINES
 from mitsim.devices.sensor import SensorModel
 
 _FIELDS = 4

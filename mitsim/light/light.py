@@ -17,6 +17,7 @@ from scipy import sparse
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import Physics, names
+from mitsim.bench.layout import before_board
 from mitsim.core.arrays import (
     PACKED,
     Behind,
@@ -27,8 +28,6 @@ from mitsim.core.arrays import (
     single_threaded_blas,
     whole_hdf5,
 )
-from mitsim.bench.layout import before_board
-from mitsim.core.arrays import PACKED, FloatArray, Labels, mean_of_neighbours, whole_hdf5
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.job import Progress, silent
 from mitsim.devices.patterns import Lighting, PatternFamily

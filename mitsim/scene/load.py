@@ -20,8 +20,6 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import fit_square, read_reflectance
-from mitsim.scene import tree
-from mitsim.scene.check import PICTURE, PLUGINS, SMALL_LAMPS, CheckedScene, Range, Unfit, check_file, looking_beside
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.sensor import PITCH_TOLERANCE, SensorModel
 from mitsim.scene import check

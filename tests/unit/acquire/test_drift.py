@@ -16,7 +16,6 @@ from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import stream
 from mitsim.core.configuration import load_model, shipped_path
 from mitsim.core.errors import MitsimError
-from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.camera import CameraGeometry, Devices, MaskProfile
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.projector import ProjectorModel

@@ -12,7 +12,6 @@ from PIL import Image
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import read_reflectance
-from mitsim.scene.outline import Outline, SceneFiles
 from mitsim.scene.outline import Outline
 
 TETRAHEDRON = "v 0 0 0\nv 10 0 0\nv 5 20 3\nv 4 2 9\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
