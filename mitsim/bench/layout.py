@@ -295,7 +295,8 @@ def _preview(scene: mi.Scene, world: FloatArray, place: FloatArray, angle: float
     empty = 1 - full
     white = float(np.percentile(light[light > 0], _WHITE)) if light.any() else 1.0
     shown = np.clip(light / white, 0, 1) * (1 - _FILL) + _FILL * by_lamp if light.any() else by_lamp
-    return Preview(shown * (1 - empty) + empty, np.linalg.inv(place), float(np.tan(np.radians(angle / 2))))
+    shown = np.asarray(shown * (1 - empty) + empty)
+    return Preview(shown, np.asarray(np.linalg.inv(place)), float(np.tan(np.radians(angle / 2))))
 
 
 # -------- Surfaces that are put before a bench: the white board of a calibration, and pictures on its prints

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import NormalDist, mean
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -332,7 +332,7 @@ class Response(ByValue):
             return (cls(sensor.efficiency(SPECTRA_NM[0]) * wavelengths, SPECTRA_NM),)
         filters = sensor.mosaic or " " * len(_PLANES)
         for name in dict.fromkeys(filters):
-            curve = getattr(sensor.mosaic_curves, name, sensor.quantum_efficiency_curve)
+            curve: Any = getattr(sensor.mosaic_curves, name, sensor.quantum_efficiency_curve)
             known, efficiency = np.array(curve.wavelengths_nm), np.array(curve.efficiency)
             first, last = max(SPECTRA_NM[0], known[0]), min(SPECTRA_NM[1], known[-1])
             if not first < last:

@@ -446,7 +446,7 @@ def put_wrappers(state: mi.parser.ParserState) -> None:
     """Replace materials of Mitsuba by wrappers that return all light, forward and backward.
 
     Mitsuba's own materials lose light of mirrors, or are correct only for light from the camera
-    (:mod:`mitsim.transport.plugins.wrappers`). A choice between materials without mirrors or holes is correct in
+    (:mod:`mitsim.transport.plugins.materials`). A choice between materials without mirrors or holes is correct in
     Mitsuba and stays.
 
     Emitting meshes emit by their faces. Mitsuba draws points of a mesh with the normals of its vertices, and weighs the

@@ -471,7 +471,7 @@ def _grating() -> type:
 # material under the same bumps gives the ratio of both, c = cos_p(wi) G(wi) / (cos_p(wo) G(wo)), where cos_p is the
 # cosine to the bumps' normal and G is Mitsuba's shadowing of bumps.
 #
-# Parameters are those of Mitsuba's plugins of the same name. :mod:`mitsim.scene.tree` puts these plugins into a scene.
+# Parameters are those of Mitsuba's plugins of the same name. :mod:`mitsim.scene.load` puts these plugins into a scene.
 
 PREFIX = "mitsim_"
 _ANY = 2**32 - 1
