@@ -37,7 +37,7 @@ from mitsim.light.settings import Settings
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.planner.planner import make_plan, plan_within
 from mitsim.reconstruct.colour import PLANES, behind
-from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
+from mitsim.transport.from_camera import FromCameraTracer, LampTracer
 from mitsim.transport.records import PathSamples
 
 _RAYS, _ALIKE = 4, 0.9
@@ -409,7 +409,7 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
     for response in responses:
 
         def counted(*bands: Band, response: Response = response) -> FloatArray:
-            seen = LampTracer(tracer, LampResponse(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
+            seen = LampTracer(tracer, response, bands, (1.0,)).trace(stream, 0, _SAMPLES)
             lit = np.bincount(seen.pixel - tracer.projector.n**2, seen.value, colour_files.MOST_LINES)
             return np.asarray(lit / _SAMPLES)
 

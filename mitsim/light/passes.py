@@ -30,9 +30,8 @@ from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_
 from mitsim.optics.shadow import Places
 from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.direct import AimedTracer, DirectTracer
-from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampResponse, LampTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
+from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import (
     DIRECT,
@@ -380,7 +379,7 @@ class Tracers(Grids):
         for number, response in enumerate(counted_lamps.responses):
             rows = counted_lamps.rows(number)
             own = [unit * response.part for unit in units]
-            lamps.append(LampTracer(tracer, LampResponse(response, counted_lamps.bands[rows], own, rows.start)))
+            lamps.append(LampTracer(tracer, response, counted_lamps.bands[rows], own, rows.start))
         if of_projector:
             lamps.insert(0, FromCameraTracer(self.setup, self.aim, replace(paths, emitters=()), points))
         return lamps[0] if len(lamps) == 1 else CombinedTracer(*lamps)

@@ -31,8 +31,7 @@ from mitsim.planner.pilot_direct import (
 )
 from mitsim.transport import records
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.indirect import adaptive_counts, block_moments, effect_of
-from mitsim.transport.integrator import KINDS
+from mitsim.transport.integrator import KINDS, adaptive_counts, block_moments, effect_of
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import PathSamples
 

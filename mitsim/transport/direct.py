@@ -29,7 +29,7 @@ _LOBE = 2.0**8
 
 class DirectTracer(Tracer):
     def __init__(self, setup: OpticalSetup, anchors: int, spread: bool = False, pixels: IntArray | None = None) -> None:
-        super().__init__(setup, SensorPoints(setup.geometry.half_width, anchors, spread))
+        super().__init__(setup, points=SensorPoints(setup.geometry.half_width, anchors, spread))
         self._pixels = np.arange(setup.projector.n**2) if pixels is None else pixels
 
     @property

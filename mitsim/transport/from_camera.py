@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +26,7 @@ from mitsim.devices.projector import SPECTRA_NM, Band, Response
 from mitsim.transport import integrator
 from mitsim.transport.connect import OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
 from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, streams, x_y
-from mitsim.transport.records import CellAxis, CellGrid, DeviceAccumulator, PathSamples, Sightings
+from mitsim.transport.records import CellGrid, DeviceAccumulator, PathSamples, Sightings
 from mitsim.transport.transmission import refracted_way
 
 _SELDOM = 0.125
@@ -34,7 +34,7 @@ _SELDOM = 0.125
 _MARGIN = 1e-4
 
 
-class FromCameraTracer(integrator.FollowingTracer):
+class FromCameraTracer(integrator.Tracer):
     of_projector: ClassVar[bool] = True
 
     def __init__(
@@ -51,7 +51,7 @@ class FromCameraTracer(integrator.FollowingTracer):
         return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
     def _launch(self, flight: integrator.InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        return CameraPaths(self, CameraState, flight).path_samples()
+        return CameraPaths(self, flight).path_samples()
 
 
 @dataclass(kw_only=True)
@@ -81,8 +81,9 @@ State = TypeVar("State", bound=CameraState)
 
 class CameraPaths(integrator.PathIntegrator[State]):
     IMPORTANCE = False
+    STATE: ClassVar[Any] = CameraState
 
-    def __init__(self, tracer: FromCameraTracer, state: type[State], flight: integrator.InFlight) -> None:
+    def __init__(self, tracer: FromCameraTracer, flight: integrator.InFlight) -> None:
         super().__init__(tracer)
         cell, row, column = tracer.points.of(flight.index, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
@@ -96,8 +97,11 @@ class CameraPaths(integrator.PathIntegrator[State]):
         jitter = _MARGIN + (1 - 2 * _MARGIN) * sobol_point(flight.sample, shared)
         sensor = tracer.points.at(*self.anchor, rng)
         self.origin, nearness = rows_columns(sensor.x, sensor.y), dr.opaque(mi.Float, 1 / tracer.points.distance)
-        self.row = _place(grid.rows, cell // columns, jitter.x) - self.origin[0] * nearness
-        self.column = _place(grid.columns, cell % columns, jitter.y) - self.origin[1] * nearness
+        places = (grid.rows, cell // columns, jitter.x), (grid.columns, cell % columns, jitter.y)
+        self.row, self.column = (
+            dr.opaque(mi.Float, axis.start) + (mi.Float(index) + part) * dr.opaque(mi.Float, axis.size) - at * nearness
+            for (axis, index, part), at in zip(places, self.origin, strict=True)
+        )
         squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
         wavelengths, spectral = tracer.wavelengths(rng, flight.sample, shared)
@@ -113,7 +117,7 @@ class CameraPaths(integrator.PathIntegrator[State]):
             solid *= dr.power(squared, -0.5 * dr.opaque(mi.Float, self.geometry.angular_exponent))
         self.weight = spectral * solid
         sightings = {kind: Sightings.none(tracer.by_line) for kind in integrator.KINDS}
-        self.paths = state(active=active, ray=ray, rng=rng, sightings=sightings)
+        self.paths = self.STATE(active=active, ray=ray, rng=rng, sightings=sightings)
 
     def path_samples(self) -> list[PathSamples]:
         kept = self.follow(self.paths).sightings
@@ -270,11 +274,6 @@ def _seen_at(si: mi.SurfaceInteraction3f, point: mi.Point3f) -> mi.SurfaceIntera
     return apparent
 
 
-def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
-    start, size = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, axis.size)
-    return start + (mi.Float(index) + jitter) * size
-
-
 # -------- Lamps' light by their own spectra
 #
 # A path carries four wavelengths, one of each band, all at the same place in theirs. Places of a cell's paths follow a
@@ -285,23 +284,17 @@ def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
 # A spectrum that is 1 everywhere is 1 W m^-2 (sr^-1) over the 470 nm from 360 to 830 nm, so L / 470 nm is spectral.
 
 
-@dataclass(frozen=True, eq=False)
-class LampResponse:
-    """Response of the camera to lamps, in one band for each wavelength of a path; ``units`` are in W m^-2."""
-
-    response: Response
-    bands: Sequence[Band]
-    units: Sequence[float]
-    first: int = 0
-
-
 class LampTracer(FromCameraTracer):
+    """Tracer of lamps, with a ``response`` of the camera in one band for each wavelength; ``units`` are in W m^-2."""
+
     of_projector = False
     by_line = True
 
-    def __init__(self, like: FromCameraTracer, counted: LampResponse) -> None:
+    def __init__(
+        self, like: FromCameraTracer, response: Response, bands: Sequence[Band], units: Sequence[float], first: int = 0
+    ) -> None:
         super().__init__(like.setup, like.grid, like.paths, like.points)
-        self.counted = counted
+        self._response, self._bands, self._units, self._first = response, bands, units, first
         self._alone: mi.UInt32 | None = None
 
     @property
@@ -309,7 +302,7 @@ class LampTracer(FromCameraTracer):
         if not self.projector.parted:
             return [self]
         tracers = []
-        for band, (first, last) in enumerate(self.counted.bands):
+        for band, (first, last) in enumerate(self._bands):
             if last > first:
                 tracers.append(copy(self))
                 tracers[-1]._alone = dr.opaque(mi.UInt32, band)
@@ -319,11 +312,11 @@ class LampTracer(FromCameraTracer):
         self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32
     ) -> tuple[mi.Color0f, mi.UnpolarizedSpectrum]:
         place = sobol_point(shuffle(sample, shared), shared).x
-        counts = mi.Float(self.counted.response.counts.astype(np.float32))
-        steps = len(self.counted.response.counts) - 1
+        counts = mi.Float(self._response.counts.astype(np.float32))
+        steps = len(self._response.counts) - 1
         step = (SPECTRA_NM[1] - SPECTRA_NM[0]) / steps
         wavelengths, weights = [], []
-        for first, last in self.counted.bands:
+        for first, last in self._bands:
             width = dr.opaque(mi.Float, last - first)
             wavelength = dr.opaque(mi.Float, first) + place * width
             position = (wavelength - SPECTRA_NM[0]) / step
@@ -347,12 +340,12 @@ class LampTracer(FromCameraTracer):
             alike = ("anchor_row", "anchor_column", "row", "column", "inverse_depth", "kind", "lane")
             several = PathSamples(
                 **{name: np.repeat(getattr(found, name), MOST_LINES) for name in alike},
-                pixel=(found.pixel[:, None] + self.counted.first + np.arange(MOST_LINES)).ravel(),
-                value=light * self.counted.units[0],
+                pixel=(found.pixel[:, None] + self._first + np.arange(MOST_LINES)).ravel(),
+                value=light * self._units[0],
             )
             if self.projector.by_line:
                 units = np.zeros(MOST_LINES)
-                units[: len(self.counted.units)] = self.counted.units
+                units[: len(self._units)] = self._units
                 several = replace(several, lines=(units[:, None] * light).astype(np.float32))
             traced.append(several)
         return traced

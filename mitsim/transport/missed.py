@@ -152,9 +152,10 @@ class _MissedState(CameraState):
 
 class _MissedPaths(CameraPaths[_MissedState]):
     tracer: _MissedTracer
+    STATE = _MissedState
 
     def __init__(self, tracer: _MissedTracer, flight: InFlight) -> None:
-        super().__init__(tracer, _MissedState, flight)
+        super().__init__(tracer, flight)
         self._rays = tracer.setup.rays  # made before the loop, in which nothing can be evaluated
 
     def _connect(self, paths: _MissedState, si: mi.SurfaceInteraction3f, first: bool) -> None:
@@ -334,42 +335,44 @@ class SharpLight:
         q / P the density of a lobe by itself.
     """
 
-    irradiance: float
-    error: float
-    hits: float
     by_pixel: FloatArray
     moments: FloatArray
-    width: float
+    error: float = 0.0
+    width: float = math.inf
     rest: float = 0.0
+
+    @property
+    def irradiance(self) -> float:
+        return float(self.by_pixel.sum())
+
+    @property
+    def hits(self) -> float:
+        moment = float(self.moments.sum())
+        return self.irradiance**2 / moment if moment else 0.0
 
     @classmethod
     def none(cls, pixels: int) -> SharpLight:
-        return cls(0.0, 0.0, math.inf, np.zeros(pixels), np.zeros(pixels), math.inf)
+        return cls(np.zeros(pixels), np.zeros(pixels))
 
 
 @keep_scenes()
 def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     """Estimate direct light over lobes too sharp for connections."""
-    n, paths_per_sample = setup.projector.n, setup.projector.n**2
-    least, every = dr.full(mi.Float, _LEAST_SHARP, paths_per_sample), np.arange(paths_per_sample)
+    n, pixels = setup.projector.n, setup.projector.n**2
+    least, every, count = dr.full(mi.Float, _LEAST_SHARP, pixels), np.arange(pixels), max(1, _CONNECTIONS // pixels)
     first = _trace_lobes(setup, least, every, seed, 0, -(-samples // _FEWER), _WIDER)
     if not len(first.widths):
-        return SharpLight.none(paths_per_sample)
+        return SharpLight.none(pixels)
     least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
     if first.widths.min() >= _BROAD * setup.geometry.half_width:
         # Broad lobes are met by connections, which measure their light.
-        count, width = max(1, _CONNECTIONS // paths_per_sample), float(first.widths.min())
-        met, others = (
-            _Connections(setup, 1, spread=True).over(least, sharp).trace(seed, 0, count) for sharp in (True, False)
-        )
-        by_pixel, moments = (
-            np.bincount(met.pixel, met.value**power, minlength=paths_per_sample) / count for power in (1, 2)
-        )
-        total, moment = float(by_pixel.sum()), float(moments.sum())
-        error = math.sqrt(max(moment - float(np.square(by_pixel).sum()), 0.0) / count)
-        hits = total**2 / moment if moment else 0.0
-        if hits * count >= _WELL_MET:
-            return SharpLight(total, error, hits, by_pixel, moments, width, float(others.value.sum()) / count)
+        met, others = (_Connections(setup, least, sharp).trace(seed, 0, count) for sharp in (True, False))
+        by_pixel, moments = (np.bincount(met.pixel, met.value**power, minlength=pixels) / count for power in (1, 2))
+        error = math.sqrt(max(float(moments.sum()) - float(np.square(by_pixel).sum()), 0.0) / count)
+        rest, width = float(others.value.sum()) / count, float(first.widths.min())
+        broad = SharpLight(by_pixel, moments, error, width, rest)
+        if broad.hits * count >= _WELL_MET:
+            return broad
     few = -(-samples // _QUARTER)
     found = _trace_lobes(setup, least, every, seed, 0, few)
     if len(found.widths) < _ENOUGH_MET:
@@ -377,26 +380,19 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     else:
         samples = few
     if len(found.widths) < _PLENTY:
-        search = _Connections(setup, 1, spread=True).over(least, sharp=True)
-        lit = np.bincount(
-            search.trace(seed, 0, max(1, _SEARCHING // paths_per_sample)).pixel, minlength=paths_per_sample
-        )
-        pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), n)
-        if len(pixels):
-            found = _trace_lobes(setup, least, pixels, seed, samples, samples * paths_per_sample // len(pixels))
-    total, moment = float(found.by_pixel.sum()), float(found.moments.sum())
-    hits = total**2 / moment if moment else 0.0
-    rest = 0.0
-    if total:
-        apart = _Connections(setup, 1, spread=True).over(least, sharp=False)
-        count = max(1, _CONNECTIONS // paths_per_sample)
-        rest = float(apart.trace(seed, 0, count).value.sum()) / count
-    width = math.inf
+        search = _Connections(setup, least, True).trace(seed, 0, max(1, _SEARCHING // pixels))
+        lit = np.bincount(search.pixel, minlength=pixels)
+        chosen = with_neighbours((found.by_pixel > 0) | (lit > 0), n)
+        if len(chosen):
+            found = _trace_lobes(setup, least, chosen, seed, samples, samples * pixels // len(chosen))
+    rest, width = 0.0, math.inf
+    if found.by_pixel.sum():
+        rest = float(_Connections(setup, least, False).trace(seed, 0, count).value.sum()) / count
     if found.widths.size:
         order = np.argsort(found.widths)
         sums = np.cumsum(found.weights[order])
         width = float(found.widths[order][np.searchsorted(sums, _SHARPEST * sums[-1])])
-    return SharpLight(total, found.error, hits, found.by_pixel, found.moments, width, rest)
+    return SharpLight(found.by_pixel, found.moments, found.error, width, rest)
 
 
 def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
@@ -428,13 +424,9 @@ class _SensorHits:
 
 
 class _Connections(DirectTracer):
-    _over_sharp: bool
-    _least: mi.Float
-    _own_least: mi.Float
-
-    def over(self, least: mi.Float, sharp: bool) -> _Connections:
-        self._least, self._over_sharp = least, sharp
-        return self
+    def __init__(self, setup: OpticalSetup, least: mi.Float, over_sharp: bool) -> None:
+        super().__init__(setup, 1, spread=True)
+        self._least, self._over_sharp = least, over_sharp
 
     def _place(
         self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f

@@ -19,38 +19,38 @@ transmission are not shared.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from copy import copy
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, reduce
 from itertools import cycle
 from operator import or_
-from typing import TYPE_CHECKING
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsim.transport.connect import Way
-from mitsim.transport.indirect import (
+from mitsim.transport.integrator import (
     MEMBERS,
     SIDE,
-    AdaptiveSamples,
-    Emission,
     IndirectTracer,
+    InFlight,
     ProjectorPaths,
     blocks_of,
+    camera_part,
+    matt_part,
+    projector_part,
+    shading_correction,
+    tilt,
 )
-from mitsim.transport.integrator import InFlight, camera_part, matt_part, projector_part, shading_correction, tilt
 from mitsim.transport.plugins.base import generator, sobol_point, split_by_line
 from mitsim.transport.records import INDIRECT, DeviceAccumulator, PathSamples, Sightings, check_finite
 
-if TYPE_CHECKING:
-    ByLine = list[mi.Float]
-    Store = Callable[[mi.UInt32, mi.UInt32, tuple[ByLine, ByLine], mi.Bool], None]
-    Sender = Callable[[mi.Vector3f, mi.Bool], tuple[ByLine, mi.Float]]
-    Turner = Callable[[mi.UInt32, mi.Bool], tuple[ByLine, ByLine]]
-
+ByLine: TypeAlias = "list[mi.Float]"
+Store: TypeAlias = "Callable[[mi.UInt32, mi.UInt32, tuple[ByLine, ByLine], mi.Bool], None]"
+Sender: TypeAlias = "Callable[[mi.Vector3f, mi.Bool], tuple[ByLine, mi.Float]]"
+Turner: TypeAlias = "Callable[[mi.UInt32, mi.Bool], tuple[ByLine, ByLine]]"
 _STEP, _TURN = 5, 16
 """Each sample begins five members on, and every sixteenth one more, which spreads points over the sequence."""
 _PATHS_PER_LAUNCH = 2**20
@@ -59,16 +59,11 @@ _REFLECTANCE = re.compile(r"(brdf_\d\.)?reflectance\.")
 
 
 class PathReuseTracer(IndirectTracer):
-    paths_per_launch = _PATHS_PER_LAUNCH
+    paths_per_launch, in_blocks = _PATHS_PER_LAUNCH, True
 
     @property
     def paths_per_sample(self) -> int:
         return MEMBERS * (len(self.adaptive) if self.adaptive else blocks_of(self.projector.n) ** 2)
-
-    def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
-        again = copy(self)
-        again.adaptive = AdaptiveSamples.of(np.asarray(repeats, dtype=np.int64))
-        return again
 
     def shares(self) -> bool:
         lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
@@ -91,7 +86,7 @@ class PathReuseTracer(IndirectTracer):
     def all_diffuse(self) -> bool:
         return len(self.diffuse) == len(self.setup.scene.shapes()) and not self.paths.steep
 
-    def _emission(self, flight: InFlight) -> Emission:
+    def emission(self, flight: InFlight) -> tuple[Any, ...]:
         block, member, sample, weight = flight.index // MEMBERS, flight.index % MEMBERS, flight.sample, 1.0
         if self.adaptive:
             block, sample, weight = self.adaptive.at(block, sample)
@@ -104,18 +99,18 @@ class PathReuseTracer(IndirectTracer):
         rng = generator(seed ^ (sample * 0x9E3779B9 + 1), pixel)
         place = (member + sample * _STEP + sample // _TURN) % MEMBERS
         first_turn = sobol_point(sample * MEMBERS + place, generator(seed, block))
-        return Emission(pixel, (none, none), rng, first_turn, dr.select(inside, mi.Float(weight), 0))
+        return pixel, (none, none), rng, first_turn, dr.select(inside, mi.Float(weight), 0)
 
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         kind = DiffuseReusedPaths if self.all_diffuse else ReusedPaths
-        return kind(self, self._emission(flight)).path_samples(accumulator)
+        return kind(self, flight).path_samples(accumulator)
 
 
 class ReusedPaths(ProjectorPaths):
     tracer: PathReuseTracer
 
-    def __init__(self, tracer: PathReuseTracer, emission: Emission) -> None:
-        super().__init__(tracer, emission)
+    def __init__(self, tracer: PathReuseTracer, flight: InFlight) -> None:
+        super().__init__(tracer, flight)
         self.tracer = tracer
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
@@ -181,9 +176,10 @@ class ReusedPaths(ProjectorPaths):
         self.shared = paths.active & (paths.scattered == 1)
         self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
         number = mi.UInt32(0)
-        self.to_sensor_way = self._way(paths, si, self.connections.sensor(number))
+        self.to_sensor_way = self.setup.way(si, self.connections.sensor(number), paths.active & ~paths.straight)
         own = replace(self.to_sensor_way, open=self.to_sensor_way.open & ~self.shared)
-        self._keep_light(paths, si, own, self._draw_numbers(paths), (paths.sightings, number))
+        drawn = {kind: paths.rng.next_float32() for kind in ("direct", "indirect")}
+        self._keep_light(paths, si, own, drawn, (paths.sightings, number))
         # Shapes that are diffuse, or all but those that are not; no comparison where both are many.
         shapes, diffuse, found = self.scene.shapes(), self.tracer.diffuse, mi.Bool(False)
         few = min(diffuse, frozenset(range(len(shapes))) - diffuse, key=len)
@@ -211,11 +207,8 @@ class ReusedPaths(ProjectorPaths):
     def _turn_on(
         self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool
     ) -> ByLine:
-        kept = self._own_part(si, tilt(si, toward) / tilt(si, onward))
+        kept = projector_part(si, tilt(si, toward) / tilt(si, onward)) if self.rules.steep else 1
         return [light * kept for light in self._turn(si, toward, onward, active)]
-
-    def _own_part(self, si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float | int:
-        return projector_part(si, correction) if self.rules.steep else 1
 
     def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
         """Return the light from each pixel to each second point of its block, and the points' densities.
@@ -302,7 +295,9 @@ class ReusedPaths(ProjectorPaths):
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.to_sensor_way, at, active)
             reception = self.setup.received(second, toward, replace(way, open=way.open & active))
-            part = (1 - camera_part(reception.pdf)) * self._own_part(second, tilt(second, toward))
+            part = 1 - camera_part(reception.pdf)
+            if self.rules.steep:
+                part *= projector_part(second, tilt(second, toward))
             connected = self._factors(reception.irradiance * part)
             beyond, turned = (
                 [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)

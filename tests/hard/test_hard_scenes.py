@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.integrator import IndirectTracer, Paths
 from tests.hard.hard_light import SCALE, SEVEN, SLOW, N, Z, gauss, matt, mean, seen_alone
 from tests.physics.radiosity import Furnace
 from tests.robustness import Recorder

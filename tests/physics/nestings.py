@@ -15,8 +15,7 @@ from skimage.io import imsave
 
 from mitsim.api.bench import Bench
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.integrator import IndirectTracer, Paths
 
 Material = tuple[Any, ...]
 """``("mirror",)``, ``("glass",)``, ``("black",)`` or a wrapper, its number or ``"textured"``, and its materials."""

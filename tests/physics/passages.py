@@ -10,8 +10,7 @@ import numpy as np
 from mitsim.api.bench import Bench
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import FromCameraTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.records import aligned_grid
 
 SEEDS, SIGMAS = 8, 7.0

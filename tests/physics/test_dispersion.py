@@ -23,9 +23,8 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core.colour_files import RUN
 from mitsim.core.errors import MitsimError
 from mitsim.transport.direct import DirectTracer, FluxTracer
-from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.from_camera import FromCameraTracer, LampTracer
+from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from mitsim.transport.specular import trace_specular_chains
@@ -114,7 +113,7 @@ def lamps(bench: Bench) -> list[list[float]]:
     aim = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov + 0.01)
     like = FromCameraTracer(bench.setup, aim, Paths(True, True, bench.loaded.lamps))
     bands = [(nm - 0.01, nm + 0.01) for nm in LINES] + [(830.0, 830.0)]
-    found = LampTracer(like, LampResponse(lit.counted_lamps.responses[0], bands, (1.0,))).trace(3, 0, SAMPLES)
+    found = LampTracer(like, lit.counted_lamps.responses[0], bands, (1.0,)).trace(3, 0, SAMPLES)
     return [seen(found.where(found.pixel == N**2 + band)) for band in range(len(LINES))]
 
 

@@ -24,8 +24,7 @@ from mitsim.optics.mirror_frames import SpecularFrames, specular_frames
 from mitsim.planner.planner import make_plan
 from mitsim.transport import plugins
 from mitsim.transport.connect import ProjectorOptics
-from mitsim.transport.specular import trace_specular_chains
-from mitsim.transport.specular_rays import SpecularRays
+from mitsim.transport.specular import SpecularRays, trace_specular_chains
 from tests.aperture import aperture_scene_parts
 from tests.physics.test_diffraction import by_point_source
 

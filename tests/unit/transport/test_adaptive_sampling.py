@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.transport.indirect import adaptive_counts, by_pixel, effect_of
+from mitsim.transport.integrator import adaptive_counts, by_pixel, effect_of
 from tests.unit.transport.test_path_reuse import SCENES, SIGMAS, summed, tracers
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -15,8 +15,7 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.transport.connect import SensorPoints
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.records import DIRECT, INDIRECT, Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 

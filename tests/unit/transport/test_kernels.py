@@ -26,8 +26,7 @@ from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.direct import DirectTracer, FluxTracer
 from mitsim.transport.from_camera import FromCameraTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths, Tracer
+from mitsim.transport.integrator import IndirectTracer, Paths, Tracer
 
 RECORDING = {"load_scene", "_launch", "sums", "highlights", "board"}
 """Functions whose calls of scenes make kernels."""

@@ -13,8 +13,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.planner.planner import make_plan
 from mitsim.transport.connect import OpticalSetup, ProjectorOptics
 from mitsim.transport.from_camera import FromCameraTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.missed import Highlights, LeftOut, highlights, left_out_light
 from mitsim.transport.records import CellGrid, aligned_grid
 from tests.physics.hidden_light import SCENES

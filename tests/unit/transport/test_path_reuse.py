@@ -16,8 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import INDIRECT, Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from tests.unit.transport.test_indirect import MATT, MIRROR, SHINY, SPHERE

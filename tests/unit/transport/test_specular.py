@@ -8,8 +8,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import specular_frames
 from mitsim.transport.connect import PinholeRays, ProjectorOptics, shines_in
-from mitsim.transport.specular import trace_specular_chains
-from mitsim.transport.specular_rays import SpecularRays
+from mitsim.transport.specular import SpecularRays, trace_specular_chains
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE = 8, 111000.0

@@ -11,8 +11,7 @@ from mitsim.scene.check import DIRECTED, PLUGINS
 from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer
-from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import Paths
+from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import aligned_grid
 from tests.conftest import write_png
