@@ -37,7 +37,7 @@ from mitsim.reconstruct.captured_session import calibrate_frames as calibrate_fr
 from mitsim.reconstruct.factors import Factors as Factors
 from mitsim.reconstruct.factors import load_calibration as load_calibration
 from mitsim.reconstruct.known_pictures import calibrate_known as calibrate_known
-from mitsim.reconstruct.point_spread_image import reconstruct_psf as reconstruct_psf
+from mitsim.reconstruct.point_spread import reconstruct_psf as reconstruct_psf
 from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
 from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
 from mitsim.report.folder_page import report_folder as report_folder

@@ -21,7 +21,7 @@ from mitsim.core.manifests import (
 )
 from mitsim.core.runs import AMBIENT, CLOSING, claim_run, frame_name
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import Status, Verdict
 
 ROWS, COLUMNS = 40, 52
 SCENE = 10, 14

@@ -17,7 +17,7 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import Status, Verdict
 from tests.shadow_factor import scene_factor
 
 N, PIXELS, PITCH = 16, 96, 0.02

@@ -131,7 +131,7 @@ class Layout:
 @keep_scenes()
 def layout_of(bench: Apparatus) -> Layout:
     """Determine the layout of a ``bench`` with one ray per projector pixel."""
-    from mitsim.reconstruct.focus import pixels_of_parallax  # here: a capture needs none of the solver
+    from mitsim.reconstruct.depth import pixels_of_parallax  # here: a capture needs none of the solver
 
     loaded, geometry, n = bench.loaded, bench.geometry, bench.n
     turn, origin = camera_place(bench)

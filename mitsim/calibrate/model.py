@@ -33,8 +33,7 @@ from mitsim.optics.shadow import SeparableTerms
 from mitsim.optics.terms import ModelledCamera, Placement, best_term
 from mitsim.reconstruct.captured_session import chosen_responses
 from mitsim.reconstruct.factors import SEPARABLE_RESIDUAL, Factors, decibels, squared_condition
-from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.reconstruct.solver import centre_frame
+from mitsim.reconstruct.solver import Status, Verdict, centre_frame
 
 _SIGNIFICANT = 3.0
 """Standard errors from which a rotation of the mask counts."""

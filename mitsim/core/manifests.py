@@ -441,7 +441,7 @@ class CalibrationManifest(_Head):
     estimate: str | None = None
     """Text of the estimator."""
     verdict: str | None = None
-    """Verdict of the estimator, one of `mitsim.reconstruct.solution.Verdict`."""
+    """Verdict of the estimator, one of `mitsim.reconstruct.solver.Verdict`."""
 
 
 # ---- Reading and writing ----

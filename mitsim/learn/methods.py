@@ -41,8 +41,7 @@ from mitsim.learn.requests import FLATNET, REFINED, UNROLLED
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import TIKHONOV
-from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.solver import Accumulator, DiagonalProblem, Prepared, noise_variance
+from mitsim.reconstruct.solver import Accumulator, DiagonalProblem, Prepared, Solution, Status, Verdict, noise_variance
 from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 
 # -------- Network

@@ -17,8 +17,8 @@ calibrated distance moves light likewise and is included."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -28,11 +28,10 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import Digital, FactorNoise, RunManifest
-from mitsim.core.runs import Capture, Measurement
+from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import BYTES_A_NUMBER, TIKHONOV, keeps_frames, slab_numbers
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, Side, half_spread
+from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, Side, Solution, half_spread
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 
 EDGES = 2.9
@@ -255,6 +254,30 @@ class Lack:
 
 
 # ---- Frames added up ----
+
+
+class DerivedCapture(Capture):
+    def __init__(
+        self,
+        whole: Capture,
+        part: tuple[slice, slice] = (slice(None), slice(None)),
+        sensor: tuple[int, int] | None = None,
+    ) -> None:
+        super().__init__(whole.manifest, whole.folder)
+        self.whole, self._part, self._sensor = whole, part, sensor
+
+    @cached_property
+    def patterns(self) -> tuple[FloatArray, FloatArray]:
+        return self.whole.patterns
+
+    @cached_property
+    def ambient(self) -> Ambient | None:
+        whole = self.whole.ambient
+        return whole and Ambient(whole.rate[self._part], whole.variance[self._part], whole.shots)
+
+    def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+        for each in self.whole.pattern_measurements(self._sensor or shape):
+            yield replace(each, frame=each.frame[self._part], light=each.light[self._part])
 
 
 @dataclass(frozen=True, eq=False)

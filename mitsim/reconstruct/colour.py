@@ -28,14 +28,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.solution import Solution
+
+if TYPE_CHECKING:
+    from mitsim.reconstruct.solver import Solution
 
 # ---- Images of all lines behind a mosaic of filters ------------------------------------------------------------------
 

@@ -25,8 +25,7 @@ from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.reconstruct.solver import centre_columns, centre_frame
+from mitsim.reconstruct.solver import Status, Verdict, centre_columns, centre_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

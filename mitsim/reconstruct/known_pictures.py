@@ -1,24 +1,45 @@
 """Calibration by captures of known pictures: prints, screens or images by another calibration.
 
 All planes of a colour sensor see one mask, so that their codes are fitted together.
+
+A mask before a sensor casts the same shadow from every direction, shifted. So a side's factor is an unknown code c on
+a grid of sensor pixels, seen from scene pixel i through a shift::
+
+    Phi[u, i] = sum_k b_k(i) c_k(u + o + s i)
+
+with s the sensor pixels that one scene pixel shifts the shadow by, o the place of this frame's pixels (planes of a
+Bayer sensor lie half a pixel apart), and b_k polynomials over the scene, b_0 = 1, for falloff or thick masks.
+
+*Alternating least squares.* With Z = X Phi_R^T a frame is Y = Phi_L Z, linear in the codes of Phi_L; left and right
+take turns. A code's numbers have an independent prior of variance 1 / alpha, estimated from the frames (MacKay 1992,
+Neural Computation 4, 415): alpha = gamma / |c|^2, where gamma = tr N (N + alpha)^-1 is the number of parameters that
+the frames determine, and (N + alpha)^-1 is their covariance.
+
+*Start.* A frame's spectrum is Y(f, g) = C_L(f) C_R(g) X(-s f, -s' g), up to the sensor's edges. Y over X is a product
+of two vectors only for the right orientation and scale of the scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize_scalar
 
-from mitsim.core.arrays import FloatArray
-from mitsim.core.colour_files import CALIBRATION, PLANES, Wanted, write_colours
+from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.colour_files import BGGR, CALIBRATION, PLANES, Preparation, Wanted, planes_of, write_colours
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, finite_channel, read_frame
 from mitsim.core.files import output_folder
-from mitsim.core.images import own_end, read_image
+from mitsim.core.images import orient, own_end, read_image
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, FactorNoise
 from mitsim.core.runs import load_run
@@ -31,11 +52,370 @@ from mitsim.reconstruct.factors import (
     rank_above_noise,
     squared_condition,
 )
-from mitsim.reconstruct.shifted_codes import Codes, Exposure, Shape, choose_terms, find_pose, fit_codes, plane_offsets
-from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.reconstruct.solver import centre_frame
+from mitsim.reconstruct.solver import Status, Verdict, centre_columns, centre_frame
 
 _MOST_TRIED = 3
+
+
+# ---- What is seen ----------------------------------------------------------------------------------------------------
+
+TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "upright": lambda scene: scene,
+    "mirrored": lambda scene: scene[:, ::-1],
+    "upside down": lambda scene: scene[::-1],
+    "turned": lambda scene: scene[::-1, ::-1],
+    "transposed": lambda scene: scene.T,
+    "transposed, mirrored": lambda scene: scene.T[:, ::-1],
+    "transposed, upside down": lambda scene: scene.T[::-1],
+    "transposed, turned": lambda scene: scene.T[::-1, ::-1],
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Frame (m, m') [electrons/s], and the light (n, n') that it shows: a picture times its pattern."""
+
+    scene: FloatArray
+    frame: FloatArray
+    group: int = 0
+    plane: str = ""
+    offset: tuple[float, float] = (0.0, 0.0)
+
+    def turn_scene(self, orientation: str) -> Exposure:
+        return replace(self, scene=TURNS[orientation](self.scene))
+
+
+def plane_offsets(how: Preparation) -> dict[str, tuple[float, float]]:
+    cell = np.empty((2, 2), dtype=object)
+    for name, place in planes_of(how.mosaic or BGGR).items():
+        cell[place] = name
+    turned = orient(cell, how.orientation) if isinstance(how.orientation, int) else cell
+    return {str(turned[row, column]): (row / 2, column / 2) for row in (0, 1) for column in (0, 1)}
+
+
+@dataclass(frozen=True)
+class Shape:
+    scales: tuple[float, float]
+    terms: int = 1
+    centre: bool = False
+
+
+@dataclass(eq=False)
+class Side:
+    sensor: int
+    scene: int
+    scale: float
+    terms: int
+    centre: bool
+
+    def __post_init__(self) -> None:
+        self.width = int(np.floor(self.scale * (self.scene - 1))) + 3
+        self.length = self.sensor + self.width - 1
+        place = np.linspace(-1, 1, self.scene) if self.scene > 1 else np.zeros(1)
+        bases = ((np.polynomial.legendre.Legendre.basis(k), 2 * k + 1) for k in range(self.terms))
+        self.weights: FloatArray = np.stack([basis(place) * np.sqrt(size) for basis, size in bases])
+
+    def hats(self, offset: float) -> FloatArray:
+        place, rows = offset + self.scale * np.arange(self.scene), np.arange(self.scene)
+        first = np.floor(place).astype(int)
+        found = np.zeros((self.scene, self.width))
+        found[rows, first] = 1 - (place - first)
+        found[rows, first + 1] += place - first
+        return found
+
+    def spread(self, offset: float) -> FloatArray:
+        return (self.weights[:, :, None] * self.hats(offset)[None]).transpose(1, 0, 2)
+
+    def factor(self, codes: FloatArray, offset: float) -> FloatArray:
+        hats, phi = self.hats(offset), np.zeros((self.sensor, self.scene))
+        for code, weight in zip(codes, self.weights, strict=True):
+            phi += (sliding_window_view(code, self.width) @ hats.T) * weight
+        return centre_columns(phi) if self.centre else phi
+
+    def normal(self, offset: float, gram: FloatArray, product: FloatArray) -> tuple[FloatArray, FloatArray]:
+        spread, w, k = self.spread(offset), self.width, self.terms
+        flat = spread.reshape(self.scene, k * w)
+        block = (flat.T @ gram @ flat).reshape(k, w, k, w)
+        side = (product @ flat).reshape(self.sensor, k, w)
+        matrix, right = np.zeros((k, self.length, k, self.length)), np.zeros((k, self.length))
+        total = np.zeros((self.scene, k, self.length))
+        for row in range(self.sensor):
+            window = slice(row, row + w)
+            matrix[:, window, :, window] += block
+            right[:, window] += side[row]
+            total[:, :, window] += spread
+        whole, every = matrix.reshape(k * self.length, -1), total.reshape(self.scene, -1)
+        if self.centre:
+            whole -= every.T @ (gram @ every) / self.sensor
+        return whole, right.ravel()
+
+
+# ---- The fit ---------------------------------------------------------------------------------------------------------
+
+_TURNS, _STILL = 20, 1e-5
+_NO_LIGHT = "known pictures: have no light, or an even one, and tell nothing of the camera; give others"
+_VAGUE, _SMALLEST, _LARGEST = 1e-3, 1e-9, 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Codes:
+    """Fitted codes (terms, length) of both sides, with the gain of each plane."""
+
+    sides: tuple[Side, Side]
+    codes: tuple[FloatArray, FloatArray]
+    gains: dict[str, float]
+    variances: FloatArray
+    explained: float
+    errors: tuple[float, float]
+    seen_errors: tuple[float, float]
+    told: tuple[float, float]
+
+    def factors(self, offset: tuple[float, float] = (0.0, 0.0), plane: str = "") -> tuple[FloatArray, FloatArray]:
+        gain = self.gains[plane]
+        left, right = (
+            side.factor(codes, place) * np.sqrt(abs(gain))
+            for side, codes, place in zip(self.sides, self.codes, offset, strict=True)
+        )
+        return np.sign(gain) * left, right
+
+    @property
+    def evidence(self) -> float:
+        """Log-likelihood of the frames, less the penalty of the determined numbers (Schwarz 1978)."""
+        size = self.sides[0].sensor * self.sides[1].sensor
+        likelihood = -0.5 * size * float(np.log(self.variances).sum())
+        return likelihood - 0.5 * sum(self.told) * float(np.log(size * len(self.variances)))
+
+    def explains(self, exposures: Sequence[Exposure]) -> float:
+        parts = []
+        for each in exposures:
+            left, right = self.factors(each.offset, each.plane)
+            misfit = each.frame - left @ each.scene @ right.T
+            parts.append(1 - float(np.sum(np.square(misfit)) / np.sum(np.square(each.frame))))
+        return float(np.mean(parts))
+
+
+@single_threaded_blas()
+def fit_codes(
+    exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS
+) -> Codes:
+    sizes = zip(exposures[0].frame.shape, exposures[0].scene.shape, shape.scales, strict=True)
+    left, right = (Side(sensor, scene, scale, shape.terms, shape.centre) for sensor, scene, scale in sizes)
+    sides = left, right
+    if start is None:
+        some = exposures[:: -(-len(exposures) // _COMPARED)]
+        start = _Spectra(some).compare([each.scene for each in some], shape.scales)[1]
+    codes = [np.zeros((shape.terms, side.length)) for side in sides]
+    codes[1][0] = np.interp(np.arange(right.length), np.arange(len(start)), start)
+    gains = dict.fromkeys((each.plane for each in exposures), 1.0)
+    energies = np.array([np.mean(np.square(each.frame)) for each in exposures])
+    if not (energies > 0).all():
+        raise MitsimError("known pictures: a frame is even, and tells nothing of the camera; leave it out")
+
+    def factors_of(axis: int) -> dict[float, FloatArray]:
+        return {place: sides[axis].factor(codes[axis], place) for place in {each.offset[axis] for each in exposures}}
+
+    variances, explained, alphas = energies.copy(), -1.0, [np.zeros(shape.terms), np.zeros(shape.terms)]
+    errors, seen, told = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+    covariances = [np.zeros((0, 0)), np.zeros((0, 0))]
+    for _ in range(turns):
+        for axis in (0, 1):
+            across = factors_of(1 - axis)
+            sums: dict[float, list[FloatArray]] = {}
+            for each, variance in zip(exposures, variances, strict=True):
+                scene, frame = (each.scene, each.frame) if axis == 0 else (each.scene.T, each.frame.T)
+                light = gains[each.plane] * (scene @ across[each.offset[1 - axis]].T)
+                added = [light @ light.T / variance, frame @ light.T / variance]
+                place = each.offset[axis]
+                sums[place] = [a + b for a, b in zip(sums[place], added, strict=True)] if place in sums else added
+            own = sides[axis]
+            matrix, data = np.zeros((own.terms * own.length,) * 2), np.zeros(own.terms * own.length)
+            for place, (gram, product) in sums.items():
+                parts = own.normal(place, gram, product)
+                matrix += parts[0]
+                data += parts[1]
+            # The codes of this side by their prior, and the variance of the prior by the numbers that frames tell.
+            level = float(np.trace(matrix)) / len(matrix)
+            if not level > 0:
+                raise MitsimError(_NO_LIGHT)
+            alphas[axis] = np.where(alphas[axis] > 0, alphas[axis], _VAGUE * level)
+            factored = cho_factor(matrix + np.diag(np.repeat(alphas[axis], own.length)))
+            codes[axis] = cho_solve(factored, data).reshape(own.terms, -1)
+            covariances[axis] = cho_solve(factored, np.eye(len(matrix)))
+            unknown = alphas[axis] * np.diag(covariances[axis]).reshape(own.terms, -1).sum(axis=1)
+            numbers = np.maximum(own.length - unknown, 0.0)
+            # Codes that explain nothing would make alpha infinite, and the matrix singular to rounding.
+            sizes = np.maximum(np.square(codes[axis]).sum(axis=1), numbers / (_LARGEST * level))
+            alphas[axis] = np.clip(numbers / np.maximum(sizes, 1e-300), _SMALLEST * level, _LARGEST * level)
+            told[axis] = float(numbers.sum())
+            lit = sum(float(np.trace(gram)) for gram, _ in sums.values())
+            seen[axis] = float(np.sqrt(told[axis] / (sides[axis].sensor * lit)))
+        phis = factors_of(0), factors_of(1)
+        models = [phis[0][each.offset[0]] @ each.scene @ phis[1][each.offset[1]].T for each in exposures]
+        # The light of each plane.
+        above, below = dict.fromkeys(gains, 0.0), dict.fromkeys(gains, 0.0)
+        for each, model in zip(exposures, models, strict=True):
+            above[each.plane] += float(np.vdot(model, each.frame))
+            below[each.plane] += float(np.vdot(model, model))
+        if not all(energy > 0 for energy in below.values()):
+            raise MitsimError(_NO_LIGHT)
+        gains = {name: above[name] / below[name] for name in gains}
+        left_over = [
+            np.mean(np.square(each.frame - gains[each.plane] * model))
+            for each, model in zip(exposures, models, strict=True)
+        ]
+        variances, before = np.asarray(left_over), explained
+        explained = 1 - float(np.mean(variances / energies))
+        if explained - before < _STILL:
+            break
+    # The error of all numbers of a factor, by the covariance of its code.
+    for axis, (side, covariance) in enumerate(zip(sides, covariances, strict=True)):
+        block = np.zeros((side.terms, side.width, side.terms, side.width))
+        whole = covariance.reshape(side.terms, side.length, side.terms, side.length)
+        for row in range(side.sensor):
+            block += whole[:, row : row + side.width, :, row : row + side.width]
+        spread = side.spread(0.0)
+        total = float(np.einsum("iaw,awbv,ibv->", spread, block, spread, optimize=True))
+        errors[axis] = float(np.sqrt(max(total, 0.0) / (side.sensor * side.scene)))
+    balance = float(np.sqrt(np.linalg.norm(codes[1]) / np.linalg.norm(codes[0])))
+    return Codes(
+        sides,
+        (codes[0] * balance, codes[1] / balance),
+        gains,
+        variances,
+        explained,
+        (errors[0] * balance, errors[1] / balance),
+        (seen[0] * balance, seen[1] / balance),
+        (told[0], told[1]),
+    )
+
+
+# ---- Orientation and scale, by spectra -------------------------------------------------------------------------------
+
+_FREQUENCIES = 20
+_COMPARED = 2
+_STEP, _FINE, _STEPS = 1.1, 1.03, 10
+_WIDEST, _NARROWEST = 1.0, 0.03
+_FIRST_TURNS, _SCALE_TURNS = 2, 3
+_CERTAIN = 1.2
+_TOLERANCE = 0.05
+
+
+class _Spectra:
+    def __init__(self, exposures: Sequence[Exposure]) -> None:
+        rows, columns = exposures[0].frame.shape
+        self._periods = 1.5 * rows, 1.5 * columns
+        waves = [_waves(count, period) for count, period in zip((rows, columns), self._periods, strict=True)]
+        self._frames = [waves[0] @ each.frame @ waves[1].T for each in exposures]
+
+    def compare(self, scenes: Sequence[FloatArray], scales: tuple[float, float]) -> tuple[float, FloatArray]:
+        """Return how nearly the spectra are a product of two vectors, 0 to 1, and the resulting code of columns."""
+        above, below = np.zeros_like(self._frames[0]), np.zeros(self._frames[0].shape)
+        left, right = (
+            np.conj(_waves(count, period / scale))
+            for count, period, scale in zip(scenes[0].shape, self._periods, scales, strict=True)
+        )
+        for frame, scene in zip(self._frames, scenes, strict=True):
+            lit = left @ scene @ right.T
+            above += frame * np.conj(lit)
+            below += np.abs(frame * lit)
+        # Phases alone: of amplitudes a few strong waves would decide, which any code has.
+        _, values, code_waves = np.linalg.svd(above / np.maximum(below, np.finfo(np.float64).tiny))
+        code = np.real(code_waves[0] @ np.conj(_waves(int(2 * self._periods[1]), self._periods[1])))
+        return float(values[0] ** 2 / max(np.sum(np.square(values)), np.finfo(np.float64).tiny)), code
+
+
+def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
+    order = np.arange(1, _FREQUENCIES + 1)
+    places = np.multiply.outer(np.concatenate([order, -order]), np.arange(count))
+    return np.asarray(np.exp(-2j * np.pi / period * places))
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Orientation and scales [sensor pixels / scene pixel] of scenes before the camera."""
+
+    orientation: str
+    scales: tuple[float, float]
+    margin: float | None = None
+    certain: bool = True
+
+
+@single_threaded_blas()
+def find_pose(
+    exposures: Sequence[Exposure], orientation: str | None = None, scales: tuple[float, float] | None = None
+) -> Pose:
+    exposures = [replace(each, frame=centre_frame(each.frame)) for each in exposures]
+    some = exposures[:: -(-len(exposures) // _COMPARED)]
+    spectra, scenes = _Spectra(some), {name: [turn(each.scene) for each in some] for name, turn in TURNS.items()}
+    ratio = some[0].frame.shape[0] / some[0].scene.shape[0]
+    count = int(np.ceil(np.log(_WIDEST / _NARROWEST) / np.log(_STEP)))
+    places = [(ratio * _NARROWEST * _STEP**power,) * 2 for power in range(count + 1)] if scales is None else [scales]
+    scores = {name: np.array([spectra.compare(own, place)[0] for place in places]) for name, own in scenes.items()}
+    # Of a scale near 0 a frame is the product of two vectors whichever way the scene lies; the right way is one alone.
+    usual, tried = np.median(list(scores.values()), axis=0), []
+    for name in scenes if orientation is None else [orientation]:
+        own, place = scenes[name], max(zip(scores[name] - usual, places, strict=True))[1]
+        if scales is None:
+            place = _refine(lambda at, own=own: -spectra.compare(own, at)[0], place, _STEP)  # type: ignore[misc]
+        fitted = fit_codes([each.turn_scene(name) for each in some], Shape(place, 1, True), turns=_FIRST_TURNS)
+        tried.append((fitted.evidence, fitted.explained, name, place))
+    _, explained, best, place = max(tried)
+    pose, others = Pose(best, place), [part for _, part, name, _ in tried if name != best]
+    if others:
+        pose = replace(pose, margin=explained - max(others), certain=1 - max(others) > _CERTAIN * (1 - explained))
+    if scales is not None:
+        return pose
+    turned = [each.turn_scene(pose.orientation) for each in exposures]
+
+    def misfit(at: tuple[float, float]) -> float:
+        return -fit_codes(turned, Shape(at, 1, True), turns=_SCALE_TURNS).evidence
+
+    for _ in range(_STEPS):
+        before, pose = pose.scales, replace(pose, scales=_refine(misfit, pose.scales, _FINE))
+        if np.all(np.abs(np.log(pose.scales) - np.log(before)) < np.log(_FINE) / 2):
+            break
+    return pose
+
+
+def _refine(
+    misfit: Callable[[tuple[float, float]], float], start: tuple[float, float], reach: float
+) -> tuple[float, float]:
+    options, bounds = {"xatol": np.log(reach) * _TOLERANCE}, (-np.log(reach), np.log(reach))
+    row = minimize_scalar(
+        lambda x: misfit((start[0] * np.exp(x), start[1])), bounds=bounds, method="bounded", options=options
+    )
+    rows = start[0] * float(np.exp(row.x))
+    column = minimize_scalar(
+        lambda x: misfit((rows, start[1] * np.exp(x))), bounds=bounds, method="bounded", options=options
+    )
+    return rows, start[1] * float(np.exp(column.x))
+
+
+# ---- How many codes: by frames that are held out ---------------------------------------------------------------------
+
+_GAIN = 0.02
+
+
+def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> tuple[int, tuple[float, ...]]:
+    """Choose the number of codes, at most ``most``, by holding out half of the pictures, or of the frames."""
+    groups = sorted({each.group for each in exposures})
+    numbers = [groups.index(each.group) for each in exposures] if len(groups) > 1 else range(len(exposures))
+    folds = [[each for each, number in zip(exposures, numbers, strict=True) if number % 2 == own] for own in (0, 1)]
+    planes = [{each.plane for each in fold} for fold in folds]
+    if not all(folds) or (len(groups) > 1 and planes[0] != planes[1]):
+        return shape.terms, ()
+    found: list[float] = []
+    for terms in range(1, most + 1):
+        parts = []
+        for kept, left_out in (folds, folds[::-1]):
+            codes = fit_codes(kept, replace(shape, terms=terms))
+            usual = float(np.mean([*codes.gains.values()]))
+            gains = dict.fromkeys((each.plane for each in left_out), usual) | codes.gains
+            parts.append(replace(codes, gains=gains).explains(left_out))
+        found.append(float(np.mean(parts)))
+        if len(found) > 1 and 1 - found[-1] > (1 - _GAIN) * (1 - found[-2]):
+            return terms - 1, tuple(found)
+    return most, tuple(found)
 
 
 # ---- The calibration -------------------------------------------------------------------------------------------------

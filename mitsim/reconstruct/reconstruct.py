@@ -18,10 +18,9 @@ from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising, print_energy
-from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map
+from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map, move_factors
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import move_factors
-from mitsim.reconstruct.misfit import Cause, LeftOut, Misfit, faulty_frames, find_misfit
+from mitsim.reconstruct.misfit import GROSS, GROSS_CHI_SQUARE, Cause, LeftOut, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.request import (
     IMAGE_FILE,
     PICTURE_FILE,
@@ -33,7 +32,7 @@ from mitsim.reconstruct.request import (
     holds_image,
     predict_cost,
 )
-from mitsim.reconstruct.solution import Solution, Verdict
+from mitsim.reconstruct.solver import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
 
@@ -41,7 +40,78 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
 
-    from mitsim.reconstruct.point_spread import PointSpreadFit
+# ---- Fit to a point spread function ----------------------------------------------------------------------------------
+
+_TURNED, _EQUAL = 0.85, 0.98
+"""Cost ratios of the best turned copy below which it is recommended, and below which the light is wrong."""
+_LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
+"""Least cost ratio of right light: the first times chi-square to the second; noise explains frames below the last."""
+_OFF = 1 / 8
+
+
+@dataclass(frozen=True)
+class PointSpreadFit:
+    """Fit of frames to a point spread function.
+
+    ``gain`` is the cost of the best turned or mirrored copy (``reading``) over that of the light as given, None where
+    all are alike. ``off`` is the distance [rows, columns] from the middle of the picture to the light's centre.
+    """
+
+    chi_square: float
+    unexplained: float
+    stated: bool
+    gain: float | None
+    reading: str
+    off: tuple[float, float]
+    size: tuple[int, int]
+
+    @property
+    def fault(self) -> tuple[str, str]:
+        left = (
+            f"{self.unexplained:.1%} of the frames is left unexplained, {self.chi_square:.3g} times the noise's energy"
+        )
+        same = "use the light of one point as this camera sees it, as it lies in the frames"
+        if self.gain is not None and self.gain < _TURNED:
+            return f"Misfit: the point spread function fits better {self.reading}; {left}", f"turn it so, or {same}"
+        least = _EQUAL if self.chi_square < _NOISY else _LEAST_GAIN * self.chi_square**_RISE
+        if self.gain is not None and self.gain < least:
+            return f"Misfit: the point spread function fits no better as given than {self.reading}; {left}", same
+        if self.unexplained > GROSS and self.chi_square > GROSS_CHI_SQUARE:
+            return f"Misfit: {left}", same
+        rows, columns = self.off
+        if max(abs(rows) / self.size[0], abs(columns) / self.size[1]) > _OFF:
+            return (
+                f"Misfit: the point's light is centred {rows:+.0f} rows and {columns:+.0f} columns from the middle of "
+                "its picture, and the image is displaced as much",
+                "take the picture of a point in the middle of the field, or shift it there",
+            )
+        return "", ""
+
+    @property
+    def gist(self) -> str:
+        return f"{self.unexplained:.1%} unexplained"
+
+    def __str__(self) -> str:
+        noise = "its stated noise" if self.stated else "noise, measured from the frames"
+        cost = "" if self.gain is None else f"; turned or mirrored, the light costs {self.gain:.3g} times as much"
+        return f"misfit: {self.unexplained:.1e} unexplained, chi-square {self.chi_square:.3g} against {noise}{cost}"
+
+    def summary(self) -> dict[str, Any]:
+        sentence, _ = self.fault
+        return {
+            "chi_square": self.chi_square,
+            "unexplained": self.unexplained,
+            "noise_stated": self.stated,
+            "flagged": bool(sentence),
+            "turned_cost": self.gain,
+            "reading": self.reading if self.gain is not None and self.gain < _TURNED else None,
+            "off_centre": list(self.off),
+        }
+
+    def judge(self, status: Status) -> Status:
+        sentence, remedy = self.fault
+        return status.with_misfit(sentence, remedy) if sentence else status
+
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 

@@ -36,8 +36,9 @@ from sensor row to row adds to all numbers of a column of W; halves of the colum
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import cached_property
 from typing import Any, Literal
 
@@ -48,7 +49,103 @@ from scipy.sparse.csgraph import connected_components
 
 from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.solution import Solution, Status, Verdict
+
+# ---- Solution and status ---------------------------------------------------------------------------------------------
+
+
+class Verdict(Enum):
+    """Result of a solver or a calibration; the value is its name in files."""
+
+    SOLVED = "solved"
+    """Every direction of the image is measured."""
+    PARTLY_MEASURED = "partly measured"
+    """Some directions of the image follow from regularisation alone."""
+    UNDER_DETERMINED = "under-determined"
+    """There are fewer sensor rows or columns than scene rows or columns."""
+    RANK_DEFICIENT = "rank deficient"
+    """Some directions are not measured, and nothing fills them."""
+    ILL_CONDITIONED = "ill-conditioned"
+    """Rounding may change the visible image."""
+    MISFIT = "misfit"
+    """The measurements contain more than any image explains."""
+    NOT_CONVERGED = "not converged"
+    """The iterations ended before the image was constant."""
+    CALIBRATED = "calibrated"
+    """Factors explain the responses."""
+    NOT_SEPARABLE = "not separable"
+    """The responses contain more than any factors explain."""
+    MOSTLY_NOISE = "mostly noise"
+    """Factors have a large error."""
+    UNKNOWN = "unknown"
+    """Factors of another program, of unknown quality."""
+
+    @property
+    def good(self) -> bool:
+        return self in (Verdict.SOLVED, Verdict.PARTLY_MEASURED, Verdict.CALIBRATED, Verdict.UNKNOWN)
+
+
+@dataclass(frozen=True)
+class Status:
+    """Verdict on a result, with the reason and the remedy; ``str`` gives all of it in sentences."""
+
+    verdict: Verdict
+    sentence: str
+    remedy: str = ""
+    figures: str = ""
+    flags: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether the verdict is good and nothing was flagged before."""
+        return self.verdict.good and not self.flags
+
+    def __str__(self) -> str:
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return " ".join(part for part in (f"{self.sentence}{remedy}.", self.figures, *self.flags) if part)
+
+    def with_misfit(self, sentence: str, remedy: str) -> Status:
+        """Return the status with a misfit, as the verdict if it is good so far and as a flag otherwise."""
+        if self.verdict.good:
+            return replace(self, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
+        return replace(self, flags=(*self.flags, f"{sentence}; {remedy}."))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Image with the statistics and the status of its solver.
+
+    Attributes
+    ----------
+    image : (n, n') array
+        Estimate of X, neither clipped nor normalised.
+    lam
+        Lambda in the unit of the model squared; for total variation its weight [data^2 / image].
+    residual
+        ||Y - model|| / ||Y|| over all frames, above a rounding of about 1e-8; of conjugate gradients the residual of
+        the normal equations, relative to their right-hand side.
+    rounding
+        Bound of ||error|| / ||image|| by rounding; None if the solver has no bound.
+    iterations
+        0 in closed form.
+    objective, relative_gap
+        Minimised function, and an upper bound of its excess over the minimum, relative to the part that images change;
+        None in closed form.
+    """
+
+    image: FloatArray
+    lam: float
+    residual: float
+    status: Status
+    rounding: float | None = None
+    iterations: int = 0
+    objective: float | None = None
+    relative_gap: float | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the image can be used without a correction."""
+        return self.status.ok
+
 
 # ---- One side of the model -------------------------------------------------------------------------------------------
 
@@ -230,6 +327,27 @@ def _frozen(array: FloatArray) -> FloatArray:
     return array
 
 
+NEIGHBOURS = 0.9
+"""Correlation rho of neighbouring pixels; 0.8 to 0.98 are within 0.7 dB of each other (docs/decisions.md)."""
+
+
+def _correlate_side(side: Side) -> Side:
+    place = np.arange(side.scene_size)
+    # F F^T is the covariance rho^|p - p'| of a row of pixels.
+    root = np.asarray(np.linalg.cholesky(NEIGHBOURS ** np.abs(place[:, None] - place)))
+    turned, singular, right = np.linalg.svd(side.response.T @ root, full_matrices=False)
+    singular[singular <= singular.max() * side.scene_size * np.finfo(np.float64).eps] = 0.0
+    # The dual of F V' is F^-T V': both made with the triangular root, neither with an inverse of C.
+    return replace(
+        side,
+        basis=root @ right.T,
+        dual=np.linalg.solve(root.T, right.T),
+        singular=singular,
+        slabs=tuple(Slab(slice(0, len(singular)), slab.matrix @ turned[slab.columns]) for slab in side.slabs),
+        spread=float(np.linalg.cond(root)),
+    )
+
+
 # ---- Lambda ----------------------------------------------------------------------------------------------------------
 
 
@@ -292,13 +410,6 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) 
     return float(np.sum(sigma**RISK_POWER * errors))
 
 
-def movement(problem: DiagonalProblem, lam: float) -> float:
-    """Return ||lambda dX / dlambda||^2 of the image, which needs no noise level (Tikhonov and Glasko 1965)."""
-    kept = problem.kept_share(lam)
-    measured = kept > 0
-    return float(np.sum(np.square((kept * (1 - kept) * problem.projected)[measured] / problem.sigma[measured])))
-
-
 def noise_variance(problem: DiagonalProblem) -> float:
     spare = problem.data_count - np.count_nonzero(problem.sigma)
     if spare <= 0:
@@ -322,12 +433,9 @@ def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
     white, halves = noise_variance(problem), problem.halves
     if not halves:
         return white + np.square(problem.struck)
-    level = halves.typical if is_misfit(problem) else float(np.fmax(white, halves.typical))
-    return _believable(problem, level + halves.excess + np.square(problem.struck))
-
-
-def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
-    """Raise the ``noise`` of octaves of sigma whose signal would need a scene brighter than the octaves before."""
+    least = halves.typical if is_misfit(problem) else float(np.fmax(white, halves.typical))
+    noise = least + halves.excess + np.square(problem.struck)
+    # Octaves of sigma whose signal would need a scene brighter than the octaves before contain more noise.
     measured = problem.sigma > 0
     sigma, found = problem.sigma[measured], noise[measured]
     octave = np.log2(sigma.max() / sigma).astype(np.intp)
@@ -338,28 +446,34 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
     )
     power = np.divide(np.maximum(data - level, 0.0), square, out=np.zeros_like(square), where=square > 0)
     before = np.cumsum(sizes * power) / np.cumsum(sizes)
-    faint = (data < _FAINT * level) & (sizes >= _FEWEST)
-    clear = np.flatnonzero((data >= _FAINT * level) & (sizes >= _FEWEST))
-    doubtful = faint[1:] & (power[1:] > before[:-1])
-    doubtful[: clear.max(initial=0)] = False
-    if not doubtful.any():
-        return noise
-    beyond = octave > int(np.argmax(doubtful))
-    raised = noise.copy()
-    raised[measured] = np.where(beyond, found * np.maximum(data[octave] / level[octave], 1.0), found)
-    return raised
+    seen = sizes >= _FEWEST
+    doubtful = ((data < _FAINT * level) & seen)[1:] & (power[1:] > before[:-1])
+    doubtful[: np.flatnonzero((data >= _FAINT * level) & seen).max(initial=0)] = False
+    if doubtful.any():
+        beyond = octave > int(np.argmax(doubtful))
+        noise[measured] = np.where(beyond, found * np.maximum(data[octave] / level[octave], 1.0), found)
+    return noise
 
 
 def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
     """Return the lambda in the unit of sigma^2 that minimises :func:`risk_score`, but at least ``problem.least``.
 
-    Where the model does not explain the frames, the steadiest image above that lambda is used (:func:`movement`).
+    Where the model does not explain the frames, the steadiest image above that lambda is used.
     Raises MitsimError without more data than unknowns, or without a signal.
     """
     noise = coefficient_noise(problem)
     if problem.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
-    lam = _least(lambda lam: risk_score(problem, lam, noise), problem.scale, _EXPONENTS)
+
+    def score(exponent: float) -> float:
+        return risk_score(problem, problem.scale * 10.0**exponent, noise)
+
+    best = int(np.argmin([score(exponent) for exponent in _EXPONENTS]))
+    lam = 0.0
+    if best > 0 or risk_score(problem, 0.0, noise) > score(_EXPONENTS[0]):
+        ends = _EXPONENTS[max(best - 1, 0)], _EXPONENTS[min(best + 1, len(_EXPONENTS) - 1)]
+        refined = minimize_scalar(score, bounds=ends, method="bounded", options={"xatol": 1e-3})
+        lam = float(problem.scale * 10.0 ** float(refined.x))
     if is_misfit(problem) or not explained:
         # Beyond the largest sigma^2 all goes to black, and at lambda 0 nothing moves, however large its noise.
         candidates = problem.scale * 10.0 ** _EXPONENTS[_EXPONENTS <= 0]
@@ -380,13 +494,19 @@ def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:
 
 
 def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
-    """Return the rising lambda at which the image moves least, as far as misfit explains the removed energy."""
-    moved = np.array([movement(problem, lam) for lam in lambdas])
+    """Return the rising lambda at which the image moves least, as far as misfit explains the removed energy.
+
+    The movement ||lambda dX / dlambda||^2 of the image needs no noise level (Tikhonov and Glasko 1965).
+    """
+    moved, sizes = np.zeros((2, len(lambdas)))
+    for number, lam in enumerate(lambdas):
+        kept = problem.kept_share(lam)
+        measured = kept > 0
+        sigma, data = problem.sigma[measured], (kept * problem.projected)[measured]
+        moved[number] = np.sum(np.square((kept * (1 - kept) * problem.projected)[measured] / sigma))
+        sizes[number] = np.sum(np.square(data / sigma))
     if len(moved) > 1 and moved[-1] < moved[-2]:
-        for number, lam in enumerate(lambdas):
-            kept = problem.kept_share(lam)
-            measured = kept > 0
-            moved[number] /= np.sum(np.square((kept * problem.projected)[measured] / problem.sigma[measured]))
+        moved /= sizes
     count = len(moved)
     if problem.halves and np.isfinite(problem.halves.typical):
         noise = noise_variance(problem)
@@ -397,17 +517,6 @@ def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
         while 1 < count < len(moved) and moved[count] < moved[count - 1]:
             count -= 1
     return lambdas[int(np.argmin(moved[:count]))]
-
-
-def _least(score: Callable[[float], float], scale: float, exponents: FloatArray) -> float:
-    best = int(np.argmin([score(scale * 10.0**exponent) for exponent in exponents]))
-    if best == 0 and score(0.0) <= score(scale * 10.0 ** exponents[0]):
-        return 0.0
-    lower, upper = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
-    refined = minimize_scalar(
-        lambda exponent: score(scale * 10.0**exponent), bounds=(lower, upper), method="bounded", options={"xatol": 1e-3}
-    )
-    return float(scale * 10.0 ** float(refined.x))
 
 
 # -------- W by quarters of the sensor in
@@ -462,10 +571,8 @@ def robust_scatter(values: FloatArray) -> float:
 
 def _medians(squares: FloatArray) -> FloatArray:
     ordered, count = np.sort(squares, axis=1), np.count_nonzero(~np.isnan(squares), axis=1)  # NaN come last
-    middle = [
-        np.take_along_axis(ordered, place[:, None], axis=1) for place in (np.maximum(count - 1, 0) // 2, count // 2)
-    ]
-    return np.asarray((middle[0] + middle[1])[:, 0] / (2 * _MEDIAN))
+    rows = np.arange(len(squares))
+    return np.asarray((ordered[rows, np.maximum(count - 1, 0) // 2] + ordered[rows, count // 2]) / (2 * _MEDIAN))
 
 
 def _excess(squares: FloatArray) -> FloatArray:
@@ -564,9 +671,10 @@ class Prepared:
         )
 
     def with_correlation(self) -> Prepared:
+        """Return the model with correlated neighbours of the scene's pixels."""
         with single_threaded_blas():
-            left = correlate_side(self.left)
-            return replace(self, left=left, right=left if self.right is self.left else correlate_side(self.right))
+            left = _correlate_side(self.left)
+            return replace(self, left=left, right=left if self.right is self.left else _correlate_side(self.right))
 
     def accumulator(self) -> Accumulator:
         return Accumulator(self)
@@ -579,7 +687,7 @@ class Prepared:
             total = self.left.pattern_count * self.right.pattern_count
             raise MitsimError(f"{len(missing)} of {total} frames are missing, first {missing[0]}; add them all")
         sigma = self.sigma
-        quarters = frames.quarters
+        quarters = frames.quarters.copy()
         data_count = self.left.data_rows * self.right.data_rows
         halves = Halves(quarters, self.left, self.right)
         data = quarters.sum(axis=(0, 1))
@@ -730,29 +838,13 @@ class Accumulator:
     def __init__(self, prepared: Prepared) -> None:
         left, right = prepared.left, prepared.right
         self.prepared = prepared
-        self._quarters = np.zeros((2, 2, len(left.singular), len(right.singular)))
-        self._energy = 0.0
+        self.quarters = np.zeros((2, 2, len(left.singular), len(right.singular)))
+        self.energy = 0.0
         self._seen = np.zeros((left.pattern_count, right.pattern_count), dtype=np.bool_)
-
-    @classmethod
-    def of_sums(cls, prepared: Prepared, quarters: FloatArray, energy: float) -> Accumulator:
-        found = cls(prepared)
-        found._quarters += quarters
-        found._energy = energy
-        found._seen[:] = True
-        return found
 
     @property
     def sum(self) -> FloatArray:
-        return np.asarray(self._quarters.sum(axis=(0, 1)))
-
-    @property
-    def quarters(self) -> FloatArray:
-        return self._quarters.copy()
-
-    @property
-    def energy(self) -> float:
-        return self._energy
+        return np.asarray(self.quarters.sum(axis=(0, 1)))
 
     @property
     def missing(self) -> list[tuple[int, int]]:
@@ -804,20 +896,10 @@ class Accumulator:
         else:
             seen = [product(values.T, right.matrix, strips) for strips in columns_of]
             found = np.array([[product(left.matrix, part, strips) for part in seen] for strips in rows_of])
-        self._quarters[(slice(None), slice(None), *where)] += found
-        self._energy += energy
+        self.quarters[(slice(None), slice(None), *where)] += found
+        self.energy += energy
         self._seen[row, column] = True
         return np.asarray(found.sum(axis=(0, 1)))
-
-
-def project_frames(left: Side, right: Side, frames: FloatArray) -> FloatArray:
-    total = np.zeros((len(left.singular), len(right.singular)))
-    for slab, own in zip(left.slabs, frames, strict=True):
-        seen = (slab.matrix.T @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])
-        rows = np.arange(len(total))[slab.columns]
-        for j, other in enumerate(right.slabs):
-            total[rows[:, None], np.arange(total.shape[1])[other.columns]] += seen[:, j] @ other.matrix
-    return total
 
 
 def centre_columns(matrix: FloatArray) -> FloatArray:
@@ -826,26 +908,3 @@ def centre_columns(matrix: FloatArray) -> FloatArray:
 
 def centre_frame(frame: FloatArray) -> FloatArray:
     return centre_columns(frame - frame.mean(axis=1, keepdims=True))
-
-
-# -------- One side of a factorised model in, whose scene pixels are taken for independent
-
-NEIGHBOURS = 0.9
-"""Correlation rho of neighbouring pixels; 0.8 to 0.98 are within 0.7 dB of each other (docs/decisions.md)."""
-
-
-def correlate_side(side: Side) -> Side:
-    place = np.arange(side.scene_size)
-    # F F^T is the covariance rho^|p - p'| of a row of pixels.
-    root = np.asarray(np.linalg.cholesky(NEIGHBOURS ** np.abs(place[:, None] - place)))
-    turned, singular, right = np.linalg.svd(side.response.T @ root, full_matrices=False)
-    singular[singular <= singular.max() * side.scene_size * np.finfo(np.float64).eps] = 0.0
-    # The dual of F V' is F^-T V': both made with the triangular root, neither with an inverse of C.
-    return replace(
-        side,
-        basis=root @ right.T,
-        dual=np.linalg.solve(root.T, right.T),
-        singular=singular,
-        slabs=tuple(Slab(slice(0, len(singular)), slab.matrix @ turned[slab.columns]) for slab in side.slabs),
-        spread=float(np.linalg.cond(root)),
-    )

@@ -33,11 +33,13 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV, Bounds
-from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import (
     Accumulator,
     DiagonalProblem,
     Prepared,
+    Solution,
+    Status,
+    Verdict,
     automatic_lambda,
     check_lambda,
     end_of_range,

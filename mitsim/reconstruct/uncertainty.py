@@ -48,8 +48,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import Channel
 from mitsim.core.manifests import FactorNoise
 from mitsim.reconstruct.accumulation import PRINT, Accumulation, Model, disagreement
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import DiagonalProblem, Side, coefficient_noise
+from mitsim.reconstruct.solver import DiagonalProblem, Side, Solution, coefficient_noise
 
 # ---- The scene's power spectrum --------------------------------------------------------------------------------------
 

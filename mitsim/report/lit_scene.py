@@ -33,8 +33,7 @@ from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
+from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, prepare
 from mitsim.report import EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
 from mitsim.sensor.chain import electrons_from_irradiance, response_variance
 

@@ -48,8 +48,7 @@ from mitsim.reconstruct.reconstruct import (
     reconstruct_request,
 )
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
-from mitsim.reconstruct.solution import Solution, Status
-from mitsim.reconstruct.solver import automatic_lambda, prepare
+from mitsim.reconstruct.solver import Solution, Status, automatic_lambda, prepare
 from mitsim.report.folder_page import ColourImage, report_folder, state_image
 
 # -------- The image of one line
@@ -118,7 +117,7 @@ def reconstruct_psf(
     ``reduce`` x ``reduce`` pixels of frames and ``psf`` become one. The ``options`` are ``lam``, ``method``, ``bounds``
     and ``iterations``.
     """
-    from mitsim.reconstruct.point_spread_image import psf_inputs, reconstruct_psf_request
+    from mitsim.reconstruct.point_spread import psf_inputs, reconstruct_psf_request
 
     request = ImageRequest(**options)
     request.check_point_spread(reduce)

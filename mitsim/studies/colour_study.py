@@ -36,8 +36,7 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, behind, chart, daylight, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.solver import Solution, prepare
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.reconstruct_run import MosaicSolver

@@ -39,8 +39,7 @@ from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.solver import Prepared, Solution
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
 from mitsim.report.pages import Value

@@ -39,8 +39,7 @@ from mitsim.learn.requests import FLATNET, REFINED, UNROLLED, PairsRequest, Trai
 from mitsim.learn.verbs import check_torch
 from mitsim.metrics import psnr
 from mitsim.reconstruct.request import MARKOV, TIKHONOV, TV
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.solvers import SOLVERS, solve_tv
 from mitsim.report import EQUAL_PEAK
 from mitsim.report.lit_scene import LAMBDAS, accumulate

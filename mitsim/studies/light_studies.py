@@ -45,8 +45,7 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import Accumulator, Prepared
+from mitsim.reconstruct.solver import Accumulator, Prepared, Solution
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import DIM, LitScene, Pair, Unexposed
 from mitsim.studies.framework.claims import Gain, Level, measured, stated

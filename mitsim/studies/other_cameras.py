@@ -42,8 +42,7 @@ from mitsim.devices.session import load_recipe
 from mitsim.metrics import psnr, relative_error
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.point_spread import DotClasses, ShiftedLight, solve_iteratively
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
+from mitsim.reconstruct.solver import Solution, centre_columns, centre_frame, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.pages import Mean

@@ -1,7 +1,7 @@
 """Real captures of two lensless cameras, compared with simulations of these cameras.
 
 *FlatCam*. The codes of the mask are learned from the other captures and their authors' images
-(:mod:`mitsim.reconstruct.shifted_codes`), so that every frame is a prediction. The authors' image is put on an evenly
+(:mod:`mitsim.reconstruct.known_pictures`), so that every frame is a prediction. The authors' image is put on an evenly
 lit sheet, and a camera with a mask of the transmission (1 + c_r(row) c_c(column)) / 2 captures it, without diffraction,
 because the learned codes contain it.
 
@@ -35,7 +35,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.images import Preparer, grey_png, read_image
 from mitsim.core.manifests import Digital
 from mitsim.devices.camera import load_psf
-from mitsim.reconstruct.shifted_codes import Codes, Exposure, Pose, Shape, find_pose, fit_codes, plane_offsets
+from mitsim.reconstruct.known_pictures import Codes, Exposure, Pose, Shape, find_pose, fit_codes, plane_offsets
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.report.pages import Value
 from mitsim.studies import Captures, find_files

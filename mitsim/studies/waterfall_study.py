@@ -47,7 +47,7 @@ from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import Solution, Status, Verdict
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.scene.load import straightening

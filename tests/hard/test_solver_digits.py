@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.solver import Solution, prepare
 from tests.exact_solver import Judge, dots, make_problem
 from tests.hard.hard_models import EPS, Frames, frames_of, shadow
 from tests.robustness import Recorder

@@ -15,7 +15,7 @@ import pytest
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.solver import Verdict
 
 pytestmark = pytest.mark.slow
 SEEDS = {"uniform": 4, "dots:4": 4, "dots:7": 4, "hadamard:8": 2}

@@ -26,7 +26,7 @@ from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.request import TIKHONOV
-from mitsim.reconstruct.solution import Status
+from mitsim.reconstruct.solver import Status
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.pages import Value

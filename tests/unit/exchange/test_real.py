@@ -26,7 +26,7 @@ from mitsim.exchange.capture_list import CaptureList, RealCapture
 from mitsim.exchange.formats import export
 from mitsim.exchange.packed import LEFT_OUT, import_capture
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import Status, Verdict
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, made
 
 ELECTRONICS = f"""

@@ -7,8 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear, nnls
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.solution import Verdict
-from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
+from mitsim.reconstruct.solver import Accumulator, Prepared, Verdict, prepare
 from mitsim.reconstruct.solvers import solve_nonnegative, solve_tv
 
 SIZE = 9

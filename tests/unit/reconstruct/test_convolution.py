@@ -12,7 +12,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.point_spread import DotClasses, ShiftedLight, conjugate_gradients, solve_iteratively
-from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.solver import Verdict
 from tests.unit.reconstruct.test_point_spread import matrix
 
 CASES = [(1, 9), (2, 9), (3, 9), (3, 10), (5, 5)]

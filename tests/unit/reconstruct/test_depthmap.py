@@ -17,10 +17,9 @@ import pytest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture, Measurement
 from mitsim.devices.patterns import parse_patterns
-from mitsim.reconstruct.accumulation import accumulate
+from mitsim.reconstruct.accumulation import DerivedCapture, accumulate
 from mitsim.reconstruct.depth import Arrivals, Depth, PixelDepths, best_depth, depth_map
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import DerivedCapture
 from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture

@@ -13,7 +13,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.reconstruct.factors import Factors, estimate_factors, load_calibration
-from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import Status, Verdict
 
 N, ROWS, COLUMNS = 12, 20, 17
 FAMILIES = ("uniform", "dots:3", "dots:5", "hadamard:4", "random:3")

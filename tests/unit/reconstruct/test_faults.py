@@ -17,10 +17,9 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.manifests import Patterns
 from mitsim.core.runs import Capture, ClosingFrame
 from mitsim.devices.camera import centred_edges
-from mitsim.reconstruct.frame_check import PictureCheck
-from mitsim.reconstruct.misfit import Cause
+from mitsim.reconstruct.misfit import Cause, PictureCheck
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
-from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.solver import Verdict
 from tests.ideal_sessions import BLACK, DARK, GAIN, PIXELS, READ, Bench, bench, picture, shadow
 from tests.shadow_factor import scene_factor
 

@@ -19,9 +19,8 @@ from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.reconstruct.depth import Depth, best_depth
+from mitsim.reconstruct.depth import ColumnSpline, Depth, FactorOfDepths, best_depth, move_factors
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import ColumnSpline, FactorOfDepths, move_factors
 from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture

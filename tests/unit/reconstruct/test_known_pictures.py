@@ -18,9 +18,8 @@ from mitsim.core.exr import write_frame
 from mitsim.core.images import Preparer, orient
 from mitsim.core.manifests import Digital
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.known_pictures import guess_noise
-from mitsim.reconstruct.shifted_codes import TURNS, plane_offsets
-from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.known_pictures import TURNS, guess_noise, plane_offsets
+from mitsim.reconstruct.solver import Verdict
 from tests.known_camera import PLANES, SCALES, KnownCamera, factor_error, write_known
 
 

@@ -15,7 +15,7 @@ import pytest
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.misfit import UNEXPLAINED, Cause, Misfit, defects_of
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
-from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.solver import Verdict
 from tests.ideal_sessions import BLACK, CODES, PIXELS, Bench, N, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import Frames, with_frames
 

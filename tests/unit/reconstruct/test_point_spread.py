@@ -11,9 +11,16 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import lsq_linear, nnls
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.point_spread import ShiftedLight, minimise, reduce_frame
-from mitsim.reconstruct.point_spread_image import find_fit, frame_error, frame_noise, solve_point_spread
-from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.point_spread import (
+    ShiftedLight,
+    find_fit,
+    frame_error,
+    frame_noise,
+    minimise,
+    reduce_frame,
+    solve_point_spread,
+)
+from mitsim.reconstruct.solver import Verdict
 from mitsim.reconstruct.solvers import Prior
 from tests.unit.reconstruct.test_tv import SIZE, smoothed_minimum
 

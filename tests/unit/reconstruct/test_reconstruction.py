@@ -21,8 +21,7 @@ from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import may_replace, reconstruct
 from mitsim.reconstruct.request import predict_cost
-from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.solver import Accumulator, Prepared
+from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Tikhonov
 from mitsim.report.reconstruct_run import reconstruct as reconstruct_folders
 

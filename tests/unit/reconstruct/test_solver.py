@@ -15,9 +15,9 @@ from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
+from mitsim.reconstruct.depth import project_frames
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, pattern_blocks, prepare, project_frames
+from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, Solution, pattern_blocks, prepare
 from tests.ideal_sessions import Bench
 
 

@@ -8,8 +8,7 @@ from skimage.restoration import denoise_tv_chambolle
 from skimage.transform import resize
 
 from mitsim.metrics import psnr
-from mitsim.reconstruct.solution import Verdict
-from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
+from mitsim.reconstruct.solver import Accumulator, Prepared, Verdict, prepare
 from mitsim.reconstruct.solvers import solve_tv
 
 SIZE = 12

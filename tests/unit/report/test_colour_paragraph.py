@@ -1,6 +1,6 @@
 """One warning for all lines of a run."""
 
-from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import Status, Verdict
 from mitsim.report.reconstruct_run import one_paragraph
 
 

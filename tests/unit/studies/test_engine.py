@@ -255,7 +255,7 @@ def test_images_of_several_arrays_stand_side_by_side() -> None:
 
 def test_flags_are_of_all_statuses_once() -> None:
     """(Planted: reasons repeated.)"""
-    from mitsim.reconstruct.solution import Status, Verdict
+    from mitsim.reconstruct.solver import Status, Verdict
 
     good = next(verdict for verdict in Verdict if verdict.good)
     status = Status(good, "solved", flags=("The frames are dim. Expose longer.",))

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from mitsim.core.errors import MitsimError
 from mitsim.learn import verbs
-from mitsim.reconstruct.shifted_codes import Pose
+from mitsim.reconstruct.known_pictures import Pose
 from mitsim.report.pages import Value
 from mitsim.studies import learned_study, twin_study
 from mitsim.studies.framework.campaign import batches

@@ -16,7 +16,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import Crop, Preparation
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.shifted_codes import Codes, Pose, Side, plane_offsets
+from mitsim.reconstruct.known_pictures import Codes, Pose, Side, plane_offsets
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.studies import find_files, twin_study
 from mitsim.studies.framework.experiment import Point, Results, Scope, Setup
