@@ -84,6 +84,7 @@ sensor
 calibration
 rare_light
 reconstruction
+convolutional
 validation
 ```
 
