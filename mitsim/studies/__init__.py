@@ -14,18 +14,9 @@ from mitsim.core.files import check_plain
 OF_NO_SCENE = ("twin",)
 OF_CAPTURES = ("learned", "twin")
 PAPER = (
-    "patterns",
-    "distance",
-    "binning",
-    "multishot",
-    "exposure",
-    "resolution",
-    "ambient",
-    "reflectivity",
-    "convolutional",
-    "depth",
-    "waterfall",
-)
+    "patterns", "distance", "binning", "multishot", "exposure", "resolution", "ambient", "reflectivity",
+    "convolutional", "depth", "waterfall",
+)  # fmt: skip
 """Studies that `mitsim study all` puts on one page, in this order."""
 EXPERIMENTS = (*PAPER, "accuracy", "calibration", "colour", "drift", "learned", "sweep", "twin")
 """Studies of many points, whose modules have a ``STUDY``. The page of all lacks ``learned``, because it takes hours and

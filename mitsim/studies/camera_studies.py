@@ -23,9 +23,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import Plane
 from mitsim.studies.framework.claims import Gain, Level, stated
-from mitsim.studies.framework.experiment import PRINT_MM, Axes, Found, Point, Scope, Study, group_by_setup
+from mitsim.studies.framework.experiment import Axes, Found, Point, Scope, Study, group_by_setup
 from mitsim.studies.framework.panels import Images, Lines
-from mitsim.studies.framework.studio import Image, Studio, finding, image_arrays, measure_image
+from mitsim.studies.framework.studio import PRINT_MM, Image, Studio, finding, image_arrays, measure_image
 
 _FAMILIES, _SHOWN = ("uniform", "dots:5", "dots:7"), ("uniform", "dots:7")
 _STABLE_DB = 3.0

@@ -7,8 +7,9 @@ frames they are compared with the camera file.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -148,23 +149,8 @@ _COMB, _EVEN, _STEADY, _STRAIGHT, _STILL, _DARK_CUT, _DEAD = 0.05, 0.03, 0.01, 0
 _FLOATS = 9
 
 
-def read_sets(flats: FlatFrames, job: Job) -> list[Alike]:
-    """Compute the statistics of every set; MitsimError if the frames show nothing of the camera."""
-    where = f"frames {flats.folder}"
-    shape = image_size(flats.folder / flats.sets[0].files[0], flats.wanted)
-    if min(shape) < _LEAST_SIDE:
-        raise MitsimError(f"{where}: {shape[0]} x {shape[1]} pixels; give {_LEAST_SIDE} or more a side")
-    Cost(memory_bytes=2 * 8 * _FLOATS * math.prod(shape)).check(where, job.limits)
-    job.progress("frames", 0.0)
-    with job.clock.stage("frames"):
-        taken = read_again(flats, shape)
-    for fault in _faults(flats, taken):
-        raise MitsimError(f"{where}: {fault}")
-    return taken
-
-
-def read_again(flats: FlatFrames, shape: tuple[int, int], places: Places | None = None) -> list[Alike]:
-    """Compute the statistics with the pixel at `places` (M, N) read in place of each pixel."""
+def read_sets(flats: FlatFrames, shape: tuple[int, int], places: Places | None = None) -> list[Alike]:
+    """Compute the statistics of every set, with the pixel at `places` (M, N) read in place of each pixel."""
     bits = flats.listed.bits
     largest = math.inf if bits is None else 2.0**bits - 1
 
@@ -537,58 +523,60 @@ def characterise(
     bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
     stated = {"name": f"{sensor.name}, found", "pixel_pitch_um": sensor.superpixel_pitch_um, "bits": bits}
     stated["source"] = f"simulated frames of {sensor.name}"
-
-    def measure(folder: str | None) -> Characterisation:
+    with ExitStack() as stack:
+        folder = None if output is None else stack.enter_context(study_folder(output, "characterise"))
         taken = frames.take(job)
         pixels = Pixels(taken, lambda index: np.mean([*frames.images(index)], axis=0), partial(frames.take, job))
         found = pixels.camera(stated, sensor.states_efficiency)
         session = session_of(taken, frames.dark, frames.bright, True, sensor.bits is not None)
         rows = figure_rows(figures(session), frames.figures_set(), sensor.states_efficiency)
-        fields, asked = field_rows(found, sensor), procedure.stated
-        return Characterisation(sensor.name, session, rows, found, fields, asked, output=folder)
-
-    return _write(measure, output)
+        done = Characterisation(sensor.name, session, rows, found, field_rows(found, sensor), procedure.stated)
+        return _write(done, folder)
 
 
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
     """Characterise a real camera by its listed frames; MitsimError for frames that show nothing of a camera."""
-    job, facts = job or Job(), listed.listed
+    job, facts, where = job or Job(), listed.listed, f"frames {listed.folder}"
     stated = {name: getattr(facts, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
+    efficient = facts.photons_per_s is not None
 
     def mean_image(index: int) -> FloatArray:
         files = listed.sets[index].files
         total = 0.0 + sum(read_image(listed.folder / name, listed.wanted).astype(np.float64) for name in files)
         return np.asarray(total / len(files))
 
-    def measure(folder: str | None) -> Characterisation:
-        taken = read_sets(listed, job)
-        pixels = Pixels(taken, mean_image, partial(read_again, listed, taken[0].shape))
-        found = pixels.camera(stated, facts.photons_per_s is not None)
+    with ExitStack() as stack:
+        folder = None if output is None else stack.enter_context(study_folder(output, "characterise"))
+        shape = image_size(listed.folder / listed.sets[0].files[0], listed.wanted)
+        if min(shape) < _LEAST_SIDE:
+            raise MitsimError(f"{where}: {shape[0]} x {shape[1]} pixels; give {_LEAST_SIDE} or more a side")
+        Cost(memory_bytes=2 * 8 * _FLOATS * math.prod(shape)).check(where, job.limits)
+        job.progress("frames", 0.0)
+        with job.clock.stage("frames"):
+            taken = read_sets(listed, shape)
+        for fault in _faults(listed, taken):
+            raise MitsimError(f"{where}: {fault}")
+        found = Pixels(taken, mean_image, partial(read_sets, listed, shape)).camera(stated, efficient)
         saturates = saturation_of(taken)[1] is not None
         session = session_of(taken, *nonuniform(taken), saturates, facts.bits is not None)
-        rows = figure_rows(figures(session), {}, facts.photons_per_s is not None)
-        asked = {"folder": str(listed.folder), "shape": taken[0].shape, "sets": len(taken)}
-        about, fields = remarks(listed, found), field_rows(found, None)
-        return Characterisation(facts.name, session, rows, found, fields, asked, True, about, folder)
-
-    return _write(measure, output)
+        rows, fields = figure_rows(figures(session), {}, efficient), field_rows(found, None)
+        asked = {"folder": str(listed.folder), "shape": shape, "sets": len(taken)}
+        done = Characterisation(facts.name, session, rows, found, fields, asked, True, remarks(listed, found))
+        return _write(done, folder)
 
 
-def _write(measure: Callable[[str | None], Characterisation], output: Path | str | None) -> Characterisation:
-    if output is None:
-        return measure(None)
-    with study_folder(output, "characterise") as folder:
-        done = measure(str(folder))
-        results = folder / "characterise.json"  # written last, so that a folder with it is complete
-        results.unlink(missing_ok=True)
-        pictures = {name: page_figure(figure) for name, figure in write_figures(folder, figures_of(done)).items()}
-        title = f"{done.camera} after EMVA 1288"
-        section = Section(
-            "characterise", title, done.message, done.where, pictures, done.parts, warnings=done.warnings
-        )  # fmt: skip
-        write_page([section], folder / "characterise.html", title)
-        write_text(folder / CAMERA_FILE, done.found.toml())
-        write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})
+def _write(done: Characterisation, folder: Path | None) -> Characterisation:
+    if folder is None:
+        return done
+    done = replace(done, output=str(folder))
+    results = folder / "characterise.json"  # written last, so that a folder with it is complete
+    results.unlink(missing_ok=True)
+    pictures = {name: page_figure(figure) for name, figure in write_figures(folder, figures_of(done)).items()}
+    title = f"{done.camera} after EMVA 1288"
+    section = Section("characterise", title, done.message, done.where, pictures, done.parts, warnings=done.warnings)
+    write_page([section], folder / "characterise.html", title)
+    write_text(folder / CAMERA_FILE, done.found.toml())
+    write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})
     return done

@@ -48,9 +48,9 @@ from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.pages import Mean
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
 from mitsim.studies.framework.claims import Gain, Holds, Judged, stated, within
-from mitsim.studies.framework.experiment import QUICK_IMAGES, SIDE, Axes, Found, Point, Scope, Study, picture
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Axes, Found, Point, Scope, Study
 from mitsim.studies.framework.panels import Images, Lines
-from mitsim.studies.framework.studio import Image, Studio, flags_of, image_arrays
+from mitsim.studies.framework.studio import SIDE, Image, Studio, flags_of, image_arrays, picture
 
 if TYPE_CHECKING:
     from pandas import DataFrame

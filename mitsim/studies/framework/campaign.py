@@ -21,23 +21,14 @@ from functools import cache
 from itertools import groupby
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from mitsim.bench.apparatus import check_scene
+from mitsim.core import files
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.files import (
-    check_output,
-    check_plain,
-    output_folder,
-    read_json,
-    sweep,
-    whole_file,
-    write_json,
-    write_text,
-)
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
@@ -47,7 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mitsim.studies.framework.panels import Section
-    from mitsim.studies.framework.studio import Studio
 
 # -------- Results of studies
 
@@ -104,7 +94,7 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figu
     """Write the figures that show something, and return them."""
     drawn = {file: figure for file, figure in figures.items() if figure.axes}
     for file, figure in drawn.items():
-        with whole_file(folder / file) as part:
+        with files.whole_file(folder / file) as part:
             figure.savefig(part, dpi=150, format="png")  # 1290 pixels wide, a page of text on a common screen
     return drawn
 
@@ -116,17 +106,17 @@ DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
 
 
 def check_study_folder(output: Path | str, name: str) -> None:
-    check_output(output, overwrite=_is_earlier(Path(output), name))
+    files.check_output(output, overwrite=_is_earlier(Path(output), name))
 
 
 def study_folder(output: Path | str, name: str) -> AbstractContextManager[Path]:
     """Hold the new, empty or earlier folder ``output`` of the study ``name``; MitsimError if it holds anything else."""
-    return output_folder(output, overwrite=_is_earlier(Path(output), name))
+    return files.output_folder(output, overwrite=_is_earlier(Path(output), name))
 
 
 def _is_earlier(place: Path, name: str) -> bool:
     head = place / f"{name}.json"
-    found = read_json(head) if head.is_file() else None
+    found = files.read_json(head) if head.is_file() else None
     written = "*.png", "*.csv", "*.html", "camera.toml", POINTS, KEPT, *DEMO_FOLDERS, *PAPER
     names = [item.name for item in place.iterdir()] if isinstance(found, dict) and found.get("kind") == name else [""]
     return all(any(fnmatch(each, known) for known in (head.name, ".*", *written)) for each in names)
@@ -146,7 +136,7 @@ class Store:
         import numpy as np
 
         rows = np.frombuffer(json.dumps([dict(row) for row in found.rows]).encode(), dtype=np.uint8)
-        with whole_file(self._file(point)) as part, part.open("wb") as file:
+        with files.whole_file(self._file(point)) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **{"rows": rows, **found.arrays})  # type: ignore[arg-type]
 
     def load(self, point: Point) -> Found:
@@ -155,7 +145,7 @@ class Store:
 
         path = self._file(point)
         try:
-            if not check_plain(path).st_size:
+            if not files.check_plain(path).st_size:
                 raise ValueError("it is empty: the disk was full, or the machine stopped")
             with path.open("rb") as file:
                 arrays = read_npz(file, path)
@@ -288,8 +278,8 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
     def copy(store: Store) -> None:
         for file in (file for part in parts for file in sorted((Path(part) / POINTS).glob("*.npz"))):
             if not (store.folder / file.name).exists():
-                check_plain(file)
-                with whole_file(store.folder / file.name) as copied:
+                files.check_plain(file)
+                with files.whole_file(store.folder / file.name) as copied:
                     shutil.copyfile(file, copied)
 
     return _complete(study, scope, output, copy)
@@ -297,7 +287,8 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
 
 def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResult]) -> StudyResult:
     with study_folder(output, ALL) as folder:
-        _write_head(folder, ALL, ALL, scope, status="incomplete")
+        head = {"kind": ALL, "study": ALL, "scope": asdict(scope), "versions": versions()}
+        files.write_json(folder / f"{ALL}.json", {**head, "status": "incomplete"})
         found = [each(name, folder / name) for name in PAPER]
         sections = [one.section for one in found if one.section]
         if len(sections) == len(found):
@@ -314,7 +305,7 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
             figures=tuple(f"{one.study}/{name}" for one in found for name in one.figures),
             warnings=tuple(f"{one.study}: {text}" for one in found for text in one.warnings),
         )
-        _write_head(folder, ALL, ALL, scope, status="complete", **result.payload())
+        files.write_json(folder / f"{ALL}.json", {**head, "status": "complete", **result.payload()})
         return result
 
 
@@ -325,14 +316,15 @@ def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Stor
     experiment, started = find_experiment(study), time.perf_counter()
     name, points = experiment.name, experiment.points(scope)  # refuses an impossible scope before there is a folder
     with study_folder(output, name) as folder:
-        head, store = folder / f"{name}.json", Store(folder / POINTS)
-        if head.exists() and (made := read_json(head).get("versions")) != versions():
+        place, store = folder / f"{name}.json", Store(folder / POINTS)
+        head = {"kind": name, "study": study, "scope": asdict(scope), "versions": versions()}
+        if place.exists() and (made := files.read_json(place).get("versions")) != versions():
             raise MitsimError(
                 f"output {folder}: its points were measured by other versions ({made}); choose another folder"
             )
         store.folder.mkdir(exist_ok=True)
-        sweep(store.folder)  # half-written files of killed processes
-        _write_head(folder, name, study, scope, status="incomplete")
+        files.sweep(store.folder)  # half-written files of killed processes
+        files.write_json(place, {**head, "status": "incomplete"})
         fill(store)
         there = sum(map(store.has, points))
         took, missing = time.perf_counter() - started, len(points) - there
@@ -344,24 +336,19 @@ def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Stor
         arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
         results = Results(rows, arrays, scope)
         claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
-        write_text(folder / f"{name}.csv", results.frame.to_csv(index=False))
+        files.write_text(folder / f"{name}.csv", results.frame.to_csv(index=False))
         section = section_of(experiment, study, claims, figures, results)
         write_page([section], folder / f"{name}.html", section.title)
         result = replace(
             result, rows=rows, claims=claims, figures=tuple(figures), section=section, warnings=section.warnings
         )
-        _write_head(folder, name, study, scope, status="complete", **result.payload())
+        files.write_json(place, {**head, "status": "complete", **result.payload()})
     return result
-
-
-def _write_head(folder: Path, name: str, study: str, scope: Scope, /, **more: Any) -> None:
-    head = {"kind": name, "study": study, "scope": asdict(scope), "versions": versions()}
-    write_json(folder / f"{name}.json", {**head, **more})
 
 
 def _head(folder: Path) -> dict[str, Any]:
     for file in sorted(folder.glob("*.json")):
-        head = read_json(file)
+        head = files.read_json(file)
         whole = isinstance(head, dict) and {"study", "scope", "versions"} <= head.keys()
         if whole and (head["study"] == ALL or (folder / POINTS).is_dir()):
             return dict(head)
@@ -393,7 +380,7 @@ def measure_batch(name: str, batch: Batch, shared: str | None = None) -> Iterato
     """Yield each point of a ``batch`` with its findings, or with the refusal that ends the batch."""
     for point in batch:
         try:
-            yield point, find_experiment(name).measure(cast("Studio", _LazyStudio(shared)), point)
+            yield point, find_experiment(name).measure(_LazyStudio(shared), point)
         except MitsimError as error:
             yield point, str(error)
             return

@@ -1,8 +1,4 @@
-"""Declaration of a study (axes, measurement of one point, claims, panels), and its results.
-
-The paper's means are over eight images, which it does not name. Those here come with scikit-image, which states their
-licences.
-"""
+"""Declaration of a study (axes, measurement of one point, claims, panels), and its results."""
 
 from __future__ import annotations
 
@@ -29,8 +25,6 @@ from mitsim.report import CONVENTIONS
 from mitsim.studies import ALL, EXPERIMENTS, GONE, SHARED
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
@@ -52,7 +46,7 @@ class Setup:
     scene
         scene XML, or the name of a shipped scene.
     picture
-        print that replaces the scene's own (:func:`picture`); None keeps it.
+        print that replaces the scene's own (:func:`mitsim.studies.framework.studio.picture`); None keeps it.
     parameters
         (name, value) of the scene's parameters.
     camera, projector, variant, outside
@@ -242,6 +236,9 @@ class Results:
 
 # -------- Declaration of a study
 
+TEST_IMAGES = ("astronaut", "camera", "chelsea", "coffee", "coins", "rocket", "page", "brick")
+"""Images of scikit-image, which states their licences; the paper does not name the eight of its means."""
+QUICK_IMAGES = ("chelsea", "page")
 KNOBS = "{knobs}"
 HEADS = "Paper", "Idealised", "Rendered"
 
@@ -439,41 +436,3 @@ def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> fl
         return kind(text)
     except ValueError:
         raise MitsimError(f"--over {knob}={text}: give {'whole ' if kind is int else ''}numbers") from None
-
-
-# -------- Test images to print
-
-
-TEST_IMAGES = ("astronaut", "camera", "chelsea", "coffee", "coins", "rocket", "page", "brick")
-QUICK_IMAGES = ("chelsea", "page")
-PRINT_MM = 128.0
-SIDE = 512
-
-
-def picture(name: str) -> npt.NDArray[np.uint8]:
-    """Return the (512, 512) eight-bit reflectance of the test image ``name``: its middle square, grey.
-
-    ``bars 0.26`` has bars of 0.26 line pairs per mm of the print, vertical on the left, horizontal on the right.
-    MitsimError for another name.
-    """
-    import numpy as np
-    from skimage import data
-    from skimage.transform import resize
-
-    kind, _, frequency = name.partition(" ")
-    if kind == "bars" and frequency:  # each texel is the mean of the bars over it
-        edges = np.arange(SIDE + 1) * PRINT_MM / SIDE * float(frequency)
-        white = np.floor(edges) / 2 + np.minimum(edges % 1, 0.5)  # integral of the bars, in periods
-        across = np.broadcast_to(np.diff(white) / np.diff(edges), (SIDE, SIDE))
-        grey = np.concatenate([across[:, : SIDE // 2], across.T[:, SIDE // 2 :]], axis=1)
-    elif name in TEST_IMAGES:
-        image = np.asarray(getattr(data, name)(), dtype=np.float64)
-        grey = image.mean(axis=2) if image.ndim == 3 else image
-        side = min(grey.shape)
-        top, left = ((size - side) // 2 for size in grey.shape)
-        square = resize(grey[top : top + side, left : left + side], (SIDE, SIDE), anti_aliasing=True)
-        grey = (square - square.min()) / (square.max() - square.min())
-    else:
-        raise MitsimError(f"picture {name!r}: use {', '.join((*TEST_IMAGES, 'bars PAIRS_A_MM'))}")
-    # Reflectances of black and white print, as on the shipped scenes.
-    return np.asarray(np.rint(255 * (0.05 + (0.90 - 0.05) * grey)), dtype=np.uint8)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections import OrderedDict
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from filelock import FileLock
-from skimage import io
+from skimage import data, io
+from skimage.transform import resize
 
 from mitsim.acquire.capture import expose
 from mitsim.api.bench import Bench, open_bench
@@ -30,7 +31,7 @@ from mitsim.reconstruct.solver import Status
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.pages import Value
-from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Found, Point, Setup, picture
+from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TEST_IMAGES, TRUTH, Found, Point, Setup
 
 Kept = TypeVar("Kept")
 
@@ -85,7 +86,7 @@ class Studio:
     def __init__(self, shared: str | None = None) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="mitsim-study-")
         self._shared = Path(self._folder.name) / "shared" if shared is None else Path(shared)
-        self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
+        self._kept: dict[str, dict[Hashable, Any]] = {}
 
     def __enter__(self) -> Studio:
         return self
@@ -196,14 +197,47 @@ class Studio:
         )
 
     def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        kept = self._kept.setdefault(kind, OrderedDict())
+        """Return what ``make`` returned for the ``key``; the ``most`` last used of a ``kind`` are kept."""
+        kept = self._kept.setdefault(kind, {})
         if key not in kept:
             while len(kept) >= most:
-                kept.popitem(last=False)  # before the new one is made: two lights need not fit
+                del kept[next(iter(kept))]  # before the new one is made: two lights need not fit
             kept[key] = make()
-        kept.move_to_end(key)
-        found: Kept = kept[key]
+        found: Kept = kept.pop(key)
+        kept[key] = found  # as the last
         return found
+
+
+# -------- Images to print
+
+
+PRINT_MM = 128.0
+SIDE = 512
+
+
+def picture(name: str) -> npt.NDArray[np.uint8]:
+    """Return the (512, 512) eight-bit reflectance of the test image ``name``: its middle square, grey.
+
+    ``bars 0.26`` has bars of 0.26 line pairs per mm of the print, vertical on the left, horizontal on the right.
+    MitsimError for another name.
+    """
+    kind, _, frequency = name.partition(" ")
+    if kind == "bars" and frequency:  # each texel is the mean of the bars over it
+        edges = np.arange(SIDE + 1) * PRINT_MM / SIDE * float(frequency)
+        white = np.floor(edges) / 2 + np.minimum(edges % 1, 0.5)  # integral of the bars, in periods
+        across = np.broadcast_to(np.diff(white) / np.diff(edges), (SIDE, SIDE))
+        grey = np.concatenate([across[:, : SIDE // 2], across.T[:, SIDE // 2 :]], axis=1)
+    elif name in TEST_IMAGES:
+        image = np.asarray(getattr(data, name)(), dtype=np.float64)
+        grey = image.mean(axis=2) if image.ndim == 3 else image
+        side = min(grey.shape)
+        top, left = ((size - side) // 2 for size in grey.shape)
+        square = resize(grey[top : top + side, left : left + side], (SIDE, SIDE), anti_aliasing=True)
+        grey = (square - square.min()) / (square.max() - square.min())
+    else:
+        raise MitsimError(f"picture {name!r}: use {', '.join((*TEST_IMAGES, 'bars PAIRS_A_MM'))}")
+    # Reflectances of black and white print, as on the shipped scenes.
+    return np.asarray(np.rint(255 * (0.05 + (0.90 - 0.05) * grey)), dtype=np.uint8)
 
 
 # -------- The measurement of one point

@@ -12,8 +12,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.mask import mls_mask
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
 from mitsim.report.lit_scene import DIM, DIM_E, Plane, bin_frame
-from mitsim.studies.framework.experiment import SIDE, TEST_IMAGES, Setup, picture
-from mitsim.studies.framework.studio import Image, Studio
+from mitsim.studies.framework.experiment import TEST_IMAGES, Setup
+from mitsim.studies.framework.studio import SIDE, Image, Studio, picture
 from tests.shadow_factor import scene_factor
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
