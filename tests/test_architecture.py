@@ -564,7 +564,7 @@ SIZES = {
     "scene": (5, 1377),
     "sensor": (5, 1189),
     "sessions": (4, 811),
-    "studies": (22, 5218),
+    "studies": (22, 5188),
     "transport": (15, 4081),
     "verbs": (1, 308),
     "version": (1, 1),
