@@ -42,8 +42,8 @@ from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
 from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
 from mitsim.report.folder_page import report_folder as report_folder
 from mitsim.report.reconstruct_run import reconstruct_colours as reconstruct_colours
-from mitsim.sessions.repeat import session_of as session_of
 from mitsim.sessions.run_session import run as run
+from mitsim.sessions.session_file import session_of as session_of
 from mitsim.verbs import characterise as characterise
 from mitsim.verbs import demo as demo
 from mitsim.verbs import doctor as doctor

@@ -194,38 +194,39 @@ def run(
             else:
                 steps.made[step.output] = _Made(inputs="")  # its earlier files no longer count
                 note()
-                says, warnings = _end(task)
+                try:
+                    while True:
+                        next(task)
+                except StopIteration as ended:
+                    says, warnings = ended.value
                 steps.made[step.output] = _Made(inputs=steps.inputs(step), files=_checksums(folder / step.output))
                 found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
                 write_text(folder / SESSION_FILE, text)  # not before: a step that is refused changes no session
             results.append(replace(found, page=steps.page_of(step, found.left_alone)))
             note()
         remove_page(folder)
-        page = _write_page(folder, text, results, job) if asked.pictures else None
-        done = SessionResult(tuple(results), str(folder), page)
+        done = SessionResult(tuple(results), str(folder), str(folder / PAGE) if asked.pictures else None)
+        if asked.pictures:
+            from mitsim.report.pages import render_page
+
+            flagged = sum(bool(step.warnings) for step in results)
+            verdict = f"{len(results)} step{'s' * (len(results) > 1)} done" + (
+                f", {flagged} flagged" if flagged else ""
+            )
+            page = render_page(
+                "session.html",
+                folder=folder.absolute(),
+                verdict=verdict,
+                warnings=done.warnings,
+                command=job and job.command,
+                steps=results,
+                images=[step.output for step in results if (folder / step.output / "image.png").is_file()],
+                text=text,
+                file=SESSION_FILE,
+            )
+            write_text(folder / PAGE, page)
         note(**done.payload(), status="complete", command=job and job.command)
     return done
-
-
-def _write_page(folder: Path, session: str, results: Sequence[StepResult], job: Job | None) -> str:
-    """Write the page of a session into its ``folder``, and return the page's path."""
-    from mitsim.report.pages import render_page
-
-    flagged = sum(bool(step.warnings) for step in results)
-    verdict = f"{len(results)} step{'s' * (len(results) > 1)} done" + (f", {flagged} flagged" if flagged else "")
-    page = render_page(
-        "session.html",
-        folder=folder.absolute(),
-        verdict=verdict,
-        warnings=SessionResult(tuple(results), "").warnings,
-        command=job and job.command,
-        steps=results,
-        images=[step.output for step in results if (folder / step.output / "image.png").is_file()],
-        text=session,
-        file=SESSION_FILE,
-    )
-    write_text(folder / PAGE, page)
-    return str(folder / PAGE)
 
 
 # ---- Steps -----------------------------------------------------------------------------------------------------------
@@ -235,16 +236,6 @@ Said = tuple[str, Sequence[str]]
 Work = Generator[None, None, Said]
 """A step's work. It has checked the request at its first yield, and has written nothing. A step of a bench has checked
 the opened scene at a second yield. Then it makes its files, and returns its result."""
-
-
-def _end(work: Work) -> Said:
-    """Finish the ``work`` of a step."""
-    try:
-        while True:
-            next(work)
-    except StopIteration as ended:
-        said: Said = ended.value
-        return said
 
 
 @dataclass
