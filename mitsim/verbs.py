@@ -189,10 +189,7 @@ class DemoRequest(Opening, Sampled, Family):
 
 @takes(DemoRequest)
 def demo(
-    scene: Path | str = "photograph",
-    output: Path | str = "demo-output",
-    job: Job | None = None,
-    **options: Any,
+    scene: Path | str = "photograph", output: Path | str = "demo-output", job: Job | None = None, **options: Any
 ) -> DemoResult:
     """Plan, capture, calibrate and reconstruct one scene under five pattern families, and write report.html.
 
@@ -310,11 +307,7 @@ def study(
 
 
 def prepare_study(
-    name: str,
-    scene: Path | str | Sequence[Path | str] | None,
-    output: Path | str,
-    asked: StudyOptions,
-    job: Job | None,
+    name: str, scene: Path | str | Sequence[Path | str] | None, output: Path | str, asked: StudyOptions, job: Job | None
 ) -> Callable[[], StudyResult]:
     """Check a study as :func:`study` does before the renderer is imported, and return the function that runs it.
 
@@ -491,10 +484,7 @@ def characterise(
 
 @takes(Irradiance)
 def sense(
-    image: Path | str | FloatArray,
-    camera: Path | str,
-    exposure: float | Literal["auto"] = "auto",
-    **options: Any,
+    image: Path | str | FloatArray, camera: Path | str, exposure: float | Literal["auto"] = "auto", **options: Any
 ) -> Sensed:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise.
 

@@ -51,12 +51,7 @@ CALLS = {
 """Python calls that do what a verb does, by its name."""
 ONE_CALL = ["demo", "run", "study", "import", "patterns", "characterise", "sense", "doctor", "export"]
 """Verbs that are one call with the same options."""
-ALIKE = {
-    "scenes": "scene",
-    "family": "patterns",
-    "repeated": "folder",
-    "stacks": "frames",
-}
+ALIKE = {"scenes": "scene", "family": "patterns", "repeated": "folder", "stacks": "frames"}
 """Arguments that the command line calls otherwise."""
 OF_THE_COMMAND_LINE = {"as_json", "quiet", "verbose", "help", "variant", "no_pictures", "max_seconds", "max_memory"}
 """Options that say how it is reported and bounded, as a job does; the variant is a bench's."""

@@ -240,11 +240,7 @@ class Bench(Apparatus):
 
     @takes(SessionRequest)
     def calibrate_lines(
-        self,
-        output: Path | str | None = None,
-        resume: bool = False,
-        job: Job | None = None,
-        **request: Any,
+        self, output: Path | str | None = None, resume: bool = False, job: Job | None = None, **request: Any
     ) -> dict[str, Factors]:
         """Estimate the camera's factors at each spectral line of the projector, by the line's name.
 
@@ -303,11 +299,7 @@ class Bench(Apparatus):
 
     @takes(SessionRequest)
     def calibrate_mosaic(
-        self,
-        output: Path | str | None = None,
-        resume: bool = False,
-        job: Job | None = None,
-        **request: Any,
+        self, output: Path | str | None = None, resume: bool = False, job: Job | None = None, **request: Any
     ) -> dict[str, Factors]:
         """Estimate the factors of a camera under colour filters by spectral line of the projector.
 
@@ -335,11 +327,7 @@ class Bench(Apparatus):
 
     @takes(SessionRequest)
     def calibrate(
-        self,
-        output: Path | str | None = None,
-        resume: bool = False,
-        job: Job | None = None,
-        **request: Any,
+        self, output: Path | str | None = None, resume: bool = False, job: Job | None = None, **request: Any
     ) -> Factors:
         """Estimate the camera's two factors from a rendered Hadamard session on a white board.
 
@@ -365,11 +353,7 @@ class Bench(Apparatus):
 
     @takes(SessionRequest)
     def calibrate_depths(
-        self,
-        output: Path | str | None = None,
-        resume: bool = False,
-        job: Job | None = None,
-        **request: Any,
+        self, output: Path | str | None = None, resume: bool = False, job: Job | None = None, **request: Any
     ) -> dict[float, Factors]:
         """Estimate the camera's two factors at each of a recipe's depths, by depth [mm].
 
@@ -386,11 +370,7 @@ class Bench(Apparatus):
 
     @takes(SessionRequest)
     def write_session(
-        self,
-        frames: Path | str,
-        output: Path | str | None = None,
-        job: Job | None = None,
-        **request: Any,
+        self, frames: Path | str, output: Path | str | None = None, job: Job | None = None, **request: Any
     ) -> Factors:
         """Calibrate as :meth:`calibrate` does, and write the session's frames.
 

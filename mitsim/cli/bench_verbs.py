@@ -548,6 +548,6 @@ def pairs(asked: Pairing) -> int:
     lines = [
         f"{payload['count']} pairs of {payload['frames']} frames of {rows}x{columns} in "
         f"{payload['seconds']['total']:.1f} s ({cost.seconds:.3g} s predicted), "
-        f"{payload['bytes'] / 2**20:.3g} MiB: {output}",
+        f"{payload['bytes'] / 2**20:.3g} MiB: {output}"
     ]
     return asked.finish(payload, lines, payload["warnings"])

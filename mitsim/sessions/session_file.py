@@ -638,10 +638,7 @@ class _Found:
         if isinstance(ends := inputs.get("bounds"), list):
             infinite = -math.inf, math.inf
             inputs["bounds"] = [infinite[place % 2] if end is None else end for place, end in enumerate(ends)]
-        for name, verb, add in (
-            ("run", "capture", self.add_run),
-            ("calibration", "calibrate", self.add_calibration),
-        ):
+        for name, verb, add in (("run", "capture", self.add_run), ("calibration", "calibrate", self.add_calibration)):
             if self.taken.get(verb) == made_of[name]:
                 continue
             try:

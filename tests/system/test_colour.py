@@ -199,11 +199,7 @@ def test_each_line_is_calibrated_for_itself(
     ],
 )
 def test_what_colour_cannot_do_is_refused(
-    shell: Callable[..., Any],
-    coloured: Callable[[str], Path],
-    tmp_path: Path,
-    options: tuple[str, ...],
-    words: str,
+    shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, options: tuple[str, ...], words: str
 ) -> None:
     scene = coloured("sheet")
     assert words in shell("capture", scene, "-o", tmp_path / "run", "--patterns", "dots:2", *options).refusal

@@ -272,7 +272,7 @@ def test_train(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     call("calibrate", *lab.arguments, "-o", tmp_path / "pairs" / "calibration", *common)
     found = call("train", "refined", tmp_path / "pairs", "-o", tmp_path / "m.pt", "--steps", 2, *common).payload
     assert found.keys() == {
-        *("model", "weights", "curve", "psnr_before_db", "psnr_db", "steps", "predicted_seconds", "seconds", "output"),
+        *("model", "weights", "curve", "psnr_before_db", "psnr_db", "steps", "predicted_seconds", "seconds", "output")
     }
     assert found["model"].startswith("refined ") and found["steps"] == 2 and len(found["curve"]) == 3
     assert_seconds(found["seconds"], "read", "train")

@@ -53,11 +53,7 @@ def test_pictures_and_frames_again(call: Callable[..., Any], lab: Any, tmp_path:
 
 
 def test_refusals(refused: Callable[..., str], lab: Any) -> None:
-    mentions(
-        refused("export", lab.run, "--format", "xml", "-o", "new"),
-        "--format 'xml'",
-        "hdf5, mat, torch, png",
-    )
+    mentions(refused("export", lab.run, "--format", "xml", "-o", "new"), "--format 'xml'", "hdf5, mat, torch, png")
     mentions(refused("export", lab.run, "--format", "flatcam", "-o", "new"), "--format 'flatcam'")
     mentions(refused("export", lab.calibration, "--format", "hdf5", "-o", "new"), "holds a calibration")
     mentions(refused("export", lab.run, "--format", "hdf5", "-o", "new", "--projector", "mp_cl1"), "--projector")

@@ -84,10 +84,7 @@ def test_no_moment_is_a_bad_one(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "words"),
-    [
-        (signal.SIGKILL, "out of memory, or killed from outside"),
-        (signal.SIGABRT, "a crash in native code"),
-    ],
+    [(signal.SIGKILL, "out of memory, or killed from outside"), (signal.SIGABRT, "a crash in native code")],
 )
 def test_a_worker_that_dies_while_it_renders(
     lab: Any, tmp_path: Path, whole: Path, how: signal.Signals, words: str

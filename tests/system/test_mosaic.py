@@ -150,11 +150,7 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
             ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"),
             "capture and calibrate by --colour mosaic",
         ),
-        (
-            "capture",
-            ("--colour", "red", "--patterns", "dots:2"),
-            "--colour 'red': use no, lines, bands:K or mosaic",
-        ),
+        ("capture", ("--colour", "red", "--patterns", "dots:2"), "--colour 'red': use no, lines, bands:K or mosaic"),
     ],
 )
 def test_a_camera_without_filters_has_no_mosaic(

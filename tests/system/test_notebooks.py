@@ -84,10 +84,7 @@ def test_what_is_stored_is_fit_for_anybody(path: Path) -> None:
         assert {kind[:2] for kind in kinds(cell)} <= FIT
 
 
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(path, id=path.stem, marks=pytest.mark.slow) for path in NOTEBOOKS],
-)
+@pytest.mark.parametrize("path", [pytest.param(path, id=path.stem, marks=pytest.mark.slow) for path in NOTEBOOKS])
 def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From top to bottom in an empty folder, by this Python, without the user's settings; the same kinds come out."""
     if path.stem == NETWORK:

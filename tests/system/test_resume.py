@@ -89,10 +89,7 @@ def test_resume_refuses_another_configuration(
     assert "--resume: run holds a run of another configuration" in line and f"({fragment} differ)" in line
 
 
-@pytest.mark.parametrize(
-    "text",
-    ['{"kind": "capt', "[]", "{}"],
-)
+@pytest.mark.parametrize("text", ['{"kind": "capt', "[]", "{}"])
 def test_resume_refuses_a_corrupted_manifest(refused: Callable[..., str], lab: Any, tmp_path: Path, text: str) -> None:
     run = lab.copy("run", tmp_path / "run")
     (run / "manifest.json").write_text(text)

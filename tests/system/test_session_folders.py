@@ -186,15 +186,7 @@ def test_an_image_that_was_begun_is_made_again(place: Path) -> None:
     assert (place / "out" / "image.exr").read_bytes() == (place / "image" / "image.exr").read_bytes()
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"warnings": 3},
-        {"seconds": "x"},
-        {"left_alone": {}},
-        {"output": None},
-    ],
-)
+@pytest.mark.parametrize("change", [{"warnings": 3}, {"seconds": "x"}, {"left_alone": {}}, {"output": None}])
 def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change: dict[str, Any]) -> None:
     """Each wrong kind is refused in one line. (Planted: entries that are taken as they are.)"""
     tables = {"reconstruct": [{**IMAGE}]}

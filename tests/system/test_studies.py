@@ -56,11 +56,7 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        (
-            "weather",
-            (),
-            "there is no such study; use patterns, distance",
-        ),
+        ("weather", (), "there is no such study; use patterns, distance"),
         ("models", (), "use `mitsim calibrate SCENE --model wave`"),
         ("diffraction", (), "use `mitsim study calibration SCENE`"),
         ("regularisation", (), "use `mitsim study sweep SCENE --over method=tikhonov,tv`"),

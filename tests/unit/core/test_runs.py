@@ -40,7 +40,7 @@ def recorded(to: Recorder, patterns: str = "hadamard:2") -> Capture:
             patterns=Patterns.of(family, [frame_name(index) for index in range(len(family.shots))]),
             plan={"effects": []},
             warnings=("too dark",),
-        ),
+        )
     )
 
 

@@ -200,7 +200,7 @@ def test_changes_take_the_place_of_fields(write: Callable[[str], Path]) -> None:
             read_session(path, {name: "x"})
         assert words in str(refused.value)
     assert [value_of(text) for text in ("3", "0.5", "dots:4", "true", '"3"', "[1, 2]", "")] == [
-        *(3, 0.5, "dots:4", True, "3", [1, 2], ""),
+        *(3, 0.5, "dots:4", True, "3", [1, 2], "")
     ]
 
 
