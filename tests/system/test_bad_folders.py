@@ -110,50 +110,42 @@ def test_a_corrupted_manifest(refused: Refused, lab: Any, run: Path, calibration
     mentions(refused("reconstruct", lab.run, "--calibration", calibration), str(calibration))
 
 
-def put(*path: str | int, value: object) -> Edit:
-    """An edit of a manifest: the item at ``path`` becomes ``value``."""
+NAN, GONE = float("nan"), object()
+
+
+def put(*path: str | int, value: object = GONE) -> Edit:
+    """An edit of a manifest: the item at ``path`` becomes ``value``, or is removed without one."""
 
     def change(manifest: Any) -> None:
         for key in path[:-1]:
             manifest = manifest[key]
-        manifest[path[-1]] = value
+        if value is GONE:
+            del manifest[path[-1]]
+        else:
+            manifest[path[-1]] = value
 
     return change
-
-
-def drop(*path: str | int) -> Edit:
-    """An edit of a manifest: the item at ``path`` is gone."""
-
-    def change(manifest: Any) -> None:
-        for key in path[:-1]:
-            manifest = manifest[key]
-        del manifest[path[-1]]
-
-    return change
-
-
-NAN = float("nan")
 
 
 @pytest.mark.parametrize(
     ("change", "fragments"),
     [
         (put("status", value="incomplete"), ["incomplete", "resume"]),
-        (drop("patterns"), ["patterns: is missing"]),
-        (drop("digital"), ["digital: is missing"]),
-        (drop("camera"), ["camera: is missing"]),
-        (drop("patterns", "P_L"), ["P_L"]),
+        (put("patterns"), ["patterns: is missing"]),
+        (put("digital"), ["digital: is missing"]),
+        (put("camera"), ["camera: is missing"]),
+        (put("patterns", "P_L"), ["P_L"]),
         (put("patterns", "P_R", value=[[1, 0], [1]]), ["P_R"]),
         (put("patterns", "P_L", value=[[1.0] * 4] * 9), ["P_L has 9 scene pixels", "16"]),
         (put("patterns", "P_L", 3, 1, value=NAN), ["P_L", "nan"]),
         (put("patterns", "captures", value=[]), ["16 of 16 patterns"]),
         (put("patterns", "captures", 2, value="frame_00002.exr"), ["captures", "frame_00002.exr"]),
-        (drop("patterns", "captures", 2), ["1 of 16 patterns", "(0, 2)"]),
+        (put("patterns", "captures", 2), ["1 of 16 patterns", "(0, 2)"]),
         (put("patterns", "captures", 2, "file", value=None), ["captures", "file", "None"]),
         (put("patterns", "captures", 2, "row", value=4), ["(4, 2)", "0 to 3"]),
         (put("patterns", "captures", 2, "column", value=1), ["(0, 1)", "signs [0, 0]"]),
         (put("patterns", "captures", 2, "sign", value=1), ["(0, 2)", "signs [1]"]),
-        (drop("digital", "gain_dn_per_e"), ["gain_dn_per_e"]),
+        (put("digital", "gain_dn_per_e"), ["gain_dn_per_e"]),
         (put("digital", "gain_dn_per_e", value=0), ["gain_dn_per_e", "0"]),
         (put("digital", "exposure_s", value=NAN), ["exposure_s", "nan"]),
         (put("digital", "black_level_dn", value=float("inf")), ["black_level_dn", "inf"]),
@@ -173,8 +165,8 @@ def test_a_run_manifest_with_a_mistake(
     ("change", "fragments"),
     [
         (put("status", value="incomplete"), ["incomplete"]),
-        (drop("camera"), ["camera: is missing"]),
-        (drop("camera", "sensor"), ["sensor", "None"]),
+        (put("camera"), ["camera: is missing"]),
+        (put("camera", "sensor"), ["sensor", "None"]),
         (put("centre", value="no"), ["centre", "'no'"]),
         (put("checksums", "left.exr", value="0" * 64), ["left.exr", "checksum"]),
         (put("checksums", value="none"), ["checksums"]),
@@ -190,7 +182,6 @@ def test_a_calibration_manifest_with_a_mistake(
 # ---- frames ----------------------------------------------------------------------------------------------------------
 
 FRAME = "frame_00005.exr"
-FACTOR = "calibration/left.exr"
 
 
 def truncated(path: Path) -> None:
@@ -225,21 +216,15 @@ DAMAGES = [
 
 
 @pytest.mark.parametrize(("damage", "checked"), DAMAGES)
-def test_a_damaged_frame(refused: Refused, lab: Any, run: Path, damage: str, checked: bool) -> None:
+def test_a_damaged_file(refused: Refused, lab: Any, run: Path, calibration: Path, damage: str, checked: bool) -> None:
+    """A frame, and a factor."""
     harm, _ = DAMAGE[damage]
-    harm(run / FRAME)
-    if not checked:
-        edit(run, drop("checksums"))
+    for folder, file in ((run, FRAME), (calibration, "left.exr")):
+        harm(folder / file)
+        if not checked:
+            edit(folder, put("checksums"))
     mentions(refused("reconstruct", "run", "--calibration", lab.calibration), f"run/{FRAME}")
-
-
-@pytest.mark.parametrize(("damage", "checked"), DAMAGES)
-def test_a_damaged_factor(refused: Refused, lab: Any, calibration: Path, damage: str, checked: bool) -> None:
-    harm, _ = DAMAGE[damage]
-    harm(calibration / "left.exr")
-    if not checked:
-        edit(calibration, drop("checksums"))
-    reported = ["calibration's are 32x64"] if damage == "smaller" and not checked else [FACTOR]
+    reported = ["calibration's are 32x64"] if damage == "smaller" and not checked else ["calibration/left.exr"]
     mentions(refused("reconstruct", lab.run, "--calibration", "calibration"), *reported)
 
 
@@ -250,10 +235,10 @@ def test_numbers_that_are_not_finite(refused: Refused, lab: Any, run: Path, cali
         return values
 
     rewrite(run / FRAME, spoil)
-    edit(run, drop("checksums"))
+    edit(run, put("checksums"))
     mentions(refused("reconstruct", "run", "--calibration", lab.calibration), f"run/{FRAME}", "not finite")
     rewrite(calibration / "right.exr", spoil)
-    edit(calibration, drop("checksums"))
+    edit(calibration, put("checksums"))
     mentions(refused("reconstruct", lab.run, "--calibration", "calibration"), "calibration/right.exr", "not finite")
 
 

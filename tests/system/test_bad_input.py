@@ -27,7 +27,6 @@ from tests.system.refusals import NEW, Refused, mentions
         (["--exposure", "-1"], ["exposure -1", "to 1e+06"]),
         (["--exposure", "0"], ["exposure 0", "to 1e+06"]),
         (["--exposure", "nan"], ["nan"]),
-        (["--exposure", "inf"], ["inf"]),
         (["--exposure", "1e300"], ["1e+300"]),
         (["--exposure", "long"], ["'long'", "auto"]),
         (["--exposure-fraction", "0"], ["fraction 0", "to 1"]),
@@ -59,13 +58,10 @@ def test_capture_refuses(refused: Refused, lab: Any, options: list[str], fragmen
 @pytest.mark.parametrize(
     ("options", "fragments"),
     [
-        (["--accuracy", "0"], ["--accuracy 0"]),
-        (["--accuracy", "nan"], ["--accuracy nan"]),
         (["--seed", "-1"], ["-1"]),
         (["--recipe", "nowhere.toml"], ["nowhere.toml"]),
         (["--max-seconds", "0.001"], ["calibration: would take about", "allowed are 0.001 s"]),
         (["--max-memory", "0.1"], ["calibration: would take about", "of memory"]),
-        (["--variant", "llvm_ad_grey"], ["llvm_ad_grey"]),
     ],
     ids=lambda value: " ".join(value) if value[0].startswith("--") else None,
 )
@@ -81,8 +77,6 @@ def test_calibrate_refuses(refused: Refused, lab: Any, options: list[str], fragm
         (["--pictures", "nowhere"], ["nowhere", "is no folder"]),
         (["--vary", "nowhere.toml"], ["nowhere.toml"]),
         (["--patterns", "dots:17"], ["dots:17", "16"]),
-        (["--exposure", "long"], ["--exposure 'long'"]),
-        (["--accuracy", "2"], ["--accuracy 2"]),
         (["--max-seconds", "0.001"], ["pairs: was not planned within the 0.001 s", "--max-seconds"]),
         (["--count", "1000000", "--max-seconds", "600"], ["1000000 pairs: would take about", "allowed are 600 s"]),
         (["--max-memory", "0.01"], ["5 pairs: would take about", "of memory"]),
@@ -98,17 +92,11 @@ def test_pairs_refuses(refused: Refused, lab: Any, options: list[str], fragments
     ("options", "fragments"),
     [
         (["--spp", "0"], ["--spp 0", "at least 4"]),
-        (["--spp", "-64"], ["--spp -64"]),
         (["--spp", "many"], ["'many'"]),
         (["--estimator", "fast"], ["'fast'", "reference or factored"]),
         (["--estimator", "factored", "--accuracy", "0"], ["--accuracy 0"]),
-        (
-            ["--spp", "100000", "--max-seconds", "0.1"],
-            ["100000 samples a pixel: would take about", "allowed are 0.1 s"],
-        ),
+        (["--spp", "100000", "--max-seconds", "0.1"], ["100000 samples a pixel: would take about", "are 0.1 s"]),
         (["--estimator", "factored", "--max-memory", "0.1"], ["would take about", "of memory"]),
-        (["--seed", "-1"], ["-1"]),
-        (["--variant", "llvm_ad_grey"], ["llvm_ad_grey"]),
     ],
     ids=" ".join,
 )
@@ -121,11 +109,9 @@ def test_render_refuses(refused: Refused, lab: Any, options: list[str], fragment
     [
         (["--lambda", "-1"], ["--lambda -1", "at least 0"]),
         (["--lambda", "nan"], ["--lambda nan"]),
-        (["--lambda", "inf"], ["--lambda inf"]),
         (["--lambda", "small"], ["'small'", "auto"]),
         (["--method", "wiener"], ["'wiener'", "tikhonov, markov, nonnegative, tv or the file of a trained network"]),
         (["--method", "none.pt"], ["model none.pt: cannot be read"]),
-        (["--method", "tv", "--lambda", "-1"], ["--lambda -1"]),
         (["--variant", "llvm_ad_grey"], ["llvm_ad_grey", "llvm_ad_mono"]),
     ],
     ids=" ".join,
@@ -137,14 +123,10 @@ def test_reconstruct_refuses(refused: Refused, lab: Any, options: list[str], fra
 @pytest.mark.parametrize(
     ("arguments", "fragments"),
     [
-        (["study", "weather", "photograph", *NEW], ["'weather'", "accuracy"]),
         (["study", "twin", "photograph", *NEW], ["study twin photograph", "leave the scene out"]),
         (["study", "twin", *NEW], ["needs real captures", "--data FOLDER", "flatnet"]),
         (["study", "transfer", *NEW], ["is no study of its own any more", "mitsim study learned --data DIR"]),
         (["study", "twin", "--data", "nowhere", *NEW], ["--data nowhere", "no such folder"]),
-        (["plan", "photograph", "--accuracy", "0"], ["--accuracy 0"]),
-        (["plan", "photograph", "--patterns", "dots:129"], ["dots:129", "128"]),
-        (["plan", "photograph", "--seed", "-1"], ["-1"]),
         (["doctor", "--variant", "llvm_ad_grey"], ["llvm_ad_grey", "llvm_ad_mono"]),
         (["develop"], ["develop"]),
         (["capture", "photograph"], ["--output"]),
@@ -159,11 +141,8 @@ def test_others_refuse(refused: Refused, arguments: list[str], fragments: list[s
     mentions(refused(*arguments), *fragments)
 
 
-def test_a_study_refuses_patterns_that_do_not_fit(refused: Refused, lab: Any) -> None:
+def test_patterns_must_fit_the_projector(refused: Refused, lab: Any) -> None:
     mentions(refused("study", "accuracy", lab.scene, *NEW, "--patterns", "dots:17"), "dots:17", "16")
-
-
-def test_a_demo_refuses_a_projector_too_small_for_its_families(refused: Refused, lab: Any) -> None:
     mentions(refused("demo", *NEW, lab.write_scene("tiny", n=4)), "dots:", "4")
 
 
@@ -175,10 +154,6 @@ def test_a_demo_refuses_a_projector_too_small_for_its_families(refused: Refused,
 def test_a_missing_toml(refused: Refused, lab: Any, verb: str, option: str) -> None:
     rest = {"plan": (), "capture": (*NEW, "--patterns", "dots:4"), "calibrate": NEW}[verb]
     mentions(refused(verb, lab.scene, *rest, option, "nowhere.toml"), "nowhere.toml", "No such file")
-
-
-_CURVE = "quantum_efficiency_curve = {wavelengths_nm = [600, 700], efficiency = [0.5, 0.4]}"
-"""Of a camera that does not see the projector."""
 
 
 def test_binary_files_where_text_is_expected(refused: Refused, lab: Any, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import math
 import os
 import pty
 import re
-import subprocess
 import sys
 import threading
 import time
@@ -22,21 +21,8 @@ import pytest
 from mitsim.bench.layout import Preview
 from mitsim.report import bench_view
 
-VERBS = ["demo", "run", "view", "plan", "capture", "calibrate", "reconstruct", "render", "study", "report"]
-VERBS += [
-    "characterise",
-    "sense",
-    "export",
-    "import",
-    "patterns",
-    "transport",
-    "list",
-    "new",
-    "doctor",
-    "pairs",
-    "train",
-]
-CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
+VERBS = ["demo", "run", "view", "plan", "capture", "calibrate", "reconstruct", "render", "study", "report", "doctor"]
+VERBS += ["characterise", "sense", "export", "import", "patterns", "transport", "list", "new", "pairs", "train"]
 
 
 def number(value: object, least: float = 0.0, most: float = math.inf) -> bool:
@@ -64,17 +50,10 @@ def test_view(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: p
     options = "--json", "--quiet", "--variant", "llvm_ad_mono"
     found = call("view", *devices, "-o", tmp_path / "bench.png", *options).payload
     assert found.keys() == {
-        *(
-            "scene",
-            "projector_mm",
-            "scene_distance_mm",
-            "window_mm",
-            "projector_pixels",
-            "keystone_pixels",
-            "depths_mm",
-        ),
+        *("scene", "projector_mm", "scene_distance_mm", "window_mm", "projector_pixels", "keystone_pixels"),
+        *("depths_mm", "warnings", "output"),
         *("seen_pixels", "parallax_pixels", "field_stop_deg", "field_stop_cuts", "sensor_pixels", "sensor_mm"),
-        *("mask_distance_mm", "surfaces", "warnings", "output"),
+        *("mask_distance_mm", "surfaces"),
     }
     assert found["projector_mm"] == pytest.approx([60, 0, 0], abs=1e-3) and found["projector_pixels"] == 16
     assert found["output"] == str(tmp_path / "bench.png") and found["surfaces"][0].keys() == {
@@ -156,14 +135,8 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     assert number(found["residual"], 1e-9, 0.5) and found["status"].endswith(".")
     assert_seconds(found["seconds"])
     assert found["output"] == str(tmp_path / "image")
-    assert sorted(path.name for path in (tmp_path / "image").iterdir()) == [
-        "image.exr",
-        "image.png",
-        "pictures",
-        "report.html",
-        "result.json",
-        "uncertainty.exr",
-    ]
+    names = {"image.exr", "image.png", "pictures", "report.html", "result.json", "uncertainty.exr"}
+    assert {path.name for path in (tmp_path / "image").iterdir()} == names
     made = found.pop("report")
     assert made.keys() == {"page", "pictures", "seconds"} and number(made["seconds"], 0, 60)
     assert made["page"] == str(tmp_path / "image" / "report.html") and all(
@@ -243,7 +216,7 @@ def test_characterise_and_sense(call: Callable[..., Any], tmp_path: Path) -> Non
     assert sensed["shape"] == [4, 6] and (tmp_path / "frame.png").is_file() and sensed["saturated_pixels"] == 0
     assert {"camera", "exposure_s", "wavelength_nm", "seed", "mean_dn", "largest_dn", "notes"} <= sensed.keys()
     refused = call("sense", tmp_path / "image.npy", "--camera", "imx477", "-o", tmp_path / "other.png")
-    assert refused.code == 2 and "quantum_efficiency" in refused.err and not (tmp_path / "other.png").exists()
+    assert "quantum_efficiency" in refused.refusal and not (tmp_path / "other.png").exists()
 
 
 def test_pairs(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
@@ -384,13 +357,6 @@ def test_no_arguments_show_the_help(call: Callable[..., Any]) -> None:
     ]
 
 
-def test_importing_the_command_line_is_cheap() -> None:
-    heavy = "'mitsuba', 'drjit', 'numpy', 'scipy', 'matplotlib'"
-    program = f"import sys, mitsim.cli; print([name for name in ({heavy}) if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 # ---- the progress bar ------------------------------------------------------------------------------------------------
 
 
@@ -467,18 +433,8 @@ def test_an_interrupt_leaves_the_terminal_whole(
 def test_a_refusal_on_a_terminal_leaves_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], lab: Any, tmp_path: Path
 ) -> None:
-    out, err = on_a_terminal(
-        monkeypatch,
-        capsys,
-        "capture",
-        *lab.arguments,
-        "-o",
-        tmp_path / "run",
-        "--patterns",
-        "dots:4",
-        "--accuracy",
-        "0",
-    )
+    options = "-o", tmp_path / "run", "--patterns", "dots:4", "--accuracy", "0"
+    out, err = on_a_terminal(monkeypatch, capsys, "capture", *lab.arguments, *options)
     assert out == ""
     visible = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", err.rsplit("\x1b[2K", 1)[-1])
     assert visible.strip().startswith("mitsim: --accuracy 0") and visible.strip().count("\n") == 0

@@ -1,5 +1,3 @@
-import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -38,19 +36,6 @@ def test_what_json_cannot_hold_is_refused_and_the_old_file_stays(tmp_path: Path)
     with pytest.raises(TypeError, match="object"):
         files.write_json(tmp_path / "m.json", {"a": object()})
     assert files.read_json(tmp_path / "m.json") == {"a": 1}
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files.write_json(tmp_path / "m.json", {"a": 1})
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(MitsimError, match="No space left"):
-        files.write_json(tmp_path / "m.json", {"a": 2})
-    assert json.loads((tmp_path / "m.json").read_text()) == {"a": 1}
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_reading_names_the_file(tmp_path: Path) -> None:
