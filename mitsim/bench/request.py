@@ -425,7 +425,7 @@ class Irradiance(Timed, Lit):
 
     exposure: float | Literal["auto"] = option("auto", "seconds, or auto", metavar="auto|SECONDS")
     f_number: float | None = option(
-        None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N", ge=0.5, lt=math.inf
+        None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N", ge=0.5, le=1e100
     )
     scale: float = option(1.0, "what its numbers are multiplied by", gt=0, lt=math.inf)
     channel: str | None = option(None, "of several channels, the one to take", metavar="NAME")

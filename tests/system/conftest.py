@@ -129,15 +129,8 @@ def _captured() -> Iterator[tuple[Path, Path]]:
 
 def shell(*arguments: object, cwd: Path | None = None, **options: Any) -> Outcome:
     """The installed program ``mitsim ARGUMENTS``, without pictures."""
-    done = subprocess.run(
-        [MITSIM, *map(str, _plain(arguments))],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        timeout=HANGS_S,
-        check=False,
-        **options,
-    )
+    command = [MITSIM, *map(str, _plain(arguments))]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=HANGS_S, check=False, **options)
     return Outcome(done.returncode, done.stdout, done.stderr)
 
 

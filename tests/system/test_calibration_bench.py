@@ -43,14 +43,10 @@ def test_modelled_factors_are_a_calibration_that_says_so(call: Callable[..., Any
     assert done.code == 0, done.err
     reported, written = done.payload, json.loads((tmp_path / "cal" / "manifest.json").read_text())
     assert reported["frames"] == 8 and reported["model"] == "wave"
-    fitted, held = (
-        written["modelled"]["parameters"]["mask_distance"],
-        written["modelled"]["parameters"]["magnification"],
-    )
-    assert abs(fitted["value"] - 2) < 5 * fitted["standard_error"] and (held["value"], held["standard_error"]) == (
-        1,
-        None,
-    )
+    parameters = written["modelled"]["parameters"]
+    fitted, held = parameters["mask_distance"], parameters["magnification"]
+    assert abs(fitted["value"] - 2) < 5 * fitted["standard_error"]
+    assert (held["value"], held["standard_error"]) == (1, None)
     image = call("reconstruct", lab.run, "--calibration", tmp_path / "cal", "-o", tmp_path / "image", "--json")
     measured = call("reconstruct", lab.run, "--calibration", lab.calibration, "-o", tmp_path / "other", "--json")
     assert image.code == 0 and image.payload["psnr"] > measured.payload["psnr"] - 1

@@ -189,18 +189,3 @@ def test_each_line_is_calibrated_for_itself(
         for key in ("separability_residual", "noise_free_residual", "condition"):
             assert channel[key] == pytest.approx(mono[key], rel=0.02), key
         assert channel["exposure_s"] * LINES[nm] == pytest.approx(mono["exposure_s"], rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--colour", "bands"), "--colour 'bands': use no, lines, bands:K or mosaic"),
-        (("--colour", "bands:5"), "--colour 'bands:5': give bands:1 to bands:4"),
-    ],
-)
-def test_what_colour_cannot_do_is_refused(
-    shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, options: tuple[str, ...], words: str
-) -> None:
-    scene = coloured("sheet")
-    assert words in shell("capture", scene, "-o", tmp_path / "run", "--patterns", "dots:2", *options).refusal
-    assert not (tmp_path / "run").exists()

@@ -11,8 +11,6 @@ import pytest
 
 from mitsim.bench.effects import SWITCHES
 
-ROW = {"name", "state", "reason", "error_if_off", "seconds"}
-
 
 @pytest.mark.parametrize(
     "verb",
@@ -33,17 +31,10 @@ def test_effects_that_make_no_sense(refused: Callable[..., str], lab: Any, verb:
 
 
 def test_a_plan_as_json(call: Callable[..., Any], lab: Any) -> None:
-    free, forced = (
-        call("plan", *lab.arguments, "--patterns", "dots:4", "--json", *more).payload
-        for more in ((), ("--effects", "+anchors,-diffraction,+ambient"))
-    )
-    for block in (free, forced):
-        assert {"effects", "accuracy", "predicted_seconds"} <= set(block)
-        rows = {row["name"]: row for row in block["effects"]}
-        assert set(SWITCHES) <= set(rows) and len(rows) == len(block["effects"])
-        assert all(set(row) >= ROW and row["seconds"] >= 0 for row in rows.values())
-        assert block["accuracy"] == 0.005 and block["predicted_seconds"] > 0
-    rows = {row["name"]: row for row in forced["effects"]}
+    options = "--patterns", "dots:4", "--json", "--effects", "+anchors,-diffraction,+ambient"
+    effects = call("plan", *lab.arguments, *options).payload["effects"]
+    rows = {row["name"]: row for row in effects}
+    assert set(SWITCHES) <= set(rows) and len(rows) == len(effects)
     assert rows["diffraction"]["state"] == "off" and "by the user" in rows["diffraction"]["reason"]
     assert rows["anchors"]["state"] == "approximate" and rows["ambient"]["state"] == "exact"
 

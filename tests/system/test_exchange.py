@@ -42,12 +42,8 @@ def test_pictures_and_frames_again(call: Callable[..., Any], lab: Any, tmp_path:
     line = out.payload["notes"][0].split("mitsim ")[1]
     names = {"NAME": lab.camera, "CAL": lab.calibration, "RUN": tmp_path / "run"}
     back = call(*(names.get(word, word) for word in line.split()), "--json")
-    assert (
-        back.code == 0
-        and back.payload.keys() == {*IMPORTED, "shape", "divided_by", "planes"}
-        and back.payload["shape"] == [64, 64]
-    )
-    assert "truth" in back.payload["left_out"]
+    assert back.code == 0 and back.payload.keys() == {*IMPORTED, "shape", "divided_by", "planes"}
+    assert back.payload["shape"] == [64, 64] and "truth" in back.payload["left_out"]
     again = image(call, tmp_path / "run", lab.calibration, tmp_path / "b")
     assert np.array_equal(again, image(call, lab.run, lab.calibration, tmp_path / "a"))
 

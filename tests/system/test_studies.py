@@ -24,17 +24,8 @@ def test_keys_of_a_study(study: Callable[..., Any], tmp_path: Path) -> None:
     found = study("-o", tmp_path / "out", "--quick", "--json")
     assert found.code == 0, found.err
     payload = found.payload
-    assert {
-        "study",
-        "points",
-        "missing",
-        "seconds",
-        "rows",
-        "claims",
-        "warnings",
-        "figures",
-        "output",
-    } == payload.keys()
+    keys = {"study", "points", "missing", "seconds", "rows", "claims", "warnings", "figures", "output"}
+    assert keys == payload.keys()
     assert payload["points"] == len(payload["rows"]) == 8 and payload["missing"] == 0
     for claim in payload["claims"]:
         assert {"claim", "paper", "idealised", "rendered", "verdict"} == claim.keys()
