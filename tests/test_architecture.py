@@ -546,7 +546,7 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 SIZES = {
     "__main__": (1, 18),
     "acquire": (6, 1281),
-    "api": (2, 223),
+    "api": (2, 203),
     "bench": (5, 1162),
     "calibrate": (6, 1286),
     "cli": (6, 1433),
@@ -563,10 +563,10 @@ SIZES = {
     "report": (8, 1954),
     "scene": (5, 1377),
     "sensor": (5, 1189),
-    "sessions": (4, 811),
+    "sessions": (3, 805),
     "studies": (22, 5188),
     "transport": (15, 4081),
-    "verbs": (1, 308),
+    "verbs": (1, 298),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
