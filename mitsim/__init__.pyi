@@ -27,9 +27,6 @@ from mitsim.exchange.formats import import_file as import_file
 from mitsim.exchange.formats import import_frames as import_frames
 from mitsim.exchange.formats import pattern_pictures as pattern_pictures
 from mitsim.learn.pair_store import PairStore as PairStore
-from mitsim.learn.verbs import load_network as load_network
-from mitsim.learn.verbs import make_pairs as make_pairs
-from mitsim.learn.verbs import train as train
 from mitsim.light.plan import Plan as Plan
 from mitsim.metrics import psnr as psnr
 from mitsim.metrics import ssim as ssim
@@ -47,7 +44,10 @@ from mitsim.sessions.session_file import session_of as session_of
 from mitsim.verbs import characterise as characterise
 from mitsim.verbs import demo as demo
 from mitsim.verbs import doctor as doctor
+from mitsim.verbs import load_network as load_network
+from mitsim.verbs import make_pairs as make_pairs
 from mitsim.verbs import scenes as scenes
 from mitsim.verbs import sense as sense
 from mitsim.verbs import study as study
+from mitsim.verbs import train as train
 from mitsim.version import __version__ as __version__

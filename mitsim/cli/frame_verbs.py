@@ -33,9 +33,9 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.exchange.capture_list import FrameFacts
 from mitsim.exchange.formats import READERS, Exported, Pictures
 from mitsim.learn.requests import METHODS, Schedule, Training
-from mitsim.learn.verbs import load_network
-from mitsim.learn.verbs import train as train_model
 from mitsim.reconstruct.request import MODEL, ImageRequest, check_joint, check_parallax, holds_image
+from mitsim.verbs import load_network
+from mitsim.verbs import train as train_model
 
 if TYPE_CHECKING:
     from mitsim.report.folder_page import ColourImage

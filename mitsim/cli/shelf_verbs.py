@@ -81,7 +81,7 @@ def _methods() -> Iterator[Entry]:
 
     for name, solver in SOLVERS.items():
         yield Entry(name, _clause(str(type(solver).__doc__)))
-    classes = {node.name: node for node in _source("mitsim.learn.methods").body if isinstance(node, ast.ClassDef)}
+    classes = {node.name: node for node in _source("mitsim.learn.networks").body if isinstance(node, ast.ClassDef)}
     words = {name.lower(): _clause(ast.get_docstring(node) or "") for name, node in classes.items()}
     for name in METHODS:
         yield Entry(name, f"{words[name.replace('-', '')]}; to be trained")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -136,3 +137,9 @@ class Training(Schedule):
         if self.method not in METHODS:
             near = near_name(str(self.method), METHODS)
             raise MitsimError(f"method {self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
+
+
+def check_torch() -> None:
+    """Raise MitsimError if torch, an extra, is not installed."""
+    if find_spec("torch") is None:
+        raise MitsimError("torch is not installed, which networks need; type: pip install 'mitsim[learn]'")

@@ -39,7 +39,6 @@ from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifes
 from mitsim.devices.framelist import load_chart
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, check_export, export
-from mitsim.learn.verbs import load_network
 from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.sessions.session_file import (
     FOLDERS,
@@ -53,7 +52,7 @@ from mitsim.sessions.session_file import (
     session_text,
     stated,
 )
-from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, open_as, prepare_study
+from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, load_network, open_as, prepare_study
 
 if TYPE_CHECKING:
     from mitsim.acquire.capture import Light

@@ -1,9 +1,8 @@
 """Loss of an image by each kind of drift between calibration and capture, measured and predicted [dB].
 
-*Measured*: noisy frames of the traced light through the camera after the drift, solved with the factors and the lambda
-from before it. *Predicted* (:mod:`mitsim.studies.causes`): from
-the same factors and the closed-form shadow of the paper's model, with the truth, the mean noise of a datum and, for
-lamps, the frame of their light.
+*Measured*: noisy frames of the traced light are captured after the drift and solved with the factors and the lambda
+from before it. *Predicted* (:mod:`mitsim.studies.causes`): the loss follows from the same factors and the closed-form
+shadow of the paper's model, with the truth, the mean noise of a datum and, for lamps, the frame of their light.
 """
 
 from __future__ import annotations
@@ -26,13 +25,11 @@ from mitsim.acquire.exposure import (
     takes_ambient_frame,
     warmer,
 )
-from mitsim.bench.apparatus import Apparatus
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import CAMERA, DEFAULT_CAMERA, locate, shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily, read_name, stripe_signs
-from mitsim.devices.projector import Spectrum
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import DRIFTS, SIDES, Drift, SessionRecipe, load_recipe
 from mitsim.light.light import SampledLight
@@ -42,7 +39,6 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Prepared, Solution
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
-from mitsim.report.pages import Value
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response, specimen
 from mitsim.studies.causes import Changed, Expected, Gains, LinearImage, Noise
 from mitsim.studies.framework.claims import Gain
@@ -73,29 +69,23 @@ _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 # -------- A drift between calibration and capture: its measured and its predicted effect
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """PSNR [dB] without and with a drift, measured and predicted at one lambda, and the measured ``image`` with it."""
+def loss_of(before_db: float, after_db: float, predicted_before_db: float, predicted_db: float) -> dict[str, float]:
+    """Return the columns of a loss, from the PSNR without and with a drift, measured and predicted at one lambda.
 
-    before_db: float
-    after_db: float
-    predicted_before_db: float
-    predicted_db: float
-    image: FloatArray
-
-    @property
-    def lost_db(self) -> float:
-        return self.before_db - self.after_db
-
-    @property
-    def predicted_lost_db(self) -> float:
-        added = squared_error(self.predicted_db) - squared_error(self.predicted_before_db)
-        return 10 * math.log10(1 + added / squared_error(self.before_db))
-
-    @property
-    def predicted_error_db(self) -> float:
-        """Return the change of the loss if the image without drift is as predicted, because the model omits light."""
-        return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
+    Added squared errors are predicted. The error of the prediction is its change if the image without drift were as
+    predicted, because the model omits light.
+    """
+    added = squared_error(predicted_db) - squared_error(predicted_before_db)
+    lost = 10 * math.log10(1 + added / squared_error(before_db))
+    return {
+        "before_db": before_db,
+        "after_db": after_db,
+        "lost_db": before_db - after_db,
+        "predicted_before_db": predicted_before_db,
+        "predicted_db": predicted_db,
+        "predicted_lost_db": lost,
+        "predicted_error_db": abs(predicted_before_db - predicted_db - lost),
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,15 +98,17 @@ class DriftStand:
     family: PatternFamily
     seed: int
 
-    def outcome(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> Outcome:
-        """Return the effect of a drift; MitsimError for a drift that the bench cannot have.
+    def outcome(
+        self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None
+    ) -> tuple[dict[str, float], FloatArray]:
+        """Return the columns of a drift's loss and the image with it; MitsimError for one that the bench cannot have.
 
         ``session`` are factors that drifted, ``lit`` is the scene in light of a moved projector.
         """
         scene, model = lit or self.lit, self._model
         if session is not None:
             model = scene.rendered_frames(session, self.family, self.seed).prepare()
-        bench, truth = scene.bench, scene.truth
+        bench = scene.bench
         moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
         expected = scene.expected_frames(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
         base = self._frames.exposer(self.exposure_s)
@@ -125,12 +117,7 @@ class DriftStand:
         (sums,) = accumulate(exposer, self.family, expected, [model])
         image = model.solve(sums, self.before.lam).image
         still, predicted = (self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
-        return Outcome(self.before_db, psnr(image, truth), still, predicted, image)
-
-    @property
-    def flags(self) -> dict[str, Value]:
-        others = (*self.lit.light.warnings, *self.lit.light.unreached, *self.factors.warnings)
-        return flags_of(self.before.status, others=others)
+        return loss_of(self.before_db, psnr(image, scene.truth), still, predicted), image
 
     @property
     def before_db(self) -> float:
@@ -150,8 +137,7 @@ class DriftStand:
 
     @cached_property
     def before(self) -> Solution:
-        (sums,) = accumulate(self._frames.exposer(self.exposure_s), self.family, self._frames.expected, [self._model])
-        return self._model.solve(sums, "auto")
+        return self._frames.solve(self.exposure_s)
 
     def session_mixes(self, drift: Drift) -> tuple[FloatArray, FloatArray]:
         """Return the (n, n) matrices that multiply the factors on the right as a session's power drifts.
@@ -182,7 +168,7 @@ class DriftStand:
 
     @cached_property
     def fixed(self) -> Mapping[str, FloatArray]:
-        """Contribution of each pixel's difference to the image (n, n)."""
+        """Return the contribution (n, n) of each kind of difference between pixels to the image."""
         still = self.linear.expected_image(self.lit.truth).image
         alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
         return {name: self.linear.expected_image(self.lit.truth, each).image - still for name, each in alone.items()}
@@ -236,7 +222,7 @@ class DriftStand:
 
     @cached_property
     def _response(self) -> FloatArray | None:
-        """Relative differences (m, m') of pixels' responses from the factors."""
+        """Return the relative differences (m, m') between the pixels' responses and the factors."""
         response = specimen(self.lit.bench.sensor, self.lit.bench.geometry.frame_shape).response
         if response is None:
             return None
@@ -249,7 +235,7 @@ class DriftStand:
 
     @cached_property
     def _fixed_frame(self) -> FloatArray | None:
-        """Readings of pixels (m, m') beyond those that a user subtracts without an ambient frame [electrons/s]."""
+        """Return readings (m, m') beyond those that a user subtracts without an ambient frame [electrons/s]."""
         sensor, shape = self.lit.bench.sensor, self.lit.bench.geometry.frame_shape
         own = specimen(sensor, shape)
         if (own.offset_e is None and own.dark_e_per_s is None) or self._frames.expected.has_ambient:
@@ -267,10 +253,10 @@ class DriftStand:
         return found
 
     def _terms(self, drift: Drift) -> SeparableTerms:
-        bench = self.lit.bench
-        best = IdealCamera(bench, bench.geometry.mask, self._spectrum).factors
+        """Return the terms that a drift of mask or projector adds to the calibrated factors' one [electrons/s]."""
+        bench, (left, right) = self.lit.bench, self._ideal(Drift()).factors
         at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
-        found = self._shadow(drift_projector(drift_mask(bench, at_rest), drift)) + _minus([best])
+        found = [*self._ideal(at_rest).terms, (-left, right)]
         if drift.vibration_um:
             # The mean shadow of a normal motion along both axes at once.
             shifted = [self._shift(place * drift.vibration_um / 1e3) for place, _ in _HERMITE]
@@ -278,49 +264,35 @@ class DriftStand:
                 sides = zip(*terms, strict=True)
                 left, right = (sum(w * one for (_, w), one in zip(_HERMITE, side, strict=True)) for side in sides)
                 found.append((np.asarray(left), np.asarray(right)))
-            found += _minus(self._shadow(bench))
+            found += [(-left, right) for left, right in self._shift(0.0)]
         if drift.mask_rotation_mrad:
             found += self._turn(drift.mask_rotation_mrad / 1e3)
-        rate = electrons_from_irradiance(
-            self.lit.board_flux, 1.0, bench.sensor, bench.projector.effective_wavelength_nm
-        )
-        return [(float(rate) * left, right) for left, right in found]
+        wavelength_nm = bench.projector.effective_wavelength_nm
+        rate = float(electrons_from_irradiance(self.lit.board_flux, 1.0, bench.sensor, wavelength_nm))
+        return [(rate * left, right) for left, right in found]
 
     def _turn(self, angle: float) -> SeparableTerms:
         """Return the shadow's change to first order in the ``angle``: theta (s_col d/d s_row - s_row d/d s_col)."""
-        camera = IdealCamera(self.lit.bench, self.lit.bench.geometry.mask)
-        shadow = ShadowGeometry.of(camera.bench.geometry, camera.bench.geometry.scene_distance)
-        row, column = (
-            shadow.along(axis).crossings(directions) - camera.bench.geometry.mask_offset[axis]
-            for axis, directions in enumerate(camera.directions)
-        )
-        still, ahead, behind = (self._shift(shift) for shift in (0.0, _STEP_MM, -_STEP_MM))
+        geometry, axes = self.lit.bench.geometry, enumerate(self._ideal(Drift()).directions)
+        shadow = ShadowGeometry.of(geometry, geometry.scene_distance)
+        row, column = (shadow.along(axis).crossings(each) - geometry.mask_offset[axis] for axis, each in axes)
         found: SeparableTerms = []
-        for (left, right), (left_ahead, right_ahead), (left_behind, right_behind) in zip(
-            still, ahead, behind, strict=True
-        ):
-            slopes = (left_ahead - left_behind) / (2 * _STEP_MM), (right_ahead - right_behind) / (2 * _STEP_MM)
-            found += [(angle * slopes[0], column * right), (-angle * row * left, slopes[1])]
+        terms = zip(*(self._shift(shift) for shift in (0.0, _STEP_MM, -_STEP_MM)), strict=True)
+        for (left, right), ahead, behind in terms:
+            down, across = ((after - before) / (2 * _STEP_MM) for after, before in zip(ahead, behind, strict=True))
+            found += [(angle * down, column * right), (-angle * row * left, across)]
         return found
 
     def _shift(self, by_mm: float) -> SeparableTerms:
-        back = Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)
-        return self._shadow(drift_mask(self.lit.bench, back))
+        return self._ideal(Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)).terms
 
-    def _shadow(self, bench: Apparatus) -> SeparableTerms:
-        return IdealCamera(bench, bench.geometry.mask, self._spectrum).terms
-
-    @property
-    def _spectrum(self) -> Spectrum | None:
-        return self.lit.light.simulation.physics.spectrum
+    def _ideal(self, drift: Drift) -> IdealCamera:
+        bench = drift_projector(drift_mask(self.lit.bench, drift), drift)
+        return IdealCamera(bench, bench.geometry.mask, self.lit.light.simulation.physics.spectrum)
 
 
 def squared_error(db: float) -> float:
     return float(10 ** (-db / 10))
-
-
-def _minus(terms: SeparableTerms) -> SeparableTerms:
-    return [(-left, right) for left, right in terms]
 
 
 # -------- Each kind of drift alone: the decibels that it costs
@@ -328,43 +300,38 @@ def _minus(terms: SeparableTerms) -> SeparableTerms:
 _SEEDS = 4
 """Seeds of noise and random drifts."""
 _LAMPS = ("lamp", "lamp_flicker", "lamp_ripple")
-_RIPPLES = "power_ripple", "lamp_ripple"
 _LAMP_SCENE, _LAMP = "lamp_bench", "11.7"
 """Default scene of lamps' drifts, whose lamp is a tenth as bright on the sheet as the projector."""
-_LINES = {"lost_db": "measured", "predicted_lost_db": "predicted"}
-_LOST = "PSNR lost [dB]"
-_ERRORS = {"predicted_lost_db": "predicted_error_db"}
 _BEFORE = "without the drift"
+_LINES, _ERRORS = {"lost_db": "measured", "predicted_lost_db": "predicted"}, {"predicted_lost_db": "predicted_error_db"}
 AGREE_DB = 0.5
 """Largest useful difference [dB] between predicted and measured loss."""
 
 
 def _points(scope: Scope) -> Sequence[Point]:
     recipe, first = recipe_of(scope.recipe), scope.seeds[0]
-    drift = recipe.drift
+    drift, sweep = recipe.drift, dict(scope.sweep)
     read_name(scope.patterns)
-    amounts = {kind: [getattr(drift, kind)] for kind in drift.kinds} if not scope.sweep else {
-        kind: [getattr(drift.alone(kind, number_of(kind, text)), kind) for text in texts] for kind, texts in scope.sweep
-    }  # fmt: skip
+    asked = [(kind, drift.alone(kind, number_of(kind, text))) for kind, texts in sweep.items() for text in texts]
+    alone = asked if sweep else [(kind, drift) for kind in drift.kinds]
+    amounts = [(kind, getattr(each, kind)) for kind, each in alone]
     if not amounts:
         raise MitsimError(f"study drift: the table [drift] of {scope.recipe} moves nothing; give amounts in it")
-    if recipe.signed_capture != "pair" and any(kind.startswith("session") for kind in amounts):
+    if recipe.signed_capture != "pair" and any(kind.startswith("session") for kind, _ in amounts):
         raise MitsimError('study drift: drift of a session is studied for signed_capture = "pair"; change the recipe')
-    if any(kind in _RIPPLES for kind in amounts):  # refused before any light is traced
+    if any(kind.endswith("ripple") for kind, _ in amounts):  # refused before any light is traced
         load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml", CAMERA)).known_line_time_s()
-    sheet = replace(scope.setup, picture=TEST_IMAGES[0])
-    lamp, own = replace(sheet, scene=_LAMP_SCENE).with_parameters(lamp=_LAMP), scope.pictures == (None,)
-    found = [
-        Point.of(
-            scope.setup if own else lamp if kind in _LAMPS else sheet,
-            recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=unit, amount=amount, seed=seed,
-            what=f"{words}, " + (f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"),
-        )
-        for seed in scope.choose(range(first, first + _SEEDS), scope.seeds)
-        for kind, each in amounts.items()
-        for unit, words in [DRIFTS[kind]]
-        for amount in each
-    ]  # fmt: skip
+    sheet = lamp = scope.setup
+    if scope.pictures != (None,):
+        sheet = replace(scope.setup, picture=TEST_IMAGES[0])
+        lamp = replace(sheet, scene=_LAMP_SCENE).with_parameters(lamp=_LAMP)
+    found = []
+    for seed in scope.choose(range(first, first + _SEEDS), scope.seeds):
+        for kind, amount in amounts:
+            (unit, words), shared = DRIFTS[kind], {"recipe": scope.recipe, "patterns": scope.patterns, "kind": kind}
+            size = f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"
+            setup, what = lamp if kind in _LAMPS else sheet, f"{words}, {size}"
+            found.append(Point.of(setup, **shared, unit=unit, amount=amount, seed=seed, what=what))
     return group_by_setup(found)
 
 
@@ -375,41 +342,31 @@ def recipe_of(path: str | None) -> SessionRecipe:
 
 def _measure(studio: Studio, point: Point) -> Found:
     setup, seed, kind = point.setup, int(point["seed"]), str(point["kind"])
-    recipe = recipe_of(point["recipe"])
+    recipe, lit = recipe_of(point["recipe"]), studio.lit_scene(setup)
     drift = recipe.drift.alone(kind, float(point["amount"]))
-    lit = studio.lit_scene(setup)
 
-    def stand() -> DriftStand:
-        family = lit.bench.family(point["patterns"], seed)
-        return DriftStand(lit, _session(studio, point, recipe, Drift()), recipe, family, seed)
+    def calibrate(drift: Drift) -> Factors:
+        own = recipe.model_copy(update={"drift": drift, "source": ""})
+        if own == load_recipe().model_copy(update={"source": ""}):
+            return studio.factors(setup, seed)
+        return studio.bench(setup).calibrate(seed=seed, recipe=own)
 
-    known = studio.once("drift", 1, (setup, point["recipe"], point["patterns"], seed), stand)
-    session = _session(studio, point, recipe, drift) if kind.startswith("session") else None
-    moved = None
+    known = studio.once(
+        "drift", 1, (setup, point["recipe"], point["patterns"], seed),
+        lambda: DriftStand(lit, calibrate(Drift()), recipe, lit.bench.family(point["patterns"], seed), seed),
+    )  # fmt: skip
+    session, moved = calibrate(drift) if kind.startswith("session") else None, None
     if kind.startswith("projector"):
         # By the same plan, so that errors of plans cancel.
         moved = studio.once(
             "moved projector", 6, (setup, drift),
             lambda: LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan)),
         )  # fmt: skip
-    found = known.outcome(drift, session, moved)
-    measured: dict[str, Value] = {
-        "before_db": found.before_db, "after_db": found.after_db, "lost_db": found.lost_db,
-        "predicted_before_db": found.predicted_before_db, "predicted_db": found.predicted_db,
-        "predicted_lost_db": found.predicted_lost_db, "predicted_error_db": found.predicted_error_db,
-        **known.flags,
-    }  # fmt: skip
-    shown = {IMAGE: found.image, _BEFORE: known.before.image, TRUTH: lit.truth}
-    return Found((point.row(**measured),), single_precision(shown))
-
-
-def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) -> Factors:
-    seed, own = int(point["seed"]), recipe.model_copy(update={"drift": drift})
-    if own.model_copy(update={"source": ""}) == load_recipe().model_copy(update={"source": ""}):
-        return studio.factors(point.setup, seed)
-    bench = studio.bench(point.setup)
-    key = bench.devices_digest, seed, own
-    return studio.once("drifting session", 2, key, lambda: bench.calibrate(seed=seed, recipe=own))
+    measured, image = known.outcome(drift, session, moved)
+    others = (*lit.light.warnings, *lit.light.unreached, *known.factors.warnings)
+    flags = flags_of(known.before.status, others=others)
+    shown = {IMAGE: image, _BEFORE: known.before.image, TRUTH: lit.truth}
+    return Found((point.row(**measured, **flags),), single_precision(shown))
 
 
 STUDY = Study(
@@ -434,14 +391,7 @@ STUDY = Study(
         ),
     ),
     panels=(
-        Bars(
-            "what",
-            file="losses",
-            colour=_LINES,
-            x_label=_LOST,
-            ordered=True,
-            errors=_ERRORS,
-        ),
+        Bars("what", file="losses", colour=_LINES, x_label="PSNR lost [dB]", ordered=True, errors=_ERRORS),
         Images(
             {_BEFORE: (_BEFORE, "{before_db:.1f} dB"), IMAGE: ("with it", "{after_db:.1f} dB")},
             before={TRUTH: "truth"},

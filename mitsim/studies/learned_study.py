@@ -35,8 +35,7 @@ from mitsim.core.images import grey_png
 from mitsim.core.job import Job
 from mitsim.learn.pair_store import WHITE
 from mitsim.learn.pairs import DrawnPictures, make_pairs
-from mitsim.learn.requests import FLATNET, REFINED, UNROLLED, PairsRequest, Training, Variation
-from mitsim.learn.verbs import check_torch
+from mitsim.learn.requests import FLATNET, REFINED, UNROLLED, PairsRequest, Training, Variation, check_torch
 from mitsim.metrics import psnr
 from mitsim.reconstruct.request import MARKOV, TIKHONOV, TV
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
@@ -52,8 +51,7 @@ from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 from mitsim.studies.twin_study import Learned, Measured, correlation, read_captures
 
 if TYPE_CHECKING:
-    from mitsim.learn.methods import LearnedSolver
-    from mitsim.learn.training import Sums
+    from mitsim.learn.networks import LearnedSolver, Sums
 
 # -------- The bench, its networks, and the images of a print
 
@@ -93,9 +91,8 @@ def middle(studio: Studio, setup: Setup, place: str = SAME) -> Setup:
 
 def network_of(studio: Studio, point: Point, training: str, method: str, patterns: str, seed: int) -> LearnedSolver:
     """Return a network of the study's folder, which is trained first if it is not there."""
-    from mitsim.learn.methods import read_network
+    from mitsim.learn.networks import read_network, train_network
     from mitsim.learn.pair_store import PairStore
-    from mitsim.learn.training import train_network
 
     setup, count, noise = middle(studio, replace(point.setup, picture=None)), int(point["pairs"]), int(point["noise"])
 
@@ -171,7 +168,7 @@ def twin_sums(prepared: Prepared, noise: tuple[float, float], truths: FloatArray
     """Return the sums of idealised frames of ``truths`` (N, n, n), 0 to 1, with white noise of a deviation within
     ``noise`` [DN].
     """
-    from mitsim.learn.training import Sums
+    from mitsim.learn.networks import Sums
 
     weights, deviations = [], []
     for number, truth in enumerate(truths):
@@ -190,8 +187,7 @@ def transfer(data: str, held_out: str, seed: int) -> Found:
     """
     import torch
 
-    from mitsim.learn.methods import Data, Diagonal, datum_variance
-    from mitsim.learn.training import Trainer, first_network
+    from mitsim.learn.networks import Data, Diagonal, Trainer, datum_variance, first_network
 
     planes = read_captures(find_files(Path(data), "learned")[0], seed)
     known = [each for each in planes if each.capture != held_out]

@@ -18,13 +18,23 @@ pytest.importorskip("torch", reason="torch is an extra: pip install 'mitsim[lear
 
 import torch
 
+from mitsim import verbs
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
-from mitsim.learn import methods, training, verbs
-from mitsim.learn.methods import CLASSES, WAYS, Data, Diagonal, LearnedSolver, UNet, has_half, read_network
+from mitsim.learn import networks, requests
+from mitsim.learn.networks import (
+    CLASSES,
+    WAYS,
+    Data,
+    Diagonal,
+    LearnedSolver,
+    UNet,
+    has_half,
+    read_network,
+    train_network,
+)
 from mitsim.learn.requests import METHODS, Training
-from mitsim.learn.training import train_network
 from mitsim.metrics import psnr
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solvers import SOLVERS
@@ -90,9 +100,9 @@ def test_half_precision_is_of_training_alone(monkeypatch: pytest.MonkeyPatch) ->
     """(Planted: of images too.)"""
     network, images = UNet(1, 4), torch.randn((1, 1, 16, 16), generator=torch.Generator().manual_seed(1))
     torch.nn.init.ones_(network.last.weight)
-    monkeypatch.setattr(methods, "has_half", lambda device: False)
+    monkeypatch.setattr(networks, "has_half", lambda device: False)
     single = network(images).detach()
-    monkeypatch.setattr(methods, "has_half", lambda device: True)
+    monkeypatch.setattr(networks, "has_half", lambda device: True)
     assert torch.equal(network.eval()(images), single)
     rounded = network.train()(images).detach()
     assert 1e-4 < float((rounded - single).abs().max() / single.abs().max()) < 0.1
@@ -117,7 +127,7 @@ def _problem(model: LearnedSolver) -> tuple[Data, Diagonal]:
     for shot in camera.run("uniform", picture(1), 1).pattern_measurements():
         sums.add(shot.frame, shot.row, shot.column)
     problem, like = prepared.problem(sums), next(model.network.parameters())
-    return Data.of(problem.projected[None], training.datum_variance(problem), like), Diagonal.of(prepared, like)
+    return Data.of(problem.projected[None], networks.datum_variance(problem), like), Diagonal.of(prepared, like)
 
 
 # -------- The camera's model
@@ -158,7 +168,7 @@ def test_every_method_learns(method: str, tmp_path: Path) -> None:
         FakeStore(), bench().calibrated(1), Training(method=method, steps=STEPS, batch=4, seed=3), tmp_path / "m.pt"
     )
     assert made.curve[0][0] == 0 and max(value for _, value in made.curve) > made.curve[0][1] + 0.5
-    blank = replace(made.model, network=training.first_network(Training(method=method), (16, 16)))
+    blank = replace(made.model, network=networks.first_network(Training(method=method), (16, 16)))
     before, after = (psnr(image_of(each).image, picture(5)) for each in (blank, made.model))
     assert after > before + 0.3
 
@@ -191,7 +201,7 @@ def test_an_interrupted_training_goes_on_bit_equal(tmp_path: Path, monkeypatch: 
     with pytest.raises(MitsimError, match="other pairs, factors or options"):
         train_network(store, factors, request.model_copy(update={"seed": 2}), tmp_path / "c.pt", resume=True)
     with monkeypatch.context() as patch, pytest.raises(MitsimError, match="numbers of other precision"):
-        patch.setattr(training, "has_half", lambda device: not has_half(device))
+        patch.setattr(networks, "has_half", lambda device: not has_half(device))
         train_network(store, factors, request, tmp_path / "c.pt", resume=True)
     unfinished = tmp_path / "d.pt.unfinished"
     unfinished.write_bytes((tmp_path / "c.pt.unfinished").read_bytes()[:-2000])
@@ -207,10 +217,10 @@ def test_a_turned_picture_has_the_frames_of_its_own(tmp_path: Path) -> None:
     store, factors = FakeStore(8), bench().calibrated(1, error=0.0)
     request = Training(method="unrolled", batch=8)
     prepared = SOLVERS["tikhonov"].init(factors, store.patterns)
-    sums = training.Sums.of(store, prepared, Job())
+    sums = networks.Sums.of(store, prepared, Job())
     exact = prepared.sigma * (prepared.left.basis.T @ sums.truths.astype(np.float64) @ prepared.right.basis)
-    network = training.first_network(request, (16, 16))
-    trainer = training.Trainer(request, prepared, replace(sums, weights=exact), network)
+    network = networks.first_network(request, (16, 16))
+    trainer = networks.Trainer(request, prepared, replace(sums, weights=exact), network)
     truths, data = trainer.batch(np.arange(8))
     turned, moved = trainer._turn(truths, data, np.random.default_rng(2))
     assert not torch.equal(turned[4:], truths[4:]) and torch.equal(turned[:4], truths[:4])
@@ -224,7 +234,7 @@ def test_oblong_pictures_are_turned_to_their_own_shape_alone() -> None:
     trainer: Any = SimpleNamespace(model=model)
     truths, data = torch.rand(4, 1, 6, 8), Data(torch.zeros(4, 1, 6, 8), torch.ones(4, 1, 1, 1))
     for seed in range(8):
-        turned, moved = training.Trainer._turn(trainer, truths, data, np.random.default_rng(seed))
+        turned, moved = networks.Trainer._turn(trainer, truths, data, np.random.default_rng(seed))
         assert turned.shape == moved.weights.shape == truths.shape
 
 
@@ -234,7 +244,7 @@ def test_no_photograph_teaches_and_judges(count: int, files: int) -> None:
     not teach either. (Planted: a permutation of pairs; one part for choosing and judging.)"""
     photographs = np.arange(count) % files
     for seed in range(5):
-        parts = training.part_photographs(photographs, seed)
+        parts = networks.part_photographs(photographs, seed)
         shown = [set(photographs[part]) for part in parts]
         assert all(len(part) for part in parts) and not any(a & b for a, b in itertools.combinations(shown, 2))
         assert len(parts[0]) > count / 4 and max(map(len, parts[1:])) <= 48
@@ -246,13 +256,13 @@ def test_the_stated_psnr_is_of_photographs_that_neither_teach_nor_choose(
     """Also where a store holds several crops of each. (Planted: the best of the curve stated; the curve of the pairs
     that judge.)"""
     store, asked = FakeStore(12, photographs=4), list[np.ndarray]()
-    judge = training.Trainer.judge
+    judge = networks.Trainer.judge
 
     def note(trainer: Any, pairs: np.ndarray) -> float:
         asked.append(store.photographs[pairs])
         return judge(trainer, pairs)
 
-    monkeypatch.setattr(training.Trainer, "judge", note)
+    monkeypatch.setattr(networks.Trainer, "judge", note)
     made = train_network(store, bench().calibrated(1), Training(method="unrolled", steps=2), tmp_path / "m.pt")
     *looks, before, after = asked
     assert len(looks) == len(made.curve) == 3 and {*np.concatenate(looks)}.isdisjoint({*before, *after})
@@ -274,9 +284,9 @@ def test_trainings_that_are_refused(tmp_path: Path) -> None:
         train_network(FakeStore(8), factors, request, tmp_path / "m.pt", Job(limits=Limits(seconds=0.01)))
     prepared = SOLVERS["tikhonov"].init(factors, FakeStore(8).patterns)
     held = 8 * (256 + prepared.sigma.size) * 4  # truths and data of 8 pairs in 32 bits
-    training.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=1.01 * held)))
+    networks.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=1.01 * held)))
     with pytest.raises(MitsimError, match=r"reading 8 pairs: would take about .* of memory"):
-        training.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=0.99 * held)))
+        networks.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=0.99 * held)))
     with pytest.raises(MitsimError, match="ran away at step"):
         train_network(HotStore(8), factors, request, tmp_path / "m.pt")
     assert not (tmp_path / "m.pt").exists()
@@ -384,7 +394,7 @@ def test_a_file_that_is_none_is_refused(damage: str, model: LearnedSolver, tmp_p
 
 
 def test_without_torch_a_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verbs, "find_spec", lambda name: None)
+    monkeypatch.setattr(requests, "find_spec", lambda name: None)
     (tmp_path / "m.pt").touch()
     (tmp_path / "calibration").mkdir()
     for work in (

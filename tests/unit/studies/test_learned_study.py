@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mitsim.core.errors import MitsimError
-from mitsim.learn import verbs
+from mitsim.learn import requests
 from mitsim.reconstruct.known_pictures import Pose
 from mitsim.report.pages import Value
 from mitsim.studies import learned_study, twin_study
@@ -106,7 +106,7 @@ def test_networks_are_kept_and_compared_with_the_best_classical_image(
 ) -> None:
     """On a small bench with few pairs. A killed training goes on where it was, a network that is there is not trained
     again, and gains are over the best of all classical images. (Planted: networks of any place in one file.)"""
-    from mitsim.learn.training import Trainer
+    from mitsim.learn.networks import Trainer
 
     print_ = np.random.default_rng(4).integers(20, 230, (64, 64))
     scene = small_scene(reflectance=print_)
@@ -166,10 +166,10 @@ def test_points_share_files_and_not_a_process() -> None:
 
 
 def test_points_of_a_whole_and_of_a_quick_study(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(verbs, "find_spec", lambda name: None)
+    monkeypatch.setattr(requests, "find_spec", lambda name: None)
     with pytest.raises(MitsimError, match=r"torch is not installed, which networks need; type: pip install"):
         STUDY.points(Scope(Setup(), ("page",)))
-    monkeypatch.setattr(verbs, "find_spec", lambda name: name)
+    monkeypatch.setattr(requests, "find_spec", lambda name: name)
     whole = STUDY.points(Scope(Setup(), ("page", "brick")))
     assert len(whole) == len({point.key for point in whole}) == 36 + 8
     assert whole[-1]["steps"] == FULL["steps"]
