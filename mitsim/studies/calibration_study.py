@@ -13,14 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.api.bench import Bench
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
@@ -32,86 +30,59 @@ from mitsim.core.manifests import SIDES as FACTORS
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import digital_of
-from mitsim.devices.session import SIDES, Drift, SessionRecipe, load_recipe
+from mitsim.devices.session import SIDES, Drift, load_recipe
 from mitsim.reconstruct.factors import Estimate, Factors, decibels
 from mitsim.report.lit_scene import SPECKLE, IdealCamera, LitScene
-from mitsim.report.pages import Value
+from mitsim.studies import waterfall_study as waterfall
 from mitsim.studies.causes import Noise, Scatter
 from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, squared_error
 from mitsim.studies.framework.claims import Judged, measured
 from mitsim.studies.framework.experiment import Found, Point, Results, Scope, Study
 from mitsim.studies.framework.panels import Bars, Part
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.waterfall_study import (
-    BLACK_LEVEL,
-    DEPTH,
-    DETAIL,
-    GLOSS,
-    INTERREFLECTION,
-    MIRRORS,
-    OCCLUSION,
-    Ablation,
-)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Row = dict[str, Value]
+Row = dict[str, Any]
 
 # -------- Cost of each source in an image
 
 CAPTURE, SCENE, SOLVER, UNEXPLAINED = "capture", "scene", "solver", "unexplained"
 RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
-ERROR_SOURCES = MappingProxyType(
-    {
-        DETAIL: "detail inside projector pixels",
-        DEPTH: "depth beside the board's",
-        OCCLUSION: "edges that hide pixels from part of the sensor",
-        INTERREFLECTION: "light over several surfaces",
-        MIRRORS: "light over mirrors",
-        GLOSS: "gloss over the sensor",
-        BLACK_LEVEL: "light that black pixels leak",
-    }
-)
+ERROR_SOURCES = {
+    waterfall.DETAIL: "detail inside projector pixels",
+    waterfall.DEPTH: "depth beside the board's",
+    waterfall.OCCLUSION: "edges that hide pixels from part of the sensor",
+    waterfall.INTERREFLECTION: "light over several surfaces",
+    waterfall.MIRRORS: "light over mirrors",
+    waterfall.GLOSS: "gloss over the sensor",
+    waterfall.BLACK_LEVEL: "light that black pixels leak",
+}
 """Effects that factors lack, in the order of their removal."""
 SURE = 3.0
 """Standard errors from which the unexplained part is not chance."""
 _LEAST_LEFT = 1e-9
 
 
-@dataclass(frozen=True)
-class LossRow:
-    """Loss of an image [dB] by a ``source``; ``squared_error`` is the source's, mean over the image, negative where
-    the image is worse without it.
+def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[Row]:
+    """Return the loss [dB] by each source of error, and by the rest that no source explains.
+
+    ``squared_error`` is the source's, mean over the image, negative where the image is worse without the source.
     """
 
-    of: str
-    source: str
-    lost_db: float
-    error_db: float
-    squared_error: float
-    deviation: float
+    def row(of: str, source: str, lost: tuple[float, float], square: float, deviation: float) -> Row:
+        name = source if of == UNEXPLAINED else f"{of}: {source}"
+        found = {"lost_db": lost[0], "error_db": lost[1], "squared_error": square, "deviation": deviation}
+        return {"kind": "losses", "of": of, "source": source, **found, "name": name}
 
-    @property
-    def missing(self) -> bool:
-        return abs(self.squared_error) > SURE * self.deviation
-
-    @property
-    def words(self) -> str:
-        errors = abs(self.squared_error) / self.deviation if self.deviation else 0.0
-        size = f"what is not explained is {errors:.1f} of its standard errors"
-        return f"{size}: the sources do not make the image's error, and a cause is missing" if self.missing else size
-
-
-def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[LossRow]:
-    """Return the loss by each source of error, and by the rest that no source explains."""
     scene, light, noises = stand.lit.truth, stand.lit.light, noises_of(stand, lit)
     exact = replace(stand.linear, left=clear.left, right=clear.right)
     pixels, scatter = scene.size, Scatter(exact, scene)
     sampled = sum((noise for (_, name), noise in noises.items() if name == RENDERING), Noise())
     drawn = sum(noises.values(), Noise()) - sampled
     # Images of the scene's light without noise: whole, and without one cause after another.
-    ablation, off, seen = Ablation(light), frozenset[str](), [stand.clear(clear, light)]
+    ablation, off, seen = waterfall.Ablation(light), frozenset[str](), [stand.clear(clear, light)]
     removed = [name for name in ERROR_SOURCES if name in ablation.effects]
     for name in removed:
         off |= {name}
@@ -126,7 +97,7 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[LossRow]:
     for name, more in stand.fixed.items():
         parts[CAPTURE, name] = _square(error + more) - _square(error), 0.0
         error = error + more
-    parts[SCENE, ERROR_SOURCES[DETAIL]] = 0.0, 0.0
+    parts[SCENE, ERROR_SOURCES[waterfall.DETAIL]] = 0.0, 0.0
     for name, before, after in zip(removed, seen, seen[1:], strict=False):
         moved = scatter.common(sampled, before - after) / pixels
         parts[SCENE, ERROR_SOURCES[name]] = _square(before - scene) - _square(after - scene), moved
@@ -136,14 +107,25 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[LossRow]:
     parts[SOLVER, LAMBDA] = bias, 0.0
 
     whole, explained = squared_error(stand.before_db), sum(square for square, _ in parts.values())
-    rows = [
-        LossRow(*source, *gain_without(square, whole, explained, deviation), square, deviation)
-        for source, (square, deviation) in parts.items()
-    ]
     left_over, chance = whole - explained, scatter.deviation(drawn, steady) / pixels
     lost = _decibels(left_over / whole)
-    error_db = abs(_decibels((left_over + chance) / whole) - lost)
-    return [*rows, LossRow(UNEXPLAINED, "not explained", lost, error_db, left_over, chance)]
+    rest_lost = lost, abs(_decibels((left_over + chance) / whole) - lost)
+    return [
+        *(
+            row(*source, gain_without(square, whole, explained, deviation), square, deviation)
+            for source, (square, deviation) in parts.items()
+        ),
+        row(UNEXPLAINED, "not explained", rest_lost, left_over, chance),
+    ]
+
+
+def judge_rest(squared_error: float, deviation: float) -> tuple[str, bool]:
+    """Return a sentence on the squared error that no source explains, and True if chance may have caused it."""
+    errors = abs(squared_error) / deviation if deviation else 0.0
+    size = f"what is not explained is {errors:.1f} of its standard errors"
+    if abs(squared_error) > SURE * deviation:
+        return f"{size}: the sources do not make the image's error, and a cause is missing", False
+    return size, True
 
 
 def _square(error: FloatArray) -> float:
@@ -223,42 +205,6 @@ _SAID_DB = 0.005
 """Least loss that is drawn."""
 
 
-def measure_session(bench: Bench, recipe: SessionRecipe, patterns: str, seed: int, accuracy: float) -> list[Row]:
-    """Return the rows of a session and of an image with its factors."""
-    job, family = Job(), bench.family(patterns, seed)
-    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
-    session = Session(bench, recipe.model_copy(update={"drift": Drift()}), seed)
-    lit = LitSession.of(session, session.trace(session.plan(accuracy, job), job), job)
-    (noisy, clean), _, _ = estimates(lit, job, (NOISY, NOISE_FREE))
-    manifest = CalibrationManifest(
-        camera=bench.identity(), centre=session.centre, board_reflectance=recipe.board_reflectance,
-        digital=digital_of(bench.sensor, lit.exposure_s), parallax=bench.parallax,
-    )  # fmt: skip
-    lit_s = lit.exposure_s * recipe.repeats
-    rows: list[Row] = [{
-        "kind": "session", "frames": session.shots,
-        "exposure_seconds": len(session.order) * lit_s,
-        "separability_residual": noisy.separability_residual, "noise_free_residual": clean.separability_residual,
-    }]  # fmt: skip
-    rows += judge_factors(lit, noisy, clean)
-    scene = LitScene(bench.light(patterns, job, accuracy=accuracy, seed=seed))
-    stand = DriftStand(scene, Factors.of(noisy, manifest), recipe, family, seed)
-    lost = losses(stand, lit, Factors.of(clean, manifest))
-    for row in lost:
-        name = row.source if row.of == UNEXPLAINED else f"{row.of}: {row.source}"
-        rows.append({"kind": "losses", **asdict(row), "name": name})
-    left, right = IdealCamera(bench, bench.geometry.mask).calibrated(scene.board_flux)
-    geometric = replace(stand, factors=replace(stand.factors, left=left, right=right)).before_db
-    explained, unexplained = sum(row.squared_error for row in lost[:-1]), lost[-1]
-    rows.append({
-        "kind": "image", "psnr_db": stand.before_db, "predicted_psnr_db": -decibels(np.sqrt(explained)),
-        "geometric_psnr_db": geometric, "frames": len(family.shots),
-        "exposure_seconds": len(family.shots) * stand.exposure_s, "flagged": unexplained.missing,
-        "reason": f"losses: {unexplained.words}" if unexplained.missing else "",
-    })  # fmt: skip
-    return rows
-
-
 @single_threaded_blas()
 def judge_factors(lit: LitSession, noisy: Estimate, clean: Estimate) -> list[Row]:
     """Return errors of each factor beside their prediction, and those of its entries in predicted deviations."""
@@ -291,9 +237,36 @@ def _points(scope: Scope) -> list[Point]:
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    recipe = load_recipe(None if point["recipe"] is None else Path(point["recipe"]))
-    asked = str(point["patterns"]), int(point["seed"]), point.setup.accuracy
-    rows = measure_session(studio.bench(point.setup), recipe, *asked)
+    bench, recipe = studio.bench(point.setup), load_recipe(None if point["recipe"] is None else Path(point["recipe"]))
+    job, seed, accuracy = Job(), int(point["seed"]), point.setup.accuracy
+    family = bench.family(point["patterns"], seed)
+    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
+    session = Session(bench, recipe.model_copy(update={"drift": Drift()}), seed)
+    lit = LitSession.of(session, session.trace(session.plan(accuracy, job), job), job)
+    (noisy, clean), _, _ = estimates(lit, job, (NOISY, NOISE_FREE))
+    manifest = CalibrationManifest(
+        camera=bench.identity(), centre=session.centre, board_reflectance=recipe.board_reflectance,
+        digital=digital_of(bench.sensor, lit.exposure_s), parallax=bench.parallax,
+    )  # fmt: skip
+    scene = LitScene(bench.light(point["patterns"], job, accuracy=accuracy, seed=seed))
+    stand = DriftStand(scene, Factors.of(noisy, manifest), recipe, family, seed)
+    *lost, rest = losses(stand, lit, Factors.of(clean, manifest))
+    left, right = IdealCamera(bench, bench.geometry.mask).calibrated(scene.board_flux)
+    geometric = replace(stand, factors=replace(stand.factors, left=left, right=right)).before_db
+    words, by_chance = judge_rest(rest["squared_error"], rest["deviation"])
+    session_row: Row = {
+        "kind": "session", "frames": session.shots,
+        "exposure_seconds": len(session.order) * (lit.exposure_s * recipe.repeats),
+        "separability_residual": noisy.separability_residual, "noise_free_residual": clean.separability_residual,
+    }  # fmt: skip
+    image_row: Row = {
+        "kind": "image", "psnr_db": stand.before_db,
+        "predicted_psnr_db": -decibels(np.sqrt(sum(row["squared_error"] for row in lost))),
+        "geometric_psnr_db": geometric, "frames": len(family.shots),
+        "exposure_seconds": len(family.shots) * stand.exposure_s, "flagged": not by_chance,
+        "reason": "" if by_chance else f"losses: {words}",
+    }  # fmt: skip
+    rows = [session_row, *judge_factors(lit, noisy, clean), *lost, rest, image_row]
     return Found(tuple(point.row(**row) for row in rows))
 
 
@@ -314,10 +287,9 @@ def _tables(results: Results) -> list[Part]:
     return found
 
 
-def _explained(rows: DataFrame) -> tuple[str, bool | None]:
-    (values,) = rows.to_dict("records")
-    row = LossRow(*(values[name] for name in LossRow.__dataclass_fields__))
-    return row.words, not row.missing
+def _explained(rows: DataFrame) -> tuple[str, bool]:
+    (row,) = rows.to_dict("records")
+    return judge_rest(row["squared_error"], row["deviation"])
 
 
 def _as_predicted(rows: DataFrame) -> tuple[str, bool]:

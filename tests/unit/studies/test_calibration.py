@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,14 +11,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from mitsim.api.bench import open_bench
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import Lighting, parse_patterns, stripe_signs
-from mitsim.devices.session import SIDES, load_recipe
+from mitsim.devices.session import SIDES
 from mitsim.optics.frames import Frame
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import calibration_study as module
@@ -28,20 +27,20 @@ from mitsim.studies.calibration_study import (
     RENDERING,
     REST,
     STUDY,
-    LossRow,
     _tables,
     entry_variances,
     gain_without,
     judge_factors,
+    judge_rest,
     losses,
-    measure_session,
     noises_of,
     session_rendering,
 )
 from mitsim.studies.causes import LinearImage, Noise, Scatter
 from mitsim.studies.drift_study import AMBIENT, SESSION
-from mitsim.studies.framework.experiment import Results, Scope, Setup
+from mitsim.studies.framework.experiment import Point, Results, Scope, Setup
 from mitsim.studies.framework.panels import flag_warnings
+from mitsim.studies.framework.studio import Studio
 from mitsim.studies.waterfall_study import DEPTH, GLOSS
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
@@ -162,7 +161,7 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     errors = {(): 0.1, (DEPTH,): 0.08, (DEPTH, GLOSS): 0.05}
     off = {names: size * RNG.standard_normal((N, N)) for names, size in errors.items()}
     ablation = SimpleNamespace(effects=effects, without=lambda names: tuple(sorted(names)))
-    monkeypatch.setattr(module, "Ablation", lambda light: ablation)
+    monkeypatch.setattr(module.waterfall, "Ablation", lambda light: ablation)
     monkeypatch.setattr(module, "noises_of", lambda *_: noises)
     fixed = {"response": 0.1 * RNG.standard_normal((N, N)), "offsets": 0.1 * RNG.standard_normal((N, N))}
     linear = LinearImage(left, right, parse_patterns("dots:2", N), 0.1)
@@ -172,33 +171,34 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
         clear=lambda factors, light: scene + off[light] if factors is clear else None,
     )  # fmt: skip
     rows = losses(stand, cast(Any, "session"), clear)
-    found, (*_, last) = {(row.of, row.source): row for row in rows}, rows
+    found, (*_, last) = {(row["of"], row["source"]): row for row in rows}, rows
     exact = replace(linear, left=2 * left, right=3 * right)
     scatter = Scatter(exact, scene)
     steps = [off[()], off[()] + fixed["response"], off[()] + fixed["response"] + fixed["offsets"]]
     drawn = Noise(datum=1e-4, left=2e-4)
     for (of, source), noise in noises.items():
         among = drawn + noise if source == RENDERING else drawn
-        assert found[of, source].squared_error == pytest.approx(linear.variance(scene, noise) / N**2)
-        assert found[of, source].deviation == pytest.approx(scatter.share(noise, among, steps[2]) / N**2)
+        assert found[of, source]["squared_error"] == pytest.approx(linear.variance(scene, noise) / N**2)
+        assert found[of, source]["deviation"] == pytest.approx(scatter.share(noise, among, steps[2]) / N**2)
     squares = [float(np.mean(step**2)) for step in (*steps, *off.values())]
     for name, before, after in zip(fixed, squares, squares[1:], strict=False):
-        assert found["capture", name].squared_error == pytest.approx(after - before)
+        assert found["capture", name]["squared_error"] == pytest.approx(after - before)
     for name, before, after in zip((DEPTH, GLOSS), squares[3:], squares[4:], strict=False):
-        assert found["scene", ERROR_SOURCES[name]].squared_error == pytest.approx(before - after)
+        assert found["scene", ERROR_SOURCES[name]]["squared_error"] == pytest.approx(before - after)
     sampled = Noise(light=3e-4, left_light=4e-4)
     moved = scatter.common(sampled, off[()] - off[DEPTH,]) / N**2
-    assert found["scene", ERROR_SOURCES[DEPTH]].deviation == pytest.approx(moved)
+    assert found["scene", ERROR_SOURCES[DEPTH]]["deviation"] == pytest.approx(moved)
     bias = float(np.mean((exact.expected_image(scene).image - scene) ** 2))
-    assert found["solver", LAMBDA].squared_error == pytest.approx(bias)
-    assert found["scene", REST].squared_error == pytest.approx(
-        squares[5] - bias - exact.variance(scene, sampled) / N**2
-    )
-    explained = sum(row.squared_error for row in rows[:-1])
-    assert last.squared_error == pytest.approx(0.01 - explained)
-    assert last.deviation == pytest.approx(scatter.deviation(drawn, steps[2]) / N**2)
+    assert found["solver", LAMBDA]["squared_error"] == pytest.approx(bias)
+    rest = squares[5] - bias - exact.variance(scene, sampled) / N**2
+    assert found["scene", REST]["squared_error"] == pytest.approx(rest)
+    explained = sum(row["squared_error"] for row in rows[:-1])
+    assert last["squared_error"] == pytest.approx(0.01 - explained)
+    assert last["deviation"] == pytest.approx(scatter.deviation(drawn, steps[2]) / N**2)
     shot = found["capture", "shot noise"]
-    assert (shot.lost_db, shot.error_db) == gain_without(shot.squared_error, 0.01, explained, shot.deviation)
+    assert (shot["lost_db"], shot["error_db"]) == gain_without(
+        shot["squared_error"], 0.01, explained, shot["deviation"]
+    )
 
 
 def test_noise_by_source_is_all_noise() -> None:
@@ -258,7 +258,7 @@ def test_all_sources_together_are_what_the_image_is_off(
     found, rows = losses_of(small_scene(name="even"), variant, camera=own)
     (image,) = of_kind(found, "image")
     assert image["predicted_psnr_db"] == pytest.approx(image["psnr_db"], abs=0.5)
-    reported = {(row.of, row.source): row.squared_error for row in rows.values()}
+    reported = {(row["of"], row["source"]): row["squared_error"] for row in rows.values()}
     left = reported.pop(("unexplained", "not explained"))
     assert reported["capture", largest] > 0.7 * sum(reported.values()) and reported["session", "rendering"] > 0
     assert image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values())))
@@ -277,12 +277,13 @@ def print_of_squares(pixels: float) -> FloatArray:
     return 25 + 200 * np.not_equal.outer(place.astype(int) % 2, place.astype(int) % 2)
 
 
-def losses_of(scene: Path, variant: str, seed: int = 1, **devices: Path) -> tuple[Rows, dict[str, LossRow]]:
+def losses_of(scene: Path, variant: str, camera: Path | None = None) -> tuple[Rows, dict[str, dict[str, Any]]]:
     """Rows of a session of 16 patterns, and losses by name."""
-    bench = open_bench(str(scene), variant, **devices)
-    found: Rows = measure_session(bench, load_recipe(), "dots:4", seed, 2e-3)
-    names = [each.name for each in fields(LossRow)]
-    return found, {row["name"]: LossRow(*(row[name] for name in names)) for row in of_kind(found, "losses")}
+    setup = Setup(str(scene), variant=variant, accuracy=2e-3, camera=camera and str(camera))
+    with Studio() as studio:
+        found = STUDY.measure(studio, Point.of(setup, recipe=None, patterns="dots:4", seed=1))
+    rows = [dict(row) for row in found.rows]
+    return rows, {row["name"]: row for row in of_kind(rows, "losses")}
 
 
 def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Callable[..., Path], variant: str) -> None:
@@ -293,13 +294,13 @@ def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Calla
     (image,) = of_kind(found, "image")
     whole = 10 ** (-image["psnr_db"] / 10)
     detail, left = rows["scene: detail inside projector pixels"], rows["not explained"]
-    assert 0.95 < detail.squared_error / whole < 1 and detail.lost_db > 13
-    assert abs(left.squared_error) < 3 * left.deviation < 0.03 * whole and not image["flagged"]
+    assert 0.95 < detail["squared_error"] / whole < 1 and detail["lost_db"] > 13
+    assert abs(left["squared_error"]) < 3 * left["deviation"] < 0.03 * whole and not image["flagged"]
     assert image["predicted_psnr_db"] == pytest.approx(image["psnr_db"], abs=0.1)
-    assert abs(rows["scene: all else"].squared_error) < 0.01 * whole
+    assert abs(rows["scene: all else"]["squared_error"]) < 0.01 * whole
     even = losses_of(small_scene("even"), variant)[1]
-    assert abs(even["scene: detail inside projector pixels"].lost_db) < 0.1
-    assert abs(even["scene: all else"].squared_error) < 0.5 * even["capture: rendering"].squared_error
+    assert abs(even["scene: detail inside projector pixels"]["lost_db"]) < 0.1
+    assert abs(even["scene: all else"]["squared_error"]) < 0.5 * even["capture: rendering"]["squared_error"]
 
 
 def test_a_cause_without_a_row_is_said_to_be_missing(
@@ -309,33 +310,30 @@ def test_a_cause_without_a_row_is_said_to_be_missing(
     own = tmp_path / "camera.toml"
     own.write_text(f"linearity = [0.03]\n{shipped_path('calibration', 'imx249.toml').read_text()}")
     found, rows = losses_of(small_scene("even"), variant, camera=own)
-    assert rows["not explained"].squared_error > 10 * rows["not explained"].deviation
+    assert rows["not explained"]["squared_error"] > 10 * rows["not explained"]["deviation"]
     (warning,) = flag_warnings("calibration", Results(found))
     assert "a cause is missing" in warning and of_kind(found, "image")[0]["flagged"]
 
 
-@pytest.mark.parametrize(("errors", "message"), [(0.9, "0.9 of its standard errors"), (-3.5, "a cause is missing")])
-def test_what_is_not_explained_is_said_by_its_standard_errors(errors: float, message: str) -> None:
-    row = LossRow("unexplained", "not explained", 0.0, 0.0, errors * 1e-6, 1e-6)
-    assert message in row.words and row.missing == (errors == -3.5)
+def test_what_is_not_explained_is_said_by_its_standard_errors() -> None:
+    words, by_chance = judge_rest(0.9e-6, 1e-6)
+    assert "0.9 of its standard errors" in words and by_chance
+    words, by_chance = judge_rest(-3.5e-6, 1e-6)
+    assert "a cause is missing" in words and not by_chance
 
 
 def test_the_page_has_every_loss_in_one_table() -> None:
     """With its uncertainty, the largest first. (Planted: the order of the rows.)"""
-    lost = (
-        LossRow("capture", "shot noise", 2.0, 0.1, 3e-5, 2e-7),
-        LossRow("scene", "all else", 3.0, 0.2, 4e-5, 0.0),
-        LossRow("session", "read noise", 0.0, 0.0, 1e-5, 0.0),
-    )
-    table = _tables(Results([{"kind": "losses", **asdict(row)} for row in lost]))[0]
+    lost = ("capture", "shot noise", 2.0, 0.1), ("scene", "all else", 3.0, 0.2), ("session", "read noise", 0.0, 0.0)
+    columns = "of", "source", "lost_db", "error_db"
+    table = _tables(Results([{"kind": "losses", **dict(zip(columns, row, strict=True))} for row in lost]))[0]
     assert table.head[2] == "lost db" and table.rows[0][:4] == ("scene", "all else", "3", "0.2")
     assert [row[1] for row in table.rows[1:]] == ["shot noise", "read noise"]
 
 
 def test_a_recipe_with_depths_is_refused_before_anything_is_traced(tmp_path: Path) -> None:
     """(Planted: let pass.)"""
-    (tmp_path / "depths.toml").write_text(
-        f"depths = [350.0, 400.0]\n{shipped_path('calibration', 'session.toml').read_text()}"
-    )
+    shipped = shipped_path("calibration", "session.toml").read_text()
+    (tmp_path / "depths.toml").write_text(f"depths = [350.0, 400.0]\n{shipped}")
     with pytest.raises(MitsimError, match="2 depths, and a report is of one session"):
         STUDY.points(Scope(Setup(), (None,), recipe=str(tmp_path / "depths.toml")))
