@@ -553,7 +553,7 @@ SIZES = {
     "core": (13, 2990),
     "devices": (8, 2034),
     "exchange": (5, 1313),
-    "learn": (7, 1305),
+    "learn": (5, 1215),
     "light": (6, 1720),
     "metrics": (1, 81),
     "mitsim": (1, 26),
@@ -563,10 +563,10 @@ SIZES = {
     "report": (8, 1954),
     "scene": (5, 1377),
     "sensor": (5, 1189),
-    "sessions": (3, 805),
-    "studies": (22, 5188),
+    "sessions": (3, 804),
+    "studies": (22, 5116),
     "transport": (15, 4081),
-    "verbs": (1, 298),
+    "verbs": (1, 348),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
