@@ -289,7 +289,8 @@ class MosaicLight(SampledLight):
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
         assert self.passed is not None, "made by of()"
         lines = [light.frames(lighting, seed, leaking).of_projector for light in self.by_line]
-        return MosaicFrames(lines, self.passed, self._lamps(seed), self.by_line[0].simulation.lamps_apart)
+        apart = not self.by_line[0].simulation.from_camera_of_projector
+        return MosaicFrames(lines, self.passed, self._lamps(seed), apart)
 
     def _lamps(self, seed: int) -> Frame | None:
         counted_lamps = self.bench.counted_lamps

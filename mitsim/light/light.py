@@ -149,10 +149,17 @@ class _Flux:
         most = max(MOST_RAYS, MOST_SAMPLES * len(unit)) // TRUTH_GROUPS
         while ((error := _rms(_over(self.standard_error, unit))) > target).any():
             part = float(np.square(_AIM * target / np.maximum(error, np.finfo(float).tiny)).min())
-            wanted = _allot(likely, self._samples, self._first, part, most)
-            if (wanted == self._samples).all():
+            # The doublings that reduce the variance most for their rays come first.
+            samples, doublings = self._samples, np.arange(_DOUBLINGS)
+            left = (likely * (samples / self._first) ** -_RATE)[:, None] * 2.0 ** (-_RATE * doublings)
+            gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings
+            best = np.argsort(-(gain / cost), axis=None, kind="stable")
+            enough = int(np.searchsorted(np.cumsum(gain.ravel()[best]), (1 - part) * left[:, 0].sum())) + 1
+            affordable = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
+            made = np.bincount(best[: min(enough, affordable)] // _DOUBLINGS, minlength=len(likely))
+            if not made.any():
                 return
-            self._sample(wanted)
+            self._sample(np.asarray(samples << np.minimum(made, _AT_ONCE)))
 
     def _sample(self, wanted: IntArray) -> None:
         pixels = np.flatnonzero(wanted > self._samples)
@@ -167,17 +174,6 @@ class _Flux:
             for sums, part in zip(groups, parts, strict=True):
                 sums += np.bincount(pixels[place], part, len(sums))
         self._samples = wanted
-
-
-def _allot(likely: FloatArray, samples: IntArray, first: int, part: float, most: int) -> IntArray:
-    doublings = np.arange(_DOUBLINGS)
-    left = (likely * (samples / first) ** -_RATE)[:, None] * 2.0 ** (-_RATE * doublings)
-    gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings
-    best = np.argsort(-(gain / cost), axis=None, kind="stable")
-    enough = int(np.searchsorted(np.cumsum(gain.ravel()[best]), (1 - part) * left[:, 0].sum())) + 1
-    accuracy_for_time = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
-    made = np.bincount(best[: min(enough, accuracy_for_time)] // _DOUBLINGS, minlength=len(likely))
-    return np.asarray(samples << np.minimum(made, _AT_ONCE))
 
 
 def _over(flux: FloatArray, unit: FloatArray) -> FloatArray:
@@ -217,10 +213,6 @@ class FrameCheck:
     simulation: Simulation
     rows: Labels
     probed: FloatArray
-
-    def at(self, light: SampledLight, rows: Labels, classes: int) -> FloatArray | None:
-        same = light.groups is self.groups and light.simulation is self.simulation and len(self.probed) == classes
-        return self.probed if same and np.array_equal(rows, self.rows) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +278,10 @@ class SampledLight:
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
         """Return the expected frames of some shots; raise ValueError if they split a class of the light."""
         rows = self.rows_of(lighting)
-        probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
+        known, probed = self.looked, None
+        if known and seed == self.seed and self.groups is known.groups and self.simulation is known.simulation:
+            alike = len(known.probed) == lighting.weights.shape[1] and np.array_equal(rows, known.rows)
+            probed = known.probed if alike else None
         return expected_of([(self.simulation, self.groups)], rows, lighting, seed, leaking, probed, self.restated)
 
     @check_arguments
@@ -714,26 +709,10 @@ def write_light(path: Path, light: SampledLight) -> None:
     if not np.array_equal(light.labels, np.arange(count)):
         raise MitsimError(f"file {path}: the light was traced for one family alone; trace it by pixel, by bench.light")
     specular = _specular(path, light)
-    with whole_hdf5(path) as file:
-        file.attrs.update(_facts(light))
-        grids = file.create_group("light", track_order=True)
-        for name, row in GRIDS.items():
-            groups = [group[name][:count] for group in light.groups]
-            if any(group.nnz for group in groups):
-                place = grids.create_group(row.key, track_order=True)
-                _write_matrix(place, sparse.csr_array(sparse.vstack(groups, format="csr")))
-                _write_shadow(place, light.simulation.grids[name])
-        if light.simulation.physics.lamps:
-            file.create_dataset("ambient", data=_ambient(light).astype(np.float32), **PACKED)
-        if specular is not None:
-            _write_matrix(file.create_group("glint", track_order=True), specular)
-
-
-def _facts(light: SampledLight) -> dict[str, Any]:
     bench, plan, devices = light.bench, light.plan, light.bench.devices
     rows, columns = bench.geometry.frame_shape
     joule = electrons_from_irradiance(1.0, 1.0, devices.sensor, devices.projector.effective_wavelength_nm)
-    return {
+    facts = {
         "mitsim_transport": LAYOUT if bench.geometry.axes_alike else LAYOUT_OF_TWO_SIDES,
         "mitsim_version": __version__,
         "n": bench.n,
@@ -752,6 +731,24 @@ def _facts(light: SampledLight) -> dict[str, Any]:
         "provenance": json.dumps({**bench.provenance(), **bench.identity()}, default=str),
         "warnings": json.dumps([*light.warnings, *light.unreached]),
     }
+    with whole_hdf5(path) as file:
+        file.attrs.update(facts)
+        grids = file.create_group("light", track_order=True)
+        for name, row in GRIDS.items():
+            groups = [group[name][:count] for group in light.groups]
+            if any(group.nnz for group in groups):
+                place = grids.create_group(row.key, track_order=True)
+                _write_matrix(place, sparse.csr_array(sparse.vstack(groups, format="csr")))
+                _write_shadow(place, light.simulation.grids[name])
+        if light.simulation.physics.lamps:
+            frames = np.zeros((len(light.groups), rows, columns), np.float64)
+            for accumulated in light.simulation.with_optics(light.groups, count)[1]:
+                for frame, group in zip(frames, accumulated.groups, strict=True):
+                    group.sort_indices()
+                    frame += accumulated.optics.frame(group.indices, group.data)
+            file.create_dataset("ambient", data=frames.astype(np.float32), **PACKED)
+        if specular is not None:
+            _write_matrix(file.create_group("glint", track_order=True), specular)
 
 
 def _write_matrix(group: h5py.Group, matrix: sparse.csr_array) -> None:
@@ -777,15 +774,6 @@ def _write_shadow(group: h5py.Group, grid: Grid) -> None:
     }
     for name, values in arrays.items():
         group.create_dataset(name, data=values)
-
-
-def _ambient(light: SampledLight) -> FloatArray:
-    frames = np.zeros((len(light.groups), *light.bench.geometry.frame_shape))
-    for accumulated in light.simulation.with_optics(light.groups, light.bench.n**2)[1]:
-        for frame, group in zip(frames, accumulated.groups, strict=True):
-            group.sort_indices()
-            frame += accumulated.optics.frame(group.indices, group.data)
-    return frames
 
 
 def _specular(path: Path, light: SampledLight) -> sparse.csr_array | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from operator import add
 from types import MappingProxyType
@@ -51,116 +51,49 @@ _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
 _MOST_ROWS = 2**12
 
 
+@dataclass(frozen=True, eq=False)
 class Grid:
-    def __init__(
-        self, bundle: Bundle, geometry: CameraGeometry, spectrum: Spectrum | None, places: Places | None = None
-    ) -> None:
-        self.bundle, self._geometry, self._spectrum, self._places = bundle, geometry, spectrum, places
+    bundle: Bundle
+    geometry: CameraGeometry
+    spectrum: Spectrum | None
+    places: Places | None = None
 
     @property
     def key(self) -> tuple[Bundle, CameraGeometry, Spectrum | None, Places | None]:
-        return self.bundle, self._geometry, self._spectrum, self._places
-
-    @property
-    def of_mean(self) -> Grid:
-        return Grid(replace(self.bundle, anchors=1), *self.key[1:])
+        return self.bundle, self.geometry, self.spectrum, self.places
 
     @cached_property
     def optics(self) -> FrameOptics:
         bundle = self.bundle
         parts = bundle.rows, bundle.columns, bundle.depths, bundle.anchors
-        return FrameOptics(self._geometry, *parts, self._spectrum, self._places)
+        return FrameOptics(self.geometry, *parts, self.spectrum, self.places)
 
 
 @dataclass(frozen=True)
 class GridRow:
     name: str
     key: str
-    bundle: Callable[[Grids], Bundle]
+    bundle: Callable[[Simulation], Bundle]
     formed: Callable[[Settings, Physics], bool]
     lamps: bool = False
-
-
-class Grids:
-    """Grids of a bench with settings.
-
-    ``one_line`` uses the mean wavelength alone for diffraction, in a third of the time. ``judging_cells`` a side of a
-    projector pixel judge the coarse cells of a run in the pilot.
-    """
-
-    def __init__(
-        self,
-        bench: Apparatus,
-        settings: Settings,
-        pixels: int | None = None,
-        one_line: bool = False,
-        places: Places | None = None,
-        judging_cells: int = 0,
-    ) -> None:
-        self.bench, self.settings, self.places = bench, settings, places
-        self.judging_cells = judging_cells
-        self.physics = Physics.with_effects(bench, settings.effects)
-        if settings.raster:
-            by_fft = self.physics.geometry.model_copy(update={"mask_fft": True, "mask_cells": settings.raster_cells})
-            self.physics = replace(self.physics, geometry=by_fft)
-        if one_line and self.physics.spectrum:
-            self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
-        if one_line:
-            self.physics = replace(self.physics, geometry=with_few_cells(self.physics.geometry, self.physics.spectrum))
-        self._pixels = pixels or bench.n
-        self._counted_lamps = counted_lamps = bench.counted_lamps if self.physics.lamps else None
-        self.lamp_rows = len(counted_lamps.bands) if counted_lamps else 1
-        # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
-        self.aim = self.cells(1, reach=None)
-        self.grids = {row.name: self._grid(row) for row in GRIDS.values()}
-
-    @cached_property
-    def ambient(self) -> Mapping[str, Grid]:
-        counted_lamps = self._counted_lamps
-        return self._of_lamps(counted_lamps.whole if counted_lamps else _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
-
-    @cached_property
-    def by_band(self) -> tuple[Mapping[str, Grid], ...]:
-        bands = self._counted_lamps.spectra if self._counted_lamps else ()
-        return tuple(map(self._of_lamps, bands)) or (self.ambient,)
-
-    def _of_lamps(self, light: Spectrum) -> Mapping[str, Grid]:
-        return {row.name: self._grid(row, light) for row in GRIDS.values() if row.lamps}
-
-    def _grid(self, row: GridRow, light: Spectrum | None = None) -> Grid:
-        spectrum = self.physics.spectrum
-        return Grid(row.bundle(self), self.physics.geometry, (light or spectrum) if spectrum else None, self.places)
-
-    @property
-    def reach(self) -> float:
-        return self.physics.geometry.reach(self.settings.depth)
-
-    def cells(self, subdivision: int = 1, width: int = 1, reach: float | None = None) -> CellGrid:
-        depth, farthest = self.settings.depth, max(self.reach, reach or 0.0)
-        return aligned_grid(*self.bench.windows_at(depth), -(-self._pixels // width), subdivision, farthest)
-
-    def mean_weights(self, anchors: int) -> FloatArray:
-        edges = self.physics.geometry.pixel_edges
-        positions = anchor_positions(anchors, self.physics.geometry.half_width)
-        return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
 
 
 # -------- The table of grids
 
 
-def _fine(made: Grids) -> Bundle:
+def _fine(made: Simulation) -> Bundle:
     settings = made.settings
     return Bundle(made.cells(settings.subdivision, reach=settings.reach), 1, settings.depths, lamps=made.lamp_rows)
 
 
-def _coarse(made: Grids, anchors: int, width: int = 1) -> Bundle:
+def _coarse(made: Simulation, anchors: int, width: int = 1) -> Bundle:
     settings, wide = made.settings, width > 1 and not made.judging_cells
     depths = settings.depths if settings.coarse_layers and not wide else (settings.depth,)
     cells = 1 if wide else made.judging_cells or settings.coarse_cells
     return Bundle(made.cells(cells, width if wide else 1, settings.reach), anchors, depths, lamps=made.lamp_rows)
 
 
-def _sharp(made: Grids) -> Bundle:
+def _sharp(made: Simulation) -> Bundle:
     settings, sharp = made.settings, made.settings.sharp
     if sharp is None:
         return Bundle(made.aim, 1, (settings.depth,), lamps=made.lamp_rows)
@@ -194,11 +127,6 @@ _GRID_ROWS = (
 GRIDS: Mapping[str, GridRow] = MappingProxyType({row.name: row for row in _GRID_ROWS})
 
 
-def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:
-    edges = np.linspace(low_nm, high_nm, count + 1)
-    return Spectrum((edges[:-1] + edges[1:]) / 2, np.full(count, 1 / count))
-
-
 # -------- One estimate of the light
 
 MEAN_GRIDS = ("fine", "indirect")
@@ -221,10 +149,20 @@ class LightEstimate:
         return self.light[grid]
 
     def __add__(self, other: LightEstimate) -> LightEstimate:
-        return LightEstimate(*(_sum(getattr(self, each.name), getattr(other, each.name)) for each in fields(self)))
+        light = dict(self.light)
+        for name, more in other.light.items():
+            if more.nnz:
+                light[name] = light[name] + more if light[name].nnz else more
+        flux = self.flux if other.flux is None else other.flux if self.flux is None else self.flux + other.flux
+        return LightEstimate(light, self.received + other.received, self.outside + other.outside, flux)
 
     def __truediv__(self, count: float) -> LightEstimate:
-        return LightEstimate(*(_divide(getattr(self, each.name), count) for each in fields(self)))
+        light = {
+            name: sparse.csr_array((each.data * (1 / count), each.indices, each.indptr), shape=each.shape)
+            for name, each in self.light.items()
+        }
+        flux = None if self.flux is None else self.flux / count
+        return LightEstimate(light, self.received / count, self.outside / count, flux)
 
     def with_light(self, light: Mapping[str, sparse.csr_array]) -> LightEstimate:
         return replace(self, light={**self.light, **light})
@@ -238,154 +176,10 @@ class LightEstimate:
         return np.asarray(reduce(add, (self.light[grid].sum(axis=1) for grid in MEAN_GRIDS)), dtype=np.float64)
 
 
-def _sum(one: Any, other: Any) -> Any:
-    if one is None or other is None:
-        return one if other is None else other
-    if isinstance(one, Mapping):
-        return {name: _sum(light, other[name]) for name, light in one.items()}
-    if not isinstance(one, sparse.csr_array) or (one.nnz and other.nnz):
-        return one + other
-    return one if one.nnz else other
-
-
-def _divide(light: Any, count: float) -> Any:
-    if light is None:
-        return None
-    if isinstance(light, Mapping):
-        return {name: _divide(each, count) for name, each in light.items()}
-    if not isinstance(light, sparse.csr_array):
-        return light / count
-    return sparse.csr_array((light.data * (1 / count), light.indices, light.indptr), shape=light.shape)
-
-
-# -------- Tracers
+# -------- The table of passes
 
 FromCamera = FromCameraTracer | CombinedTracer
 PassTracer = DirectTracer | IndirectTracer | FromCamera
-
-
-class Tracers(Grids):
-    """Tracers of a bench with settings.
-
-    ``divides`` divides light that shading normals make heavy between both sides; it is off for a short pilot.
-    """
-
-    divides = True
-
-    @cached_property
-    def setup(self) -> OpticalSetup:
-        return replace(self.bench.setup, projector=self.physics.projector, geometry=self.physics.geometry)
-
-    # ---- Direct light
-
-    @cached_property
-    def direct(self) -> DirectTracer:
-        return self._direct(1, spread=self.settings.anchors > 1)
-
-    @property
-    def spread(self) -> DirectTracer:
-        return self._direct(1, spread=True)
-
-    @cached_property
-    def anchored(self) -> DirectTracer | None:
-        settings = self.settings
-        return self._direct(settings.anchors, settings.with_own_anchors) if settings.anchors > 1 else None
-
-    @cached_property
-    def anchored_occluded(self) -> DirectTracer | None:
-        settings = self.settings
-        others = np.setdiff1d(np.arange(self.bench.n**2), settings.with_own_anchors)
-        return self._direct(settings.occluded_anchors, others) if settings.with_own_anchors else None
-
-    @cached_property
-    def sharp(self) -> AimedTracer | None:
-        sharp = self.settings.sharp
-        return AimedTracer(self.setup, sharp.anchors, np.array(sharp.pixels)) if sharp else None
-
-    def _direct(self, anchors: int, without: Labels | tuple[int, ...] = (), spread: bool = False) -> DirectTracer:
-        sharp = self.settings.sharp
-        absent = np.union1d(without, sharp.pixels if sharp else ()).astype(np.int64)
-        pixels = np.setdiff1d(np.arange(self.bench.n**2), absent) if len(absent) else None
-        return DirectTracer(self.setup, anchors, spread, pixels)
-
-    # ---- Light that is followed further
-
-    @cached_property
-    def indirect(self) -> IndirectTracer | None:
-        tracer, repeats = self._indirect(self._mean_points, self.settings.shared), self.settings.repeats
-        return tracer.with_adaptive_counts(repeats) if tracer and repeats else tracer
-
-    @cached_property
-    def from_camera(self) -> FromCamera | None:
-        return self._from_camera(self._mean_points)
-
-    @cached_property
-    def at_anchors(self) -> tuple[IndirectTracer | None, FromCamera | None]:
-        points = self._points(self.settings.followed_anchors)
-        return self._indirect(points), self._from_camera(points)
-
-    # ---- Light that the projector's lens scatters
-
-    @cached_property
-    def glare(self) -> CombinedTracer | None:
-        scattered = replace(self.setup, projector=self.setup.projector.scattered)
-        if scattered.projector.share == 0:
-            return None
-        direct = DirectTracer(scattered, 1, self.settings.anchors > 1)
-        indirect = self._indirect(self._mean_points, setup=scattered)
-        return CombinedTracer(*filter(None, (direct, indirect)))
-
-    @property
-    def _mean_points(self) -> SensorPoints:
-        return self._points(1, self.settings.followed_anchors > 1)
-
-    @property
-    def lamps_apart(self) -> bool:
-        return not self._from_camera_of_projector
-
-    @property
-    def _from_camera_of_projector(self) -> bool:
-        return self.physics.mirrors or (self.physics.interreflection and self.bench.loaded.glossy) or self._steep
-
-    @property
-    def _steep(self) -> bool:
-        loaded = self.bench.loaded
-        return self.physics.interreflection and ((self.divides and loaded.smoothed) or loaded.hairy)
-
-    def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
-        return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
-
-    def _indirect(
-        self, points: SensorPoints, shared: bool = False, setup: OpticalSetup | None = None
-    ) -> IndirectTracer | None:
-        # Light that the lens scatters is followed from the projector alone.
-        paths = Paths(self.physics.mirrors, self.physics.interreflection, steep=self._steep and setup is None)
-        if not (paths.mirrors or paths.interreflection):
-            return None
-        return (PathReuseTracer if shared else IndirectTracer)(setup or self.setup, paths, points)
-
-    def _from_camera(self, points: SensorPoints) -> FromCamera | None:
-        physics, counted_lamps = self.physics, self.bench.counted_lamps
-        of_projector = self._from_camera_of_projector
-        if not (physics.lamps or of_projector):
-            return None
-        paths = Paths(physics.mirrors, physics.interreflection, physics.lamps, self._steep)
-        tracer = FromCameraTracer(self.setup, self.aim, paths, points)
-        if counted_lamps is None or not physics.lamps:
-            return tracer
-        # Lamps have wavelengths of their own, and filters of each colour count them on their own.
-        units = counted_lamps.units_of(self.bench.projector.lines)
-        lamps: list[FromCameraTracer] = []
-        for number, response in enumerate(counted_lamps.responses):
-            rows = counted_lamps.rows(number)
-            own = [unit * response.part for unit in units]
-            lamps.append(LampTracer(tracer, response, counted_lamps.bands[rows], own, rows.start))
-        if of_projector:
-            lamps.insert(0, FromCameraTracer(self.setup, self.aim, replace(paths, emitters=()), points))
-        return lamps[0] if len(lamps) == 1 else CombinedTracer(*lamps)
-
-
-# -------- The table of passes
 
 FOLLOWED = names(lambda effect: effect.followed)
 """Effects whose light is followed over several surfaces or from the camera."""
@@ -415,7 +209,7 @@ class Pass:
 
     name: str
     stream: str
-    tracer: Callable[[Tracers], PassTracer | None]
+    tracer: Callable[[Simulation], PassTracer | None]
     unit_cost: float
     grid: str
     indirect_grid: str = ""
@@ -427,10 +221,6 @@ class Pass:
     device: Literal["", "room", "pays"] = ""
     pilot: str = "effects"
     key: str = ""
-
-    @property
-    def samples_key(self) -> str:
-        return f"{self.key or self.name}_samples"
 
     @property
     def grids(self) -> tuple[str, ...]:
@@ -521,7 +311,185 @@ class TracedPass:
         return self.tracer.trace(seed, first, samples, accumulator)
 
 
-class Simulation(Tracers):
+class Simulation:
+    """Grids and tracers of a bench with settings.
+
+    ``one_line`` uses the mean wavelength alone for diffraction, in a third of the time. ``judging_cells`` a side of a
+    projector pixel judge the coarse cells of a run in the pilot. ``divides`` divides light that shading normals make
+    heavy between both sides; it is off for a short pilot.
+    """
+
+    divides = True
+    settings: Settings
+
+    def __init__(
+        self,
+        bench: Apparatus,
+        settings: Settings,
+        pixels: int | None = None,
+        one_line: bool = False,
+        places: Places | None = None,
+        judging_cells: int = 0,
+    ) -> None:
+        self.bench, self.settings, self.places = bench, settings, places
+        self.judging_cells = judging_cells
+        self.physics = Physics.with_effects(bench, settings.effects)
+        if settings.raster:
+            by_fft = self.physics.geometry.model_copy(update={"mask_fft": True, "mask_cells": settings.raster_cells})
+            self.physics = replace(self.physics, geometry=by_fft)
+        if one_line and self.physics.spectrum:
+            self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
+        if one_line:
+            self.physics = replace(self.physics, geometry=with_few_cells(self.physics.geometry, self.physics.spectrum))
+        self._pixels = pixels or bench.n
+        self._counted_lamps = counted_lamps = bench.counted_lamps if self.physics.lamps else None
+        self.lamp_rows = len(counted_lamps.bands) if counted_lamps else 1
+        # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
+        self.aim = self.cells(1, reach=None)
+        self.grids = {row.name: self._grid(row) for row in GRIDS.values()}
+
+    @cached_property
+    def ambient(self) -> Mapping[str, Grid]:
+        if self._counted_lamps:
+            return self._of_lamps(self._counted_lamps.whole)
+        edges = np.linspace(*_AMBIENT_NM, _AMBIENT_BANDS + 1)
+        return self._of_lamps(Spectrum((edges[:-1] + edges[1:]) / 2, np.full(_AMBIENT_BANDS, 1 / _AMBIENT_BANDS)))
+
+    @cached_property
+    def by_band(self) -> tuple[Mapping[str, Grid], ...]:
+        bands = self._counted_lamps.spectra if self._counted_lamps else ()
+        return tuple(map(self._of_lamps, bands)) or (self.ambient,)
+
+    def _of_lamps(self, light: Spectrum) -> Mapping[str, Grid]:
+        return {row.name: self._grid(row, light) for row in GRIDS.values() if row.lamps}
+
+    def _grid(self, row: GridRow, light: Spectrum | None = None) -> Grid:
+        spectrum = self.physics.spectrum
+        return Grid(row.bundle(self), self.physics.geometry, (light or spectrum) if spectrum else None, self.places)
+
+    @property
+    def reach(self) -> float:
+        return self.physics.geometry.reach(self.settings.depth)
+
+    def cells(self, subdivision: int = 1, width: int = 1, reach: float | None = None) -> CellGrid:
+        depth, farthest = self.settings.depth, max(self.reach, reach or 0.0)
+        return aligned_grid(*self.bench.windows_at(depth), -(-self._pixels // width), subdivision, farthest)
+
+    def mean_weights(self, anchors: int) -> FloatArray:
+        edges = self.physics.geometry.pixel_edges
+        positions = anchor_positions(anchors, self.physics.geometry.half_width)
+        return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
+
+    @cached_property
+    def setup(self) -> OpticalSetup:
+        return replace(self.bench.setup, projector=self.physics.projector, geometry=self.physics.geometry)
+
+    # ---- Direct light
+
+    @cached_property
+    def direct(self) -> DirectTracer:
+        return self._direct(1, spread=self.settings.anchors > 1)
+
+    @property
+    def spread(self) -> DirectTracer:
+        return self._direct(1, spread=True)
+
+    @cached_property
+    def anchored(self) -> DirectTracer | None:
+        settings = self.settings
+        return self._direct(settings.anchors, settings.with_own_anchors) if settings.anchors > 1 else None
+
+    @cached_property
+    def anchored_occluded(self) -> DirectTracer | None:
+        settings = self.settings
+        others = np.setdiff1d(np.arange(self.bench.n**2), settings.with_own_anchors)
+        return self._direct(settings.occluded_anchors, others) if settings.with_own_anchors else None
+
+    @cached_property
+    def sharp(self) -> AimedTracer | None:
+        sharp = self.settings.sharp
+        return AimedTracer(self.setup, sharp.anchors, np.array(sharp.pixels)) if sharp else None
+
+    def _direct(self, anchors: int, without: Labels | tuple[int, ...] = (), spread: bool = False) -> DirectTracer:
+        sharp = self.settings.sharp
+        absent = np.union1d(without, sharp.pixels if sharp else ()).astype(np.int64)
+        pixels = np.setdiff1d(np.arange(self.bench.n**2), absent) if len(absent) else None
+        return DirectTracer(self.setup, anchors, spread, pixels)
+
+    # ---- Light that is followed further
+
+    @cached_property
+    def indirect(self) -> IndirectTracer | None:
+        tracer, repeats = self._indirect(self._mean_points, self.settings.shared), self.settings.repeats
+        return tracer.with_adaptive_counts(repeats) if tracer and repeats else tracer
+
+    @cached_property
+    def from_camera(self) -> FromCamera | None:
+        return self._from_camera(self._mean_points)
+
+    @cached_property
+    def at_anchors(self) -> tuple[IndirectTracer | None, FromCamera | None]:
+        points = self._points(self.settings.followed_anchors)
+        return self._indirect(points), self._from_camera(points)
+
+    # ---- Light that the projector's lens scatters
+
+    @cached_property
+    def glare(self) -> CombinedTracer | None:
+        scattered = replace(self.setup, projector=self.setup.projector.scattered)
+        if scattered.projector.share == 0:
+            return None
+        direct = DirectTracer(scattered, 1, self.settings.anchors > 1)
+        indirect = self._indirect(self._mean_points, setup=scattered)
+        return CombinedTracer(*filter(None, (direct, indirect)))
+
+    @property
+    def _mean_points(self) -> SensorPoints:
+        return self._points(1, self.settings.followed_anchors > 1)
+
+    @property
+    def from_camera_of_projector(self) -> bool:
+        return self.physics.mirrors or (self.physics.interreflection and self.bench.loaded.glossy) or self._steep
+
+    @property
+    def _steep(self) -> bool:
+        loaded = self.bench.loaded
+        return self.physics.interreflection and ((self.divides and loaded.smoothed) or loaded.hairy)
+
+    def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
+        return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
+
+    def _indirect(
+        self, points: SensorPoints, shared: bool = False, setup: OpticalSetup | None = None
+    ) -> IndirectTracer | None:
+        # Light that the lens scatters is followed from the projector alone.
+        paths = Paths(self.physics.mirrors, self.physics.interreflection, steep=self._steep and setup is None)
+        if not (paths.mirrors or paths.interreflection):
+            return None
+        return (PathReuseTracer if shared else IndirectTracer)(setup or self.setup, paths, points)
+
+    def _from_camera(self, points: SensorPoints) -> FromCamera | None:
+        physics, counted_lamps = self.physics, self.bench.counted_lamps
+        of_projector = self.from_camera_of_projector
+        if not (physics.lamps or of_projector):
+            return None
+        paths = Paths(physics.mirrors, physics.interreflection, physics.lamps, self._steep)
+        tracer = FromCameraTracer(self.setup, self.aim, paths, points)
+        if counted_lamps is None or not physics.lamps:
+            return tracer
+        # Lamps have wavelengths of their own, and filters of each colour count them on their own.
+        units = counted_lamps.units_of(self.bench.projector.lines)
+        lamps: list[FromCameraTracer] = []
+        for number, response in enumerate(counted_lamps.responses):
+            rows = counted_lamps.rows(number)
+            own = [unit * response.part for unit in units]
+            lamps.append(LampTracer(tracer, response, counted_lamps.bands[rows], own, rows.start))
+        if of_projector:
+            lamps.insert(0, FromCameraTracer(self.setup, self.aim, replace(paths, emitters=()), points))
+        return lamps[0] if len(lamps) == 1 else CombinedTracer(*lamps)
+
+    # ---- Passes
+
     @cached_property
     def passes(self) -> Mapping[str, TracedPass]:
         found = {}

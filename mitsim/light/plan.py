@@ -106,7 +106,7 @@ class Plan:
     def block(self) -> dict[str, Any]:
         from mitsim.light.passes import PASSES  # with what traces them: a plan that is read needs no renderer
 
-        samples = {row.samples_key: row.predicted_samples(self.settings) for row in PASSES.values()}
+        samples = {f"{row.key or row.name}_samples": row.predicted_samples(self.settings) for row in PASSES.values()}
         derived = {name: getattr(self.settings, name) for name in ("coarse_cells", "followed_width")}
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects), **derived, **samples}
         del settings["samples"]

@@ -137,7 +137,7 @@ class AnchorRuns:
         weights, grids = simulation.mean_weights(self.few), self._grids(simulation)
         mean = [replicate.average(weights) for replicate in seen]
         frames = self._form(grids, seen) if frames is None else frames
-        return frames - self._form([grid.of_mean for grid in grids], mean)
+        return frames - self._form([replace(grid, bundle=replace(grid.bundle, anchors=1)) for grid in grids], mean)
 
     @cached_property
     def _few(self) -> list[PathSamples]:
