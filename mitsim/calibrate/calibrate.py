@@ -201,7 +201,8 @@ def calibrate_lines(whole: Apparatus, request: SessionRequest, task: Task, mosai
     """
     bench = SpectralBench.of(without_filters(whole) if mosaic else whole, CALIBRATION)
     if mosaic and request.recipe is None:
-        request = replace(request, recipe=load_recipe().model_copy(update={"repeats": _REPEATS_BEHIND_FILTERS}))
+        recipe = load_recipe().model_copy(update={"repeats": _REPEATS_BEHIND_FILTERS})
+        request = request.model_copy(update={"recipe": recipe})
     assert bench.manifest is not None
     names, filters = bench.names, bench.whole.filters
     passed: Sequence[FloatArray | None] = [None] * len(names)
