@@ -189,7 +189,7 @@ def test_every_room_has_a_floor() -> None:
         ("mitsim.reconstruct.factors", "from mitsim.exchange.packed import Packed"),
         ("mitsim.devices.session", "def f():\n    from mitsim.bench import apparatus as bench"),
         ("mitsim.scene.load", "if TYPE_CHECKING:\n    from mitsim.bench.apparatus import Apparatus"),
-        ("mitsim.report.demo_page", "from mitsim.studies.demo import demo"),
+        ("mitsim.report.folder_page", "from mitsim.studies.demo import demo"),
         ("mitsim.core.files", "import mitsim"),
         ("mitsim", "if TYPE_CHECKING:\n    from mitsim.cli import app"),
         ("mitsim", "if TYPE_CHECKING:\n    import mitsuba"),

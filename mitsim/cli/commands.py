@@ -169,10 +169,10 @@ class Pictured(Common):
         """
 
         def make() -> dict[str, Any]:
-            from mitsim.report.pages import Picture, Scale
+            from mitsim.report.pages import Picture
 
             start, (path, values, unit) = time.perf_counter(), frame
-            drawn = Picture.of(path.name, path.name, values, Scale.of(values, unit))
+            drawn = Picture.of(path.name, path.name, values, unit=unit, ends=(None, None))
             return {
                 "file": str(drawn.write(path.parent)),
                 "shows": drawn.caption,

@@ -1,4 +1,4 @@
-"""`mitsim report`: pictures and a page of a run, a calibration or an image, from its folder's files alone.
+"""Pages: of a run, a calibration or an image from its folder's files alone (`mitsim report`), and of `mitsim demo`.
 
 The truth of an image is read from its run, if the run is still in its place.
 """
@@ -6,62 +6,45 @@ The truth of an image is read from its run, if the run is still in its place.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from pydantic import TypeAdapter, ValidationError
 
+from mitsim.core import colour_files, files
 from mitsim.core.arrays import FloatArray
-from mitsim.core.colour_files import (
-    CALIBRATION,
-    COLOUR,
-    IMAGE,
-    MOSAIC,
-    RUN,
-    ColourManifest,
-    SpectralFolder,
-    open_lines,
-    write_colours,
-)
+from mitsim.core.colour_files import ColourManifest, SpectralFolder, open_lines
 from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, finite_channel, read_frame, verify_files, write_frame
-from mitsim.core.files import (
-    PAGE,
-    PICTURES,
-    output_folder,
-    prepare_output,
-    read_json,
-    remove_page,
-    write_bytes,
-    write_text,
-)
-from mitsim.core.images import card, lightness, png
+from mitsim.core.files import PAGE, PICTURES, output_folder, read_json, remove_page, write_bytes, write_text
+from mitsim.core.images import card, data_uri, grey_png, lightness, png
 from mitsim.core.job import size_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, read_manifest
 from mitsim.core.runs import TRUTH, load_mosaic, load_run
 from mitsim.devices.framelist import ChartPlace
+from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality, psnr, summary_of, truth_for
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.reconstruct.reconstruct import DEPTH_FILE, MADE_OF, POINT_SPREAD, UNCERTAINTY_FILE, read_result
-from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, RESULT_FILE
-from mitsim.report.pages import (
-    LARGEST,
-    REFLECTANCE,
-    SMALLEST,
-    Picture,
-    Scale,
-    contact_sheet,
-    lines_of,
-    plan_rows,
-    render_page,
-    stages_of,
-    total_of,
+from mitsim.reconstruct.misfit import chi_square_text
+from mitsim.reconstruct.reconstruct import (
+    DEPTH_FILE,
+    MADE_OF,
+    POINT_SPREAD,
+    UNCERTAINTY_FILE,
+    Reconstruction,
+    read_result,
 )
+from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, RESULT_FILE
+from mitsim.report import pages
+from mitsim.report.pages import LARGEST, REFLECTANCE, SMALLEST, Picture, lines_of, page_figure, render_page
 
 _ELSEWHERE = {
     *("kind", "format", "status", "configuration", "configuration_sha256", "checksums", "patterns", "plan"),
@@ -69,6 +52,7 @@ _ELSEWHERE = {
     *("opened", "inputs", MADE_OF),
 }
 """Keys of a manifest or result outside the table of numbers."""
+_ABOVE_BLACK = "DN above the black level"
 _TRUTH = "what a perfect image shows: of each projector pixel what it lights, black where that is not seen"
 _MISFIT = 2.0
 """Least chi-square that is white, so that chance fills no scale."""
@@ -119,12 +103,10 @@ def _write(folder: Path, shown: Shown) -> None:
             page=shown,
             folder=folder.absolute(),
             images=[name for name in images if (folder / name / PAGE).is_file() and name not in shown["parts"]],
-            stages=stages_of(shown["seconds"]),
-            total=total_of(shown["seconds"]),
         )
         try:
             if shown["pictures"]:
-                prepare_output(folder / PICTURES, overwrite=True)
+                files.prepare_output(folder / PICTURES, overwrite=True)
             for picture in shown["pictures"]:
                 picture.write(folder / PICTURES)
             write_text(folder / PAGE, text)
@@ -134,8 +116,8 @@ def _write(folder: Path, shown: Shown) -> None:
 
 
 def _content(folder: Path) -> Shown:
-    lines = open_lines(folder, RUN, MOSAIC, CALIBRATION, IMAGE)
-    if lines.colours and lines.colours.kind == IMAGE:
+    lines = open_lines(folder, colour_files.RUN, colour_files.MOSAIC, colour_files.CALIBRATION, colour_files.IMAGE)
+    if lines.colours and lines.colours.kind == colour_files.IMAGE:
         return _of_colours(lines)
     if lines.colours and not lines.filters:
         return _of_parts(folder, lines.names, "line")
@@ -189,15 +171,20 @@ def _of_run(lines: SpectralFolder) -> Shown:
     single = {"frame": (f"One of them, {taken.captures[0].file}", first, "")} if count > 1 else {}
     titles = {"ambient": "Projector off: what is taken off", "closing": "Closing frame: no part of the image"}
     single |= {kind: (titles[kind], frame(name), name) for kind, name in manifest.others.items()}
-    pictures = [contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape)]
+    pictures = [pages.contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape)]
     for name, (title, values, about) in single.items():
-        pictures.append(Picture.of(name, title, values, Scale.of(values, "DN above the black level", 0.0), about))
+        pictures.append(Picture.of(name, title, values, about, _ABOVE_BLACK, (0.0, None)))
     if shots.truth is not None:
-        pictures.append(Picture.of("truth", "The truth", shots.truth, REFLECTANCE, _TRUTH))
+        pictures.append(Picture.of("truth", "The truth", shots.truth, _TRUTH))
     for name in lines.names if lines.filters else ():
         if (path := lines.folder / name / TRUTH).is_file():
             truth = finite_channel(read_frame(path)[0], "reflectance", path)
-            pictures.append(Picture.of(f"truth_{name}", f"The truth at {name}", truth, REFLECTANCE))
+            pictures.append(Picture.of(f"truth_{name}", f"The truth at {name}", truth))
+    effects = (manifest.plan or {}).get("effects")
+    plan, row = list[PlanRow](), TypeAdapter(PlanRow)
+    for each in effects if isinstance(effects, list) else ():
+        with suppress(ValidationError):
+            plan.append(row.validate_python(each))
     asked = "" if error is None or accuracy is None else f"accuracy {accuracy:g} asked for, "
     return _shown(
         "Capture",
@@ -207,7 +194,7 @@ def _of_run(lines: SpectralFolder) -> Shown:
         warnings=manifest.warnings,
         command=manifest.command,
         pictures=pictures,
-        plan=plan_rows(manifest.plan),
+        plan=plan,
         accuracy=accuracy,
         seconds=manifest.seconds,
         kernels=manifest.kernels,
@@ -225,8 +212,8 @@ def _of_calibration(folder: Path) -> Shown:
     pictures = []
     for name, side, axis in (("left", factors.left, "rows"), ("right", factors.right, "columns")):
         about = f"{side.shape[1]} projector {axis} (down) x {side.shape[0]} sensor {axis} (across)"
-        scale = Scale.of(side, "sqrt(electrons/s)")
-        pictures.append(Picture.of(name, f"The {name} factor, of {axis}", side.T, scale, about, wide=True))
+        title, unit = f"The {name} factor, of {axis}", "sqrt(electrons/s)"
+        pictures.append(Picture.of(name, title, side.T, about, unit, (None, None), wide=True))
     known = {key: value for key, value in result.items() if key not in _ELSEWHERE}
     return _shown(
         "Calibration",
@@ -270,28 +257,26 @@ def _of_image(folder: Path) -> Shown:
     inputs = result.get("inputs") if isinstance(result.get("inputs"), dict) else {}
     white, truth, size = result.get("white"), _truth_of(result), f"{image.shape[0]} x {image.shape[1]} projector pixels"
     by_spread = POINT_SPREAD in (inputs or {}) and isinstance(white, float)
-    scale = Scale(0.0, white, "electrons/s") if by_spread and isinstance(white, float) else REFLECTANCE
-    pictures = [Picture.of("image", "The image", image, scale, size)]
+    unit, most = ("electrons/s", white) if by_spread else (REFLECTANCE, 1.0)
+    pictures = [Picture.of("image", "The image", image, size, unit, (0.0, most))]
     if truth is not None and truth.shape == image.shape:
-        pictures.append(Picture.of("truth", "The truth", truth, REFLECTANCE, _TRUTH))
-        pictures.append(_error_picture(np.abs(image - truth), REFLECTANCE.unit, "|image \N{MINUS SIGN} truth|"))
-    trust = "How far to trust it", "standard uncertainty that the image states of each pixel"
-    for file, channel, unit, (title, about) in (
-        (UNCERTAINTY_FILE, "uncertainty", REFLECTANCE.unit, trust),
-        (DEPTH_FILE, "depth_mm", "mm", ("Depth of each pixel", "")),
-        (DEPTH_FILE, "confidence", "(1: certain)", ("How sure the depth is", "")),
+        pictures.append(Picture.of("truth", "The truth", truth, _TRUTH))
+        pictures.append(_error_picture(np.abs(image - truth), REFLECTANCE, "|image \N{MINUS SIGN} truth|"))
+    trust = "standard uncertainty that the image states of each pixel"
+    for file, channel, title, about, unit, ends in (
+        (UNCERTAINTY_FILE, "uncertainty", "How far to trust it", trust, REFLECTANCE, (0.0, None)),
+        (DEPTH_FILE, "depth_mm", "Depth of each pixel", "", "mm", (None, None)),
+        (DEPTH_FILE, "confidence", "How sure the depth is", "", "(1: certain)", (0.0, 1.0)),
     ):
         if (path := folder / file).is_file():
             values = finite_channel(read_frame(path)[0], channel, path)
-            scale = Scale.of(values, unit, None if channel == "depth_mm" else 0.0)
-            scale = Scale(0.0, 1.0, unit) if channel == "confidence" else scale
-            pictures.append(Picture.of(channel.removesuffix("_mm"), title, values, scale, about))
+            pictures.append(Picture.of(channel.removesuffix("_mm"), title, values, about, unit, ends))
     misfit = result.get("misfit")
     tiles = np.array(misfit.get("map", []) if isinstance(misfit, dict) else [], dtype=np.float64)
     if tiles.ndim == 2 and tiles.size > 1 and np.isfinite(tiles).all():
         about = "chi-square a datum by place on the sensor, 1 where only noise is left"
-        scale = Scale(0.0, max(float(tiles.max()), _MISFIT), "a datum")
-        pictures.append(Picture.of("misfit", "Where the frames do not fit", tiles, scale, about))
+        ends = 0.0, max(float(tiles.max()), _MISFIT)
+        pictures.append(Picture.of("misfit", "Where the frames do not fit", tiles, about, "a datum", ends))
     return _shown(
         "Image",
         ("Flagged. " if warnings else "") + ", ".join(known),
@@ -309,8 +294,8 @@ def _of_image(folder: Path) -> Shown:
 
 
 def _error_picture(error: FloatArray, unit: str, about: str, least: float = 0.0) -> Picture:
-    scale = Scale(0.0, max(float(np.percentile(error, _SHOWN_PERCENT)), least), unit)
-    return Picture.of("error", "How they differ", error, scale, about)
+    largest = max(float(np.percentile(error, _SHOWN_PERCENT)), least)
+    return Picture.of("error", "How they differ", error, about, unit, (0.0, largest))
 
 
 def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
@@ -320,7 +305,7 @@ def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
         return None
     try:
         run = Path(str(made_of["run"]))
-        if open_lines(run, RUN, MOSAIC).filters:
+        if open_lines(run, colour_files.RUN, colour_files.MOSAIC).filters:
             mosaic = load_mosaic(run)
             shots, truth = mosaic.shots, mosaic.truth(result.get("board_reflectance"))
         else:
@@ -335,9 +320,9 @@ def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
 def _of_colours(lines: SpectralFolder) -> Shown:
     folder, colours, names = lines.folder, lines.colours, lines.names
     assert colours is not None
-    data = read_json(folder / COLOUR)
+    data = read_json(folder / colour_files.COLOUR)
     if data.get("status") == "incomplete":
-        raise MitsimError(f"{folder / COLOUR}: holds no result of a finished image; reconstruct it again")
+        raise MitsimError(f"{folder / colour_files.COLOUR}: holds no result of a finished image; reconstruct it again")
     verify_files(folder, data.get("checksums"), "reconstruct it again")
     parts = {name: _of_image(folder / name) for name in names if (folder / name / RESULT_FILE).is_file()}
     files = [folder / name / IMAGE_FILE for name in names]
@@ -349,11 +334,12 @@ def _of_colours(lines: SpectralFolder) -> Shown:
     else:
         truth = _truth_of(data)
         truth = truth if truth is not None and truth.shape == images.shape else None
+    place = data.get("chart")
     image = ColourImage(
         lines=colours,
         images=images,
         board=data.get("board_reflectance") or 1.0,
-        chart=None if data.get("chart") is None else validate(ChartPlace, data["chart"], f"{folder / COLOUR}: chart"),
+        chart=None if place is None else validate(ChartPlace, place, f"{folder / colour_files.COLOUR}: chart"),
         truth=truth,
         qualities={
             name: None if truth is None else Quality.of(images[..., number], truth[..., number])
@@ -385,9 +371,9 @@ def _of_colours(lines: SpectralFolder) -> Shown:
         pictures.append(_error_picture(image.delta_e, "Delta E 2000", about, 1.0))
     for number, line in enumerate(colours.channels):
         title = f"{line.wavelength_nm:g} nm"
-        pictures.append(Picture.of(f"image_{line.name}", title, images[..., number], REFLECTANCE))
+        pictures.append(Picture.of(f"image_{line.name}", title, images[..., number]))
         if truth is not None:
-            pictures.append(Picture.of(f"truth_{line.name}", f"{title}, truth", truth[..., number], REFLECTANCE))
+            pictures.append(Picture.of(f"truth_{line.name}", f"{title}, truth", truth[..., number]))
     return _shown(
         "Image in colour",
         verdict,
@@ -567,9 +553,162 @@ class ColourImage:
 def state_image(folder: Path, lines: ColourManifest, **more: Any) -> None:
     """Write colour.json; with ``status="incomplete"``, a killed work can be replaced."""
     remove_page(folder)
-    write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), **more)
+    colour_files.write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), **more)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
+
+
+# -------- The page of `mitsim demo`: one self-contained HTML file without scripts or links
+
+_PATTERN_CORNER = 40
+_SMALLEST = 384
+_GAIN_DB = 0.5
+"""Least gain that counts: a tenth of the squared error."""
+COVERED = 1.96
+"""Standard uncertainties of a 95 % interval."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trust:
+    """Stated standard ``uncertainty`` and actual ``error`` of an image, (n, n') reflectance.
+
+    ``chi_square`` is None where there are no more data than unknowns; ``cause`` flags the misfit.
+    """
+
+    uncertainty: FloatArray
+    error: FloatArray
+    chi_square: float | None = None
+    cause: str = ""
+
+    @classmethod
+    def of(cls, image: Reconstruction, truth: FloatArray) -> Trust | None:
+        """Compare an ``image`` with the truth; None where its uncertainty is not known."""
+        if image.uncertainty is None:
+            return None
+        found = (image.misfit.chi_square, image.misfit.reason) if image.misfit else (None, "")
+        return cls(image.uncertainty, np.abs(image.image - truth), *found)
+
+    @property
+    def stated(self) -> float:
+        return float(np.sqrt(np.mean(np.square(self.uncertainty))))
+
+    @property
+    def actual(self) -> float:
+        return float(np.sqrt(np.mean(np.square(self.error))))
+
+    @property
+    def within(self) -> float:
+        return float(np.mean(self.error <= COVERED * self.uncertainty))
+
+    def pictures(self) -> tuple[Picture, Picture]:
+        largest = max(float(self.uncertainty.max()), float(np.percentile(self.error, _SHOWN_PERCENT)))
+        stated, actual = (f"rms {pages.reflectance(value)}" for value in (self.stated, self.actual))
+        ends, title = (0.0, largest), "Actual: |image \N{MINUS SIGN} truth|"
+        return (
+            Picture.of("stated", "Stated: standard uncertainty", self.uncertainty, stated, ends=ends),
+            Picture.of("actual", title, self.error, actual, ends=ends),
+        )
+
+    def summary(self) -> dict[str, Any]:
+        return {
+            "uncertainty": self.stated,
+            "rms_error": self.actual,
+            "within_95": self.within,
+            "chi_square": self.chi_square,
+            "cause": self.cause or None,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    image: FloatArray
+    quality: Quality
+    lam: float | None = None
+    status: str = ""
+    trust: Trust | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FamilyResult:
+    """A pattern family.
+
+    ``shots`` counts frames. ``patterns`` are some (n, n) examples. ``idealised`` solves the paper's model, ``rendered``
+    rendered frames with calibrated factors, whose PSNR [dB] by exposure convention is ``by_exposure``.
+    """
+
+    name: str
+    label: str
+    shots: int
+    patterns: tuple[FloatArray, ...] = ()
+    singular_values: FloatArray | None = None
+    idealised: Recovery | None = None
+    rendered: Recovery | None = None
+    by_exposure: Mapping[str, float] = field(default_factory=dict)
+
+
+def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
+    """Return headline and detail, such as "49 dots beat uniform by 11.0 dB"; MitsimError without a rendered result."""
+    if best.rendered is None or baseline.rendered is None:
+        raise MitsimError(f"report: no rendered result of {best.label} or {baseline.label}; reconstruct both first")
+    ours, theirs = best.rendered.quality.psnr_db, baseline.rendered.quality.psnr_db
+    if best.name == baseline.name:
+        return f"{best.label}: {ours:.1f} dB", "PSNR, rendered light and calibrated factors."
+    gain, name = ours - theirs, baseline.label[:1].lower() + baseline.label[1:]
+    if not best.rendered.quality.is_image:
+        headline = f"{best.label}: no image, {ours:.1f} dB"
+    elif gain >= _GAIN_DB:
+        headline = f"{best.label} beat {name} by {gain:.1f} dB"
+    else:
+        headline = f"{best.label}: {abs(gain):.1f} dB {'above' if gain >= 0 else 'below'} {name}"
+    if best.rendered.quality.is_image and gain >= 0 and best.rendered.trust and best.rendered.trust.cause:
+        headline += ", but part of their light fits no image"
+    detail = f"{ours:.1f} against {theirs:.1f} dB PSNR, rendered light and calibrated factors."
+    if best.idealised is not None and baseline.idealised is not None:
+        ideal = best.idealised.quality.psnr_db - baseline.idealised.quality.psnr_db
+        detail += f" The idealised model says {ideal:+.1f} dB."
+    return headline, detail
+
+
+def render_demo(report: Mapping[str, Any]) -> str:
+    """Render the page; the same data give the same bytes, and a section without data is left out.
+
+    ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, row 0 at the top as seen along +z. ``main``
+    is the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in DN by
+    caption, and ``budget`` has name, relative rms of the expected frames (None: unknown) and meaning of each source of
+    error. MitsimError when an image is not finite.
+    """
+    from mitsim.report.plots import singular_values
+
+    families, best = report["families"], {}
+    for row in ("idealised", "rendered"):
+        psnr = {each.name: getattr(each, row).quality.psnr_db for each in families if getattr(each, row) is not None}
+        best[row] = max(psnr, key=psnr.__getitem__) if psnr else ""
+    curves = {each.label: each.singular_values for each in families if each.singular_values is not None}
+    trust = next((each.rendered.trust for each in families if each.rendered and each.name == report["main"]), None)
+
+    def finite(image: npt.ArrayLike, name: str) -> FloatArray:
+        values = np.asarray(image, dtype=np.float64)
+        if values.ndim != 2 or values.size == 0 or not np.all(np.isfinite(values)):
+            raise MitsimError(f"report: {name} of shape {values.shape} must be rows x columns of finite numbers")
+        return values
+
+    def pattern_of(pattern: npt.ArrayLike) -> str:
+        values = finite(pattern, "pattern")[:_PATTERN_CORNER, :_PATTERN_CORNER]
+        return data_uri(grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values, smallest=_SMALLEST))
+
+    shown = {name: finite(dn, name) for name, dn in report["frames"].items()}
+    return render_page(
+        "report.html",
+        report=report,
+        best=best,
+        singular_values=page_figure(singular_values(curves))[0] if curves else "",
+        frames=[Picture.of(name, name, dn, unit="DN", ends=(None, None)) for name, dn in shown.items()],
+        errors=trust.pictures() if trust else (),
+        pattern_corner=_PATTERN_CORNER,
+        picture_of=lambda image, name: data_uri(grey_png(lightness(finite(image, name)), smallest=_SMALLEST)),
+        pattern_of=pattern_of,
+        chi_square=chi_square_text,
+    )

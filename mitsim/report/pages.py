@@ -19,7 +19,6 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import write_bytes
 from mitsim.core.images import data_uri, png
 from mitsim.core.job import size_text
-from mitsim.light.plan import PlanRow
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -43,8 +42,9 @@ def _environment() -> Environment:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"sci": scientific, "typeset": typeset, "sentence": sentence, "seconds": duration}
-    environment.filters |= {"rms": reflectance, "db": lambda value: f"{value:.1f} dB"}
+    filters: dict[str, Any] = {"sci": scientific, "typeset": typeset, "sentence": sentence, "seconds": duration}
+    more: dict[str, Any] = {"rms": reflectance, "db": lambda value: f"{value:.1f} dB", "stages": stages_of}
+    environment.filters.update(filters | more)
     return environment
 
 
@@ -120,31 +120,13 @@ _LEAST_STAGE = 0.01
 _MOST_LISTED = 6
 
 
-def plan_rows(plan: Mapping[str, Any] | None) -> tuple[PlanRow, ...]:
-    listed = (plan or {}).get("effects")
-    rows = []
-    for each in listed if isinstance(listed, list) else ():
-        match each:
-            case {
-                "name": str(name),
-                "state": ("exact" | "approximate" | "off") as state,
-                "reason": str(reason),
-                "error_if_off": (float() | int() | None) as error,
-                "seconds": (float() | int()) as seconds,
-            }:
-                rows.append(PlanRow(name, state, reason, error, seconds))
-    return tuple(rows)
-
-
 def stages_of(seconds: Mapping[str, float]) -> dict[str, float]:
-    total, stages = total_of(seconds), {name: value for name, value in seconds.items() if name != "total"}
+    """Return the seconds of stages, of all else and in total; stages of little time are in all else."""
+    total = seconds.get("total", math.fsum(seconds.values()))
+    stages = {name: value for name, value in seconds.items() if name != "total"}
     shown = {name: value for name, value in stages.items() if value >= _LEAST_STAGE * total}
     rest = total - math.fsum(shown.values())
-    return shown | ({"all else": rest} if stages and rest > _LEAST_STAGE * total else {})
-
-
-def total_of(seconds: Mapping[str, float]) -> float:
-    return seconds.get("total", math.fsum(seconds.values()))
+    return shown | ({"all else": rest} if stages and rest > _LEAST_STAGE * total else {}) | {"total": total}
 
 
 def lines_of(data: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -178,31 +160,7 @@ _MOST_READ = _MOST_FRAMES << 18
 _GAP = 2
 
 
-@dataclass(frozen=True)
-class Scale:
-    """Black and white ends of a picture in a ``unit``."""
-
-    black: float
-    white: float
-    unit: str
-
-    @classmethod
-    def of(cls, values: npt.ArrayLike, unit: str, black: float | None = None) -> Scale:
-        """Scale from ``black``, by default the least of ``values``, to the largest."""
-        return cls(float(np.min(values)) if black is None else black, float(np.max(values)), unit)
-
-    def levels(self, values: npt.NDArray[Any]) -> FloatArray:
-        span = self.white - self.black
-        return (np.asarray(values, dtype=np.float64) - self.black) / (span if span > 0 else np.inf)
-
-    def words(self, values: npt.NDArray[Any]) -> str:
-        beyond = float(np.mean((values < self.black) | (values > self.white)))
-        cut = f"; {beyond:.2g} of the pixels lie beyond" if beyond else ""
-        black, white = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (self.black, self.white))
-        return f"black {black}, white {white} {self.unit}{cut}"
-
-
-REFLECTANCE = Scale(0.0, 1.0, "of the board's reflectance")
+REFLECTANCE = "of the board's reflectance"
 
 
 @dataclass(frozen=True)
@@ -215,11 +173,25 @@ class Picture:
 
     @classmethod
     def of(
-        cls, name: str, title: str, values: npt.NDArray[Any], scale: Scale, about: str = "", wide: bool = False
+        cls,
+        name: str,
+        title: str,
+        values: npt.NDArray[Any],
+        about: str = "",
+        unit: str = REFLECTANCE,
+        ends: tuple[float | None, float | None] = (0.0, 1.0),
+        wide: bool = False,
     ) -> Picture:
-        words = scale.words(values)
-        caption = f"{about}: {words}" if about else words
-        return cls(name, title, caption, png(scale.levels(values), LARGEST, SMALLEST), wide)
+        """Draw ``values`` in a ``unit`` between black and white ``ends``; an end of None is that of the values."""
+        black, white = (
+            float(known(values)) if end is None else end for end, known in zip(ends, (np.min, np.max), strict=True)
+        )
+        beyond = float(np.mean((values < black) | (values > white)))
+        cut = f"; {beyond:.2g} of the pixels lie beyond" if beyond else ""
+        low, high = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (black, white))
+        caption = f"{about}{': ' if about else ''}black {low}, white {high} {unit}{cut}"
+        levels = (np.asarray(values, dtype=np.float64) - black) / (white - black if white > black else np.inf)
+        return cls(name, title, caption, png(levels, LARGEST, SMALLEST), wide)
 
     @property
     def uri(self) -> str:
@@ -245,8 +217,8 @@ def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[in
         top, left = place // columns * (shape[0] + _GAP), place % columns * (shape[1] + _GAP)
         sheet[top : top + shape[0], left : left + shape[1]] = frame
     which = f"all {count}" if len(chosen) == count else f"{len(chosen)} of {count}, evenly taken"
-    scale, about = Scale(0.0, white, "DN above the black level"), f"{which}, row by row, {columns} a row"
-    return Picture.of("frames", "What the camera recorded", sheet, scale, about, wide=True)
+    about, unit = f"{which}, row by row, {columns} a row", "DN above the black level"
+    return Picture.of("frames", "What the camera recorded", sheet, about, unit, (0.0, white), wide=True)
 
 
 # -------- Means of the rows of a study

@@ -18,7 +18,7 @@ from mitsim.core.configuration import opening_words
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
-from mitsim.core.files import write_json
+from mitsim.core.files import write_json, write_text
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture, frame_name
 from mitsim.devices.session import load_recipe
@@ -26,7 +26,7 @@ from mitsim.light.light import SampledLight, pinhole_view
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.report import CONVENTIONS, EQUAL_PEAK, label
-from mitsim.report.demo_page import BudgetRow, FamilyResult, Recovery, ReportData, Trust, build_report, verdict
+from mitsim.report.folder_page import FamilyResult, Recovery, Trust, render_demo, verdict
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.studies.framework.campaign import DEMO_FOLDERS, DEMO_PAGE, study_folder
 
@@ -133,11 +133,15 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
             frame, _ = read_frame(folder / "run" / frame_name(index))
             frames[f"{label(request.patterns)}, {caption}"] = frame["DN"]
     with job.clock.stage("report"):
-        page = replace(
-            _page(light, shots, factors, families, request.patterns),
-            render=view, frames=frames, warnings=warnings, seconds=job.clock.seconds(), kernels=job.clock.kernels(),
-        )  # fmt: skip
-        report = build_report(page, folder / DEMO_PAGE)
+        page = {
+            **_page(light, shots, factors, families, request.patterns),
+            "render": view,
+            "frames": frames,
+            "warnings": warnings,
+            "seconds": job.clock.seconds(),
+            "kernels": job.clock.kernels(),
+        }
+        write_text(folder / DEMO_PAGE, render_demo(page))
     rendered = {name: each.rendered for name, each in families.items() if each.rendered}
     psnr = {name: each.quality.psnr_db for name, each in rendered.items()}
     return DemoResult(
@@ -145,13 +149,13 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
         psnr_ideal={name: each.idealised.quality.psnr_db for name, each in families.items() if each.idealised},
         exposure={name: dict(each.by_exposure) for name, each in families.items()},
         gain_db=psnr[request.patterns] - psnr["uniform"],
-        verdict=page.verdict,
+        verdict=page["verdict"],
         mc_error=shots.manifest.mc_error or 0.0,
         truth_error=light.apparent.error,
         trust={name: each.trust.summary() for name, each in rendered.items() if each.trust},
         seconds=job.clock.seconds(),
-        kernels=dict(page.kernels),
-        report=str(report),
+        kernels=dict(page["kernels"]),
+        report=str(folder / DEMO_PAGE),
         warnings=warnings,
     )
 
@@ -190,7 +194,7 @@ def _compare(lit: LitScene, factors: Factors, name: str, shots: Capture | None) 
 
 def _page(
     light: SampledLight, shots: Capture, factors: Factors, families: dict[str, FamilyResult], main: str
-) -> ReportData:
+) -> dict[str, Any]:
     bench, session, plan, geometry = light.bench, factors.manifest.result, light.plan, light.bench.geometry
     headline, detail = verdict(families[main], families["uniform"])
     unexplained = session["unexplained_residual"]  # JSON has no infinity: None
@@ -203,24 +207,24 @@ def _page(
         ("Separable model", session["noise_free_residual"],
          "what no product of a left and a right factor explains of noise-free frames of the board"),
     )  # fmt: skip
-    rows, columns = geometry.frame_shape
+    (rows, columns), full = geometry.frame_shape, 100 * Exposure().fraction
     size = " x ".join(f"{pitch * 1e3:g}" for pitch in geometry.pitches[geometry.row_pitch is None :])
     mask = f"{geometry.mask_words}, {geometry.mask_feature * 1e3:g} um, {geometry.mask_distance:g} mm from the sensor"
-    return ReportData(
-        title=f"Coded-illumination lensless imaging: {bench.loaded.path.parent.name}",
-        verdict=headline,
-        verdict_detail=detail,
-        truth=light.truth,
-        scene=scene_line(bench.loaded.path),
-        families=tuple(families.values()),
-        main=main,
-        exposure=f"equal peak: each family's brightest pixel fills {100 * Exposure().fraction:.0f} % of the full well",
-        calibration={**session, "status": f"{factors.status}{beyond}"},
-        budget=tuple(BudgetRow(*row) for row in budget),
-        accuracy=plan.accuracy,
-        error=shots.manifest.total_error,
-        effects=plan.effects,
-        configuration={
+    return {
+        "title": f"Coded-illumination lensless imaging: {bench.loaded.path.parent.name}",
+        "verdict": headline,
+        "verdict_detail": detail,
+        "truth": light.truth,
+        "scene": scene_line(bench.loaded.path),
+        "families": tuple(families.values()),
+        "main": main,
+        "exposure": f"equal peak: each family's brightest pixel fills {full:.0f} % of the full well",
+        "calibration": {**session, "status": f"{factors.status}{beyond}"},
+        "budget": budget,
+        "accuracy": plan.accuracy,
+        "error": shots.manifest.total_error,
+        "effects": plan.effects,
+        "configuration": {
             "variant": bench.variant,
             "camera": bench.sensor.name,
             "projector": bench.projector.name,
@@ -231,15 +235,15 @@ def _page(
             f"exposure ({label(main)})": f"{shots.exposure_s:.3g} s a frame",
             "accuracy asked for": f"{plan.accuracy:g}",
         },
-        seeds={"root": light.seed},
-        versions=versions(),
-        notes=(
+        "seeds": {"root": light.seed},
+        "versions": versions(),
+        "notes": (
             "PSNR has peak 1 and no gain or offset fit; truth is apparent reflectance relative to the board, with a "
             f"standard error of {light.apparent.error:.1e} from sampling of its own.",
             "Idealised: the paper's model with its own exact factors and the same sensor noise.",
             "lambda is chosen by an unbiased risk estimate; no result has seen the truth.",
         ),
-    )
+    }
 
 
 def doubts(family: FamilyResult) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import MANIFEST
 from mitsim.core.runs import RunFolder, load_run
 from mitsim.report.folder_page import report_folder
-from mitsim.report.pages import Picture, Scale, contact_sheet, lines_of
+from mitsim.report.pages import Picture, contact_sheet, lines_of
 from mitsim.report.reconstruct_run import reconstruct
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, Made, made
 from tests.unit.report.test_report import _Outside
@@ -137,11 +137,11 @@ def test_many_frames_are_evenly_taken_and_large_ones_are_fewer_and_smaller() -> 
 def test_a_picture_says_what_is_black_white_and_beyond() -> None:
     """(Planted: the part beyond not counted.)"""
     values = np.array([[-1.0, 0.0], [0.5, 3.0]])
-    shown = Picture.of("name", "Title", values, Scale(0.0, 1.0, "units"), "what it is")
+    shown = Picture.of("name", "Title", values, "what it is", "units")
     assert shown.caption == "what it is: black 0, white 1 units; 0.5 of the pixels lie beyond"
     levels = np.asarray(Image.open(BytesIO(shown.data)))
     assert levels.shape == (512, 512) and [*levels[0, ::256], *levels[-1, ::256]] == [0, 0, 188, 255]
-    assert not np.asarray(Image.open(BytesIO(Picture.of("a", "A", 0 * values, Scale.of([0.0], "")).data))).any()
+    assert not np.asarray(Image.open(BytesIO(Picture.of("a", "A", 0 * values, ends=(None, None)).data))).any()
 
 
 def test_an_image_shows_what_is_known_of_it(image: Path) -> None:

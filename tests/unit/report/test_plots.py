@@ -18,7 +18,7 @@ import mitsim as ms
 from mitsim.acquire.reference import Rendered
 from mitsim.core.images import lightness, linear_light
 from mitsim.report import plots
-from mitsim.report.demo_page import Trust
+from mitsim.report.folder_page import Trust
 from tests.exchanged import made
 from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
