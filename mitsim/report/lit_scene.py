@@ -240,7 +240,8 @@ class IdealCamera:
 
     @cached_property
     def terms(self) -> SeparableTerms:
-        return self._terms(*self.directions)
+        distance = self.bench.geometry.scene_distance
+        return shadow_terms(self._geometry, *self.directions, distance, self.spectrum)
 
     @cached_property
     def factors(self) -> Pair:
@@ -256,16 +257,16 @@ class IdealCamera:
 
     def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
-        optics = self._optics if plane is None else self._optics_at(plane)
+        if plane is None:
+            optics = self._optics
+        else:
+            shift = 1 / plane.depth_mm - 1 / self.bench.geometry.scene_distance
+            rows, columns = (
+                Directions(pixels.centres + baseline * shift, pixels.width)
+                for pixels, baseline in zip(self.directions, plane.baseline_mm, strict=True)
+            )
+            optics = FrameOptics(self._geometry, rows, columns, (plane.depth_mm,), 1, self.spectrum)
         return ExpectedFrames([AccumulatedLight(optics, (light,))], family.lighting, seed=0)
-
-    def _optics_at(self, plane: Plane) -> FrameOptics:
-        shift = 1 / plane.depth_mm - 1 / self.bench.geometry.scene_distance
-        rows, columns = (
-            Directions(pixels.centres + baseline * shift, pixels.width)
-            for pixels, baseline in zip(self.directions, plane.baseline_mm, strict=True)
-        )
-        return FrameOptics(self._geometry, rows, columns, (plane.depth_mm,), 1, self.spectrum)
 
     @property
     def _geometry(self) -> CameraGeometry:
@@ -275,9 +276,6 @@ class IdealCamera:
     def directions(self) -> tuple[Directions, Directions]:
         rows, columns = (Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows)
         return rows, columns
-
-    def _terms(self, rows: Directions, columns: Directions) -> SeparableTerms:
-        return shadow_terms(self._geometry, rows, columns, self.bench.geometry.scene_distance, self.spectrum)
 
     @cached_property
     def _optics(self) -> FrameOptics:

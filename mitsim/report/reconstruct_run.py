@@ -6,10 +6,10 @@ A run has one unnamed line, a folder for each line, or frames of all lines behin
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -183,76 +183,69 @@ def reconstruct_colours(
         raise MitsimError(
             f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
         )
-    work = _Work(lines, run, calibration, output, boards.pop(), chart, overwrite, job)
-    image = (_solve_at_once if found.filters else _solve_one_by_one)(work, **options)
+    board = boards.pop()
+
+    def finish(folder: Path, **solved: Any) -> ColourImage:
+        image = ColourImage(lines=lines, board=board or 1.0, chart=chart, output=str(folder), **solved)
+        image.write(folder, **_origin(job, run, calibration))
+        return image
+
+    if found.filters:
+        image = _solve_at_once(lines, run, calibration, output, board, overwrite, job, finish, **options)
+    else:
+        replaces = is_coloured(output) and (read_colours(output, IMAGE).names == lines.names or overwrite)
+        with output_folder(output, overwrite=replaces) as folder:
+            begins, images = not is_coloured(folder), dict[str, Judged]()
+            if begins:
+                state_image(folder, lines, status="incomplete")
+            try:
+                for name in lines.names:
+                    own = {"overwrite": overwrite, "job": job.apart(f"{name} "), **options}
+                    images[name] = reconstruct(run / name, calibration / name, folder / name, **own)
+            except BaseException:
+                if begins and not any((folder / name).is_dir() for name in lines.names):  # refused before any image
+                    (folder / COLOUR).unlink()
+                raise
+            solved = {name: judged.reconstruction for name, judged in images.items()}
+            shapes = {each.image.shape for each in solved.values()}
+            if len(shapes) > 1:
+                raise MitsimError(
+                    f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid"
+                )
+            truths = [judged.truth for judged in images.values() if judged.truth is not None]
+            of_lines = {name: judged.summary() for name, judged in images.items()}
+            image = finish(
+                folder,
+                images=np.stack([each.image for each in solved.values()], axis=-1),
+                truth=np.stack(truths, axis=-1) if len(truths) == len(images) else None,
+                qualities={name: judged.quality for name, judged in images.items()},
+                facts={
+                    "frames": "one line at a time, a run for each",
+                    "solved": "each line by itself",
+                    "lambda": ", ".join(f"{name} {each.lam:.3g}" for name, each in solved.items()),
+                    "residual of the frames": ", ".join(f"{name} {each.residual:.1e}" for name, each in solved.items()),
+                },
+                warnings=one_paragraph({name: each.status for name, each in solved.items()}),
+                seconds={"total": sum(each["seconds"]["total"] for each in of_lines.values())},
+                of_lines=of_lines,
+            )
     if page:
         report_folder(output)
     return image
 
 
-class _Work(NamedTuple):
-    lines: ColourManifest
-    run: Path
-    calibration: Path
-    output: Path
-    board: float | None
-    chart: ChartPlace | None
-    overwrite: bool
-    job: Job
-
-    def finish(self, folder: Path, **found: Any) -> ColourImage:
-        known: dict[str, Any] = {
-            "lines": self.lines,
-            "board": self.board or 1.0,
-            "chart": self.chart,
-            "output": str(folder),
-        }
-        image = ColourImage(**known, **found)
-        image.write(folder, **_origin(self.job, self.run, self.calibration))
-        return image
-
-
-def _solve_one_by_one(work: _Work, **options: Any) -> ColourImage:
-    lines, run, calibration, output, _, _, overwrite, job = work
-    replaces = is_coloured(output) and (read_colours(output, IMAGE).names == lines.names or overwrite)
-    with output_folder(output, overwrite=replaces) as folder:
-        begins, images = not is_coloured(folder), dict[str, Judged]()
-        if begins:
-            state_image(folder, lines, status="incomplete")
-        try:
-            for name in lines.names:
-                own = {"overwrite": overwrite, "job": job.apart(f"{name} "), **options}
-                images[name] = reconstruct(run / name, calibration / name, folder / name, **own)
-        except BaseException:
-            if begins and not any((folder / name).is_dir() for name in lines.names):  # refused before any image
-                (folder / COLOUR).unlink()
-            raise
-        solved = {name: judged.reconstruction for name, judged in images.items()}
-        shapes = {each.image.shape for each in solved.values()}
-        if len(shapes) > 1:
-            raise MitsimError(f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid")
-        truths = [judged.truth for judged in images.values() if judged.truth is not None]
-        of_lines = {name: judged.summary() for name, judged in images.items()}
-        return work.finish(
-            folder,
-            images=np.stack([each.image for each in solved.values()], axis=-1),
-            truth=np.stack(truths, axis=-1) if len(truths) == len(images) else None,
-            qualities={name: judged.quality for name, judged in images.items()},
-            facts={
-                "frames": "one line at a time, a run for each",
-                "solved": "each line by itself",
-                "lambda": ", ".join(f"{name} {each.lam:.3g}" for name, each in solved.items()),
-                "residual of the frames": ", ".join(f"{name} {each.residual:.1e}" for name, each in solved.items()),
-            },
-            warnings=one_paragraph({name: each.status for name, each in solved.items()}),
-            seconds={"total": sum(each["seconds"]["total"] for each in of_lines.values())},
-            of_lines=of_lines,
-        )
-
-
 @single_threaded_blas()
-def _solve_at_once(work: _Work, lam: Lambda = "auto") -> ColourImage:
-    lines, run, calibration, output, board, _, overwrite, job = work
+def _solve_at_once(
+    lines: ColourManifest,
+    run: Path,
+    calibration: Path,
+    output: Path,
+    board: float | None,
+    overwrite: bool,
+    job: Job,
+    finish: Callable[..., ColourImage],
+    lam: Lambda = "auto",
+) -> ColourImage:
     check_joint(lam)
     clock = job.apart("").clock
     with clock.stage("read"):
@@ -306,7 +299,7 @@ def _solve_at_once(work: _Work, lam: Lambda = "auto") -> ColourImage:
             with output_folder(folder / name, overwrite=True) as place:
                 write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": lam})
                 write_bytes(place / PICTURE_FILE, png(image))
-        return work.finish(
+        return finish(
             folder,
             images=np.moveaxis(solved.image, 0, -1),
             truth=truth,
@@ -319,13 +312,8 @@ def _solve_at_once(work: _Work, lam: Lambda = "auto") -> ColourImage:
             },
             warnings=tuple(warnings),
             seconds=clock.seconds(),
-            solution={
-                "mosaic": JOINT,
-                "lambda": lam,
-                "steps": solved.iterations,
-                "residual": residual,
-                "unexplained": unexplained,
-            },
+            solution={"mosaic": JOINT, "lambda": lam, "steps": solved.iterations}
+            | {"residual": residual, "unexplained": unexplained},
             inputs=inputs,
         )
 
