@@ -44,13 +44,11 @@ import numpy.typing as npt
 from harness import ROOT, arguments, held, show, write
 
 import mitsim as ms
-from mitsim.acquire.exposure import Exposer
+from mitsim.acquire.exposure import Exposer, Totals
 from mitsim.core.arrays import integer
 from mitsim.core.exr import read_frame
 from mitsim.light import light as light_module
 from mitsim.light.light import Sampling, trace_light
-from mitsim.light.settings import Estimate
-from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
 from mitsim.planner.choose import predicted_candidate
 from mitsim.planner.planner import make_plan
 from mitsim.studies.accuracy_study import Probe
@@ -192,8 +190,7 @@ def covered(scene: str, accuracy: float, seeds: int, halves: Frames) -> dict[str
         plan = make_plan(bench, family.lighting, accuracy, seed)
         expected = trace_light(bench, plan, family.lighting, seed, Sampling(by_pixel=False)).frames(family.lighting, 0)
         square, _ = squared_error(*shares(np.array([frame.irradiance for frame in expected]), halves))
-        noise = Estimate(monte_carlo_error(expected), monte_carlo_bound(expected))
-        rows.append((math.sqrt(max(square, 0)), *plan.total(noise)))
+        rows.append((math.sqrt(max(square, 0)), *plan.total(Totals.of(expected).noise)))
     errors, totals, bounds = np.array(rows).T
     return {
         "seeds": seeds,
@@ -252,9 +249,8 @@ def coverage(scene: str, patterns: str, accuracy: float, seeds: int, options: ar
         light = trace_light(bench, plan, family.lighting, seed, Sampling(by_pixel=False))
         expected = list(light.frames(family.lighting, seed, leaking=False))
         spent = time.process_time() - before
-        noise = monte_carlo_error(expected), monte_carlo_bound(expected)
         frames.append(np.array([frame.irradiance for frame in expected]).ravel())
-        rows.append((*noise, plan.sampling_target, light.paths, spent))
+        rows.append((*Totals.of(expected).noise, plan.sampling_target, light.paths, spent))
     module.Simulation, module.trace_groups = kept
     seen, (stated, bounds, targets, paths, spent) = np.array(frames), np.array(rows).T
     count, off = len(seen), seen - seen.mean(axis=0)

@@ -1,7 +1,7 @@
 # Names of the face, each with its module: for type checkers, and for the import at first use in __init__.py.
 
 from mitsim.acquire.capture import Light as Light
-from mitsim.acquire.reference import Rendered as Rendered
+from mitsim.acquire.capture import Rendered as Rendered
 from mitsim.api.bench import Bench as Bench
 from mitsim.api.bench import flat_scene as flat_scene
 from mitsim.api.bench import open_bench as open_bench

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-USERS = ("mitsim.acquire.spectral", "mitsim.calibrate.board_session", "mitsim.acquire.reference")
+USERS = ("mitsim.acquire.spectral", "mitsim.calibrate.board_session", "mitsim.acquire.capture")
 """Modules that plan."""
 _kept: dict[str, Any] = {}
 

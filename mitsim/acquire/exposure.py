@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -38,6 +38,7 @@ from mitsim.sensor.chain import (
 from mitsim.sensor.moments import mean_variance, saturated_pixels
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
+Used = TypeVar("Used")
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,20 @@ def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
         yield [first, *islice(remaining, frames_at_once(first[-1].irradiance.size) - 1)]
 
 
+def used_in_chunks(
+    items: Iterable[Item], use: Callable[[Item], Used], job: Job
+) -> Iterator[tuple[list[Item], list[Used]]]:
+    """Form ``items`` in chunks, apply ``use`` in threads, and yield each chunk with its results."""
+    chunks = in_chunks(items)
+    while True:
+        with job.clock.stage("optics"):
+            if (chunk := next(chunks, None)) is None:
+                return
+        with job.clock.stage("sensor"):
+            results = in_threads(use, chunk)
+        yield chunk, results
+
+
 def peak_irradiance(expected: ExpectedFrames) -> float:
     return max(float(frame.irradiance.max()) for frame in expected)
 
@@ -127,12 +142,11 @@ def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str
 # and a run less its ambient frame has the expectation of the same run in a dark room. The light that black pixels
 # leak stays in the frames, as there.
 
-AmbientChoice = Literal["auto", "yes", "no"]
 _PART = 1 / 16
 """Part of an image's noise variance that its ambient frame may add (0.26 dB)."""
 
 
-def takes_ambient_frame(choice: AmbientChoice, family: PatternFamily, expected: ExpectedFrames) -> bool:
+def takes_ambient_frame(choice: Literal["auto", "yes", "no"], family: PatternFamily, expected: ExpectedFrames) -> bool:
     """Return True if an ambient frame is taken; by default if lamps are on and shots are not subtracted in pairs."""
     return choice == "yes" or (choice == "auto" and expected.has_ambient and not family.signed)
 
@@ -182,15 +196,12 @@ def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames)
 
 @dataclass(frozen=True)
 class Totals:
+    """Brightest pixel, Monte Carlo error, and largest parts below zero and from one group, of all frames."""
+
     peak: float
-    mc_error: float
+    noise: Estimate
     removed: float
     heaviest: float
-    mc_bound: float
-
-    @property
-    def noise(self) -> Estimate:
-        return Estimate(self.mc_error, self.mc_bound)
 
     @classmethod
     def of(cls, expected: ExpectedFrames) -> Totals:
@@ -205,8 +216,13 @@ class Totals:
                 variance += frame.variance * frame.irradiance.size
                 heaviest += frame.heaviest * frame.variance * frame.irradiance.size
                 parts = parts + frame.by_group * frame.irradiance.size
-        mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
-        return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
+        noise = Estimate(float(np.sqrt(variance / energy)) if energy else 0.0, bound_of(parts, energy))
+        return cls(peak, noise, removed, heaviest / variance if variance else 0.0)
+
+
+Exposed = tuple[int, Shot, FloatArray, Digital, float, float, bool, FloatArray]
+"""Number, shot, electrons, digital numbers, Monte Carlo error [electrons] and its ratio to the sensor's noise, True if
+saturated, and sums over the pixels, of a frame."""
 
 
 class Shooting:
@@ -226,49 +242,26 @@ class Shooting:
     ) -> None:
         self.family, self.recorder, self.exposer = family, recorder, exposer
         self.ambient, self.always = ambient, always
-        self.saturated, self.noise_ratio, self._sums = 0, 0.0, np.zeros(4)
-
-    @property
-    def sensor_noise(self) -> float:
-        noise, energy = self._sums[:2]
-        return math.sqrt(noise / energy) if energy else 0.0
-
-    @property
-    def dilution(self) -> float:
-        return math.sqrt(self._sums[1] / self._sums[2]) if self._sums[2] else 1.0
-
-    @property
-    def ambient_part(self) -> float:
-        return float(self.always.sum()) * len(self.family.shots) / float(self._sums[3]) if self._sums[3] else 0.0
-
-    @property
-    def noise_to_signal(self) -> float:
-        own, (noise, _, signal, _) = 0.0, self._sums
-        if self.ambient is not None and not self.family.signed:
-            own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
-            own *= self.always.size * len(self.family.shots)
-        return math.sqrt((noise + own) / signal) if signal else math.inf
+        self.saturated, self.noise_ratio = 0, 0.0
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
         exposer, wavelength = self.exposer, self.exposer.devices.projector.effective_wavelength_nm
+        total = np.zeros(4)
 
-        def expose_shot(item: tuple[int, Shot, Frame]) -> tuple[int, Shot, FloatArray, Digital, float]:
+        def expose_shot(item: tuple[int, Shot, Frame]) -> Exposed:
             index, shot, frame = item
             electrons = exposer.shot_electrons(frame, *shot.names)
             digital = exposer.digital(electrons, *shot.names)
             unit = electrons_from_irradiance(1.0, exposer.exposure_s, exposer.devices.sensor, wavelength)
-            return index, shot, electrons, digital, float(np.sqrt(frame.variance) * unit)
-
-        def measure(exposed: tuple[int, Shot, FloatArray, Digital, float]) -> tuple[float, bool, FloatArray]:
-            _, _, electrons, digital, rendered = exposed
-            energy, noise = sum_of_squares(electrons), exposer.sensor_noise(electrons)
+            rendered, noise = float(np.sqrt(frame.variance) * unit), exposer.sensor_noise(electrons)
+            energy = sum_of_squares(electrons)
             signal = sum_of_squares(electrons - self.always) if self.always.any() else energy
             ratio = 0.0 if not rendered else rendered / noise if noise else math.inf
             sums = np.array([noise**2 * electrons.size, energy, signal, float(electrons.sum())])
-            return ratio, exposer.saturates(digital, electrons), sums
+            return index, shot, electrons, digital, rendered, ratio, exposer.saturates(digital, electrons), sums
 
-        def record(exposed: tuple[int, Shot, FloatArray, Digital, float]) -> None:
-            index, shot, electrons, digital, rendered = exposed
+        def record(exposed: Exposed) -> None:
+            index, shot, electrons, digital, rendered, *_ = exposed
             if not self.recorder.keeps(index):
                 metadata: dict[str, str | int | float] = {
                     "row": shot.row, "column": shot.column, "sign": shot.sign, "exposure_s": exposer.exposure_s,
@@ -280,26 +273,27 @@ class Shooting:
                 channels: dict[str, Channel] = {"DN": dn, "electrons": electrons.astype(np.float32)}
                 self.recorder.write_frame(index, channels, metadata)
 
-        chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
+        shots = zip(range(len(expected)), self.family.shots, expected, strict=True)
         job.progress("frames", 0.0)
         with Behind(record) as writing:
-            while True:
-                with job.clock.stage("optics"):
-                    chunk = next(chunks, None)
-                if chunk is None:
-                    break
-                with job.clock.stage("sensor"):
-                    exposed = in_threads(expose_shot, chunk)
-                    measured = in_threads(measure, exposed)
+            for chunk, exposed in used_in_chunks(shots, expose_shot, job):
                 with job.clock.stage("write"):
                     writing.give(exposed)
-                for ratio, saturated, sums in measured:
+                for *_, ratio, saturated, sums in exposed:
                     self.noise_ratio = max(self.noise_ratio, ratio)
                     self.saturated += saturated
-                    self._sums += sums
+                    total += sums
                 job.progress("frames", (chunk[-1][0] + 1) / len(expected))
             with job.clock.stage("write"):
                 writing.wait()
+        own, (noise, energy, signal, light) = 0.0, total
+        if self.ambient is not None and not self.family.signed:
+            own = exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
+            own *= self.always.size * len(self.family.shots)
+        self.sensor_noise = math.sqrt(noise / energy) if energy else 0.0
+        self.dilution = math.sqrt(energy / signal) if signal else 1.0
+        self.ambient_part = float(self.always.sum()) * len(self.family.shots) / float(light) if light else 0.0
+        self.noise_to_signal = math.sqrt((noise + own) / signal) if signal else math.inf
 
 
 # -------- Drift of a bench and of a camera's exposure

@@ -23,8 +23,7 @@ from mitsim.core.job import Job
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from mitsim.acquire.capture import Light
-    from mitsim.acquire.reference import Rendered
+    from mitsim.acquire.capture import Light, Rendered
     from mitsim.acquire.spectral import Coloured
     from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.devices.session import BoardShape
@@ -429,7 +428,7 @@ class Bench(Apparatus):
         MitsimError
             for another estimator, an integrator that cannot render this sensor, or work beyond the job's limits.
         """
-        from mitsim.acquire.reference import render
+        from mitsim.acquire.capture import render
 
         return render(self, estimator, spp, accuracy, seed, effects, job)
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mitsim.devices.patterns import PatternFamily
     from mitsim.devices.projector import CountedLamps, Lines, ProjectorModel, Spectrum
     from mitsim.devices.sensor import SensorModel
-    from mitsim.optics.mirror_frames import SpecularLight
+    from mitsim.optics.frames import SpecularLight
     from mitsim.scene.load import LoadedScene
     from mitsim.transport.connect import OpticalSetup, ProjectorOptics
 
@@ -162,7 +162,7 @@ class Apparatus:
     @cached_property
     def specular(self) -> SpecularLight:
         """Return the light that reaches the sensor over mirrors or free space alone."""
-        from mitsim.optics.mirror_frames import SpecularLight
+        from mitsim.optics.frames import SpecularLight
         from mitsim.transport.specular import trace_specular_chains
 
         return SpecularLight(trace_specular_chains(self.loaded.scene, self.loaded.camera, self.projector_optics))

@@ -1,50 +1,51 @@
-"""Patterns and light of a rendered Hadamard calibration session on a white board (the paper, section IV-A).
+"""Rendered Hadamard calibration session on a white board (the paper, section IV-A), and its responses.
 
 Every column h_i of a Hadamard matrix is shown as stripes h_i 1^T and 1 h_i^T, each +-1 pattern as two shots (or one and
 a shared uniform one). If n is no Hadamard order, the first n rows of the next one are used, because rows stay
-orthogonal.
+orthogonal. Written frames contain only the data of a real session: digital numbers, patterns and camera settings.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+from PIL import Image
 
-from mitsim.acquire.exposure import camera_warnings, levels
+from mitsim.acquire.exposure import Exposer, camera_warnings, levels, used_in_chunks
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import MOST_LOST, before_board, mask_fault, missed_pixels
-from mitsim.core.arrays import FloatArray, in_threads
+from mitsim.bench.request import Exposure
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.files import whole_file, write_json
 from mitsim.core.job import Cost, Job
+from mitsim.core.manifests import Digital
 from mitsim.devices.camera import CameraGeometry, side_of
-from mitsim.devices.patterns import Lighting, stripe_signs
+from mitsim.devices.framelist import LISTS, FrameList, StripeFile
+from mitsim.devices.patterns import Lighting, PatternFamily, stripe_signs
 from mitsim.devices.projector import Spectrum
-from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
-from mitsim.light.cost_model import (
-    Numbers,
-    first_shadow,
-    forming_seconds,
-    frame_seconds,
-    frames_at_once,
-    in_waves,
-    light_bytes,
-)
+from mitsim.devices.session import SIDES, UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
+from mitsim.light import cost_model
 from mitsim.light.light import SampledLight, Sampling, trace_lines
 from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.optics.fft_shadow import raster
-from mitsim.optics.frames import Frame, at_once, mixes
+from mitsim.optics.frames import Frame, at_once, mix_frames, mixes
 from mitsim.optics.image_formation import number_of_terms
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.factors import SEPARABLE_RESIDUAL, decibels
+from mitsim.sensor.chain import Digital as DigitalNumbers
 
 _IN_RAYS = 0.5
 """Part (rms) of the geometric residual below which the residual is attributed to diffraction."""
@@ -90,27 +91,18 @@ class Session:
         """Return True if row and column means are subtracted from every response, as for a FlatCam mask."""
         return self.bench.geometry.centred
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        return (
-            *self.board_warnings,
-            *self.mask_warnings,
-            *camera_warnings(self.bench.sensor, self.bench.geometry.frame_shape),
-        )
-
     @cached_property
-    def board_warnings(self) -> tuple[str, ...]:
-        shape = self.recipe.board
-        missed = 0 if shape == BoardShape() else missed_pixels(self.board)
-        if not missed:
-            return ()
-        z = self.distance
-        rows, columns = (z * (last - first) for first, last in self.bench.windows_at(z))
-        return (
-            f"board: {missed} of {self.bench.n**2} projector pixels do not fall whole on it ({shape.words}), and "
-            f"their light is missing in the factors; the window is {rows:.4g} x {columns:.4g} mm there: "
-            "take a larger board, or hang it straight",
-        )
+    def warnings(self) -> tuple[str, ...]:
+        shape, found = self.recipe.board, list[str]()
+        if missed := 0 if shape == BoardShape() else missed_pixels(self.board):
+            z = self.distance
+            rows, columns = (z * (last - first) for first, last in self.bench.windows_at(z))
+            found.append(
+                f"board: {missed} of {self.bench.n**2} projector pixels do not fall whole on it ({shape.words}), and "
+                f"their light is missing in the factors; the window is {rows:.4g} x {columns:.4g} mm there: "
+                "take a larger board, or hang it straight"
+            )
+        return (*found, *self.mask_warnings, *camera_warnings(self.bench.sensor, self.bench.geometry.frame_shape))
 
     def check_mask(self, job: Job | None = None) -> None:
         """Raise MitsimError for a mask without factors, and if the session exceeds the limits of a ``job``."""
@@ -171,10 +163,6 @@ class Session:
         return stripe_signs(self.bench.n).astype(np.float64)
 
     @property
-    def lit_lines(self) -> float:
-        return float((1 + self.signs).mean()) / 2
-
-    @property
     def pairs(self) -> bool:
         return self.recipe.signed_capture == "pair"
 
@@ -204,9 +192,9 @@ class Session:
     def plan(self, accuracy: float, job: Job) -> Plan:
         n, count, spent = self.bench.n, self.signs.shape[1], job.clock.seconds()
         self._first_cost.check("calibration", job.limits)
-        with job.planning("calibration", first_shadow(self.board, {})):
+        with job.planning("calibration", cost_model.first_shadow(self.board, {})):
             plan, started = make_plan(self.board, _lines(n), accuracy, self.seed), time.perf_counter()
-            geometry, waves, terms = self.board.geometry, in_waves(plan.settings.effects), 1.0
+            geometry, waves, terms = self.board.geometry, cost_model.in_waves(plan.settings.effects), 1.0
             if geometry.is_drawn(waves):
                 # Drawn here in the cells that were chosen, a shadow is the session's own.
                 geometry = geometry.model_copy(update={"mask_cells": plan.settings.raster_cells})
@@ -221,14 +209,12 @@ class Session:
         cost.check("calibration", job.limits)
         return replace(plan, cost=cost)
 
-    def trace(self, plan: Plan, job: Job) -> SampledLight:
-        (light,) = self.trace_lines((self.board,), plan, job)
-        return light
-
-    def trace_lines(self, boards: Sequence[Apparatus], plan: Plan, job: Job) -> list[SampledLight]:
+    def trace(self, plan: Plan, job: Job, boards: Sequence[Apparatus] = ()) -> list[SampledLight]:
+        """Return the light of the board, or of the ``boards`` of all lines, which share the paths."""
         with job.clock.stage("transport"):
             sampling, lighting = Sampling(purpose="calibration"), _lines(self.bench.n)
-            lights = trace_lines(self.board, boards, plan, lighting, self.seed, sampling, job.progress)
+            every = boards or (self.board,)
+            lights = trace_lines(self.board, every, plan, lighting, self.seed, sampling, job.progress)
         return [light.merge() for light in lights]
 
 
@@ -245,7 +231,7 @@ def _lines(n: int) -> Lighting:
 
 
 # -------- Cost of a calibration session
-# The reason of each figure is how :class:`mitsim.calibrate.session.LitSession` works.
+# The reason of each figure is how :class:`LitSession` works.
 
 _PRODUCT_S = 1.1e-11
 """Cost of a multiplication in products as large as those of stripes: half of that in small ones."""
@@ -283,9 +269,9 @@ def session_seconds(
         correlated=(board.geometry.is_drawn(waves=False), board.geometry.is_drawn(board.geometry.diffracts)),
         largest_terms=(largest_terms,) * 2,
     )
-    numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
+    numbers = replace(cost_model.Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
     frames = n if mixed else count
-    seconds = 2 * float(forming_seconds(forming, numbers, frames, _PRODUCT_S))
+    seconds = 2 * float(cost_model.forming_seconds(forming, numbers, frames, _PRODUCT_S))
     if 1 < largest_terms < math.inf:
         of_anchors = (settings.anchors > 1) * settings.anchors * settings.coarse_cells
         lit_cells = cells * len(settings.depths) + n * of_anchors
@@ -293,66 +279,247 @@ def session_seconds(
     each = n * _PRODUCT_S + _MIXED_S if mixed else _FORMED_S
     return {
         "optics": seconds + 2 * count * pixels**2 * each,
-        "sensor": _UNWRITTEN * frame_seconds(board, shots)["sensor"],
+        "sensor": _UNWRITTEN * cost_model.frame_seconds(board, shots)["sensor"],
     }
 
 
 def session_cost(board: Apparatus, count: int, settings: Settings, seconds: float) -> Cost:
     n, pixels = board.n, board.geometry.frame_side
     lines = n if lines_held(n, count, pixels) else 0
-    frames = lines + 3 * at_once(pixels) + _HELD + _AT_WORK * frames_at_once(round(pixels**2))
+    frames = lines + 3 * at_once(pixels) + _HELD + _AT_WORK * cost_model.frames_at_once(round(pixels**2))
     memory_bytes = 8.0 * (frames * pixels**2 + _SUMS * count * pixels)
-    return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + memory_bytes)
+    return Cost(seconds=seconds, memory_bytes=cost_model.light_bytes(board, n * n, settings) + memory_bytes)
 
-
-# -------- Frames of a side's stripes
-# Where frames of single lines can be held, those of patterns are mixed from them: by :class:`ExpectedFrames` up to
-# 256 lines, and here beyond. Otherwise they are formed in lots: which pixels each of 512 patterns lights would be 2
-# GiB.
 
 _LINES_BYTES = 7 * 2**28
 """Largest memory for frames of lines."""
-_COLUMNS = 2**14
-"""Pixels per product, fixed because it affects the last bits."""
 
 
 def lines_held(lines: int, patterns: int, pixels: float) -> bool:
     return mixes(lines, patterns, pixels) or (patterns >= lines and 8 * lines * pixels**2 <= _LINES_BYTES)
 
 
-def stripe_frames(
-    light: SampledLight, stripes: Lighting, seed: int, shape: tuple[int, int], first: int
-) -> Iterator[tuple[int, Frame]]:
-    """Yield numbers and frames of patterns without light of black pixels and without Monte Carlo error.
+# -------- A session with its light: responses with and without noise, and frames
 
-    The bits do not depend on the ``first`` pattern. ``stripes`` has the line of each projector pixel, and the power 0
-    or 1 of each line in every pattern.
+Result = TypeVar("Result")
+SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quantisation"
+"""Sources of a frame's noise."""
+MOST_TIFF = 2**16 - 1
+"""Largest digital number of a 16-bit TIFF; frames with larger or real numbers become NPY."""
+
+
+class KeptFrames:
+    """Folder of a session's frames, as a real camera's user has them."""
+
+    def __init__(self, session: Session, folder: Path) -> None:
+        self._session, self._folder, largest = session, folder, session.bench.sensor.largest_dn
+        self._tiff = largest is not None and largest <= MOST_TIFF
+        self._files: dict[tuple[str, int, int], StripeFile] = {}
+        for (side, index, sign), repeat in product(session.order, range(session.recipe.repeats)):
+            file = f"frame_{len(self._files):05d}.{'tif' if self._tiff else 'npy'}"
+            listed = StripeFile(file=file, side=side, index=index, sign=sign, repeat=repeat)
+            self._files[(*session.shot((side, index, sign)), repeat)] = listed
+
+    def write(self, shot: tuple[str, int, int], numbers: DigitalNumbers) -> None:
+        with whole_file(self._folder / self._files[shot].file) as part, part.open("wb") as file:
+            if self._tiff:
+                Image.fromarray(numbers.astype(np.uint16)).save(file, "TIFF")
+            else:
+                np.save(file, numbers)
+
+    def finish(self, digital: Digital) -> None:
+        bench, recipe = self._session.bench, self._session.recipe
+        listed = FrameList(
+            camera=bench.identity(),
+            n=bench.n,
+            signed_capture=recipe.signed_capture,
+            repeats=recipe.repeats,
+            digital=digital,
+            centre=self._session.centre,
+            board_reflectance=recipe.board_reflectance,
+            frames=tuple(self._files.values()),
+        )
+        write_json(self._folder / LISTS[1], listed.model_dump(mode="json", exclude_defaults=True))
+
+
+@dataclass(frozen=True)
+class Response:
+    """Response (m, m') to a +-1 pattern [electrons / s], its saturated shots, and the sum of a pair."""
+
+    rate: FloatArray
+    saturated: int = 0
+    light: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LitSession:
+    """A session with traced light: its responses, with or without noise.
+
+    Attributes
+    ----------
+    light
+        Light of the board by projector pixel.
+    white
+        Expected frame of the uniform shot.
+    exposure_s
+        Exposure time of every shot [s].
+    speckle
+        Speckle contrast of the frames.
+    kept
+        Folder for its frames, or None.
     """
-    count, n = stripes.weights.shape
-    lines, pixels, removed = None, side_of(shape), False
-    if lines_held(n, count, pixels) and not mixes(n, count, pixels):
-        held, single = np.empty((n, math.prod(shape))), Lighting(stripes.labels, np.eye(n))
-        for start in range(0, n, together := at_once(pixels)):
-            numbers = np.arange(start, min(start + together, n))
-            formed = [*light.frames(single.shots(numbers), seed, leaking=False)]
-            held[numbers] = [frame.irradiance.ravel() for frame in formed]
-            removed = removed or any(frame.removed for frame in formed)
-        lines = None if removed else held
-    # Batches depend on the sensor alone, because their size affects the last bits.
-    step = count if mixes(n, count, pixels) else at_once(pixels)
-    for start in range(0, count, step):
-        numbers = np.arange(start, min(start + step, count))
-        if numbers[-1] < first:
-            continue
-        if lines is None:
-            frames: Iterator[Frame] = iter(light.frames(stripes.shots(numbers), seed, leaking=False))
-        else:
-            weights, mixed = stripes.weights[numbers], np.empty((len(numbers), lines.shape[1]))
 
-            def mix(begin: int, weights: FloatArray = weights, mixed: FloatArray = mixed) -> None:
-                inside = slice(begin, begin + _COLUMNS)
-                mixed[:, inside] = weights @ lines[:, inside]
+    session: Session
+    light: SampledLight
+    white: Frame
+    exposure_s: float
+    speckle: float
+    kept: KeptFrames | None = None
 
-            in_threads(mix, range(0, lines.shape[1], _COLUMNS))
-            frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in mixed.reshape(-1, *shape))
-        yield from (item for item in zip(numbers.tolist(), frames, strict=True) if item[0] >= first)
+    @classmethod
+    def of(cls, session: Session, light: SampledLight, job: Job) -> LitSession:
+        with job.clock.stage("optics"):
+            n, signs = session.bench.n, session.signs
+            white = next(iter(light.frames(Lighting.uniform(n), session.seed)))
+            exposure = Exposure(None, session.recipe.exposure_fraction)
+            exposure_s = exposure.choose(session.bench.devices, float(session.through_filters(white.irradiance).max()))
+        stripes = PatternFamily("stripes", signs[:, 1:2].astype(np.int8), np.ones((n, 1), np.int8))
+        return cls(session, light, white, exposure_s, light.speckle(stripes))
+
+    @property
+    def response_noise(self) -> float:
+        """Standard deviation of a number of a response [electrons / s], its mean over all pixels."""
+        every = [part for parts in self.response_variances() for part in parts.values()]
+        return float(np.sqrt(sum(every, np.zeros(self.uniform_rate.shape)).mean()))
+
+    def response_variances(self) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+        """Return noise variances [(electrons / s)^2], (m, m') or one number: each response's own, and a side's shared.
+
+        Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 R / t^2 with dark electrons D and the
+        variance R of reading and rounding. 2 Y(positive) - Y(uniform) for a part p of the lines has (4 p L + 4 D) / t +
+        4 R / t^2 of its own; the uniform shot's (L + D) / t + R / t^2 is shared. Means of repeats have the
+        corresponding part.
+        """
+        session, sensor, time = self.session, self.session.bench.sensor, self.exposure_s
+        rounding = 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2)
+        single: dict[str, FloatArray | float] = {
+            SHOT: session.through_filters(self.uniform_rate) / time,
+            DARK: sensor.superpixel_dark_current_e_per_s / time,
+            READ: sensor.superpixel_reading_noise_e**2 / time**2,
+            ROUNDING: rounding / time**2,
+        }
+        # As many times a uniform shot's light, and another shot's other noise, as a response has.
+        lines, own_shots, shared_shots = 0.5, 2.0, 0.0
+        if not session.pairs:
+            lines, own_shots, shared_shots = float((1 + session.signs).mean()) / 2, 4.0, 1.0
+        weight = 1.0 if session.filters is None else 1.0 / np.square(session.filters)
+        own, shared = {}, {}
+        for source, one in single.items():
+            part = lines if source == SHOT else 1.0
+            own[source] = np.asarray(own_shots * part * weight * one / session.recipe.repeats)
+            shared[source] = np.asarray(shared_shots / session.recipe.repeats * weight * one)
+        return own, shared
+
+    def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
+        """Apply ``use`` to number and expected frame of the +-1 patterns of a ``side``, in threads.
+
+        Results are in order. Number 0 is the uniform pattern; the frame is that of a pattern's +1 pixels.
+        """
+        black, count = self.light.simulation.physics.black_level, self.session.signs.shape[1]
+
+        def use_response(item: tuple[int, Frame]) -> Result:
+            number, frame = item
+            if number and black:
+                lit = (1 - black) * frame.irradiance + black * self.white.irradiance
+                frame = replace(frame, irradiance=lit)
+            return use((number, frame))
+
+        job.progress(f"{side} stripes", first / count)
+        for chunk, results in used_in_chunks(self.stripes(side, first), use_response, job):
+            job.progress(f"{side} stripes", (chunk[-1][0] + 1) / count)
+            yield from results
+
+    def stripes(self, side: str, first: int) -> Iterator[tuple[int, Frame]]:
+        """Yield numbers and frames of the +1 pixels of a ``side``'s patterns, without light of black pixels.
+
+        Where frames of single lines can be held, those of patterns are mixed from them: by :class:`ExpectedFrames` up
+        to 256 lines, and here beyond. Otherwise they are formed in lots: which pixels each of 512 patterns lights would
+        be 2 GiB. The bits do not depend on the ``first`` pattern, and there is no Monte Carlo error.
+        """
+        if first == 0:
+            yield 0, self.white
+        seed, (n, count) = self.session.seed, self.session.signs.shape
+        row, column = np.divmod(np.arange(n * n), n)
+        stripes = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
+        lines, pixels, removed = None, side_of(self.session.bench.geometry.frame_shape), False
+        if lines_held(n, count, pixels) and not mixes(n, count, pixels):
+            held, single = np.empty((n, *self.session.bench.geometry.frame_shape)), Lighting(stripes.labels, np.eye(n))
+            for start in range(0, n, together := at_once(pixels)):
+                numbers = np.arange(start, min(start + together, n))
+                formed = [*self.light.frames(single.shots(numbers), seed, leaking=False)]
+                held[numbers] = [frame.irradiance for frame in formed]
+                removed = removed or any(frame.removed for frame in formed)
+            lines = None if removed else held
+        # Batches depend on the sensor alone, because their size affects the last bits.
+        step = count if mixes(n, count, pixels) else at_once(pixels)
+        for start in range(0, count, step):
+            numbers = np.arange(start, min(start + step, count))
+            if numbers[-1] < max(first, 1):
+                continue
+            if lines is None:
+                frames: Iterator[Frame] = iter(self.light.frames(stripes.shots(numbers), seed, leaking=False))
+            else:
+                mixed = mix_frames(stripes.weights[numbers], lines)
+                frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in mixed)
+            yield from (item for item in zip(numbers.tolist(), frames, strict=True) if item[0] >= max(first, 1))
+
+    def noisy(self, side: str, number: int, frame: Frame) -> Response:
+        if not self.session.pairs:
+            (rate, saturated), uniform = self._expose(frame.irradiance, side, number + 1), self._uniform[side]
+            return Response(2 * rate - uniform[0], saturated + (uniform[1] if number == 0 else 0))
+        positive, saturated = self._expose(frame.irradiance, side, 2 * number)
+        # Rounding leaves pixels that see the +1 stripes alone a little below zero.
+        rest = np.maximum(self._both - frame.irradiance, 0.0)
+        negative, also_saturated = self._expose(rest, side, 2 * number + 1)
+        return Response(positive - negative, saturated + also_saturated, positive + negative)
+
+    def noise_free(self, frame: Frame) -> FloatArray:
+        """Return the (m, m') response from the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
+        return 2 * self._second.electrons(frame) - self.uniform_rate
+
+    @property
+    def _second(self) -> Exposer:
+        return Exposer(self.session.bench.devices, 1.0, self.session.seed)
+
+    @cached_property
+    def uniform_rate(self) -> FloatArray:
+        return self._second.electrons(self.white)
+
+    @cached_property
+    def _both(self) -> FloatArray:
+        n = self.session.bench.n
+        off = Lighting(np.zeros(n * n, dtype=np.int64), np.zeros((1, 1)))
+        (dark,) = self.light.frames(off, self.session.seed)
+        return np.asarray(self.white.irradiance + dark.irradiance)
+
+    @cached_property
+    def _uniform(self) -> Mapping[str, tuple[FloatArray, int]]:
+        return {side: self._expose(self.white.irradiance, side, 0) for side in SIDES}
+
+    def _expose(self, irradiance: FloatArray, side: str, index: int) -> tuple[FloatArray, int]:
+        """Return the rate [electrons / s] of a shot, the mean of its repeats, and its saturated frames."""
+        session, repeats, saturated = self.session, self.session.recipe.repeats, 0
+        exposer = Exposer(session.bench.devices, self.exposure_s, session.seed, self.speckle)
+        passed = Frame(session.through_filters(irradiance), 0.0, 0.0, 0.0)
+        lit = exposer.shot_electrons(passed, "calibration", side, index)
+        total: DigitalNumbers | FloatArray = np.zeros(0)
+        for repeat, power in enumerate(session.powers[side, index]):
+            names = ("repeat", repeat) if repeat else ()
+            light = power * lit
+            digital = exposer.digital(light, "calibration", side, index, *names)
+            if self.kept is not None:
+                self.kept.write((side, index, repeat), digital)
+            saturated += int(exposer.saturates(digital, light))
+            total = total + digital if repeat else digital if repeats == 1 else digital.astype(np.float64)
+        rate = exposer.rate(total if repeats == 1 else total / repeats)
+        return rate if session.filters is None else rate / session.filters, saturated

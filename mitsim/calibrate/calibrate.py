@@ -27,13 +27,12 @@ from mitsim.acquire.capture import colour_folder
 from mitsim.acquire.spectral import SpectralBench, without_filters
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, SessionRequest, Task
-from mitsim.calibrate.board_session import Session
-from mitsim.calibrate.lit_session import MOST_TIFF, KeptFrames, LitSession, Response
+from mitsim.calibrate.board_session import MOST_TIFF, KeptFrames, LitSession, Response, Session
 from mitsim.core.arrays import FloatArray, integer, single_threaded_blas
 from mitsim.core.colour_files import CALIBRATION
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import PARTS, output_folder, plain, read_json, remove_page, whole_file, whole_folder, write_json
+from mitsim.core.files import PARTS, output_folder, plain, remove_page, whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, resumable
 from mitsim.devices.sensor import digital_of
@@ -107,24 +106,6 @@ class Checkpoint:
 
     def _digest(self, data: memoryview) -> bytes:
         return hashlib.sha256(hashlib.sha256(self._session).digest() + data).digest()
-
-
-def is_finished(output: Path, configuration: Mapping[str, Any]) -> bool:
-    if not (output / MANIFEST).is_file():
-        return False
-    _check_same(output, plain(configuration))
-    return bool(read_json(output / MANIFEST).get("status") == "complete")
-
-
-def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
-    before = resumable(path, KIND).get("configuration")
-    before = before if isinstance(before, dict) else {}
-    changed = [key for key in {**configuration, **before} if before.get(key) != configuration.get(key)]
-    if changed:
-        raise MitsimError(
-            f"resume=True: {path} holds a session of another configuration ({', '.join(changed)} differ); "
-            "use the same options, or another folder"
-        )
 
 
 # ---- Light and sums of responses as parts of a checkpoint ----
@@ -250,11 +231,17 @@ def _run_sessions(
             "recipe": recipe.model_dump(exclude_defaults=True, exclude={"depths"}),
             "versions": deciding_versions(),
         }
-        if session.depth is not None and task.resume and place is not None and is_finished(place, configuration):
-            return [load_calibration(place)]
         again = task.resume and place is not None and (place / MANIFEST).is_file()
         if again and place is not None:
-            _check_same(place, plain(configuration))
+            before, own = resumable(place, KIND), plain(configuration)
+            earlier = before["configuration"] if isinstance(before.get("configuration"), dict) else {}
+            if changed := [key for key in {**own, **earlier} if earlier.get(key) != own.get(key)]:
+                raise MitsimError(
+                    f"resume=True: {place} holds a session of another configuration ({', '.join(changed)} differ); "
+                    "use the same options, or another folder"
+                )
+            if session.depth is not None and before.get("status") == "complete":
+                return [load_calibration(place)]
         # The folder is claimed before any work; a new one is removed if the session fails before writing.
         with nullcontext() if place is None else output_folder(place, overwrite=again) as folder:
             checkpoint = Checkpoint(folder, configuration)
@@ -262,7 +249,7 @@ def _run_sessions(
             checkpoint.begin()
             light = kept_light(checkpoint, session, plan)
             if light is None:
-                lights = lights or whole.trace_lines([each.board for each in lines], plan, job)
+                lights = lights or whole.trace(plan, job, [each.board for each in lines])
                 light = lights[number]
                 (group,) = light.groups
                 own = ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
@@ -380,12 +367,12 @@ def session_sums(
     session, checkpoint, found = lit.session, checkpoint or Checkpoint(), dict[str, tuple[StripeSums, StripeSums]]()
     count = session.signs.shape[1]
 
-    def respond(kind: str, side: str, number: int, frame: Frame) -> Response:
-        return lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
+    def respond(side: str, number: int, frame: Frame) -> list[Response]:
+        return [lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame)) for kind in kinds]
 
     def fit_responses(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[ResponseFit, int]]:
-        each = [respond(kind, sums[0].side, *shown) for kind in kinds]
-        return [(own.fit_response(r.rate, shown[0], r.light), r.saturated) for own, r in zip(sums, each, strict=True)]
+        each = zip(sums, respond(sums[0].side, *shown), strict=True)
+        return [(own.fit_response(r.rate, shown[0], r.light), r.saturated) for own, r in each]
 
     if (arrays := checkpoint.load("stripes")) is not None:
         saturated = int(arrays["saturated"])
@@ -401,8 +388,8 @@ def session_sums(
     else:
         saturated = 0
         with job.clock.stage("sensor"):
-            for kind in kinds:
-                one, other = (respond(kind, side, 0, lit.white) for side in SIDES)
+            uniform = zip(kinds, *(respond(side, 0, lit.white) for side in SIDES), strict=True)
+            for kind, one, other in uniform:
                 lights = one.light, other.light
                 found[kind] = stripe_sums(one.rate, other.rate, count, session.centre, lights=lights)
                 saturated += one.saturated + other.saturated

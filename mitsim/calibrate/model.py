@@ -17,8 +17,7 @@ from scipy.optimize import least_squares
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import SessionRequest
-from mitsim.calibrate.board_session import Session
-from mitsim.calibrate.lit_session import LitSession
+from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
@@ -108,7 +107,7 @@ def calibrate_model(
             recipe = (request.recipe or load_recipe()).of_one_depth()
             board = Session(bench, recipe, request.seed)
             plan = board.plan(request.accuracy, job)
-            lit = LitSession.of(board, board.trace(plan, job), job)
+            lit = LitSession.of(board, board.trace(plan, job)[0], job)
             with job.clock.stage("sensor"):
                 shown, used = simulate_responses(lit, modelling)
             digital, reflectance = digital_of(bench.sensor, lit.exposure_s), recipe.board_reflectance

@@ -24,9 +24,8 @@ from mitsim.acquire.exposure import Exposer
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, Request, check_psnr
-from mitsim.calibrate.board_session import Session, session_seconds
+from mitsim.calibrate.board_session import LitSession, Session, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
-from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import single_threaded_blas, stream
 from mitsim.core.errors import check_arguments
 from mitsim.core.job import Job
@@ -213,7 +212,7 @@ def plan_calibration(
     with job.clock.stage("session"), single_threaded_blas():
         own = job.apart("session ")
         plan = session.plan(accuracy, own)
-        whole = LitSession.of(session, session.trace(plan, own), own)
+        whole = LitSession.of(session, session.trace(plan, own)[0], own)
         sums = session_sums(whole, own, (NOISE_FREE,))[0][NOISE_FREE]
     truth = truth_for(shots, largest.board_reflectance)
     assert truth is not None

@@ -72,7 +72,7 @@ class Steps(ByValue):
     def at(self, s: FloatArray) -> FloatArray:
         """Return the values at points ``s`` [mm]; an edge belongs to the interval that begins there."""
         if self.blur_mm:
-            return self._blurred_means(s, 0.0, 0.0)
+            return self.over(s, 0.0)
         padded = np.concatenate(([0.0], self.values, [0.0]))
         return np.asarray(padded[np.searchsorted(self.edges, s, side="right")])
 
@@ -84,7 +84,7 @@ class Steps(ByValue):
 
     def cell_means(self, start: float, step: float, count: int) -> FloatArray:
         if self.blur_mm:
-            return self._blurred_means(np.asarray(start + step * (np.arange(count) + 0.5)), step / 2, 0.0)
+            return self.over(np.asarray(start + step * (np.arange(count) + 0.5)), step / 2)
         bounds = start + step * np.arange(count + 1)
         index = np.searchsorted(self.edges, bounds, side="right")
         means = np.concatenate(([0.0], self.values, [0.0]))[index[:-1]]
@@ -103,11 +103,8 @@ class Steps(ByValue):
         points = np.asarray(start + step / _PER_CELL * (np.arange(count * _PER_CELL) + 0.5))
         return np.asarray(np.sqrt(np.maximum(power.at(points), 0)).reshape(count, _PER_CELL).mean(axis=1))
 
-    def over(self, centres: FloatArray, half: FloatArray) -> FloatArray:
-        """Return the means over boxes about ``centres`` [mm]; at half-width 0 the value."""
-        return self._blurred_means(centres, half, 0.0)
-
-    def _blurred_means(self, centres: FloatArray, half: FloatArray | float, other: float) -> FloatArray:
+    def over(self, centres: FloatArray, half: FloatArray | float, other: float = 0.0) -> FloatArray:
+        """Return the means over two boxes about ``centres`` [mm], whose half-widths may be 0."""
         reach = half + other + _BEYOND * self.blur_mm
         jumps = np.diff(self.values, prepend=0.0, append=0.0)
         first = np.searchsorted(self.edges, centres - reach, side="right")
@@ -121,7 +118,7 @@ class Steps(ByValue):
 
     def box_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
         if self.blur_mm:
-            return self._blurred_means(centres, half_pixel, half_cell)
+            return self.over(centres, half_pixel, half_cell)
         reach = half_pixel + half_cell
         low, high = centres.min() - reach, centres.max() + reach
         inside = self.edges[(self.edges > low) & (self.edges < high)]

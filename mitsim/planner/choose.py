@@ -104,7 +104,8 @@ class Candidates:
         """
         if (accuracy, sure) not in self._chosen:
             # Most combinations omit light for which no choice of numbers compensates.
-            accurate = [table for table in self._tables if table.accurate(accuracy, sure).any()]
+            most = _MARGIN * accuracy
+            accurate = [table for table in self._tables if (table.systematic(sure, table.given) < most).any()]
             found = [table.predict(accuracy, sure) for table in accurate]
             if not any(each.fits[each.best] for each in found):
                 found = [table.predict(accuracy, sure) for table in self._tables]
@@ -196,16 +197,13 @@ class _Table:
 
     # ---- errors
 
-    def accurate(self, accuracy: float, sure: float) -> npt.NDArray[np.bool_]:
-        return self._systematic(sure, self.given) < _MARGIN * accuracy
-
     @property
     def unsure(self) -> dict[Approximation, float]:
         weights = {part: float(self._weight(part)[0]) for part in self.pilot_result.changes.parts}
         errors = {part: self.pilot_result.error(part) for part, weight in weights.items() if weight}
         return {part: weights[part] ** 2 * (each.bound**2 - each.value**2) for part, each in errors.items()}
 
-    def _systematic(self, sure: float, ignored: frozenset[Approximation]) -> FloatArray:
+    def systematic(self, sure: float, ignored: frozenset[Approximation]) -> FloatArray:
         result, cells = self.pilot_result, self.raster_cells
         drawn = [
             size**2
@@ -253,7 +251,7 @@ class _Table:
 
     def predict(self, accuracy: float, sure: float) -> _Prediction:
         result, forming, numbers = self.pilot_result, self.pilot_result.forming, self.numbers
-        avoidable, none = self._systematic(sure, self.given), np.zeros(len(self.rows))
+        avoidable, none = self.systematic(sure, self.given), np.zeros(len(self.rows))
 
         # ---- Monte Carlo error at which sampling may stop; checks of all shots need no margin
         left = np.square(_MARGIN * accuracy) - np.square(avoidable)
@@ -316,7 +314,7 @@ class _Table:
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.
-        rest = [float(self._systematic(each, frozenset())[0]) for each in (0.0, SURE)]
+        rest = [float(self.systematic(each, frozenset())[0]) for each in (0.0, SURE)]
         if not math.isinf(result.hits):
             one_hit = 1 / (result.hits * float(found.samples["direct"][0]))
             rest = [math.hypot(error, hits * one_hit) for error, hits in zip(rest, _OFF_BY_HITS, strict=True)]

@@ -13,6 +13,7 @@ import numpy as np
 
 from mitsim.bench import effects
 from mitsim.bench.apparatus import Apparatus
+from mitsim.bench.effects import EFFECTS
 from mitsim.core.arrays import FloatArray, Labels, integer
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
@@ -212,7 +213,7 @@ class PilotRuns:
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
         rows, columns = (np.unique(each).size / self.bench.n for each in np.divmod(self._base.occluded, self.bench.n))
         samples = self.samples["effects"].followed * REPLICATES
-        indirect, shared, repeats = switched.indirect_cost()
+        indirect, shared, repeats = switched.indirect_cost
         sample_costs = {
             **switched.sample_costs,
             **self.followed.sample_costs(light),
@@ -247,7 +248,7 @@ class PilotRuns:
             shared=shared,
             repeats=repeats,
             forming=replace(self.forming, lines=self._lines, occluded=(rows, columns)),
-            apart=switched.apart,
+            apart={name: simulation.physics.speckle for name in self.present if not EFFECTS[name].in_frames},
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
             unresolved_specular=unsure / (found + unsure) if unsure else 0.0,
@@ -442,20 +443,19 @@ def sharp_pixels(
         window = float(seen.row.min()), float(seen.row.max()), float(seen.column.min()), float(seen.column.max())
     left = math.exp(-anchors * rate) * sharp.irradiance / whole
     chosen = SharpPixels(tuple(pixels.tolist()), anchors, window, left)
-    return chosen if _connections(simulation, chosen, accuracy, seed) <= _MOST_CONNECTIONS else None
 
-
-def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, seed: int) -> float:
-    if len(chosen.pixels) * chosen.anchors**2 > _MOST_CONNECTIONS:
-        return math.inf
+    # ---- Connections for the accuracy, from the noise of two halves of a trial
+    if len(pixels) * anchors**2 > _MOST_CONNECTIONS:
+        return None
     tracer = Simulation(simulation.bench, replace(simulation.settings, sharp=chosen)).sharp
     assert tracer is not None
     samples = min(max(_LARGEST_TRIAL // tracer.paths_per_sample, 2), _TRIAL)
-    seen = [tracer.trace(integer(seed, half), 0, samples) for half in range(2)]
-    place = [(light.pixel * chosen.anchors + light.anchor_row) * chosen.anchors + light.anchor_column for light in seen]
+    halves = [tracer.trace(integer(seed, half), 0, samples) for half in range(2)]
+    place = [(light.pixel * anchors + light.anchor_row) * anchors + light.anchor_column for light in halves]
     every, where = np.unique(np.concatenate(place), return_inverse=True)
     parts = np.split(where, [len(place[0])])
-    first, second = (np.bincount(at, light.value, len(every)) for at, light in zip(parts, seen, strict=True))
+    first, second = (np.bincount(at, light.value, len(every)) for at, light in zip(parts, halves, strict=True))
     energy = float((first * second).sum())
     noise = math.sqrt(float(np.square(first - second).sum()) / 2 / energy) if energy > 0 else math.inf
-    return float(tracer.paths_per_sample * samples * (noise / accuracy) ** (1 / SHARP_RATE))
+    needed = tracer.paths_per_sample * samples * (noise / accuracy) ** (1 / SHARP_RATE)
+    return chosen if needed <= _MOST_CONNECTIONS else None

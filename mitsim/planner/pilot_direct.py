@@ -37,7 +37,6 @@ _DIGITS = 12  # of a pattern's light, without rounding
 _SPARSE = 8  # places per entry of light above which entries are sorted
 _PIXELS = 64**2  # Fewer pixels get more samples each.
 _MOST_PATHS = 2**20  # of one replicate in memory: 60 MB
-_CLOSER = 16  # times the samples of a replicate
 _SHARP_PATHS = 2**18
 _MOST_SHARP = 256  # samples of a sharp pixel: an error of 3e-3
 _OCCLUDED, _MOST_OCCLUDED, _FEWEST_OCCLUDED = 2**9, 2**11, 4
@@ -94,16 +93,12 @@ class Sample:
         return len(self.places[0]), len(self.places[1])
 
     @property
-    def rows(self) -> Labels:
-        return np.arange(self.lighting.weights.shape[1])
-
-    @property
     def shown(self) -> Labels:
         return np.flatnonzero((self.lighting.weights != 0).any(axis=0)[self.lighting.labels])
 
     @property
     def fine(self) -> int:
-        return self._within(4 * self.times * max(1, _PIXELS // len(self.shown)), len(self.shown))
+        return self.within(4 * self.times * max(1, _PIXELS // len(self.shown)), len(self.shown))
 
     @property
     def anchored(self) -> int:
@@ -112,14 +107,11 @@ class Sample:
     @property
     def direct(self) -> int:
         pixels = len(self.lighting.labels)
-        return self._within(2 * self.times * max(1, _PIXELS // pixels), pixels)
+        return self.within(2 * self.times * max(1, _PIXELS // pixels), pixels)
 
     @property
     def followed(self) -> int:
         return max(1, self.direct // 2)
-
-    def closer(self, paths: int) -> int:
-        return self._within(_CLOSER * self.followed, paths)
 
     def samples_of_occluded(self, pixels: int) -> int:
         return max(_FEWEST_OCCLUDED, min(self.times * _OCCLUDED, _MOST_OCCLUDED) // max(pixels, 1))
@@ -128,7 +120,7 @@ class Sample:
         paths = simulation.sharp.paths_per_sample if simulation.sharp else 1
         return min(max(_SHARP_PATHS // paths, 4), _MOST_SHARP)
 
-    def _within(self, samples: int, pixels: int) -> int:
+    def within(self, samples: int, pixels: int) -> int:
         return max(1, min(samples, _MOST_PATHS // pixels))
 
     def simulation(
@@ -329,7 +321,7 @@ class DirectRuns:
     def forming(self, family: Lighting) -> Forming:
         geometry, waves = self.bench.geometry, self.bench.waves
         bundle, light = self._accumulated
-        shots = (self.sample.lighting.weights @ (light[: len(self.sample.rows)] != 0)) != 0
+        shots = (self.sample.lighting.weights @ (light[: self.sample.lighting.weights.shape[1]] != 0)) != 0
         places = [np.flatnonzero(shot) if isinstance(shot, np.ndarray) else shot.indices for shot in shots]
         rows = max(1.0, float(np.mean([len(np.unique(place // bundle.cells[1])) for place in places])))
 

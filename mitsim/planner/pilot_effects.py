@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.effects import DIRECT, EFFECTS, FOLLOWED, Effect
+from mitsim.bench.effects import DIRECT, EFFECTS, FOLLOWED
 from mitsim.core.arrays import FloatArray, integer
 from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.passes import PASSES, Grid, Simulation, emission
@@ -51,7 +51,8 @@ _WORTH_SHARING_S = 0.5
 """Seconds of indirect light above which shared paths are tried."""
 _SHARING, _CLEARLY = 2, 0.7
 """Replicates that try shared paths, and the ratio of variance times paths below which paths are shared."""
-_OF_CLOSER = 4
+_CLOSER, _OF_CLOSER = 16, 4
+"""Samples of a closer look in those of a replicate, and in those of its first part."""
 _OPEN = 0.15
 """Part of the accuracy that noise may hide of the change of indirect light by one cell a pixel."""
 
@@ -292,8 +293,21 @@ class EffectRuns:
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
-        shown = [name for name in EFFECTS if name in self.everything.effects and EFFECTS[name].in_frames]
-        found = {Approximation(name): self.frames - self._without(EFFECTS[name]) for name in shown}
+        found = {}
+        for name, effect in EFFECTS.items():
+            if name not in self.everything.effects or not effect.in_frames:
+                continue
+            effects = self.everything.effects - {name}
+            simulation = self.sample.simulation(self.bench, replace(self.everything, effects=effects))
+            retraced = effect.retraced(simulation.physics)
+            direct, sharp = self.direct, self.sharp
+            if DIRECT in retraced:
+                direct, sharp = self._direct(simulation), self._sharp(simulation)
+            if FOLLOWED in retraced:
+                followed = self._by_kind({each: self._follow(simulation, each) for each in _FOLLOWED})
+            else:
+                followed = {kind: light for kind, light in self._kinds.items() if kind != effect.kind}
+            found[Approximation(name)] = self.frames - self._form(simulation, direct, followed, sharp)
         return {**found, **self._coarse}
 
     @cached_property
@@ -347,7 +361,8 @@ class EffectRuns:
         wanted = math.ceil(first.samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
         cost = SampleCost.relative(self._noise_of_bounced(first), self.light, first.samples, 1)
         most = _OF_INDIRECT * float(cost.samples_for(self.accuracy)) / REPLICATES
-        more = min(wanted, self.sample.closer(tracer.paths_per_sample), math.ceil(most))
+        enough = self.sample.within(_CLOSER * self.sample.followed, tracer.paths_per_sample)
+        more = min(wanted, enough, math.ceil(most))
         if more <= first.samples:
             return first, first
         # Own seeds, because vague first replicates do not imply that these are vague.
@@ -360,14 +375,22 @@ class EffectRuns:
         light = sum(float(replicate.value.sum()) for replicates in self.followed.values() for replicate in replicates)
         return light / (REPLICATES * self.sample.followed)
 
-    @property
-    def apart(self) -> dict[str, float]:
-        effects = self.everything.effects
-        return {name: self.simulation.physics.speckle for name in effects if not EFFECTS[name].in_frames}
-
+    @cached_property
     def indirect_cost(self) -> tuple[SampleCost, bool, tuple[int, ...]]:
         """Return the cost of indirect light, True if pixels share paths, and the paths of each block."""
-        sample_cost, shared = self._shared_or_not
+        plain = sample_cost = self.sample_costs["indirect"]
+        taken, shared = plain.samples_for(self.accuracy) * plain.paths * PASSES["indirect"].unit_cost, False
+        tracer = None
+        if plain.error and taken >= _WORTH_SHARING_S:
+            tracer = self.sample.simulation(self.bench, replace(self.everything, shared=True)).indirect
+        if isinstance(tracer, PathReuseTracer) and tracer.shares():
+            samples = max(1, self._looks[1].samples // SHARED_COST)
+            seen = tracer.replicates([integer(seed, "shared") for seed in self.seeds[:_SHARING]], samples)[0]
+            seen += [PathSamples.none()] * (REPLICATES - _SHARING)
+            frames = self._indirect(1, (), Bounced.of(seen, samples))[:_SHARING]
+            own = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
+            shared = own.variance * own.paths < _CLEARLY * plain.variance * plain.paths
+            sample_cost = own if shared else plain
         pixels = self.bench.n
         moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._looks[1].indirect]
         # Each half is judged by the other replicates, because a single heavy path favours only its own block.
@@ -379,23 +402,6 @@ class EffectRuns:
         repeats = tuple(int(count) for count in adaptive_counts(np.sum(moments, axis=0)).ravel())
         error = sample_cost.error * math.sqrt(variance)
         return replace(sample_cost, error=error, paths=math.ceil(sample_cost.paths * paths)), shared, repeats
-
-    @cached_property
-    def _shared_or_not(self) -> tuple[SampleCost, bool]:
-        plain = self.sample_costs["indirect"]
-        taken = plain.samples_for(self.accuracy) * plain.paths * PASSES["indirect"].unit_cost
-        if not plain.error or taken < _WORTH_SHARING_S:
-            return plain, False
-        tracer = self.sample.simulation(self.bench, replace(self.everything, shared=True)).indirect
-        if not isinstance(tracer, PathReuseTracer) or not tracer.shares():
-            return plain, False
-        samples = max(1, self._looks[1].samples // SHARED_COST)
-        seen = tracer.replicates([integer(seed, "shared") for seed in self.seeds[:_SHARING]], samples)[0]
-        seen += [PathSamples.none()] * (REPLICATES - _SHARING)
-        frames = self._indirect(1, (), Bounced.of(seen, samples))[:_SHARING]
-        shared = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
-        less = shared.variance * shared.paths < _CLEARLY * plain.variance * plain.paths
-        return (shared, True) if less else (plain, False)
 
     @cached_property
     def sample_costs(self) -> dict[str, SampleCost]:
@@ -414,19 +420,6 @@ class EffectRuns:
                 continue
             found[name] = SampleCost.relative(error, self.light, samples, paths, rate)
         return {**dict.fromkeys(_FOLLOWED, SampleCost.none()), **found}
-
-    def _without(self, effect: Effect) -> FloatArray:
-        effects = self.everything.effects - {effect.name}
-        simulation = self.sample.simulation(self.bench, replace(self.everything, effects=effects))
-        retraced = effect.retraced(simulation.physics)
-        direct, sharp = self.direct, self.sharp
-        if DIRECT in retraced:
-            direct, sharp = self._direct(simulation), self._sharp(simulation)
-        if FOLLOWED in retraced:
-            followed = self._by_kind({name: self._follow(simulation, name) for name in _FOLLOWED})
-        else:
-            followed = {kind: light for kind, light in self._kinds.items() if kind != effect.kind}
-        return self._form(simulation, direct, followed, sharp)
 
     def _direct(self, simulation: Simulation) -> list[PathSamples]:
         return simulation.direct.replicates(self.seeds, self.sample.direct)[0]

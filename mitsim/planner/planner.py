@@ -11,7 +11,7 @@ import time
 from bisect import bisect_left
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 
@@ -27,11 +27,9 @@ from mitsim.light.settings import COUNTED, GROUPS, WIDE, Estimate, PilotResult, 
 from mitsim.optics.diffraction import check_openings
 from mitsim.optics.fft_shadow import check_waves
 from mitsim.planner import choose, pilot
+from mitsim.scene.load import LoadedScene
 from mitsim.transport.connect import part_of_view, shines_in
 from mitsim.transport.plugins.base import turn_and_origin
-
-if TYPE_CHECKING:
-    from mitsim.scene.load import LoadedScene
 
 _OPENING_S = 1.5
 """Seconds to start the program and open a scene (1.2 to 1.6 on two cores)."""
@@ -304,9 +302,11 @@ def _rows(
         seconds = saved(effects=settings.effects - {name}) if on and name in costly else 0.0
         yield PlanRow(name, state, "; ".join(filter(None, parts)), error.value, seconds)
 
-    square = PlanRow("keystone", "off", "the projector faces the aligned plane squarely", 0.0, 0.0)
-    off = f"the projector's window is {facts.keystone:.1f} of its pixels off a square; responses are not separable"
-    yield PlanRow("keystone", "exact", off, None, 0.0) if facts.keystone else square
+    if facts.keystone:
+        off = f"the projector's window is {facts.keystone:.1f} of its pixels off a square; responses are not separable"
+        yield PlanRow("keystone", "exact", off, None, 0.0)
+    else:
+        yield PlanRow("keystone", "off", "the projector faces the aligned plane squarely", 0.0, 0.0)
     yield facts.spectrum
     noise = "Poisson, full well, read noise and quantisation of each frame"
     yield PlanRow("sensor-noise", "exact", noise, None, 0.0)
@@ -360,18 +360,18 @@ class SceneFacts:
         loaded, off = bench.loaded, {name for name, on in (switches or {}).items() if not on}
         warnings = (*known_losses(loaded, switches or {}), *_limits(bench, off))
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        spectrum = PlanRow("spectrum", "off", _GREY, 0.0, 0.0)
+        reason, curve = _GREY, bench.sensor.quantum_efficiency_curve
+        state: State = "off"
         if bench.lines is not None:
             nanometres = ", ".join(f"{wave:g}" for wave in bench.lines.wavelengths_nm)
-            spectrum = PlanRow("spectrum", "exact", f"all is simulated at {nanometres} nm", None, 0.0)
+            state, reason = "exact", f"all is simulated at {nanometres} nm"
         elif loaded.coloured:
             may = f"{len(loaded.coloured)} of the scene's tags may have colours"
             first = f"the first {loaded.coloured[0].path.name}:{loaded.coloured[0].line}"
             reason = f"one panchromatic reflectance; {may}, {first}; --colour lines tells them apart"
-            spectrum = PlanRow("spectrum", "off", reason, None, 0.0)
-        elif bench.sensor.quantum_efficiency_curve is not None:
+        elif curve is not None:
             reason = f"{_GREY}, but the camera does; --colour lines tells them apart"
-            spectrum = PlanRow("spectrum", "off", reason, None, 0.0)
+        spectrum = PlanRow("spectrum", state, reason, 0.0 if reason == _GREY else None, 0.0)
         return cls(notes, loaded.pixels.keystone, warnings, spectrum)
 
 

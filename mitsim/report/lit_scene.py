@@ -19,7 +19,7 @@ from scipy import sparse
 from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off, takes_ambient_frame
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
-from mitsim.calibrate.lit_session import DARK, READ, ROUNDING, SHOT
+from mitsim.calibrate.board_session import DARK, READ, ROUNDING, SHOT
 from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry

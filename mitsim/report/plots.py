@@ -23,7 +23,7 @@ from mitsim.core.images import lightness, linear_light
 from mitsim.report.pages import Mean, scientific, typeset
 
 if TYPE_CHECKING:
-    from mitsim.acquire.reference import Rendered
+    from mitsim.acquire.capture import Rendered
     from mitsim.acquire.sense import Sensed
     from mitsim.core.runs import Capture
     from mitsim.light.plan import Plan

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mitsim.acquire.capture import capture
-from mitsim.acquire.reference import render, show_pattern
+from mitsim.acquire.capture import capture, render, show_pattern
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import EFFECTS, Physics, names, present

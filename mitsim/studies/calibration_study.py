@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.bench.request import Exposure
-from mitsim.calibrate.board_session import Session
+from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
-from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -242,7 +241,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     family = bench.family(point["patterns"], seed)
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), seed)
-    lit = LitSession.of(session, session.trace(session.plan(accuracy, job), job), job)
+    lit = LitSession.of(session, session.trace(session.plan(accuracy, job), job)[0], job)
     (noisy, clean), _, _ = estimates(lit, job, (NOISY, NOISE_FREE))
     manifest = CalibrationManifest(
         camera=bench.identity(), centre=session.centre, board_reflectance=recipe.board_reflectance,

@@ -25,13 +25,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mitsim.acquire.capture import rendered_psf
 from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off
-from mitsim.acquire.reference import rendered_psf
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
-from mitsim.calibrate.board_session import Session
+from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.calibrate import estimate
-from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray, integer, single_threaded_blas, stream
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -88,7 +87,7 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
     """
     recipe, job = load_recipe(), Job()
     session = Session(bench, recipe, seed)
-    light = session.trace(session.plan(accuracy, job), job)
+    (light,) = session.trace(session.plan(accuracy, job), job)
 
     def lit(row: float, column: float) -> LitSession:
         own = Session(move_mask(bench, row, column), recipe, integer(seed, "mask", f"{row:g}", f"{column:g}"))

@@ -23,8 +23,8 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
+from mitsim.optics.frames import Beams
 from mitsim.optics.image_formation import IntArray
-from mitsim.optics.mirror_frames import Beams
 from mitsim.transport.connect import PinholeRays, ProjectorOptics, wavelength_sets
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
 from mitsim.transport.transmission import CLEAR, flat_panes, transmits

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mitsim.acquire.exposure import Totals
 from mitsim.api.bench import Bench
 from mitsim.bench import effects
 from mitsim.core.arrays import integer
@@ -22,7 +23,6 @@ from mitsim.light.light import Sampling, trace_light
 from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Estimate, Settings
-from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
 
 GROUPS = 6
 STUDENT = 2.02
@@ -83,8 +83,7 @@ def planned(bench: Bench, plan: Plan, shots: Lighting, seed: int) -> tuple[np.nd
     """(shots, pixels, pixels) frames that ``plan`` makes, and their relative Monte Carlo error with its bound."""
     light = trace_light(bench, plan, shots, seed, Sampling(by_pixel=False))
     expected = list(light.frames(shots, seed))
-    noise = Estimate(monte_carlo_error(expected), monte_carlo_bound(expected))
-    return np.stack([frame.irradiance for frame in expected]), noise
+    return np.stack([frame.irradiance for frame in expected]), Totals.of(expected).noise
 
 
 def total_error(frames: np.ndarray, groups: np.ndarray) -> Error:

@@ -33,9 +33,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.calibrate.board_session import Session
+from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.calibrate import estimate
-from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.session import load_recipe
@@ -66,7 +65,7 @@ def sessions(bench: Bench, patterns: str, seeds: range) -> Iterator[tuple[float,
     """Part of the pixels that are covered, and that are expected to be, in each session before one print."""
     light = bench.light(patterns=patterns, accuracy=3e-4)
     session, recipe = Session(bench, load_recipe(), 0), load_recipe()
-    board = LitSession.of(session, session.trace(session.plan(2e-4, Job()), Job()), Job())
+    board = LitSession.of(session, session.trace(session.plan(2e-4, Job()), Job())[0], Job())
     manifest = CalibrationManifest(
         camera=bench.identity(), centre=session.centre, board_reflectance=recipe.board_reflectance
     )

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.acquire.reference import reference
+from mitsim.acquire.capture import reference
 from mitsim.acquire.spectral import SpectralBench, line_alone, lit_by_lamps
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.colour_files import RUN

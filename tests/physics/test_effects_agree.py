@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.acquire.reference import show_pattern
+from mitsim.acquire.capture import show_pattern
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.configuration import shipped_path
 from mitsim.devices.patterns import Lighting

@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.acquire.reference import show_pattern
+from mitsim.acquire.capture import show_pattern
 from mitsim.api.bench import Bench
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import SampledLight, Sampling, trace_light

@@ -55,7 +55,7 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
     """Mitsuba's ``path``. Runs of one seed share each path's first reflection, so it cancels in total - direct."""
     import mitsuba as mi
 
-    from mitsim.acquire.reference import show_pattern
+    from mitsim.acquire.capture import show_pattern
     from mitsim.api.bench import open_bench
 
     bench = open_bench(scene, for_render=True)

@@ -20,7 +20,7 @@ from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.passes import expected_of
 from mitsim.optics.fft_shadow import geometric_samplers
-from mitsim.optics.mirror_frames import SpecularFrames, specular_frames
+from mitsim.optics.frames import SpecularFrames, specular_frames
 from mitsim.planner.planner import make_plan
 from mitsim.transport import plugins
 from mitsim.transport.connect import ProjectorOptics

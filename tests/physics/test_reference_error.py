@@ -23,7 +23,7 @@ Runs = Callable[[str], tuple[np.ndarray, np.ndarray]]
 @pytest.fixture(scope="module")
 def runs(shared_scene: Callable[..., Path], variant: str) -> Runs:
     """(RUNS, 2) sums of runs, and their stated errors: of `reference`, or where its paths stay "random"."""
-    from mitsim.acquire.reference import reference
+    from mitsim.acquire.capture import reference
     from mitsim.api.bench import open_bench
 
     @cache

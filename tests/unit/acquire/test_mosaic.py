@@ -13,9 +13,8 @@ import pytest
 
 from mitsim.acquire.spectral import MosaicFrames, MosaicLight, without_filters
 from mitsim.api.bench import Bench, open_bench
-from mitsim.calibrate.board_session import Session
+from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
-from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import Lighting
@@ -108,7 +107,7 @@ def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans
     job, recipe = Job(), load_recipe()
     session = Session(bench, recipe, 0, filters=passed)
     plan = session.plan(1e-2, job)
-    lit = LitSession.of(session, session.trace(plan, job), job)
+    lit = LitSession.of(session, session.trace(plan, job)[0], job)
     (noisy, clean), saturated, _ = estimates(lit, job, (NOISY, NOISE_FREE))
     assert saturated == 0
     for name, predicted in zip(("left", "right"), noisy.predicted_error, strict=True):

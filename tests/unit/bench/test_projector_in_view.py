@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.acquire import reference
+from mitsim.acquire import capture
 from mitsim.api.bench import Bench, open_bench
 from mitsim.planner.planner import SceneFacts
 
@@ -48,8 +48,8 @@ def test_a_frame_of_one_path_is_flagged(small_scene: Callable[..., Path], monkey
     light = np.zeros((64, 64, 1))
     light[3, 5] = 1.0
     bench = open_bench(small_scene(), for_render=True)
-    monkeypatch.setattr(reference, "reference", lambda *_: (light, light))
+    monkeypatch.setattr(capture, "reference", lambda *_: (light, light))
     (warning,) = bench.render("reference", spp=4).warnings
     assert "too few paths met any light" in warning
-    monkeypatch.setattr(reference, "reference", lambda *_: (light, light / 2))
+    monkeypatch.setattr(capture, "reference", lambda *_: (light, light / 2))
     assert not bench.render("reference", spp=4).warnings

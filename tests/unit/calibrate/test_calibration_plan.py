@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import mitsim as ms
+from mitsim.calibrate.board_session import LitSession
 from mitsim.calibrate.calibrate import NOISE_FREE, estimate, session_sums
-from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session_plan import drawn_estimate, least_dose
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError

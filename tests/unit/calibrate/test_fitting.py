@@ -16,8 +16,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import mitsim as ms
-from mitsim.calibrate.board_session import Session
-from mitsim.calibrate.lit_session import LitSession
+from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.model import Fitted, Shown, fit_placement, model_of, simulate_responses
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -219,7 +218,7 @@ def test_a_mask_that_is_off_is_found_in_frames_that_were_traced(bench: Any, kept
     """37 and -21 um off the axis and 50 um too far, by 8 frames: within three standard errors and the light's own
     error, a thousandth, of the 60 um of a feature. Signs and axes are those of the camera's own offsets."""
     session = Session(bench, load_recipe(), 3)
-    light = session.trace(session.plan(1e-3, Job()), Job())
+    (light,) = session.trace(session.plan(1e-3, Job()), Job())
     camera = bench.geometry.model_copy(
         update={name: getattr(bench.geometry, name) + off for name, off in OFF_MM.items()}
     )

@@ -16,9 +16,8 @@ import numpy.typing as npt
 import pytest
 
 from mitsim.acquire.exposure import Exposer
-from mitsim.calibrate.board_session import Session
+from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, Checkpoint, estimate, estimates
-from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.devices.camera import Devices

@@ -14,7 +14,10 @@ import pytest
 from mitsim.calibrate import board_session as session
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.patterns import Lighting, hadamard_matrix
+from mitsim.devices.session import load_recipe
+from mitsim.light import cost_model
 from mitsim.light.settings import Settings
+from mitsim.optics import frames
 from mitsim.optics.frames import Frame
 
 N, ROWS, COLUMNS = 12, 20, 23
@@ -39,8 +42,9 @@ class ToyLight:
 
 
 def found(light: ToyLight, first: int = 1) -> dict[int, FloatArray]:
-    lighting = Lighting(np.repeat(np.arange(N), N), (1.0 + hadamard_matrix(N).T) / 2)
-    numbered = dict(session.stripe_frames(light, lighting, 0, (ROWS, COLUMNS), first))  # type: ignore[arg-type]
+    bench = SimpleNamespace(n=N, geometry=SimpleNamespace(frame_shape=(ROWS, COLUMNS)))
+    own: Any = session.Session(bench, load_recipe()), light  # type: ignore[arg-type]
+    numbered = dict(session.LitSession(*own, Frame(np.ones(1), 0.0, 0.0, 0.0), 1.0, 0.0).stripes("horizontal", first))
     assert all(frame.variance == frame.removed == frame.heaviest == 0 for frame in numbered.values())
     return {number: frame.irradiance for number, frame in numbered.items()}
 
@@ -50,7 +54,7 @@ def many_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     """More lines than frames of a family would be mixed of, in lots of 5 and parts of 64 pixels."""
     monkeypatch.setattr(session, "mixes", lambda *_: False)
     monkeypatch.setattr(session, "at_once", lambda _: 5)
-    monkeypatch.setattr(session, "_COLUMNS", 64)
+    monkeypatch.setattr(frames, "_COLUMNS", 64)
 
 
 @pytest.mark.usefixtures("many_lines")
@@ -73,10 +77,10 @@ def test_lines_are_mixed_into_the_frames_of_patterns(first: int) -> None:
 def test_lines_that_lost_light_are_not_mixed() -> None:
     """Set to zero in a line, it would be missing in every pattern. (Planted: mixed all the same.)"""
     light = ToyLight(removed=1e-9)
-    frames = found(light)
-    assert light.formed > N and len(frames) == N - 1
+    formed = found(light)
+    assert light.formed > N and len(formed) == N - 1
     for number, sign in list(enumerate(hadamard_matrix(N).T))[1:]:
-        assert np.array_equal(frames[number], light._frame(np.repeat((1 + sign) / 2, N).reshape(N, N)).irradiance)
+        assert np.array_equal(formed[number], light._frame(np.repeat((1 + sign) / 2, N).reshape(N, N)).irradiance)
 
 
 @pytest.mark.parametrize(
@@ -103,8 +107,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     calls: list[Any] = []
     fine = SimpleNamespace(bundle=SimpleNamespace(cells=(CELLS - 1, CELLS)))
     monkeypatch.setattr(session, "Simulation", lambda *_: SimpleNamespace(grids={"fine": fine}))
-    monkeypatch.setattr(session, "forming_seconds", lambda *arguments: calls.append(arguments) or FORMED_S)
-    monkeypatch.setattr(session, "light_bytes", lambda board, rows, settings: LIGHT * (rows == board.n**2))
+    monkeypatch.setattr(cost_model, "forming_seconds", lambda *arguments: calls.append(arguments) or FORMED_S)
+    monkeypatch.setattr(cost_model, "light_bytes", lambda board, rows, settings: LIGHT * (rows == board.n**2))
     return calls
 
 

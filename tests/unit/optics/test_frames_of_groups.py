@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
+from mitsim.acquire.exposure import Totals
 from mitsim.optics.frames import (
     AccumulatedLight,
     ClassFrames,
     bound_of,
-    monte_carlo_bound,
-    monte_carlo_error,
     probe_vectors,
 )
 from tests.unit.optics.small_camera import BESIDE, PIXELS, ambient_groups, expected_frames, random_groups, small_optics
@@ -32,7 +31,7 @@ def test_the_predicted_variance_is_the_actual_one(groups: int) -> None:
         actual.append(sum(np.square(f.irradiance - e).sum() for f, e in zip(found, exact, strict=True)))
         predicted.append(sum(f.variance * f.irradiance.size for f in found))
         energy = sum(np.square(f.irradiance).sum() for f in found)
-        assert monte_carlo_error(found) == pytest.approx(np.sqrt(predicted[-1] / energy), rel=1e-12)
+        assert Totals.of(found).noise.value == pytest.approx(np.sqrt(predicted[-1] / energy), rel=1e-12)
     ratio = np.sum(actual) / np.sum(predicted)
     residual = np.array(actual) - ratio * np.array(predicted)
     deviation = residual.std(ddof=1) / np.sqrt(SEEDS) / np.mean(predicted)
@@ -56,11 +55,11 @@ def test_the_sampling_error_is_told_without_frames(family: str) -> None:
         optics, groups, labels, weights, 0, ambient=[AccumulatedLight(optics, lamps)], specular=exact
     )
     error, bound = frames.sampling_error()
-    assert error == pytest.approx(monte_carlo_error(frames), rel=0.02)
-    assert bound / error == pytest.approx(monte_carlo_bound(frames) / monte_carlo_error(frames), rel=1e-9)
+    assert error == pytest.approx(Totals.of(frames).noise.value, rel=0.02)
+    assert bound / error == pytest.approx(Totals.of(frames).noise.bound / Totals.of(frames).noise.value, rel=1e-9)
     for without in ({"specular": exact}, {"ambient": [AccumulatedLight(optics, lamps)]}):
         other, _ = expected_frames(optics, groups, labels, weights, 0, **without).sampling_error()
-        assert other != pytest.approx(monte_carlo_error(frames), rel=0.02)
+        assert other != pytest.approx(Totals.of(frames).noise.value, rel=0.02)
 
 
 def test_probes_see_every_matrix_with_its_norm_and_what_columns_share_exactly() -> None:

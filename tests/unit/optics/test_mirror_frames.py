@@ -6,7 +6,7 @@ import pytest
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import geometric_samplers, wave_samplers
-from mitsim.optics.mirror_frames import Beams, _cuts, specular_frames
+from mitsim.optics.frames import Beams, _cuts, specular_frames
 
 PITCH = 0.05
 LABELS = np.arange(9) % 3
@@ -119,16 +119,16 @@ def test_beams_are_cut_into_boxes_that_tile_them_and_are_small_enough(angle: flo
     """
     box = 0.025
     cuts = list(_cuts(beams(turned(angle, side)), np.array([0]), box))
-    sizes = {cut.size for cut in cuts}
-    assert len(sizes) == 1 and sum(len(cut.beams) * len(cut.a) * len(cut.b) for cut in cuts) == pytest.approx(
+    sizes = {size for *_, size in cuts}
+    assert len(sizes) == 1 and sum(len(those) * len(a) * len(b) for those, a, b, _ in cuts) == pytest.approx(
         1 / np.prod(next(iter(sizes)))
     )
-    places = np.unique(np.concatenate([cut.a for cut in cuts]))
-    np.testing.assert_allclose(places, (np.arange(len(places)) + 0.5) * cuts[0].size[0], atol=1e-12)
+    places = np.unique(np.concatenate([a for _, a, *_ in cuts]))
+    np.testing.assert_allclose(places, (np.arange(len(places)) + 0.5) * cuts[0][3][0], atol=1e-12)
     # How far from the axes: twice the smaller share of a side in one axis, up to 1.
     finer = 1 + 2 * min(4 * min(abs(np.sin(angle)), abs(np.cos(angle))), 1)
     need = max(side / box * finer, 1)
-    for size in cuts[0].size:
+    for size in cuts[0][3]:
         assert need - 1e-9 <= 1 / size <= max(np.ceil(need), 1.25 * need) + 1e-9
 
 

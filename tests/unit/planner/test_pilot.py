@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.acquire.exposure import Totals
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench import effects
 from mitsim.bench.effects import EFFECTS
@@ -19,7 +20,6 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import REPLICATES, WIDE, PilotResult, Settings
-from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
 from mitsim.transport.records import PathSamples
@@ -114,7 +114,7 @@ def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[
     found, lighting = measured(bench, 1), parse_patterns("dots:4", N).lighting.shots(SHOWN)
     made = Simulation(bench, Settings(depth=found.depth, anchors=2))
     groups = [made.accumulate("direct", made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
-    actual = monte_carlo_error(expected_of([(made, groups)], np.arange(16), lighting, 0)) * 8**0.5
+    actual = Totals.of(expected_of([(made, groups)], np.arange(16), lighting, 0)).noise.value * 8**0.5
     assert promised(float(found.spread.error_left(16)), actual)
     assert found.spread.error_left(16) > 10 * found.sample_costs["direct"].error_left(16)
 
@@ -253,7 +253,7 @@ def test_frames_of_pilot_runs_are_those_that_a_capture_forms(bench: Bench, monke
         for pilot_direct, *pilot_indirect in zip(found.direct, *found.followed.values(), strict=True)
     ]
     assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5
-    formed = [expected_of([(made, [light])], sample.rows, sample.lighting, 0) for light in accumulated]
+    formed = [expected_of([(made, [light])], np.arange(16), sample.lighting, 0) for light in accumulated]
     expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
 

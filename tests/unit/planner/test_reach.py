@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.acquire.exposure import Totals
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
-from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner.pilot import light_reach
 from mitsim.planner.planner import make_plan
 
@@ -98,7 +98,7 @@ def test_light_beyond_the_cells_flags_the_result(scene: Callable[..., Bench], tm
     frames = [next(iter(each.frames(Lighting.uniform(N), 0))) for each in (kept, lost)]
     whole, part = (float(frame.irradiance.sum()) for frame in frames)
     assert 1 - part / whole == pytest.approx(lost.lost, rel=0.1)
-    assert monte_carlo_error(frames) < 1e-2
+    assert Totals.of(frames).noise.value < 1e-2
     run = tmp_path / "run"
     bench.capture("uniform", run, accuracy=1e-2)
     assert json.loads((run / "manifest.json").read_text())["lost_light"] == 0

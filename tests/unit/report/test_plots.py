@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import mitsim as ms
-from mitsim.acquire.reference import Rendered
+from mitsim.acquire.capture import Rendered
 from mitsim.core.images import lightness, linear_light
 from mitsim.report import plots
 from mitsim.report.folder_page import Trust

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.acquire.reference import rendered_psf
+from mitsim.acquire.capture import rendered_psf
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns

@@ -6,7 +6,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.fft_shadow import geometric_samplers
-from mitsim.optics.mirror_frames import specular_frames
+from mitsim.optics.frames import specular_frames
 from mitsim.transport.connect import PinholeRays, ProjectorOptics, shines_in
 from mitsim.transport.specular import SpecularRays, trace_specular_chains
 
