@@ -31,11 +31,12 @@ from mitsim.sensor.chain import (
     dn_to_electrons,
     electrons_from_irradiance,
     expose,
+    mean_variance,
     ripple_level,
     ripple_response,
+    saturated_pixels,
     specimen,
 )
-from mitsim.sensor.moments import mean_variance, saturated_pixels
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
 Used = TypeVar("Used")

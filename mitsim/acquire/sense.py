@@ -44,7 +44,7 @@ class Sensed:
     @property
     def saturated(self) -> int:
         """Return the number of pixels that reached the full well or the end of the ADC."""
-        from mitsim.sensor.moments import saturated_pixels
+        from mitsim.sensor.chain import saturated_pixels
 
         return saturated_pixels(self.digital, self.electrons, self.exposure_s, self.sensor)
 

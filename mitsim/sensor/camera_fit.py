@@ -1,6 +1,6 @@
 """The sensor model that explains lit and dark frames of a camera, each number with its standard error.
 
-The closed-form moments of the whole chain (`mitsim.sensor.moments`) are fitted to the means and variances of all sets
+The closed-form moments of the whole chain (`mitsim.sensor.chain`) are fitted to the means and variances of all sets
 at once, because readings cut at 0 and rounding to few codes bend the straight lines of EMVA 1288.
 """
 
@@ -19,8 +19,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import toml_value, validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel
+from mitsim.sensor.chain import frame_moments
 from mitsim.sensor.emva import HIDDEN, LEAST_DARK, MOST_FITTED, Alike
-from mitsim.sensor.moments import frame_moments
 
 NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2", "spatial")
 """Units: DN/e-, DN, DN, e-/s, e- per unit of light, 1, 1, and DN^2 (variance of offsets)."""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import special, stats
 
 from mitsim.devices.sensor import SensorModel
-from mitsim.sensor import moments
+from mitsim.sensor import chain
 from tests.invented import sensor
 from tests.robustness import Recorder
 
@@ -61,7 +61,7 @@ def test_clipped_moments_against_45_digits(measured: Recorder, well: float) -> N
     """
     deviations = np.array([-13, -11.99, -5, -2, 0, 0.5, 4.4, 6])
     means = [mean for mean in well + deviations * math.sqrt(well) if mean > 0]
-    first, variance = moments.clipped_moments(np.array(means), well)
+    first, variance = chain.clipped_moments(np.array(means), well)
     for mean, *found in zip(means, first, variance, strict=True):
         exact = exact_clipped(float(mean), well)
         scale = min(float(mean), well)
@@ -72,7 +72,7 @@ def test_clipped_moments_against_45_digits(measured: Recorder, well: float) -> N
 @pytest.mark.parametrize("well", [0.5, 1.0, 129_440.0, 1e12])
 def test_far_above_the_full_well_nothing_is_left_to_vary(well: float) -> None:
     for factor in (1e2, 1e6, 1e12):
-        first, variance = moments.clipped_moments(max(factor * well, 2000.0), well)
+        first, variance = chain.clipped_moments(max(factor * well, 2000.0), well)
         assert first == well and variance <= 1e-15 * well
 
 
@@ -121,7 +121,7 @@ def test_moments_of_few_electrons_are_exact_behind_any_adc(model: SensorModel, m
     1e-5 is what the dither of 0.8 DN and the integral over codes of 2 DN leave. 1/12 DN^2 and no ends would be off by
     any factor here: a quiet camera whose gain is 1 rounds nothing.
     """
-    first, variance = moments.frame_moments(mean, 0.0, model)
+    first, variance = chain.frame_moments(mean, 0.0, model)
     exact = behind_the_adc(mean, model)
     assert first == pytest.approx(exact[0], abs=1e-4)
     assert variance == pytest.approx(exact[1], rel=1e-3, abs=1e-9)
@@ -131,7 +131,7 @@ def test_moments_of_few_electrons_are_exact_behind_any_adc(model: SensorModel, m
 @given(models, st.floats(math.log10(64.1), 3.99).map(lambda x: 10**x))
 def test_moments_of_some_electrons_are_exact_too(model: SensorModel, mean: float) -> None:
     """64 to 10 000 electrons: summed over the counts that occur, so as good as those of few."""
-    first, variance = moments.frame_moments(mean, 0.0, model)
+    first, variance = chain.frame_moments(mean, 0.0, model)
     exact = behind_the_adc(mean, model)
     assert first == pytest.approx(exact[0], abs=1e-4)
     assert variance == pytest.approx(exact[1], rel=1e-3, abs=1e-9)
@@ -142,7 +142,7 @@ def test_moments_of_some_electrons_are_exact_too(model: SensorModel, mean: float
 @given(models, st.floats(4.01, 5).map(lambda x: 10**x))
 def test_moments_of_many_electrons_are_right_to_a_quarter_of_a_code(model: SensorModel, mean: float) -> None:
     """Above 10 000 electrons 129 counts stand for all: 0.25 DN of the mean, 1 % + 0.02 DN^2 of the variance."""
-    first, variance = moments.frame_moments(mean, 0.0, model)
+    first, variance = chain.frame_moments(mean, 0.0, model)
     exact = behind_the_adc(mean, model)
     assert first == pytest.approx(exact[0], abs=0.25)
     assert variance == pytest.approx(exact[1], rel=0.01, abs=0.02)
@@ -152,9 +152,9 @@ def test_moments_between_the_grid_s_points() -> None:
     """A frame of many pixels is interpolated: 1e-3 of the moments that single pixels have."""
     model = sensor(bits=8, full_well_e=3000.0, gain_dn_per_e=0.09, read_noise_e=1.0)
     light = np.linspace(70, 9000, 40_000)
-    first, variance = moments.frame_moments(light, 0.0, model)
+    first, variance = chain.frame_moments(light, 0.0, model)
     for index in range(0, 40_000, 1999):
-        one = moments.frame_moments(light[index], 0.0, model)
+        one = chain.frame_moments(light[index], 0.0, model)
         assert first[index] == pytest.approx(float(one[0]), abs=1e-2)
         assert variance[index] == pytest.approx(float(one[1]), rel=5e-3, abs=1e-3)
 
@@ -167,6 +167,6 @@ def test_where_full_well_and_adc_end_together_the_variance_holds() -> None:
     model = sensor(bits=10, full_well_e=1023.0)
     for mean in np.linspace(900, 1100, 21):
         exact = behind_the_adc(mean, model)
-        found = moments.frame_moments(mean, 0.0, model)
+        found = chain.frame_moments(mean, 0.0, model)
         assert found[0] == pytest.approx(exact[0], abs=0.1)
         assert found[1] == pytest.approx(exact[1], rel=0.05, abs=0.5)

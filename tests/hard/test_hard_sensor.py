@@ -19,7 +19,7 @@ from mitsim.core.arrays import stream
 from mitsim.core.configuration import shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.sensor import chain, moments
+from mitsim.sensor import chain
 from tests.invented import draw_electrons, sensor
 from tests.robustness import Recorder
 
@@ -98,7 +98,7 @@ def pearson(drawn: np.ndarray, mean: float) -> tuple[float, int]:
 )
 def test_everything_is_finite_for_any_camera_and_light(bits, binning, well, gain, read, mean) -> None:
     model = sensor(bits=bits, binning=binning, full_well_e=well, gain_dn_per_e=gain, read_noise_e=read)
-    first, variance = moments.frame_moments(mean, 0.0, model)
+    first, variance = chain.frame_moments(mean, 0.0, model)
     frame = exposed(model, mean, 16)
     assert np.isfinite(first) and np.isfinite(variance) and variance >= 0 and np.isfinite(frame).all()
     if model.largest_dn is not None:
@@ -123,7 +123,7 @@ def test_frames_of_1_to_16_bits_have_their_moments(measured: Recorder, bits: int
         (0.0, 1e-6, 0.1, 3.0, 30.0, 200.0, 700.0, 844.0, 1200.0, 1600.0, 1900.0, 2300.0, 1e12)
     ):
         frame = exposed(model, mean, count, bits, level)
-        first, variance = (float(value) for value in moments.frame_moments(mean, 0.0, model))
+        first, variance = (float(value) for value in chain.frame_moments(mean, 0.0, model))
         deviation = np.sqrt(max(variance, frame.var()) / count)
         square = np.square(frame - first)
         spread = max(square.std() / math.sqrt(count), 0.01 * variance, 1e-3)

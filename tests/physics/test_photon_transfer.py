@@ -16,7 +16,7 @@ from scipy import stats
 from mitsim.core.arrays import stream
 from mitsim.core.configuration import shipped_path
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.sensor import chain, moments
+from mitsim.sensor import chain
 from tests.invented import draw_electrons
 
 Record = Callable[[str, object], None]
@@ -92,7 +92,7 @@ def test_the_mean_is_linear_up_to_saturation_and_equals_its_closed_form(camera: 
         frame = chain.expose(
             expected, EXPOSURE_S, camera, stream(SEED, "linear", index), stream(SEED, "linear read", index)
         )
-        mean, variance = moments.frame_moments(expected[0, 0], EXPOSURE_S, camera)
+        mean, variance = chain.frame_moments(expected[0, 0], EXPOSURE_S, camera)
         z = (frame.mean() - mean) / math.sqrt(variance / side**2)
         assert abs(z) < 5, f"level {level}: mean off by {z:.1f} standard deviations"
 
@@ -121,7 +121,7 @@ def test_clipped_electrons_have_the_closed_form_moments(camera: SensorModel, lev
     drawn = chain.clip_at_full_well(
         draw_electrons(np.full(size, level * well), stream(SEED, "clip", str(level))), camera
     )
-    mean, variance = moments.clipped_moments(level * well, well)
+    mean, variance = chain.clipped_moments(level * well, well)
     assert abs(drawn.mean() - mean) < SIGMAS * math.sqrt(variance / size) + 1e-5
     spread = ((drawn - mean) ** 2).std() / math.sqrt(size)
     assert abs(((drawn - mean) ** 2).mean() - variance) < SIGMAS * spread + 1e-5

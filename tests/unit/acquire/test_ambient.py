@@ -25,7 +25,7 @@ from mitsim.light.passes import Simulation
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare
-from mitsim.sensor.moments import frame_moments
+from mitsim.sensor.chain import frame_moments
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N, ACCURACY = 16, 3e-3

@@ -24,7 +24,7 @@ from mitsim.devices.session import load_recipe
 from mitsim.light.light import trace_light
 from mitsim.light.settings import GROUPS
 from mitsim.planner.planner import make_plan
-from mitsim.sensor.moments import frame_moments
+from mitsim.sensor.chain import frame_moments
 from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

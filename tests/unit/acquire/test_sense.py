@@ -14,7 +14,7 @@ from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
 from mitsim.devices.sensor import load_sensor
-from mitsim.sensor import chain, moments
+from mitsim.sensor import chain
 from tests.invented import sensor
 
 CAMERA = sensor(
@@ -28,7 +28,7 @@ def test_an_image_is_exposed_and_read_as_a_capture_s_frame() -> None:
     frame = sense(IMAGE, CAMERA, seed=3)
     assert frame.exposure_s == chain.exposure_for_peak(2e-6, 0.8, CAMERA, 550.0)
     assert frame.electrons.max() == pytest.approx(6400, rel=1e-12)
-    mean, variance = moments.frame_moments(frame.electrons, frame.exposure_s, CAMERA)
+    mean, variance = chain.frame_moments(frame.electrons, frame.exposure_s, CAMERA)
     squares = float((np.square(frame.digital - mean) / variance).sum())
     assert abs(squares - IMAGE.size) < 5 * math.sqrt(2 * IMAGE.size)
     assert np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=3).digital)

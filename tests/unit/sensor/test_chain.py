@@ -12,7 +12,7 @@ from scipy import special, stats
 from mitsim.core.arrays import stream
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel
-from mitsim.sensor import chain, moments
+from mitsim.sensor import chain
 from mitsim.sensor import chain as compiled
 from tests.invented import draw_electrons, sensor
 
@@ -97,7 +97,7 @@ def exact_moments(mean: float, well: float) -> tuple[float, float]:
 @settings(max_examples=60, deadline=None)
 @given(mean=st.floats(0.01, 300), well=st.floats(0.5, 400))
 def test_clipped_moments_equal_the_sum_over_the_distribution(mean: float, well: float) -> None:
-    first, variance = moments.clipped_moments(mean, well)
+    first, variance = chain.clipped_moments(mean, well)
     exact = exact_moments(mean, well)
     # Rounding: differences of terms of size mean^2 + well^2 in double precision (about 1e-16 each, 1e3
     # headroom).

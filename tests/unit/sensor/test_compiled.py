@@ -54,7 +54,7 @@ def test_numpy_makes_the_same_frame_of_the_same_deviates() -> None:
     light, count = np.linspace(300, 50_000, 10_001), 10_001
     shot, read = deviates("shot", "read", count=count)
     electrons = chain.clip_at_full_well(chain.poisson_count(light, shot), model)
-    electrons = chain.add_read_noise(chain.bend(electrons, model), model, read)
+    electrons = chain.bend(electrons, model) + model.superpixel_read_noise_e * read
     expected = chain.quantise(chain.amplify(electrons, model), model)
     drawn = chain.expose(light, 0.0, model, stream(SEED, "shot"), stream(SEED, "read"))
     assert drawn.dtype == np.uint32

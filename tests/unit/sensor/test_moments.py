@@ -10,7 +10,7 @@ from scipy import special, stats
 from mitsim.core.arrays import stream
 from mitsim.core.configuration import shipped_path
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.sensor import moments
+from mitsim.sensor import chain
 from mitsim.sensor.camera_fit import average_moments
 from mitsim.sensor.chain import poisson_quantile, specimen
 from tests.invented import sensor
@@ -37,7 +37,7 @@ def test_a_poisson_probability_has_twelve_digits_on_both_sides_of_the_change_of_
     """At 32 counts the remainder's next term is 1/(1680 count^7) = 2e-14; logarithms of 1e2 to 1e3 round by 1e-13."""
     means = count * np.array([0.7, 1.0, 1.3])
     exact = [float(mpmath.exp(count * mpmath.log(mean) - mean - mpmath.loggamma(count + 1))) for mean in means]
-    np.testing.assert_allclose(moments._poisson(count, means), exact, rtol=1e-12)
+    np.testing.assert_allclose(chain._poisson(count, means), exact, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_electrons_that_fill_the_well_are_one_code_and_not_dithered(black: float
     share = weights @ np.diff(edges, axis=1)
     mean = share @ codes[1:]
     variance = share @ np.square(codes[1:] - mean)
-    ours = moments.frame_moments(np.array([light]), 0.0, model)
+    ours = chain.frame_moments(np.array([light]), 0.0, model)
     assert ours[0][0] == pytest.approx(mean, abs=0.01)
     assert ours[1][0] == pytest.approx(variance, rel=0.01)
 
@@ -90,16 +90,16 @@ def test_moments_of_linear_noise_are_those_without_short_cuts() -> None:
             read_noise_e=10 ** rng.uniform(-1, 2),
             black_level_dn=rng.uniform(0, 0.4) * (2 ** (bits or 12) - 1),
         )
-        first, last = moments._linear(model)
+        first, last = chain._linear(model)
         if first >= last:
             continue
         light = first + (last - first) * np.append(np.geomspace(1e-6, 0.5, 30), 1 - np.geomspace(1e-6, 0.4, 10))
-        found, exact = moments.frame_moments(light, 0.0, model), moments._cut(light, model)
+        found, exact = chain.frame_moments(light, 0.0, model), chain._cut(light, model)
         np.testing.assert_allclose(found[0], exact[0], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(found[1], exact[1], rtol=1e-9)
         for part in (light, np.append(light, last * 1.1))[: 1 + (seen < 10)]:
-            mean = moments.frame_moments(part, 0.0, model)[1].mean()
-            assert moments.mean_variance(part, 0.0, model) == pytest.approx(mean, rel=1e-12)
+            mean = chain.frame_moments(part, 0.0, model)[1].mean()
+            assert chain.mean_variance(part, 0.0, model) == pytest.approx(mean, rel=1e-12)
         seen += 1
     assert seen > 80
 
@@ -122,12 +122,12 @@ def test_an_offset_is_another_black_level_to_1_500_of_the_noise_of_reading(read:
     )
     shape = 10, 20
     light = stream(5, "light").choice([0.0, 1.0, 20.0, 70.0, 300.0, 500.0, 600.0], shape)
-    found = moments.frame_moments(light, 0.0, model)
+    found = chain.frame_moments(light, 0.0, model)
     offset = specimen(model, shape).offset_e
     assert offset is not None
     for place in np.ndindex(shape):
         changes = {"dsnu_pixel_e": 0.0, "black_level_dn": 3 * read + 0.5 * float(offset[place])}
-        mean, variance = moments.frame_moments(light[place], 0.0, model.model_copy(update=changes))
+        mean, variance = chain.frame_moments(light[place], 0.0, model.model_copy(update=changes))
         assert found[0][place] == pytest.approx(float(mean), abs=read / 500)
         assert found[1][place] == pytest.approx(float(variance), rel=1e-3, abs=max(read**2, 1) / 300)
 
@@ -142,7 +142,7 @@ def test_without_noise_an_offset_is_rounded_with_the_pixel_s_signal() -> None:
     assert offset is not None
     signal = 4 + offset.astype(np.float64)
     clear = np.abs(signal - np.floor(signal) - 0.5) > 1 / 64
-    mean, variance = moments.frame_moments(np.zeros((40, 50)), 0.0, model)
+    mean, variance = chain.frame_moments(np.zeros((40, 50)), 0.0, model)
     np.testing.assert_array_equal(mean[clear], np.clip(np.rint(signal), 0, 255)[clear])
     assert not variance[clear].any()
     assert clear.mean() > 0.95
@@ -151,7 +151,7 @@ def test_without_noise_an_offset_is_rounded_with_the_pixel_s_signal() -> None:
 def test_the_shipped_camera_s_noise_is_linear_from_the_dark_to_a_percent_below_its_well() -> None:
     """What the short cut is for: a frame that leaves it costs four times as much."""
     model = load_sensor(shipped_path("calibration", "imx249.toml"))
-    first, last = moments._linear(model)
+    first, last = chain._linear(model)
     assert first == 0 and 0.95 < last / model.superpixel_full_well_e < 1
 
 

@@ -11,8 +11,7 @@ import pytest
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.sensor.chain import expose, ripple_level, ripple_response
-from mitsim.sensor.moments import frame_moments
+from mitsim.sensor.chain import expose, frame_moments, ripple_level, ripple_response
 
 SENSOR = load_sensor(shipped_path("calibration", "imx249.toml"))
 ROWS, HERTZ, AMPLITUDE = 40, 120.0, 0.7

@@ -13,7 +13,7 @@ from mitsim.core.arrays import stream
 from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel
-from mitsim.sensor import chain, moments
+from mitsim.sensor import chain
 from mitsim.sensor.chain import (
     dark_current_variance,
     mean_dark_current,
@@ -83,7 +83,7 @@ def test_drawn_frames_have_the_closed_form_mean_and_variance_of_every_pixel(name
     """
     model = camera(**STAGES[name])
     drawn = frames(model, light())
-    mean, variance = moments.frame_moments(light(), EXPOSURE_S, model)
+    mean, variance = chain.frame_moments(light(), EXPOSURE_S, model)
     noisy = variance > 0
     z = np.zeros_like(mean)
     z[noisy] = (drawn.mean(axis=0) - mean)[noisy] * np.sqrt(FRAMES / variance[noisy])
@@ -144,7 +144,7 @@ def test_a_camera_without_effects_makes_no_maps(monkeypatch: pytest.MonkeyPatch)
     for name in ("specimen", "neighbours"):
         monkeypatch.setattr(chain, name, lambda *_: pytest.fail("a map was asked for"))
     frames(camera(), np.full((4, 4), 10.0), 1)
-    moments.mean_variance(np.full((4, 4), 10.0), 1.0, camera())
+    chain.mean_variance(np.full((4, 4), 10.0), 1.0, camera())
 
 
 # ---- what is fixed in space
@@ -213,7 +213,7 @@ def test_a_specimen_is_the_same_in_every_shot_and_another_by_its_own_seed() -> N
 def test_dead_pixels_see_no_light_and_hot_ones_more_dark_current() -> None:
     model = camera(dead_pixels=0.1, hot_pixels=0.1, hot_dark_current_e_per_s=100.0, read_noise_e=0.0, bits=None)
     own = specimen(model, (30, 30))
-    mean, _ = moments.frame_moments(np.full((30, 30), 500.0), 2.0, model)
+    mean, _ = chain.frame_moments(np.full((30, 30), 500.0), 2.0, model)
     hot = own.dark_e_per_s > 20
     dead = own.response == 0
     assert dead.sum() == own.dead == 90 and hot.sum() == own.hot == 90
@@ -249,7 +249,7 @@ def test_moments_of_a_polynomial_of_counts_equal_the_sum_over_them(
     weights = stats.poisson.pmf(counts, mean)
     read = chain.bend(counts, model)
     first = weights @ read
-    found = moments.bent_moments(np.array([mean]), model)
+    found = chain.bent_moments(np.array([mean]), model)
     assert found[0][0] == pytest.approx(first, rel=1e-10, abs=1e-12)
     assert found[1][0] == pytest.approx(weights @ (read - first) ** 2, rel=1e-9, abs=1e-12)
 
@@ -267,7 +267,7 @@ def test_moments_of_a_bent_full_well_equal_the_sum_over_counts(mean: float, bits
     read = chain.bend(np.minimum(counts, 900.0), model) * 1.5 + 100
     first = weights @ read
     second = weights @ (read - first) ** 2 + 4.5**2 + (1 / 12 if bits else 0)
-    found = moments.frame_moments(np.array([mean]), 0.0, model)
+    found = chain.frame_moments(np.array([mean]), 0.0, model)
     assert found[0][0] == pytest.approx(first, rel=1e-9)
     assert found[1][0] == pytest.approx(second, rel=1e-8)
 
