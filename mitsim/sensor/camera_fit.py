@@ -157,15 +157,11 @@ class Transfer:
         index = NAMES.index(name)
         return math.sqrt(self.covariance[index, index])
 
-    @property
-    def light_error(self) -> float:
-        """Relative error that all sets share, because no set of an unsteady lamp is known to be right."""
-        return self.lamp if self.light in ("scatters", "drifts") else 0.0
-
     def under(self, light: Light) -> Transfer:
         done = replace(self, light=light, covariance=self.covariance * max(self.worse, 1.0))
-        index = NAMES.index("response")
-        done.covariance[index, index] += (done.light_error * done["response"]) ** 2
+        if light in ("scatters", "drifts"):  # an error that all sets share, because no set is known to be right
+            index = NAMES.index("response")
+            done.covariance[index, index] += (self.lamp * done["response"]) ** 2
         return done
 
 
@@ -212,9 +208,7 @@ class _Problem:
         self.still, self.spatial, self.bits = int(used[:still].sum()), spatial, bits
         # Moments depend on the offsets where an end of the ADC or its steps hide part of the noise.
         self.hidden = bits is not None and (variance.min() < _DITHERED or cut[0].max() > _AT_END / 100)
-        self.start = self._lines()
-
-    def _lines(self) -> FloatArray:
+        # Straight lines through the used sets, from which the fit starts.
         lit, (mean, variance) = self.lit, self.measured
         first = int(np.argmin(np.where(lit, np.inf, self.time)))
         signal, noise, times = mean[lit] - mean[first], variance[lit], self.time[~lit]
@@ -224,7 +218,7 @@ class _Problem:
         response = float((self.light[lit] * signal).sum() / np.square(self.light[lit]).sum()) / gain
         current = max(float(np.polyfit(times, mean[~lit], 1)[0]) / gain, 0.0) if np.ptp(times) > 0 else 0.0
         read = math.sqrt(max(float(variance[first]) - current * times.min() * gain**2 - 1 / 12, 0.01))
-        return np.array([gain, read, mean[first], current, max(response, 1e-12), 0.0, 0.0, self.spatial[0]])
+        self.start = np.array([gain, read, mean[first], current, max(response, 1e-12), 0.0, 0.0, self.spatial[0]])
 
     def moments(self, values: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         gain, read, black, current, response, *bends = (float(value) for value in values[:-1])
@@ -465,12 +459,13 @@ class Pixels:
         return FoundCamera(sensor, errors, transfer, self, tuple(self.notes))
 
     def _read(self, transfer: Transfer) -> dict[str, Known]:
-        gain, gain_error, dark = (
+        gain, gain_error, read, error = (
             transfer["gain"],
             transfer.error("gain"),
-            [each for each in self.taken if not each.light],
+            transfer["read"],
+            transfer.error("read"),
         )
-        read, error = transfer["read"], transfer.error("read")
+        dark = [each for each in self.taken if not each.light]
         if min(each.variance for each in dark) < LEAST_DARK:
             error = max(error, math.sqrt(LEAST_DARK - 1 / 12) - read)  # few codes hide the noise: an upper limit
         (m, n), values = self.shape, np.array([each.rows for each in dark])
