@@ -459,12 +459,7 @@ class Pixels:
         return FoundCamera(sensor, errors, transfer, self, tuple(self.notes))
 
     def _read(self, transfer: Transfer) -> dict[str, Known]:
-        gain, gain_error, read, error = (
-            transfer["gain"],
-            transfer.error("gain"),
-            transfer["read"],
-            transfer.error("read"),
-        )
+        gain, read, error = transfer["gain"], transfer["read"], transfer.error("read")
         dark = [each for each in self.taken if not each.light]
         if min(each.variance for each in dark) < LEAST_DARK:
             error = max(error, math.sqrt(LEAST_DARK - 1 / 12) - read)  # few codes hide the noise: an upper limit
@@ -476,7 +471,9 @@ class Pixels:
         row_error = float(weight.sum() ** -0.5 / share)
         shared, shared_error = _root(float((values * weight).sum() / weight.sum() / share), row_error)
         own = math.sqrt(max(read**2 - shared**2, 0.0))
-        own_error = math.hypot(error, own * gain_error / gain, row_error / max(2 * own, 1e-9) if shared else 0.0)
+        own_error = math.hypot(
+            error, own * transfer.error("gain") / gain, row_error / max(2 * own, 1e-9) if shared else 0.0
+        )
         black = transfer["black"]
         black_error = math.hypot(transfer.error("black"), math.sqrt(self._mean_variance(self.offsets[0])))
         if black < -_SURE * black_error and max(each.cut[0] for each in dark) > _CUT:

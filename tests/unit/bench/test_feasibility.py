@@ -52,9 +52,7 @@ def test_a_code_of_two_terms_has_factors_once_it_covers_what_the_sensor_sees(sma
         ({"kind": "mura", "features": 251}, "", ""),
     ],
 )
-def test_a_mask_without_factors_is_named_with_the_reason(
-    small_scene: Callable[..., Path], mask: Mapping[str, Any], reason: str, remedy: str
-) -> None:
+def test_lacking_factors(small_scene: Callable[..., Path], mask: Mapping[str, Any], reason: str, remedy: str) -> None:
     """(Planted: no means taken off, so that a MURA has no factors either.)"""
     fault = mask_fault(masked(open_bench(small_scene()), feature_mm=0.06, **mask))
     if not reason:
@@ -68,9 +66,7 @@ def test_a_mask_without_factors_is_named_with_the_reason(
     [(16, "uniform", True), (17, "uniform", None), (8, "dots:2", True), (9, "dots:2", None), (4, "dots:3", True),
      (8, "hadamard:4", None), (8, "dots:1x2", True)],
 )  # fmt: skip
-def test_frames_of_no_more_numbers_than_unknowns_are_told_before_light(
-    small_scene: Callable[..., Path], pixels: int, patterns: str, undetermined: bool | None
-) -> None:
+def test_few_numbers(small_scene: Callable[..., Path], pixels: int, patterns: str, undetermined: bool | None) -> None:
     """16 x 16 unknowns. With as many data, none is left to tell the noise, and an automatic lambda is refused; the
     advice, one pattern more, is enough. (Planted: "at least as many" for "more".)"""
     bench = open_bench(small_scene(pixels=pixels))

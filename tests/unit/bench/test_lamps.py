@@ -109,9 +109,7 @@ HOLE = '<bsdf type="mask"><float name="opacity" value="{}"/><bsdf type="diffuse"
         (LAMPS["constant"], False),
     ],
 )
-def test_a_small_lamp_in_view_flags_the_plan(
-    small_scene: Callable[..., Path], variant: str, extra: str, seen: bool
-) -> None:
+def test_a_small_lamp_flags_the_plan(small_scene: Callable[..., Path], variant: str, extra: str, seen: bool) -> None:
     """With its line: of its light onto the sensor, twelve times what comes over the sheet, frames hold nothing.
 
     A sun that shines into the camera comes through the sheet: it does not. (Planted: every lamp; field stop ignored.)
@@ -174,7 +172,7 @@ BY_FACES = MOVED + '<boolean name="face_normals" value="true"/>'
 
 @pytest.mark.parametrize(("name", "degrees"), [("lamp.obj", 30), ("lamp.ply", 60)])
 @pytest.mark.parametrize("merged", [False, True])
-def test_a_mesh_emits_by_its_faces(
+def test_emitting_faces(
     small_scene: Callable[..., Path], variant: str, name: str, degrees: float, merged: bool
 ) -> None:
     """L A cos / r^2 at a point 30 mm off the axis: by vertex normals, which are refused, Mitsuba's samples gave 0.85

@@ -94,9 +94,7 @@ def test_a_print_is_seen_on_its_surface(small_scene: Callable[..., Path]) -> Non
 
 
 @pytest.mark.slow
-def test_a_preview_shows_what_the_camera_sees(
-    small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_previews_show_what_the_camera_sees(small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """The white quarter at the upper left of what is seen from the sensor's place, and from the free place where its
     corners are projected to."""
     monkeypatch.setattr(module, "_PIXELS", 64)

@@ -99,7 +99,7 @@ def test_devices_are_camera_and_projector(tmp_path: Path) -> None:
         ((0.011731, 0.011709), None),
     ],
 )
-def test_pitches_are_the_scenes_to_a_thousandth(
+def test_pitches_are_the_scenes(
     loader: Loader, scene: Path, pitches: tuple[float, float], reported: str | None
 ) -> None:
     """Along columns and down the rows. (Planted: one for the other; a shorter pitch let pass.)"""
@@ -112,9 +112,7 @@ def test_pitches_are_the_scenes_to_a_thousandth(
     open_bench(scene, for_render=True)
 
 
-def test_pixels_of_a_camera_that_is_named_are_the_scenes(
-    loader: Loader, scene: Path, camera: Callable[..., Path]
-) -> None:
+def test_pixels_of_a_named_camera_are_the_scenes(loader: Loader, scene: Path, camera: Callable[..., Path]) -> None:
     """Its sensor goes to the loader, and goes there again. (Planted: left out where a bench is opened anew.)"""
     tall = camera(row_pitch_um="7.0")
     bench = open_bench(scene, camera=tall)
@@ -124,9 +122,7 @@ def test_pixels_of_a_camera_that_is_named_are_the_scenes(
     assert loader.asked[-1][3] == {"outside": True, "sensor": bench.sensor}
 
 
-def test_a_camera_that_is_blind_to_the_projector_is_refused(
-    loader: Loader, scene: Path, camera: Callable[..., Path]
-) -> None:
+def test_a_camera_blind_to_the_projector_is_refused(loader: Loader, scene: Path, camera: Callable[..., Path]) -> None:
     """Before the scene is loaded; a scene to render counts no electrons. Filters wait for lines: they are checked where
     these are told apart. (Planted: filters refused in a variant that tells lines apart; taken in one that does not.)"""
     plain = camera(quantum_efficiency="")

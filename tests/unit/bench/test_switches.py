@@ -9,11 +9,9 @@ from mitsim.core.errors import MitsimError
 @pytest.mark.parametrize(
     ("text", "chosen"),
     [
-        ("", {}),
-        ("+ambient", {"ambient": True}),
+        *(("", {}), ("+ambient", {"ambient": True})),
         ("+ambient,-diffraction", {"ambient": True, "diffraction": False}),
-        (" -anchors , +layers,", {"anchors": False, "layers": True}),
-        ("-blur,-blur", {"blur": False}),
+        *((" -anchors , +layers,", {"anchors": False, "layers": True}), ("-blur,-blur", {"blur": False})),
         ("+mask-thickness,-black-level", {"mask-thickness": True, "black-level": False}),
     ],
 )

@@ -10,9 +10,6 @@ from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
-from tests.shadow_factor import shadow_factor
-
-# (60 um)^2 / (0.55 um x 2 mm) = 3.27
 
 
 def test_a_region_of_a_sensor_that_is_not_square_lies_where_it_does() -> None:
@@ -32,9 +29,7 @@ def test_a_region_of_a_sensor_that_is_not_square_lies_where_it_does() -> None:
 
 @pytest.mark.parametrize("kind", ["separable", "flatcam"])
 @pytest.mark.parametrize("spectrum", [None, Spectrum([500.0, 600.0], [0.3, 0.7])])
-def test_shadows_on_a_region_of_tall_pixels_are_parts_and_means_of_those_on_small_ones(
-    kind: str, spectrum: Spectrum | None
-) -> None:
+def test_shadows_on_tall_pixels_are_means_of_those_on_small_ones(kind: str, spectrum: Spectrum | None) -> None:
     """Rows 2 to 4 of pixels of two rows each, columns 3 to 7; off the axis. (Planted: columns of the whole sensor; the
     row's number as the column's; the width of a pixel as its height.)"""
     rows, columns = Directions.cells(np.linspace(-0.1, 0.12, 6)), Directions.cells(np.linspace(-0.05, 0.1, 5))
@@ -53,9 +48,7 @@ def test_shadows_on_a_region_of_tall_pixels_are_parts_and_means_of_those_on_smal
 def test_tall_pixels_behind_a_mask_on_a_raster_are_refused() -> None:
     """Its cells are square. A mask of one term has no raster. (Planted: let pass.)"""
     tall = CameraGeometry(pixels=8, row_pitch=0.02)
-    with pytest.raises(
-        MitsimError, match=r"row_pitch: got 0\.02 beside pixel_pitch 0\.01172; .* pixels must be square"
-    ):
+    with pytest.raises(MitsimError, match=r"row_pitch: got 0\.02 beside pixel_pitch 0\.01172; .* must be square"):
         MaskProfile(kind="separable", feature_mm=0.06, order=5, rotation_deg=1.0).put_on(tall, Path())
     assert MaskProfile(kind="flatcam", feature_mm=0.06, order=5).put_on(tall, Path()).row_pitch == 0.02
 
@@ -63,21 +56,10 @@ def test_tall_pixels_behind_a_mask_on_a_raster_are_refused() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("rows", 0),
-        ("pixels", 8193),
-        ("roi", (0, 1, 3, 512)),
-        ("roi", (0, 0, 0, 3)),
-        ("pixels", 2.5),
-        ("pixel_pitch", float("nan")),
-        ("mask_order", 1),
-        ("mask_distance", float("inf")),
-        ("mask_thickness", -0.1),
-        ("pixel_fill_factor", 0.0),
-        ("angular_exponent", -1.0),
-        ("fov", 1e-6),
-        ("pixel_fill_factor", 1e-9),
-        ("mask_thickness", True),
-        ("colour", 1),
+        *(("rows", 0), ("pixels", 8193), ("roi", (0, 1, 3, 512)), ("roi", (0, 0, 0, 3)), ("pixels", 2.5)),
+        *(("pixel_pitch", float("nan")), ("mask_order", 1), ("mask_distance", float("inf"))),
+        *(("mask_thickness", -0.1), ("pixel_fill_factor", 0.0), ("angular_exponent", -1.0), ("fov", 1e-6)),
+        *(("pixel_fill_factor", 1e-9), ("mask_thickness", True), ("colour", 1)),
     ],
 )
 def test_bad_numbers_are_refused_in_one_line(field: str, value: object) -> None:
@@ -107,17 +89,6 @@ def test_shadow_terms_sum_to_the_masks_mean_transmission(kind: str) -> None:
         closed = sum(left[pixel, cell] * right[2 - pixel, cell + 1] for left, right in terms)
         # 200 000 pairs: standard deviation of a 0..1 transmission at most 0.0012; five of them.
         assert closed == pytest.approx(sampled, abs=0.006)
-
-
-def test_one_shadow_serves_both_axes_but_only_for_equal_edges() -> None:
-    geometry = CameraGeometry(pixels=8)
-    rows, columns = np.linspace(-0.1, 0.1, 9), np.linspace(-0.12, 0.1, 12)
-    (left, right), *_ = shadow_terms(geometry, Directions.cells(rows), Directions.cells(columns), 400.0)
-    profile = geometry.build_mask().terms[0][1]
-    # The same numbers from edges: rounding of the edges only.
-    for factor, edges in ((left, rows), (right, columns)):
-        expected = shadow_factor(profile, 0.06, geometry.pixel_edges, edges, 2.0, 400.0)
-        assert np.allclose(factor, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["separable", "flatcam", "open"])

@@ -108,6 +108,8 @@ def test_a_mask_without_light_is_refused(most: float) -> None:
     with pytest.raises(MitsimError, match="no feature lets light through"):
         Plate(0.06, most * np.eye(3), "it")
     assert len(Plate(0.06, 1e-11 * np.eye(2), "it").terms) == 2
+    with pytest.raises(MitsimError, match=r"^it: [^\n]+$"):
+        Plate(0.06, np.ones((4097, 4097)), "it")
 
 
 def test_transmission_at_points_and_outside() -> None:
@@ -187,15 +189,17 @@ def test_other_files_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("table", "word"),
     [
-        ('kind = "mura"\nfeature_mm = 0.06', "features"),
-        ('kind = "random"\nfeature_mm = 0.06\nfeatures = 5\norder = 3', "order"),
-        ('kind = "separable"\nfeature_mm = 0.0', "feature_mm"),
-        ('kind = "pinhole"\nfeature_mm = 0.06', "kind"),
+        *(('kind = "mura"', "features"), ('kind = "random"\nfeatures = 5\norder = 3', "order")),
+        *(('kind = "pinhole"', "kind"), ('kind = "separable"\nfeature_mm = 0.0', "feature_mm")),
+        *(("dust_per_mm2 = 1.0", "dust_per_mm2"), ("edge_blur_um = -1.0", "edge_blur_um")),
+        ("opaque_transmission = 0.5\nclear_transmission = 0.4", "opaque_transmission"),
+        *(("rotation_deg = 200.0", "rotation_deg"), ("psf_distance_mm = 400.0", "psf_distance_mm")),
     ],
 )
 def test_other_tables_are_refused_in_one_line(table: str, word: str, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
-    path.write_text(f"[mask]\n{table}\n")
+    stated = {name: f"{name} = {value}\n" for name, value in (("kind", '"separable"'), ("feature_mm", "0.06"))}
+    path.write_text("[mask]\n" + "".join(line for name, line in stated.items() if name not in table) + table)
     with pytest.raises(MitsimError, match=rf"^file .*: mask.*{word}[^\n]*$"):
         load_mask(path)
     path.write_text("mask = 3\n")
@@ -203,23 +207,14 @@ def test_other_tables_are_refused_in_one_line(table: str, word: str, tmp_path: P
         load_mask(path)
 
 
-@pytest.mark.parametrize("values", [np.zeros((3, 3)), np.ones((4097, 4097))])
-def test_impossible_plates_are_refused_in_one_line(values: np.ndarray) -> None:
-    with pytest.raises(MitsimError, match=r"^it: [^\n]+$"):
-        Plate(0.06, values, "it")
+_KNOWN = "scene_distance", "fov", "angular_exponent"
 
 
 def test_a_camera_wears_a_profile_and_cameras_without_stay_what_they_were() -> None:
     """(Planted: the plate in every identity.)"""
     bare = CameraGeometry(mask_offset_row=0.5)
-    known = {*CameraGeometry.model_fields} - {
-        "mask_offset_column",
-        "mask_plate",
-        "mask_motion",
-        "mask_fft",
-        "mask_cells",
-    }
-    known -= {"mask_lean_mrad", "mask_cells", "rows", "columns", "row_pitch", "roi"}
+    known = {name for name in CameraGeometry.model_fields if name.startswith(("mask", "pixel")) or name in _KNOWN}
+    known -= {f"mask_{name}" for name in ("offset_column", "plate", "motion", "fft", "cells", "lean_mrad")}
     assert set(bare.identity) == known and bare.mask_terms == 1 and bare.diffracts and not bare.centred
     flatcam = MaskProfile(kind="flatcam", feature_mm=0.05, order=5).put_on(bare, Path())
     assert flatcam == CameraGeometry(mask="flatcam", mask_feature=0.05, mask_order=5, mask_offset_row=0.5)

@@ -23,9 +23,7 @@ def drawn(path: Path, background: int, colours: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("background", "colours", "name"), [(400, False, "a.tif"), (40, True, "b.png")])
-def test_background_goes_pixels_are_averaged_and_the_sum_is_one(
-    tmp_path: Path, background: int, colours: bool, name: str
-) -> None:
+def test_pixels_are_averaged_and_the_sum_is_one(tmp_path: Path, background: int, colours: bool, name: str) -> None:
     light = drawn(tmp_path / name, background, colours)
     expected = light[:68, :80].reshape(17, 4, 20, 4).mean(axis=(1, 3))
     np.testing.assert_allclose(load_psf(tmp_path / name, 4), expected / expected.sum(), rtol=1e-12)

@@ -6,22 +6,14 @@ from pydantic import ValidationError
 
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
-from mitsim.devices.sensor import SensorModel, load_sensor
+from mitsim.devices.sensor import load_sensor
 from tests.invented import sensor
-
-BASE = {
-    "name": "test",
-    "pixel_pitch_um": 5.0,
-    "full_well_e": 1000.0,
-    "read_noise_e": 3.0,
-    "quantum_efficiency": 0.5,
-    "gain_dn_per_e": 2.0,
-    "source": "invented for this test",
-}
 
 
 def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
-    model = SensorModel(**BASE, binning=3, dark_current_e_per_s=2.0, black_level_dn=10.0, bits=12)
+    model = sensor(
+        pixel_pitch_um=5.0, read_noise_e=3.0, binning=3, dark_current_e_per_s=2.0, black_level_dn=10.0, bits=12
+    )
     assert model.superpixel_pitch_um == 15.0
     assert model.superpixel_area_m2 * 1e12 == pytest.approx(225.0, rel=1e-12)
     assert model.superpixel_full_well_e == 9000.0
@@ -34,31 +26,20 @@ def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("pixel_pitch_um", 0.0),
-        ("full_well_e", -1.0),
-        ("read_noise_e", -0.1),
-        ("quantum_efficiency", 1.01),
-        ("quantum_efficiency", 1e-9),
-        ("full_well_e", 1e13),
-        ("read_noise_e", 1e7),
-        ("gain_dn_per_e", 1e7),
-        ("binning", 2.0),
-        ("gain_dn_per_e", math.inf),
-        ("colour", "red"),
+        *(("pixel_pitch_um", 0.0), ("full_well_e", -1.0), ("read_noise_e", -0.1), ("quantum_efficiency", 1.01)),
+        *(("quantum_efficiency", 1e-9), ("full_well_e", 1e13), ("read_noise_e", 1e7), ("gain_dn_per_e", 1e7)),
+        *(("binning", 2.0), ("gain_dn_per_e", math.inf), ("colour", "red")),
     ],
 )
 def test_a_value_out_of_range_is_refused(field: str, value: object) -> None:
     with pytest.raises(ValidationError, match=field):
-        SensorModel(**{**BASE, field: value})
+        sensor(**{field: value})
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (
-            "read_noise_e = -6.7",
-            r"read_noise_e: got -6\.7; give a number from 0 to ",
-        ),
+        ("read_noise_e = -6.7", r"read_noise_e: got -6\.7; give a number from 0 to "),
         ("read_noise = 6.7", r"read_noise: got 6\.7, no such field; did you mean read_noise_e\?$"),
     ],
 )

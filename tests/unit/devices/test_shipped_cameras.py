@@ -31,9 +31,7 @@ def serves(camera: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("camera", SENSORS, ids=lambda path: path.stem)
-def test_a_camera_captures_as_its_file_says_or_is_told_what_it_lacks(
-    camera: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_camera_captures_as_its_file_says(camera: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before a scene is loaded. (Seen failing: files that said nothing. Planted: one without efficiency let pass.)"""
     asked: list[Any] = []
     monkeypatch.setattr(opening, "_load", lambda *_, **options: asked.append(options["sensor"]) or loaded())
@@ -56,9 +54,7 @@ def loaded() -> Any:
 
 
 @pytest.mark.parametrize("camera", [path for path in SENSORS if load_sensor(path).rows], ids=lambda path: path.stem)
-def test_a_scene_has_the_pixels_of_the_camera_that_is_named(
-    camera: Path, small_scene: Callable[..., Path], tmp_path: Path, variant: str
-) -> None:
+def test_pixels_are_the_cameras(camera: Path, small_scene: Callable[..., Path], tmp_path: Path, variant: str) -> None:
     """A file of two lines that stands on a sensor alone captures with it: its pitch, rows and columns, whatever the
     scene's film is. (Planted: columns for rows; the scene's pitch kept; the window of its film kept;
     a bench in another variant without the camera's sensor.)"""

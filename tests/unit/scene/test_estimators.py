@@ -56,9 +56,7 @@ def test_media_are_for_the_reference_alone(small_scene: Write, extra: str, name:
 
 
 @pytest.mark.parametrize("written", ["", '<string name="filter_type" value="bilinear"/>'])
-def test_a_projector_whose_pixels_run_into_each_other_is_for_the_reference_alone(
-    small_scene: Write, written: str
-) -> None:
+def test_a_projector_whose_pixels_run_into_each_other_is_for_the_reference(small_scene: Write, written: str) -> None:
     """Bilinear is Mitsuba's default. (Seen failing: frames 1.7 % brighter than the reference's, without a word.)"""
     path = small_scene(mask="open")
     text, nearest = path.read_text(), '<string name="filter_type" value="nearest"/>'
@@ -119,13 +117,11 @@ def plate(bsdf: str) -> str:
 @pytest.mark.parametrize(
     "bsdf",
     [
-        f'<bsdf type="twosided">{METAL}</bsdf>',
-        f'<bsdf type="twosided">{DIFFUSE}{METAL}</bsdf>',
+        *(f'<bsdf type="twosided">{METAL}</bsdf>', f'<bsdf type="twosided">{DIFFUSE}{METAL}</bsdf>'),
         f'<bsdf type="blendbsdf"><float name="weight" value="0.5"/>{DIFFUSE}<bsdf type="dielectric"/></bsdf>',
         f'<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="twosided">{METAL}</bsdf></bsdf>',
         f'<bsdf type="bumpmap">{BITMAP.format("bump")}{METAL}</bsdf>',
-        f'<bsdf type="normalmap">{BITMAP.format("normalmap")}{METAL}</bsdf>',
-        '<bsdf type="plastic"/>',
+        *(f'<bsdf type="normalmap">{BITMAP.format("normalmap")}{METAL}</bsdf>', '<bsdf type="plastic"/>'),
     ],
 )
 def test_mirrors_inside_of_other_materials_are_mirrors(small_scene: Write, bsdf: str) -> None:
@@ -171,11 +167,8 @@ def flat(small_scene: Write) -> None:
 @pytest.mark.parametrize(
     ("inner", "at_fault"),
     [
-        (HOLE.format(MATT), "mask"),
-        (HOLE.format(HOLE.format(MATT)), "mask"),
-        (BLEND, "mask"),
-        ('<bsdf type="null"/>', "null"),
-        ('<bsdf type="thindielectric"/>', "thindielectric"),
+        *((HOLE.format(MATT), "mask"), (HOLE.format(HOLE.format(MATT)), "mask"), (BLEND, "mask")),
+        *(('<bsdf type="null"/>', "null"), ('<bsdf type="thindielectric"/>', "thindielectric")),
     ],
     ids=["mask", "two masks", "blend", "null", "pane"],
 )

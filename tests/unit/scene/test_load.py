@@ -85,18 +85,13 @@ def plate(turned: str, bsdf: str = MATT, shape: str = "rectangle") -> str:
 @pytest.mark.parametrize(
     ("extra", "one_way"),
     [
-        ("", True),
-        (plate("180") + plate("180", shape="disk"), True),
-        (plate("180.01"), False),
-        (plate("0"), False),
-        (plate("180", f'<bsdf type="twosided">{MATT}</bsdf>'), False),
+        *(("", True), (plate("180") + plate("180", shape="disk"), True), (plate("180.01"), False)),
+        *((plate("0"), False), (plate("180", f'<bsdf type="twosided">{MATT}</bsdf>'), False)),
         (plate("180", f'<bsdf type="mask"><float name="opacity" value="0.5"/>{MATT}</bsdf>'), False),
         (BALL, False),
     ],
 )
-def test_flat_surfaces_that_turn_one_side_the_same_way_see_none_of_each_other(
-    small_scene: Write, extra: str, one_way: bool
-) -> None:
+def test_flat_surfaces_that_face_one_way_see_none_of_each_other(small_scene: Write, extra: str, one_way: bool) -> None:
     """Before the sheet: nothing, plates that face as it does, one turned a little, one that faces it, and what reflects
     or passes light on both sides, or is curved. (Planted: both sides counted as one; any angle below a degree.)"""
     assert load_scene(small_scene(extra=extra)).one_way is one_way

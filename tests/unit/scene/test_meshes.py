@@ -164,9 +164,7 @@ def normals_of(loaded: LoadedScene) -> dict[str, FloatArray]:
     return found
 
 
-def test_normals_are_the_same_in_any_number_of_threads(
-    small_scene: Callable[..., Path], set_threads: Callable[[int], None]
-) -> None:
+def test_normals_do_not_depend_on_threads(small_scene: Callable[..., Path], set_threads: Callable[[int], None]) -> None:
     """And those of Mitsuba but for rounding. (Seen failing: Mitsuba's own, which differ from loading to loading, and
     frames by them; sums in 32 bits; faces that count alike at all their corners.)"""
     import drjit as dr
@@ -212,9 +210,7 @@ def write_sheet(path: Path, faces: Sequence[tuple[int, ...]], rows: Sequence[Row
          '<shape type="instance"><ref id="group"/></shape>', True),
     ],
 )  # fmt: skip
-def test_shading_normals_that_are_not_the_surfaces_own_are_seen(
-    small_scene: Callable[..., Path], extra: str, smoothed: bool
-) -> None:
+def test_foreign_shading_normals_are_seen(small_scene: Callable[..., Path], extra: str, smoothed: bool) -> None:
     """Of a bent sheet, though some faces be even; of a flat one whose file gives others, by three degrees, but not the
     other side's; and what an instance hides may have them. (Planted: of all faces; the side counts; 25 degrees; no
     instance; never.)"""
@@ -229,9 +225,7 @@ def test_shading_normals_that_are_not_the_surfaces_own_are_seen(
     assert load_scene(path).smoothed is smoothed
 
 
-def test_whatever_mitsuba_added_up_is_added_up_anew(
-    small_scene: Callable[..., Path], variant: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sums_are_added_anew(small_scene: Callable[..., Path], variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In groups and merged shapes, too; but normals that a file gives, a shape of its own or one among those merged,
     stay. (Planted: another order of the sums, here a change of all normals.)"""
     import mitsuba as mi

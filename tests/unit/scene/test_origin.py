@@ -143,11 +143,8 @@ def test_shapes_that_single_precision_holds(small_scene: Callable[..., Path]) ->
 @pytest.mark.parametrize(
     ("shape", "held"),
     [
-        (wire(0.15), 0.98),
-        (wire(0.1, '<bsdf type="plastic"/>'), 0.98),
-        (wire(0.001, '<bsdf type="conductor"/>'), 0.0039),
-        (ball(3e-4), 0.00038),
-        (ball(0.5, LAMP), 6),
+        *((wire(0.15), 0.98), (wire(0.1, '<bsdf type="plastic"/>'), 0.98)),
+        *((wire(0.001, '<bsdf type="conductor"/>'), 0.0039), (ball(3e-4), 0.00038), (ball(0.5, LAMP), 6)),
         (group(wire(0.15, z=38), 10), 0.28),
     ],
 )

@@ -153,9 +153,7 @@ def oblong() -> np.ndarray:
     [(np.zeros((N, 2 * N)), "all black"), (oblong(), "8x16 and must fill a square"), (hollow(), "must fill a square")],
     ids=["black", "oblong", "hollow"],
 )
-def test_a_window_that_is_no_filled_square_is_refused(
-    small_scene: Callable[..., Path], canvas: np.ndarray, fragment: str
-) -> None:
+def test_a_window_is_a_filled_square(small_scene: Callable[..., Path], canvas: np.ndarray, fragment: str) -> None:
     path = small_scene(canvas=canvas)
     with pytest.raises(MitsimError, match=fragment) as caught:
         grid_of(path)

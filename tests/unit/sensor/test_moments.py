@@ -9,7 +9,7 @@ from scipy import special, stats
 
 from mitsim.core.arrays import stream
 from mitsim.core.configuration import shipped_path
-from mitsim.devices.sensor import SensorModel, load_sensor
+from mitsim.devices.sensor import load_sensor
 from mitsim.sensor import chain
 from mitsim.sensor.camera_fit import average_moments
 from mitsim.sensor.chain import poisson_quantile, specimen
@@ -51,17 +51,7 @@ def test_electrons_that_fill_the_well_are_one_code_and_not_dithered(black: float
     sum over all counts; 129 points stand for them to 0.01 DN. (Planted: light fills the well within 0.08 electrons.)
     """
     gain, read = 0.1, 1.0
-    model = SensorModel(
-        name="coarse",
-        pixel_pitch_um=5,
-        full_well_e=well,
-        read_noise_e=read,
-        quantum_efficiency=0.5,
-        gain_dn_per_e=gain,
-        black_level_dn=black,
-        bits=12,
-        source="chosen",
-    )
+    model = sensor(full_well_e=well, read_noise_e=read, gain_dn_per_e=gain, black_level_dn=black, bits=12)
     counts = np.arange(9000, 11_000)
     weights = stats.poisson.pmf(counts, light)
     signal, codes = np.minimum(counts, well) * gain + black, np.arange(850, 1060)

@@ -39,9 +39,7 @@ def added_up(begin_s: float, seconds: float, phase: float) -> float:
         ({"binning": 3, "shutter": "global", "line_time_us": None}, [[0] for _ in range(ROWS)]),
     ],
 )  # fmt: skip
-def test_a_rows_level_is_the_light_over_its_own_exposure(
-    changes: dict[str, Any], begins: list[list[int]], seconds: float
-) -> None:
+def test_a_rows_level_is_its_exposures_light(changes: dict[str, Any], begins: list[list[int]], seconds: float) -> None:
     """Of superpixels: the mean of their rows. (Planted: the begin in place of the middle of an exposure; a superpixel
     that begins with its first row; one line time a pixel row on chip; sin for cos.)"""
     for phase in (0.0, 2.0):
