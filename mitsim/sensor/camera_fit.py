@@ -471,9 +471,8 @@ class Pixels:
         row_error = float(weight.sum() ** -0.5 / share)
         shared, shared_error = _root(float((values * weight).sum() / weight.sum() / share), row_error)
         own = math.sqrt(max(read**2 - shared**2, 0.0))
-        own_error = math.hypot(
-            error, own * transfer.error("gain") / gain, row_error / max(2 * own, 1e-9) if shared else 0.0
-        )
+        apart = row_error / max(2 * own, 1e-9) if shared else 0.0
+        own_error = math.hypot(error, own * transfer.error("gain") / gain, apart)
         black = transfer["black"]
         black_error = math.hypot(transfer.error("black"), math.sqrt(self._mean_variance(self.offsets[0])))
         if black < -_SURE * black_error and max(each.cut[0] for each in dark) > _CUT:

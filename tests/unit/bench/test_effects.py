@@ -40,19 +40,13 @@ ALWAYS = ("interreflection", "diffraction")
 _EFFECTS, _PASSES = "mitsim/bench/effects.py", "mitsim/light/passes.py"
 TOY = (
     Step(_EFFECTS, "below", "interreflection: bool", "    lamp: float\n"),
-    Step(
-        *(_EFFECTS, "below", "interreflection=True,"),
-        '            lamp=0.9 if "dimmed" in bench.projector.name else 1.0,\n',
-    ),
-    Step(
-        *(_EFFECTS, "below", "_TABLE = ("),
-        '    Effect("dimming", {"lamp": 1.0}, absent="the projector\'s lamp gives all that it can", in_truth=True),\n',
-    ),
-    Step(
-        *(_PASSES, "below", "black = physics.black_level if leaking else 0.0"),
-        "    lighting = Lighting(lighting.labels, physics.lamp * lighting.weights)\n",
-    ),
-)
+    Step(_EFFECTS, "below", "interreflection=True,",
+         '            lamp=0.9 if "dimmed" in bench.projector.name else 1.0,\n'),
+    Step(_EFFECTS, "below", "_TABLE = (", '    Effect("dimming", {"lamp": 1.0}, absent="the projector\'s lamp gives '
+         'all that it can", in_truth=True),\n'),
+    Step(_PASSES, "below", "black = physics.black_level if leaking else 0.0",
+         "    lighting = Lighting(lighting.labels, physics.lamp * lighting.weights)\n"),
+)  # fmt: skip
 """An effect as docs/extending.md has one: power of the projector's lamp, as a part of its full power."""
 
 
@@ -98,11 +92,8 @@ def test_a_bench_has_what_its_devices_and_scene_have(everything: Bench, nothing:
 def test_a_simulation_has_what_is_on(everything: Bench) -> None:
     for name in EFFECTS:
         physics = Physics.with_effects(everything, {name})
-        on = {
-            other
-            for other, effect in EFFECTS.items()
-            if any(attrgetter(f)(physics) != v for f, v in effect.neutral.items())
-        }
+        neutral = {other: effect.neutral.items() for other, effect in EFFECTS.items()}
+        on = {other for other, values in neutral.items() if any(attrgetter(f)(physics) != v for f, v in values)}
         assert on == {name}
 
 

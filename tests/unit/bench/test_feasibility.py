@@ -28,9 +28,8 @@ def test_a_code_of_two_terms_has_factors_once_it_covers_what_the_sensor_sees(sma
     bench = open_bench(small_scene())
     geometry, (low, high) = bench.geometry, bench.windows[0]
     side = float(geometry.centres(0)[-1])
-    seen = 2 * (
-        side * (1 - geometry.mask_distance / geometry.scene_distance) + geometry.mask_distance * max(-low, high)
-    )
+    near = geometry.mask_distance
+    seen = 2 * (side * (1 - near / geometry.scene_distance) + near * max(-low, high))
     fault = mask_fault(masked(bench, kind="mura", feature_mm=0.025, features=31))
     assert fault and f"covers 0.78 mm of the {seen:.2g} mm" in fault.reason
     least = int(fault.remedy.split()[3])

@@ -15,13 +15,10 @@ from mitsim.planner.planner import SceneFacts
 @pytest.fixture
 def facing(small_scene: Callable[..., Path]) -> Path:
     """A projector on the camera's axis, 800 mm away, that faces the sensor past a small sheet."""
-    path = small_scene(
-        mask="open", projector_turn='<rotate y="1" angle="180"/><translate x="-60" z="800"/>', sheet_z=300
-    )
-    text = path.read_text(encoding="utf-8")
-    path.write_text(
-        text.replace('<scale x="64" y="64"/>', '<scale x="2" y="2"/> <translate x="20"/>'), encoding="utf-8"
-    )
+    turn = '<rotate y="1" angle="180"/><translate x="-60" z="800"/>'
+    path = small_scene(mask="open", projector_turn=turn, sheet_z=300)
+    small = '<scale x="2" y="2"/> <translate x="20"/>'
+    path.write_text(path.read_text().replace('<scale x="64" y="64"/>', small))
     return path
 
 
@@ -35,9 +32,8 @@ def test_the_reference_and_a_lens_are_flagged(facing: Path) -> None:
     def lens(bench: Bench, switches: dict[str, bool] | None = None) -> list[str]:
         return [text for text in SceneFacts.of(bench, switches).warnings if "as a pinhole, without its lens" in text]
 
-    wide = replace(
-        bench, devices=replace(bench.devices, projector=bench.projector.model_copy(update={"aperture_radius_mm": 10.0}))
-    )
+    light = bench.projector.model_copy(update={"aperture_radius_mm": 10.0})
+    wide = replace(bench, devices=replace(bench.devices, projector=light))
     (warning,) = lens(wide)
     assert "blur the mask's shadow by 0.05 mm" in warning
     assert not lens(bench) and not lens(wide, {"mirrors": False})

@@ -80,6 +80,11 @@ pytestmark = pytest.mark.usefixtures("variant")
 SPHERE = '<shape type="sphere"><bsdf type="{type}">{inside}</bsdf></shape>'
 PICTURE = '<texture name="reflectance" type="bitmap"><string name="filename" value="{name}.png"/></texture>'
 
+SPECTRA = ("0.3", False), ("400:0.3, 700:0.3", False), ("400:0.3, 700:0.4", True)
+INDEX = '<spectrum name="eta" value="3"/><spectrum name="k" value="4"/>'
+IRREGULAR = '<spectrum name="reflectance" type="irregular"><string name="wavelengths" value="400,500"/>'
+IRREGULAR += '<string name="values" value="0.2,0.3"/></spectrum>'
+
 
 def diffuse(inside: str) -> str:
     return SPHERE.format(type="diffuse", inside=inside)
@@ -89,29 +94,13 @@ def diffuse(inside: str) -> str:
     ("extra", "coloured"),
     [
         ("", False),
-        (diffuse('<spectrum name="reflectance" value="0.3"/>'), False),
-        (diffuse('<spectrum name="reflectance" value="400:0.3, 700:0.3"/>'), False),
-        (diffuse('<spectrum name="reflectance" value="400:0.3, 700:0.4"/>'), True),
-        (diffuse('<rgb name="reflectance" value="0.3"/>'), False),
-        (diffuse('<rgb name="reflectance" value="0.3, 0.3, 0.2"/>'), True),
-        (
-            diffuse(
-                '<spectrum name="reflectance" type="irregular"><string name="wavelengths" value="400,500"/>'
-                '<string name="values" value="0.2,0.3"/></spectrum>'
-            ),
-            True,
-        ),
-        (diffuse(PICTURE.format(name="grey")), False),
-        (diffuse(PICTURE.format(name="red")), True),
-        (SPHERE.format(type="conductor", inside=""), True),
+        *((diffuse(f'<spectrum name="reflectance" value="{value}"/>'), coloured) for value, coloured in SPECTRA),
+        *((diffuse('<rgb name="reflectance" value="0.3"/>'), False), (diffuse(PICTURE.format(name="grey")), False)),
+        *((diffuse('<rgb name="reflectance" value="0.3, 0.3, 0.2"/>'), True), (diffuse(IRREGULAR), True)),
+        *((diffuse(PICTURE.format(name="red")), True), (SPHERE.format(type="conductor", inside=""), True)),
         (SPHERE.format(type="conductor", inside='<string name="material" value="Au"/>'), True),
         (SPHERE.format(type="conductor", inside='<string name="material" value="none"/>'), False),
-        (
-            SPHERE.format(
-                type="roughconductor", inside='<spectrum name="eta" value="3"/><spectrum name="k" value="4"/>'
-            ),
-            False,
-        ),
+        (SPHERE.format(type="roughconductor", inside=INDEX), False),
         ('<emitter type="constant"><rgb name="radiance" value="1, 2, 3"/></emitter>', True),
     ],
 )

@@ -46,10 +46,8 @@ def test_media_are_for_the_reference_alone(small_scene: Write, extra: str, name:
     for action in (lambda: open_bench(path), lambda: bench.render("factored"), lambda: bench.plan("uniform")):
         reported = message(action)
         line = path.read_text().split(tag.split(" id")[0].replace("'", '"'))[0].count("\n") + 1
-        assert (
-            reported.startswith(f"{path}:{line}: {name}: got a medium in {tag}; only the reference")
-            and "\n" not in reported
-        )
+        start = f"{path}:{line}: {name}: got a medium in {tag}; only the reference"
+        assert reported.startswith(start) and "\n" not in reported
     assert bench.loaded.unfit.reference is None
     if extra == FOG:
         assert bench.render("reference", spp=4).mean.any()
@@ -135,9 +133,8 @@ def test_mirrors_inside_of_other_materials_are_mirrors(small_scene: Write, bsdf:
 def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
     """It is no pane and brings no specular chain there, and an instance does not show its materials."""
     group = '<shape type="shapegroup" id="group">{}</shape>'
-    placed = (
-        '<shape type="instance"><ref id="group"/><transform name="to_world"><translate z="20"/></transform></shape>'
-    )
+    move = '<transform name="to_world"><translate z="20"/></transform>'
+    placed = f'<shape type="instance"><ref id="group"/>{move}</shape>'
     path = small_scene(extra=group.format(BALL.format("dielectric")) + placed)
     loaded = open_bench(path).loaded
     assert loaded.mirrors and loaded.unfit.instances is not None and "'dielectric'" in loaded.unfit.instances
@@ -189,6 +186,8 @@ def test_what_light_passes_is_not_hidden_under_bumps(small_scene: Write, bumps: 
 
 
 AREA = '<emitter type="area"><spectrum name="radiance" value="1"/></emitter>'
+NO_SAMPLES = '<integer name="bsdf_samples" value="0"/>'
+UNDRAWN = '<float name="sampling_weight" value="0"/></'
 THIN = '<shape type="disk"><bsdf type="principledthin"><float name="spec_trans" value="0.5"/></bsdf></shape>'
 
 
@@ -198,14 +197,8 @@ THIN = '<shape type="disk"><bsdf type="principledthin"><float name="spec_trans" 
         ({"extra": AREA}, "emitter: got 'area' in <emitter type='area'>; it is the light of a shape"),
         ({"integrator_options": '<boolean name="hide_emitters" value="true"/>'}, "hide_emitters: got true"),
         ({"integrator_options": '<float name="timeout" value="2"/>'}, "timeout: got 2"),
-        (
-            {"integrator": "direct", "integrator_options": '<integer name="bsdf_samples" value="0"/>'},
-            "bsdf_samples: got 0",
-        ),
-        (
-            {"extra": AREA.replace("area", "constant").replace("</", '<float name="sampling_weight" value="0"/></', 1)},
-            "sampling_weight: got 0",
-        ),
+        ({"integrator": "direct", "integrator_options": NO_SAMPLES}, "bsdf_samples: got 0"),
+        ({"extra": AREA.replace("area", "constant").replace("</", UNDRAWN, 1)}, "sampling_weight: got 0"),
         ({"extra": THIN}, "spec_trans: got a transmission"),
     ],
     ids=["area", "hide", "timeout", "bsdf", "weight", "thin"],
@@ -221,7 +214,6 @@ def test_what_differs_along_the_surface_is_not_turned_by_a_bump_map(small_scene:
     """Mitsuba takes the axes of a bump map from another frame: mirrors under two maps lost all their light."""
     own = BUMPS.get(inner, "") + (MATT if inner in BUMPS else "")
     own += '<float name="alpha_u" value="0.2"/>' if inner == "roughconductor" else ""
-    extra = (
-        f'<shape type="disk"><bsdf type="bumpmap">{BUMPS["bumpmap"]}<bsdf type="{inner}">{own}</bsdf></bsdf></shape>'
-    )
+    bumpy = f'<bsdf type="bumpmap">{BUMPS["bumpmap"]}<bsdf type="{inner}">{own}</bsdf></bsdf>'
+    extra = f'<shape type="disk">{bumpy}</shape>'
     assert f"bsdf: got '{inner}' in " in message(lambda: open_bench(small_scene(extra=extra), "llvm_ad_mono"))

@@ -15,6 +15,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.images import read_reflectance
 from mitsim.scene.headers import check_image, check_obj, check_ply
+from tests.ply import ply_text
 
 # -------- Wavefront meshes
 
@@ -69,9 +70,6 @@ def test_a_wavefront_mesh_is_read_right_or_refused(tmp_path: Path, variant: str,
     assert float(np.array(mesh.surface_area()).ravel()[0]) == pytest.approx(right, rel=1e-3)
 
 
-# -------- Names in messages
-
-
 # -------- OpenEXR pictures
 
 
@@ -99,9 +97,7 @@ def test_windows_that_differ_are_refused(tmp_path: Path, what: str, reader: str)
     path = tmp_path / "a.exr"
     header = {"type": OpenEXR.scanlineimage, **WINDOWS[what]}
     OpenEXR.File(header, {"Y": np.ones((6, 8), np.float32)}).write(str(path))
-    with pytest.raises(
-        (MitsimError, ValueError), match=r"has the data window .* and the display window .*; save it with"
-    ):
+    with pytest.raises((MitsimError, ValueError), match=r"has the data window .* and the display window .*; save it"):
         READERS[reader](path)
 
 
@@ -120,10 +116,6 @@ def test_channels_of_several_types_are_refused_in_scenes_and_read_elsewhere(tmp_
 
 
 def test_a_texture_that_a_mesh_names_is_found(tmp_path: Path) -> None:
-    path, comment = tmp_path / "a.ply", "comment TextureFile bricks.png\n"
-    text = "ply\nformat ascii 1.0\n{}element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    text += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
-    path.write_text(text.format(""))
-    assert check_ply(path) == (False, "")
-    path.write_text(text.format(comment))
-    assert check_ply(path) == (False, "bricks.png")
+    for comment, texture in (("", ""), ("comment TextureFile bricks.png", "bricks.png")):
+        (tmp_path / "a.ply").write_text(ply_text([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)], comment))
+        assert check_ply(tmp_path / "a.ply") == (False, texture)

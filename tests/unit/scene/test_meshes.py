@@ -13,6 +13,7 @@ import pytest
 from mitsim.core.arrays import FloatArray
 from mitsim.scene.headers import check_ply
 from mitsim.scene.load import LoadedScene, load_scene
+from tests.ply import ply_text
 
 pytestmark = pytest.mark.usefixtures("variant")
 VERTICES = [(-20.0, -20.0, 0.0), (20.0, -20.0, 0.0), (20.0, 20.0, 0.0), (-20.0, 20.0, 0.0)]
@@ -135,16 +136,12 @@ def rough(side: int) -> tuple[FloatArray, FloatArray]:
 def write_mesh(path: Path, side: int, normals: bool = False) -> None:
     """A rough sheet as PLY or Wavefront file; with ``normals`` all corners have the same one."""
     points, faces = rough(side)
+    text = ply_text([(*point, *UP * normals) for point in points], faces)
     if path.suffix == ".obj":
         lines = [*(("v", *point) for point in points), *(("f", *face) for face in faces + 1)]
         lines += [("vn", *UP)] if normals else []
-    else:
-        names = [f"{axis}{n}" for axis in ("", "n")[: 1 + normals] for n in "xyz"]
-        lines = [("ply",), ("format ascii 1.0",), (f"element vertex {len(points)}",)]
-        lines += [(f"property float {name}",) for name in names] + [(f"element face {len(faces)}",)]
-        lines += [("property list uchar int vertex_indices",), ("end_header",)]
-        lines += [(*point, *UP * normals) for point in points] + [(3, *face) for face in faces]
-    path.write_text("".join(" ".join(map(str, line)) + "\n" for line in lines), encoding="utf-8")
+        text = "".join(" ".join(map(str, line)) + "\n" for line in lines)
+    path.write_text(text, encoding="utf-8")
 
 
 def mesh(name: str) -> str:
@@ -183,18 +180,6 @@ def test_normals_do_not_depend_on_threads(small_scene: Callable[..., Path], set_
     assert np.allclose(ours, np.array(mi.traverse(theirs)["vertex_normals"]), rtol=0, atol=2e-6)
 
 
-BENT = [(0.0, 0, 0), (1, 0, 0), (0, 1, 0), (0.9, 0.9, 0.1)]
-
-
-def write_sheet(path: Path, faces: Sequence[tuple[int, ...]], rows: Sequence[Row] = BENT) -> None:
-    """Some ``faces`` of corners ``rows``, with their normals where these have six numbers."""
-    names = ("x", "y", "z", "nx", "ny", "nz")[: len(rows[0])]
-    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *(f"property float {name}" for name in names)]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    text = "\n".join([*header, *(" ".join(map(str, row)) for row in [*rows, *((3, *face) for face in faces)])])
-    path.write_text(text + "\n", encoding="utf-8")
-
-
 @pytest.mark.parametrize(
     ("extra", "smoothed"),
     [
@@ -218,10 +203,10 @@ def test_foreign_shading_normals_are_seen(small_scene: Callable[..., Path], extr
     flat = [(*place, 0) for place in ((0.0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (2, 1))]
     faces = [(0, 1, 2), (1, 3, 2), (1, 4, 3), (4, 5, 3)]
     lean = np.radians(3.0)
-    write_sheet(path.parent / "bent.ply", faces, [*flat[:5], (2, 1, 1.0)])
-    write_sheet(path.parent / "flat.ply", faces, flat)
-    write_sheet(path.parent / "turned.ply", faces, [(*row, 0, 0, -1) for row in flat])
-    write_sheet(path.parent / "leaning.ply", faces, [(*row, np.sin(lean), 0, np.cos(lean)) for row in flat])
+    (path.parent / "bent.ply").write_text(ply_text([*flat[:5], (2, 1, 1.0)], faces))
+    (path.parent / "flat.ply").write_text(ply_text(flat, faces))
+    (path.parent / "turned.ply").write_text(ply_text([(*row, 0, 0, -1) for row in flat], faces))
+    (path.parent / "leaning.ply").write_text(ply_text([(*row, np.sin(lean), 0, np.cos(lean)) for row in flat], faces))
     assert load_scene(path).smoothed is smoothed
 
 
