@@ -21,7 +21,6 @@ import numpy as np
 from mitsim.acquire.capture import expose
 from mitsim.acquire.exposure import Exposer
 from mitsim.acquire.spectral import SpectralBench, plan_request
-from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Exposure, Request, SessionRequest, Task
 from mitsim.calibrate.calibrate import calibrate_lines
 from mitsim.core.arrays import FloatArray, integer, single_threaded_blas
@@ -79,8 +78,9 @@ class LitLine:
         return integer(seed, "line", self.name)
 
 
-def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
-    colours = SpectralBench.of(_open(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
+def light_lines(studio: Studio, setup: Setup, seed: int) -> tuple[LitLine, ...]:
+    """Trace the light of each line of a scene, and calibrate the camera in it."""
+    colours = SpectralBench.of(studio.bench(_spectral(setup)), RUN)
     request = Request.of(accuracy=setup.accuracy, seed=seed)
     plan = plan_request(colours.whole, request)
     lighting = colours.whole.family(request.patterns, seed).lighting
@@ -92,23 +92,21 @@ def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
     )
 
 
-def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
-    """Return the irradiance (m, m') [W m^-2] of a scene in a lamp's daylight (D65), and its photons' mean wavelength
-    [nm].
+def daylight_frame(studio: Studio, setup: Setup) -> tuple[FloatArray, float]:
+    """Return the irradiance (m, m') [W m^-2] of a scene in daylight (D65), and its photons' mean wavelength [nm].
 
     The scene's spectra are averaged over D65's photons, 380 to 780 nm, for a camera of constant efficiency. MitsimError
     for a scene without spectra.
     """
-    own = locate(setup.scene, "scenes", "scene.xml")
-    shutil.copytree(own.parent, folder / "daylight")
-    found = 0
+    own, folder, found = locate(setup.scene, "scenes", "scene.xml"), studio.folder("daylight"), 0
+    shutil.copytree(own.parent, folder, dirs_exist_ok=True)
 
     def even(match: re.Match[str]) -> str:
         pairs = np.array([[float(part) for part in pair.split(":")] for pair in re.split(r"[,\s]+", match[1].strip())])
         photons = daylight(pairs[:, 0]) * pairs[:, 0]
         return f'value="{float((pairs[:, 1] * photons).sum() / photons.sum()):.9g}"'
 
-    for file in (folder / "daylight").glob("*.xml"):
+    for file in folder.glob("*.xml"):
         text, count = _SPECTRUM.subn(even, file.read_text(encoding="utf-8"))
         found += count
         if file.name == own.name:
@@ -121,7 +119,7 @@ def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
         )
     wavelengths = np.arange(380.0, 781.0, 5.0)
     mean = float((daylight(wavelengths) * wavelengths).sum() / daylight(wavelengths).sum())
-    bench = _open(setup, folder / "daylight" / own.name)
+    bench = studio.bench(replace(_spectral(setup), scene=str(folder / own.name)))
     bench = replace(bench, devices=replace(bench.devices, projector=bench.projector.at(mean)))
     light = bench.light("uniform", accuracy=setup.accuracy)
     return light.merge().frames(bench.family("uniform").lighting, light.seed).projector_off.irradiance, mean
@@ -137,18 +135,15 @@ def serving(line: LitLine, other: LitLine) -> Factors:
     return replace(model, left=root * model.left, right=root * model.right, manifest=manifest, lacking=())
 
 
-def _open(setup: Setup, scene: Path) -> Bench:
-    parameters: dict[str, Any] = dict(setup.parameters)
-    variant = f"{setup.variant.rpartition('_')[0]}_spectral"
-    return open_bench(scene, variant, setup.camera, setup.projector, setup.outside, **parameters)
+def _spectral(setup: Setup) -> Setup:
+    return replace(setup, variant=f"{setup.variant.rpartition('_')[0]}_spectral")
 
 
 # -------- Filters over the sensor's pixels, and daylight beside the projector
 
 
 def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, seed: int) -> Solution:
-    """Expose all lines at once, at equal peak, behind filters, and solve their images (lines, n, n') with the best
-    lambda.
+    """Expose all lines at once behind filters, and solve their images (lines, n, n') with the best lambda.
 
     MitsimError for a line outside the filters' curves.
     """
@@ -237,13 +232,13 @@ _SHOWN = "dots:7"
 
 def _measure(studio: Studio, point: Point) -> Found:
     setup, way, patterns, seed = point.setup, str(point["way"]), str(point["patterns"]), int(point["seed"])
-    lines = studio.once("lines", 1, (setup, seed), lambda: light_lines(setup, seed))
+    lines = studio.once("lines", 1, (setup, seed), lambda: light_lines(studio, setup, seed))
     if way == MOSAIC:
         joint = mosaic_images(lines, lines[0].lit.bench.family(patterns, seed), seed)
         images, flags = np.moveaxis(joint.image, 0, -1), flags_of(joint.status)
     else:
         if way == D65:
-            light = studio.once("daylight", 1, setup, lambda: daylight_frame(setup, studio.folder("daylight")))
+            light = studio.once("daylight", 1, setup, lambda: daylight_frame(studio, setup))
             solved = [daylit_image(line, light, point["lux"], patterns, seed) for line in lines]
         else:
             factors = [line.factors if way == OWN else serving(line, lines[len(lines) // 2]) for line in lines]

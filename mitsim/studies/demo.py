@@ -37,9 +37,7 @@ _SECOND_SHOWN = 0.4
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Result of `mitsim demo`: PSNR [dB] by family and exposure, relative errors of frames and truth, and time by
-    stage.
-    """
+    """Result of `mitsim demo`: PSNR [dB] by family and exposure, relative errors, and time by stage."""
 
     psnr: dict[str, float]
     psnr_ideal: dict[str, float]

@@ -15,16 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.acquire import exposure
 from mitsim.acquire.capture import trace_request
-from mitsim.acquire.exposure import (
-    DriftedExposer,
-    ambient_shots,
-    drift_mask,
-    drift_projector,
-    levels,
-    takes_ambient_frame,
-    warmer,
-)
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import CAMERA, DEFAULT_CAMERA, locate, shipped_path
@@ -110,10 +102,11 @@ class DriftStand:
             model = scene.rendered_frames(session, self.family, self.seed).prepare()
         bench = scene.bench
         moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
-        expected = scene.expected_frames(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
-        base = self._frames.exposer(self.exposure_s)
+        mask = exposure.drift_mask(bench, drift) if moved else None
+        expected, base = scene.expected_frames(RENDERED, self.family, bench=mask), self._frames.exposer(self.exposure_s)
         ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
-        exposer = DriftedExposer(bench.devices, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
+        shot = base.exposure_s, base.seed, base.speckle
+        exposer = exposure.DriftedExposer(bench.devices, *shot, drift, self.family, ambient)
         (sums,) = accumulate(exposer, self.family, expected, [model])
         image = model.solve(sums, self.before.lam).image
         still, predicted = (self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
@@ -185,10 +178,10 @@ class DriftStand:
     def noises(self) -> Mapping[str, Noise]:
         frames = self._frames.noises(self.exposure_s)
         found = {name: Noise(datum=variance) for name, variance in frames.items() if name != NONUNIFORMITY}
-        if takes_ambient_frame("auto", self.family, self._frames.expected):
+        if exposure.takes_ambient_frame("auto", self.family, self._frames.expected):
             exposer = self._frames.exposer(self.exposure_s)
             off = exposer.electrons(self._frames.expected.projector_off)
-            variance = (exposer.sensor_noise(off) / self.exposure_s) ** 2 / ambient_shots(self.family)
+            variance = (exposer.sensor_noise(off) / self.exposure_s) ** 2 / exposure.ambient_shots(self.family)
             found[AMBIENT] = Noise(ambient=variance)
         if known := self.factors.manifest.noise:
             found[SESSION] = Noise(left=known.left**2, right=known.right**2)
@@ -197,7 +190,7 @@ class DriftStand:
     def _frame_changes(self, drift: Drift) -> Changed:
         count = self.family.left.shape[1], self.family.right.shape[1]
         black = self.lit.light.simulation.physics.black_level
-        ramp = levels(self.seed, "power", len(self.family.shots), drift.power_ramp).reshape(*count, -1)
+        ramp = exposure.levels(self.seed, "power", len(self.family.shots), drift.power_ramp).reshape(*count, -1)
         gain = (1 + drift.exposure) * (1 + drift.power) * ramp
         changed = Changed(
             terms=self._terms(drift),
@@ -212,10 +205,10 @@ class DriftStand:
             exposer = self._frames.exposer(1.0)
             lamps = exposer.electrons(self._frames.expected.projector_off)
             each = self._gains(drift, "lamp", drift.lamp_flicker)
-            common = [rms / ambient_shots(self.family) ** 0.5 for rms in each]
+            common = [rms / exposure.ambient_shots(self.family) ** 0.5 for rms in each]
             return replace(changed, added=lamps, added_gain=drift.lamp, added_flicker=each, added_common=common)
         sensor = self.lit.bench.sensor
-        dark = warmer(sensor, drift.temperature_k).superpixel_dark_current_e_per_s * (1 + drift.exposure)
+        dark = exposure.warmer(sensor, drift.temperature_k).superpixel_dark_current_e_per_s * (1 + drift.exposure)
         offset = drift.black_level_dn * sensor.codes / sensor.gain_dn_per_e / self.exposure_s
         frame = np.full(self.lit.bench.geometry.frame_shape, offset + dark - sensor.superpixel_dark_current_e_per_s)
         return replace(changed, added=frame if self._fixed_frame is None else frame + self._fixed_frame)
@@ -287,7 +280,7 @@ class DriftStand:
         return self._ideal(Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)).terms
 
     def _ideal(self, drift: Drift) -> IdealCamera:
-        bench = drift_projector(drift_mask(self.lit.bench, drift), drift)
+        bench = exposure.drift_projector(exposure.drift_mask(self.lit.bench, drift), drift)
         return IdealCamera(bench, bench.geometry.mask, self.lit.light.simulation.physics.spectrum)
 
 
@@ -360,7 +353,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         # By the same plan, so that errors of plans cancel.
         moved = studio.once(
             "moved projector", 6, (setup, drift),
-            lambda: LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan)),
+            lambda: LitScene(trace_request(exposure.drift_projector(lit.bench, drift), lit.light.plan)),
         )  # fmt: skip
     measured, image = known.outcome(drift, session, moved)
     others = (*lit.light.warnings, *lit.light.unreached, *known.factors.warnings)

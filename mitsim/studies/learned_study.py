@@ -165,9 +165,7 @@ def twin_camera(measured: Measured, learned: Learned) -> Prepared:
 
 
 def twin_sums(prepared: Prepared, noise: tuple[float, float], truths: FloatArray, seed: int) -> Sums:
-    """Return the sums of idealised frames of ``truths`` (N, n, n), 0 to 1, with white noise of a deviation within
-    ``noise`` [DN].
-    """
+    """Return sums of idealised frames of ``truths`` (N, n, n), 0 to 1, whose noise deviates within ``noise`` [DN]."""
     from mitsim.learn.networks import Sums
 
     weights, deviations = [], []

@@ -239,10 +239,8 @@ def split(frames: Unexposed, twin: LitScene, seconds: float) -> tuple[Solution, 
             sums.add(exposer.electrons(frame) / seconds, shot.row, shot.column)
         return model.solve(sums, solution.lam).image
 
-    even, direct = (
-        image(LitScene(light).expected_frames(RENDERED, frames.family))
-        for light in (as_bright(twin.light, lit.light), direct_of(lit.light))
-    )
+    lights = as_bright(twin.light, lit.light), direct_of(lit.light)
+    even, direct = (image(LitScene(light).expected_frames(RENDERED, frames.family)) for light in lights)
     whole = image(frames.expected)
     parts = {PIXELS: lit.truth - twin.truth, SENSOR: direct - even, INTERREFLECTION: whole - direct}
     return solution, {**parts, REST: solution.image - twin.truth - sum(parts.values())}
@@ -269,18 +267,11 @@ def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
 
 
 CARD, BLADE, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
-_TRUTHS = ("matt paint", "apparent")
-_IMAGE = "49 dots"
-_GREY = 0.5
-_ROUNDING = 1e-12
-_PLAIN_DB = 20.0
-_ACCURACY = 3e-3
-
-
 BOUNCING = ("corner", "cookie_bag")
 GLOSS, GLOBAL_LIGHT = ("gloss", "global light")
 AS_IT_IS, MENDED = ("as it is", "depth mended")
-_ALL, SEPARATED, ALONE = DIRECT_IMAGES = ("all light", "separated", "direct alone")
+_ALL, SEPARATED, _ = DIRECT_IMAGES = ("all light", "separated", "direct alone")
+_TRUTHS, _IMAGE, _PLAIN_DB, _ACCURACY = ("matt paint", "apparent"), "49 dots", 20.0, 3e-3
 _LEAST_EIGENVALUE = 1e-3
 
 
@@ -324,10 +315,6 @@ def separate(model: Prepared, factors: Pair, patterns: Pair, weights: FloatArray
     return np.asarray(bases[0] @ (modes @ (inverse * (modes.T @ target.ravel()))).reshape(rows, columns) @ bases[1].T)
 
 
-def _measure_reflectivity(studio: Studio, point: Point) -> Found:
-    return (_measure_gloss if point["part"] == GLOSS else _measure_global)(studio, point)
-
-
 def _measure_global(studio: Studio, point: Point) -> Found:
     frames = studio.frames(point.setup, RENDERED, "dots:7", int(point["seed"]))
     lit, family, model = frames.lit, frames.family, frames.prepare()
@@ -366,7 +353,7 @@ def _measure_global(studio: Studio, point: Point) -> Found:
 def _measure_gloss(studio: Studio, point: Point) -> Found:
     def decibels(error: FloatArray) -> float | None:
         power = float(np.square(error).mean())
-        return -10 * float(np.log10(power)) if power > _ROUNDING else None
+        return -10 * float(np.log10(power)) if power > 1e-12 else None  # else rounding alone
 
     seed = int(point["seed"])
     factors = studio.factors(point.setup, seed)
@@ -383,7 +370,7 @@ def _measure_gloss(studio: Studio, point: Point) -> Found:
         **{f"{cause}_db": decibels(part) for cause, part in parts.items()},
     )
     images = {**dict(zip(_TRUTHS, (twin.truth, lit.truth), strict=True)), _IMAGE: solution.image}
-    images |= {cause: part + _GREY for cause, part in parts.items()}
+    images |= {cause: part + 0.5 for cause, part in parts.items()}
     return Found((row,), single_precision(images))
 
 
@@ -392,7 +379,7 @@ REFLECTIVITY = Study(
     "Gloss and global light",
     "What do shiny surfaces and light over several surfaces do to the image?",
     points=_reflectivity_points,
-    measure=_measure_reflectivity,
+    measure=lambda studio, point: (_measure_gloss if point["part"] == GLOSS else _measure_global)(studio, point),
     claims=(
         *(
             Level(

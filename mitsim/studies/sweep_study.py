@@ -34,12 +34,11 @@ def _points(scope: Scope) -> Sequence[Point]:
     values |= {name: knobs[name] for name in ("patterns", "exposure", "method") if name in knobs}
     scene = {name: each for name, each in knobs.items() if name not in NO_SCENE}
     own = replace(scope, seeds=tuple(int(each) for each in knobs.get("seed", scope.seeds)))
-    if "accuracy" not in knobs:
-        return Axes({"model": (RENDERED,), **values}, scene)(own)
     points = []
-    for accuracy in knobs["accuracy"]:
-        setup = replace(scope.setup, accuracy=number_of("accuracy", accuracy))
-        points += Axes({"model": (RENDERED,), "accuracy": (accuracy,), **values}, scene)(replace(own, setup=setup))
+    for accuracy in knobs.get("accuracy", (None,)):
+        setup = replace(scope.setup, accuracy=number_of("accuracy", accuracy)) if accuracy else scope.setup
+        varied = {"accuracy": (accuracy,), **values} if accuracy else values
+        points += Axes({"model": (RENDERED,), **varied}, scene)(replace(own, setup=setup))
     return points
 
 

@@ -203,8 +203,7 @@ _SCENE = Template("""<scene version="3.0.0">
 
 @single_threaded_blas()
 def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> FloatArray:
-    """Return the expected electrons (m, m') of a simulated camera that sees a frame's scene through a mask of
-    ``codes``.
+    """Return the expected electrons (m, m') of a simulated camera that sees a frame's scene through a mask of codes.
 
     ``folder`` gets the bench's files, which any verb accepts.
     """
@@ -241,12 +240,9 @@ def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> Floa
 
 # -------- Explained part of a measured frame
 
-CAUSES = ("row and column means", "explained", "mask's code", "noise", "rest")
-"""Parts of a measured frame's energy, in the order of their removal."""
-
-
-def column_of(cause: str) -> str:
-    return f"part_{cause.replace(' ', '_')}"
+CAUSES = "row and column means", "explained", "mask's code", "noise", "rest"
+COLUMNS = tuple(f"part_{cause.replace(' ', '_')}" for cause in CAUSES)
+"""Columns of the parts of a measured frame's energy by cause, in the order of their removal."""
 
 
 @single_threaded_blas()
@@ -276,7 +272,7 @@ def compare(measured: Measured, codes: Codes, electrons: FloatArray, other: Floa
         "chi_square": missed / max(noise, np.finfo(float).tiny),
         "noise": noise / energy(frame),
         "render_error": float(np.linalg.norm(own * simulated - model) / np.linalg.norm(model)),
-        **{column_of(name): part / whole for name, part in zip(CAUSES, parts, strict=True)},
+        **{column: part / whole for column, part in zip(COLUMNS, parts, strict=True)},
     }
 
 
@@ -317,9 +313,7 @@ def statistics(light: FloatArray) -> tuple[float, float]:
 
 
 def read_spread(path: Path) -> FloatArray:
-    """Return the lit square of the point spread function in a picture; MitsimError for a picture in colour or too small
-    a lit part.
-    """
+    """Return the lit square of a point spread function; MitsimError for one in colour or with too small a lit part."""
     if read_image(path, Wanted("point spread function", colour=True)).ndim != 2:
         raise MitsimError(f"point spread function {path}: is in colour; give the sensor's own grey picture")
     light = load_psf(path, _REDUCE)
@@ -453,7 +447,7 @@ STUDY = Study(
                 "difference": ("measured less simulated", "")}, file="frames", down=("frame",),
                title=f"Middle {_SHOWN} x {_SHOWN} pixels, row and column means off", where=_FRAMES | {"plane": "gb"}),
         Bars("frame", file="causes", where=_FRAMES, title="Energy that the simulation leaves, by cause",
-             colour={column_of(name): name for name in CAUSES[2:]}, x_label="part of the frame's energy [1]"),
+             colour=dict(zip(COLUMNS[2:], CAUSES[2:], strict=True)), x_label="part of the frame's energy [1]"),
         Images({"measured": ("measured", ""), "simulated 1": ("simulated", "")}, file=_DIFFUSER, down=("source",),
                title="Root of light over its mean", where=_DIFFUSERS | {"draw": "measured"}),
     ),

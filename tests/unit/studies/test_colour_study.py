@@ -31,6 +31,7 @@ from mitsim.studies.colour_study import (
 )
 from mitsim.studies.framework.campaign import batches
 from mitsim.studies.framework.experiment import Point, Results, Scope, Setup
+from mitsim.studies.framework.studio import Studio
 from tests.ideal_sessions import picture, shadow
 from tests.invented import sensor
 
@@ -158,6 +159,6 @@ def test_pixels_see_a_line_as_their_filters_curves_say() -> None:
     assert weights[0, 0] == pytest.approx((0.2 * 0.405 + 0.8 * 0.352) / 0.5)  # 638 nm, between 630 and 640
 
 
-def test_a_scene_without_spectra_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MitsimError, match="scene photograph: has no spectra"):
-        daylight_frame(Setup("photograph"), tmp_path)
+def test_a_scene_without_spectra_is_refused() -> None:
+    with Studio() as studio, pytest.raises(MitsimError, match="scene photograph: has no spectra"):
+        daylight_frame(studio, Setup("photograph"))

@@ -24,10 +24,10 @@ from mitsim.studies.framework.panels import flag_warnings
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.twin_study import (
     CAUSES,
+    COLUMNS,
     STUDY,
     Learned,
     Measured,
-    column_of,
     compare,
     noise_of,
     preparation,
@@ -183,7 +183,7 @@ def parts_of(measured: Measured, codes: Codes, frame: FloatArray, noise: float, 
     drawn = centre_frame(noise * np.random.default_rng(seed + 1000).standard_normal(SENSOR))
     shown = replace(measured, level=level, noise=drawn)
     row = compare(shown, codes, 1000 + frame_of(codes, measured.scene), measured.scene)
-    found = {name: float(str(row[column_of(name)])) for name in CAUSES}
+    found = {name: float(str(row[column])) for name, column in zip(CAUSES, COLUMNS, strict=True)}
     assert sum(found.values()) == pytest.approx(1)
     whole = np.square(level - level.mean()).sum() / np.square(measured.frame).sum()
     return {name: part * whole for name, part in found.items()}
