@@ -564,7 +564,7 @@ SIZES = {
     "scene": (5, 1377),
     "sensor": (4, 1160),
     "sessions": (3, 804),
-    "studies": (22, 5117),
+    "studies": (22, 5095),
     "transport": (15, 4081),
     "verbs": (1, 348),
     "version": (1, 1),
