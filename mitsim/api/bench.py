@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mitsim.devices.session import BoardShape
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
-    from mitsim.report.bench_view import BenchView
+    from mitsim.report.lit_scene import BenchView
 
 
 # ---- Opening a bench ----
@@ -394,7 +394,7 @@ class Bench(Apparatus):
 
         The drawing shows itself in a notebook, and is saved as a picture or as a page on which it can be turned.
         """
-        from mitsim.report.bench_view import view
+        from mitsim.report.lit_scene import view
 
         return view(self)
 

@@ -54,10 +54,9 @@ _NAME_LETTERS = 34
 _UPRIGHT_LETTERS, TITLE_LETTERS = 26, 46
 LOGARITHMIC = 30.0
 """Ratio of largest to least value from which an axis is logarithmic."""
+Layout = Literal["constrained", "compressed"]
 Curve = Mapping[Any, Mean]
 """Means by what varies: numbers, or their text."""
-Point = tuple[float, float]
-"""Wall seconds, relative error."""
 
 
 # -------- Figures
@@ -143,7 +142,7 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
     slots = len(kinds) if max(map(len, groups.values())) > 1 else 1
     lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in groups]
     rows_height = ROW * len(lines) * (1 + 0.6 * (max(lines) - 1))
-    figure, axes = figure_of(0.9 + max(0.75 * slots, 1.0) * rows_height, _BARS)
+    figure, ((axes,),) = panels_of(1, 1, 0.9 + max(0.75 * slots, 1.0) * rows_height, _BARS)
     height, places = 0.8 / slots, np.arange(len(groups))[::-1]
     for index, kind in enumerate(kinds):
         own = [(place, bars[kind]) for place, bars in zip(places, groups.values(), strict=True) if kind in bars]
@@ -166,7 +165,7 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
 
 
 def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
-    figure, axes = figure_of(0.42 * WIDTH)
+    figure, ((axes,),) = panels_of(1, 1, 0.42 * WIDTH)
     for index, (name, values) in enumerate(curves.items()):
         ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
         share = 100.0 * np.arange(1, ordered.size + 1) / ordered.size
@@ -189,34 +188,19 @@ def line_style(index: int) -> dict[str, Any]:
 
 
 def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both") -> None:
-    if x:
-        axes.set_xlabel(x, fontsize=FONT)
-    if y:
-        axes.set_ylabel(y, fontsize=FONT)
+    axes.set_xlabel(x, fontsize=FONT)
+    axes.set_ylabel(y, fontsize=FONT)
     axes.grid(True, which="major", axis=grid, color=_GRID)
     axes.set_axisbelow(True)
 
 
-def figure_of(
-    height: float, width: float = WIDTH, layout: Literal["constrained", "compressed"] = "constrained"
-) -> tuple[Figure, Axes]:
-    """Return an empty figure [inches] with its own Agg canvas and one axes.
-
-    The layout "compressed" leaves space around an image of fixed aspect.
-    """
-    figure, places = panels_of(1, 1, height, width, layout)
-    axes: Axes = places[0, 0]
-    return figure, axes
-
-
 def panels_of(
-    rows: int,
-    columns: int,
-    height: float,
-    width: float = WIDTH,
-    layout: Literal["constrained", "compressed"] = "constrained",
-    **shared: Any,
+    rows: int, columns: int, height: float, width: float = WIDTH, layout: Layout = "constrained", **shared: Any
 ) -> tuple[Figure, Any]:
+    """Return an empty figure [inches] with its own Agg canvas and axes.
+
+    The layout "compressed" leaves space around images of fixed aspect.
+    """
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     places: Any = figure.subplots(rows, columns, squeeze=False, **shared)

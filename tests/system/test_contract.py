@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from mitsim.bench.layout import Preview
-from mitsim.report import bench_view
+from mitsim.report import lit_scene
 
 VERBS = ["demo", "run", "view", "plan", "capture", "calibrate", "reconstruct", "render", "study", "report", "doctor"]
 VERBS += ["characterise", "sense", "export", "import", "patterns", "transport", "list", "new", "pairs", "train"]
@@ -45,7 +45,7 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 def test_view(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without its previews, which unit/bench/test_layout.py renders."""
     blank = Preview(np.ones((4, 4, 1)), np.eye(4), 0.2)
-    monkeypatch.setattr(bench_view, "previews", lambda *_: (blank, blank))
+    monkeypatch.setattr(lit_scene, "previews", lambda *_: (blank, blank))
     devices = lab.scene, "--camera", lab.camera, "--projector", lab.projector
     options = "--json", "--quiet", "--variant", "llvm_ad_mono"
     found = call("view", *devices, "-o", tmp_path / "bench.png", *options).payload

@@ -18,7 +18,7 @@ from numpy.testing import assert_allclose
 from mitsim.api.bench import open_bench
 from mitsim.bench.layout import Layout, Preview, Surface
 from mitsim.core.errors import MitsimError
-from mitsim.report.bench_view import BenchView
+from mitsim.report.lit_scene import BenchView
 
 CORNERS = np.array([[60.0, 60, 400], [-60, 60, 400], [-60, -60, 400], [60, -60, 400]])
 
