@@ -560,7 +560,7 @@ SIZES = {
     "optics": (7, 1773),
     "planner": (6, 1657),
     "reconstruct": (16, 5845),
-    "report": (7, 1854),
+    "report": (6, 1831),
     "scene": (5, 1377),
     "sensor": (4, 1160),
     "sessions": (3, 804),
