@@ -30,7 +30,7 @@ MORE = {
               "with_board", "family", "windows_at", "parallax_from", "speckle"],
     "shots": ["save", "read", "pattern_measurements", "measurements"],
     "factors": ["save", "operator", "check_fit"],
-    "light": ["expose", "save", "load", "speckle"],
+    "light": ["expose", "save"],
     "image": ["save"],
     "rendered": ["save"],
     "plan": ["row", "taking", "save", "load"],
