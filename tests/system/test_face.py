@@ -226,23 +226,6 @@ def test_light_is_exposed_with_other_seeds_and_times_but_no_other_light(bench: m
 # ---- the linear model ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("patterns", ["uniform", "dots:3", "hadamard:2", "random:3"])
-def test_the_operator_and_its_adjoint(factors: ms.Factors, patterns: str) -> None:
-    """<A x, y> = <x, A^H y>, and A x is Phi_L (P o X) Phi_R^T for every pattern P."""
-    from mitsim.devices.patterns import parse_patterns
-
-    operator, family = factors.operator(patterns, seed=2), parse_patterns(patterns, 16, 2)
-    rng = np.random.default_rng(1)
-    x, y = rng.normal(size=operator.shape[1]), rng.normal(size=operator.shape[0])
-    forward, back = operator @ x, operator.H @ y
-    assert abs(forward @ y - x @ back) < 1e-12 * np.linalg.norm(forward) * np.linalg.norm(y)
-    frames = forward.reshape(family.left.shape[1], family.right.shape[1], 64, 64)
-    for i, j in np.ndindex(frames.shape[:2]):
-        shown = np.outer(family.left[:, i], family.right[:, j])
-        expected = factors.left @ (shown * x.reshape(16, 16)) @ factors.right.T
-        assert np.allclose(frames[i, j], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-
-
 def test_an_operator_of_other_patterns(factors: ms.Factors, shared_scene: Callable[..., Path]) -> None:
     with pytest.raises(ms.MitsimError, match="dots:17"):
         factors.operator("dots:17")

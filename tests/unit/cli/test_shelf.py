@@ -182,17 +182,6 @@ def test_what_cannot_be_begun_is_refused(
     assert sorted(tmp_path.rglob("*")) == before and (tmp_path / "there.toml").read_text() == "mine"
 
 
-@pytest.mark.slow
-def test_a_new_scene_and_camera_capture_their_first_frame(tmp_path: Path) -> None:
-    from tests.system.conftest import shell
-
-    for words in (["new", "scene", "bench"], ["new", "camera", "mine"], ["new", "projector", "lamp"]):
-        assert shell(*words, cwd=tmp_path).code == 0
-    devices = "--camera", "mine.toml", "--projector", "lamp.toml"
-    done = shell("capture", "bench", *devices, "-o", "run", "--patterns", "uniform", "--accuracy", "0.1", cwd=tmp_path)
-    assert done.code in (0, 1) and (tmp_path / "run" / "manifest.json").is_file(), done.err
-
-
 # ---- completion ------------------------------------------------------------------------------------------------------
 
 

@@ -107,12 +107,6 @@ def test_frames_are_read_when_they_are_asked_for(tmp_path: Path, monkeypatch: py
     assert read == [frame_name(0), frame_name(1)]
 
 
-def test_saving_over_something_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(MitsimError, match="holds files already"):
-        recorded(Recorder()).save(tmp_path)
-
-
 def test_it_shows_itself(tmp_path: Path) -> None:
     for shots in (recorded(Recorder()), on_disk(tmp_path / "run")):
         text = shots._repr_html_()

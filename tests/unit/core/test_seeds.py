@@ -28,14 +28,6 @@ def test_different_names_give_different_streams() -> None:
     assert len(set(values)) == len(values)
 
 
-def test_streams_of_neighbouring_names_are_uncorrelated() -> None:
-    # 16 streams of 20 000 normals: 120 correlations of standard deviation 1/sqrt(20 000) = 0.0071. The
-    # bound is 4.5 standard deviations: 120 x 7e-6 = 8e-4 chance that an ideal generator fails.
-    draws = np.array([stream(5, "shot", frame).standard_normal(20_000) for frame in range(16)])
-    correlation = np.corrcoef(draws)
-    assert np.abs(correlation[np.triu_indices(16, 1)]).max() < 4.5 / np.sqrt(20_000)
-
-
 def test_integers_are_32_bit_and_spread() -> None:
     values = [integer(3, "pass", index) for index in range(2000)]
     assert all(isinstance(value, int) and 0 <= value < 2**32 for value in values)

@@ -129,16 +129,13 @@ def just_before(wait, *arguments):
     return [*map(operator.methodcaller("__call__"), calls)][-1]
 """
 LATE_IN_THE_WORKER = LATE + HEED.replace("time.sleep(600)", "just_before(time.sleep, 600)") + "    end_stopped()\n"
-LATE_IN_THE_PARENT = (
-    LATE
-    + """
+IN_THE_PARENT = """
 waitpid = os.waitpid
 def once(*given):
     os.waitpid = waitpid
     return just_before(waitpid, *given)
 os.waitpid = once
 """
-)
 
 
 def test_a_signal_just_before_a_wait_ends_it() -> None:
@@ -147,7 +144,7 @@ def test_a_signal_just_before_a_wait_ends_it() -> None:
     process, _ = started(LATE_IN_THE_WORKER)
     assert process.communicate(timeout=HANGS_S) == ("", "mitsim: ended by SIGTERM\n")
     assert process.returncode == 143
-    program = PROGRAM.replace("enter_worker()\n", LATE_IN_THE_PARENT).format(
+    program = PROGRAM.replace("enter_worker()\n", LATE + IN_THE_PARENT).format(
         work=TELL.replace("print(os.getpid(), flush=True)", "enter_worker()")
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=HANGS_S)
@@ -396,16 +393,3 @@ def test_a_closed_stream_is_no_file(tmp_path: Path, number: int) -> None:
         assert (done.returncode, done.stdout, done.stderr) == (0, "out\n", "err\n" if number == 0 else "")
         assert (tmp_path / "kept").read_text() == ""
 
-
-COLLECTED = """
-import gc
-from mitsim.core.worker import enter_worker, pause_collector
-enter_worker()
-for module in ("colorsys", "colorsys", "sys"):  # the first alone is loaded here
-    with pause_collector():
-        assert not gc.isenabled()
-        __import__(module)
-    assert gc.isenabled()
-    print(gc.get_freeze_count() > 0)
-    gc.unfreeze()
-"""
