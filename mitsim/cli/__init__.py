@@ -10,7 +10,7 @@ import signal
 import sys
 import warnings
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -67,25 +67,19 @@ def run() -> None:
         _fail(f"{error.filename or 'output'}: {error.strerror}; choose another place")
     except Exception as error:
         # Usage errors of click (wherever typer keeps it) carry their own one-line message.
-        if hasattr(error, "format_message") and hasattr(error, "exit_code"):
-            _fail(_usage(error))
-        end_uncaught(error)
+        if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
+            end_uncaught(error)
+        message: str = error.format_message()
+        if message.startswith("Usage:"):  # no command was given, and click's sentence is the whole help
+            typer.echo(message, err=True)
+            _fail("give one of the commands above")
+        checked, context = getattr(error.__cause__, "errors", None), getattr(error, "ctx", None)
+        if checked is not None:  # a typer that checks with pydantic leaves out the value
+            message += f"; got {checked()[0].get('input')!r}"
+        _fail(message if context is None else f"{message.rstrip('.')}; see {context.command_path} --help")
     if code == INTERRUPTED:  # some versions of typer turn Control-C into this status without a word
         end_stopped()
     sys.exit(code if isinstance(code, int) else 0)
-
-
-def _usage(error: Any) -> str:
-    """Click's sentence about a command line, with the value that a typer which checks with pydantic leaves out."""
-    message: str = error.format_message()
-    if message.startswith("Usage:"):  # no command was given, and click's sentence is the whole help
-        typer.echo(message, err=True)
-        return "give one of the commands above"
-    checked = getattr(error.__cause__, "errors", None)
-    if checked is not None:
-        message += f"; got {checked()[0].get('input')!r}"
-    context = getattr(error, "ctx", None)
-    return message if context is None else f"{message.rstrip('.')}; see {context.command_path} --help"
 
 
 def _fail(*lines: str) -> None:

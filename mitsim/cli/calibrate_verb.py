@@ -50,47 +50,6 @@ class Calibrating(SessionRequest, Coloured, Opening, LimitedPictured, Resumed):
     fit: str | None = option(None, "what --model fits", show_default="mask, magnification, gain", metavar="NAME,...")
 
 
-_MODES = {
-    "known": "known",
-    "planning": "scene planning psnr patterns recipe seed accuracy opening",
-    "model": "scene model frames frames_used fit recipe seed accuracy opening",
-    "frames": "frames camera",
-    "scene": "scene recipe seed accuracy colour write_frames resume opening",
-}
-"""Options of each kind of calibration beside those of the output; the first kind that is given counts."""
-
-
-@command
-def calibrate(asked: Calibrating) -> int:
-    """Estimate the camera's two factors, simulated or real.
-
-    Renders a Hadamard session on a white board, or reads the frames of a real one (--frames) or of known pictures
-    (--known).
-
-    $ mitsim calibrate photograph -o cal
-    $ mitsim calibrate photograph -o few --model wave
-    $ mitsim calibrate --frames session -o cal --camera imx249
-    """
-    mode = next((name for name in _MODES if getattr(asked, name)), None)
-    if mode is None:
-        raise MitsimError(
-            "calibrate: give a scene, --frames DIR with the frames of a real session, or --known LIST of known pictures"
-        )
-    allowed = {*_MODES[mode].replace("opening", " ".join(_OPENING)).split()}
-    if mode == "model" and asked.frames:
-        allowed -= {"recipe", "seed", "accuracy"}
-    if others := sorted({*asked.given} - allowed - {"output", "as_json", "quiet", "verbose", "no_pictures"}):
-        kind = mode if mode == "scene" else option_name(mode)
-        raise MitsimError(f"{option_name(others[0])}: has no effect on a calibration by {kind}; leave it out")
-    if asked.output is None and mode != "planning":
-        raise MitsimError("Missing option '-o' / '--output': give the calibration folder to make")
-    made = {"known": _known, "planning": _plan, "model": _fit, "frames": _frames, "scene": _simulated}
-    return made[mode](asked, asked.output or Path())
-
-
-_OPENING = (*Opening.model_fields, "max_seconds", "max_memory")
-
-
 def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memory: float) -> int:
     """Print calibrations by the name of their folder in ``folder``, or one without a name; return the exit status."""
     results = {
@@ -245,3 +204,42 @@ def _fit(asked: Calibrating, folder: Path) -> int:
         f"{result['condition']:.2e}",
     ]
     return asked.finish_folder(folder, {**result, "output": str(folder)}, lines, factors.warnings)
+
+
+_OPENING = " ".join((*Opening.model_fields, "max_seconds", "max_memory"))
+_MODES = {
+    "known": (_known, "known"),
+    "planning": (_plan, f"scene planning psnr patterns recipe seed accuracy {_OPENING}"),
+    "model": (_fit, f"scene model frames frames_used fit recipe seed accuracy {_OPENING}"),
+    "frames": (_frames, "frames camera"),
+    "scene": (_simulated, f"scene recipe seed accuracy colour write_frames resume {_OPENING}"),
+}
+"""Function and options of each kind of calibration, beside those of the output; the first kind that is given counts."""
+
+
+@command
+def calibrate(asked: Calibrating) -> int:
+    """Estimate the camera's two factors, simulated or real.
+
+    Renders a Hadamard session on a white board, or reads the frames of a real one (--frames) or of known pictures
+    (--known).
+
+    $ mitsim calibrate photograph -o cal
+    $ mitsim calibrate photograph -o few --model wave
+    $ mitsim calibrate --frames session -o cal --camera imx249
+    """
+    mode = next((name for name in _MODES if getattr(asked, name)), None)
+    if mode is None:
+        raise MitsimError(
+            "calibrate: give a scene, --frames DIR with the frames of a real session, or --known LIST of known pictures"
+        )
+    calibrated, words = _MODES[mode]
+    allowed = {*words.split()}
+    if mode == "model" and asked.frames:
+        allowed -= {"recipe", "seed", "accuracy"}
+    if others := sorted({*asked.given} - allowed - {"output", "as_json", "quiet", "verbose", "no_pictures"}):
+        kind = mode if mode == "scene" else option_name(mode)
+        raise MitsimError(f"{option_name(others[0])}: has no effect on a calibration by {kind}; leave it out")
+    if asked.output is None and mode != "planning":
+        raise MitsimError("Missing option '-o' / '--output': give the calibration folder to make")
+    return calibrated(asked, asked.output or Path())

@@ -44,19 +44,12 @@ if TYPE_CHECKING:
 # ---- Images of frames ------------------------------------------------------------------------------------------------
 
 
-def _method(name: str) -> Any:
-    """Return a method's name, or the network in a file."""
-    if not name.endswith(MODEL):
-        return name
-    return load_network(name)
-
-
 class Reconstructing(ImageRequest, Pictured):
     """Options of `mitsim reconstruct`."""
 
     PANEL = WHAT
     FIRST = "run output calibration"
-    CHANGES = shown(method={"read": _method})
+    CHANGES = shown(method={"read": lambda name: load_network(name) if name.endswith(MODEL) else name})
 
     run: Path = argument(..., "folder of `mitsim capture`", "RUN")
     output: Path | None = to_make(None, "folder for the image; RUN/reconstruction if not given", "DIR")

@@ -138,7 +138,7 @@ def planes_of(mosaic: str) -> dict[str, tuple[int, int]]:
     """Return the first row and column of each of the :data:`PLANES`."""
     places = {(index // 2, index % 2): colour.lower() for index, colour in enumerate(mosaic)}
     names = {
-        colour if colour != "g" else colour + places[row, 1 - column]: (row, column)
+        colour + (places[row, 1 - column] if colour == "g" else ""): (row, column)
         for (row, column), colour in places.items()
     }
     return {name: names[name] for name in PLANES}
@@ -342,16 +342,14 @@ def open_lines(folder: Path | str, *kinds: str) -> SpectralFolder:
     """Return a folder with its spectral lines; MitsimError if colour.json is invalid or not in ``kinds``."""
     if not is_coloured(folder):
         return SpectralFolder(Path(folder), None)
-    data = read_json(Path(folder) / COLOUR)
-    kind = kind_of(data) if kind_of(data) in kinds else kinds[0]
-    return SpectralFolder(Path(folder), checked_colours(data, kind, Path(folder)))
+    return SpectralFolder(Path(folder), checked_colours(read_json(Path(folder) / COLOUR), Path(folder), *kinds))
 
 
 def read_colours(folder: Path | str, kind: str) -> ColourManifest:
     """Return the lines of a folder; MitsimError if colour.json is missing, of another ``kind``, or invalid."""
     if not is_coloured(folder):
         raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
-    return checked_colours(read_json(Path(folder) / COLOUR), kind, Path(folder))
+    return checked_colours(read_json(Path(folder) / COLOUR), Path(folder), kind)
 
 
 def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
@@ -364,10 +362,10 @@ def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
         )
 
 
-def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
-    if kind_of(data) != kind:
-        raise MitsimError(f"{place}: holds a {cut(kind_of(data))}, not a {kind}; give the right folder")
-    return validate(MosaicManifest if kind == MOSAIC else ColourManifest, data, f"{place}/{COLOUR}")
+def checked_colours(data: Any, place: Path, *kinds: str) -> ColourManifest:
+    if kind_of(data) not in kinds:
+        raise MitsimError(f"{place}: holds a {cut(kind_of(data))}, not a {kinds[0]}; give the right folder")
+    return validate(MosaicManifest if kind_of(data) == MOSAIC else ColourManifest, data, f"{place}/{COLOUR}")
 
 
 def write_colours(folder: Path, colours: ColourManifest, **more: Any) -> None:

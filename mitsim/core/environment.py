@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import importlib.metadata
 import json
 import os
 import platform
@@ -229,12 +230,23 @@ def find_llvm() -> Path:
     """Return the library that DRJIT_LIBLLVM_PATH names, else the newest working one; MitsimError if none works."""
     tried = []
     named = os.environ.get(VARIABLE)
+    # A success is noted on disk, because a probe takes about a second.
+    store = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsim" / "llvm.json"
     for path in [Path(named)] if named else candidates():
         major, fault = version(path), "does not exist"
         if named and major is not None and major < OLDEST:
             fault = f"is LLVM {major}, but Dr.Jit needs {OLDEST} or newer"
         elif path.exists():
-            fault = _cached_probe(path)
+            stat, drjit = path.stat(), importlib.metadata.version("drjit")
+            key = f"{os.path.realpath(path)} {stat.st_mtime_ns} {stat.st_size} drjit {drjit}"
+            with suppress(OSError, ValueError):
+                if json.loads(store.read_text(encoding="utf-8")) == [key]:
+                    return path
+            fault = probe(path)
+            if not fault:
+                with suppress(OSError, MitsimError):  # without a cache the probe runs again next time
+                    store.parent.mkdir(parents=True, exist_ok=True)
+                    write_json(store, [key])
         if not fault:
             return path
         tried.append(f"{path} {fault}")
@@ -262,24 +274,6 @@ def _names() -> Iterator[Path]:
     yield from (Path(folder, f"libLLVM.{ending}") for folder in folders for ending in ("so", "dylib"))
 
 
-def _cached_probe(path: Path) -> str:
-    """Return `probe`'s result; success is noted on disk because a probe takes about a second."""
-    import importlib.metadata  # here: it takes 20 ms to import, and no refusal needs it
-
-    store = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsim" / "llvm.json"
-    stat = path.stat()
-    key = f"{os.path.realpath(path)} {stat.st_mtime_ns} {stat.st_size} drjit {importlib.metadata.version('drjit')}"
-    with suppress(OSError, ValueError):
-        if json.loads(store.read_text(encoding="utf-8")) == [key]:
-            return ""
-    fault = probe(path)
-    if not fault:
-        with suppress(OSError, MitsimError):  # without a cache the probe runs again next time
-            store.parent.mkdir(parents=True, exist_ok=True)
-            write_json(store, [key])
-    return fault
-
-
 # -------- Versions of packages
 
 DECIDING = ("mitsim", "mitsuba", "drjit", "numpy", "scipy")
@@ -289,9 +283,7 @@ _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
 
 @cache
 def versions() -> dict[str, str]:
-    """Return the versions of mitsim, Python and packages without importing them."""
-    import importlib.metadata  # read once: it takes 8 ms, and a coloured run states them nine times
-
+    """Return the versions of mitsim, Python and packages without importing them, read once because it takes 8 ms."""
     return {
         "mitsim": __version__,
         "python": platform.python_version(),

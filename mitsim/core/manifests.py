@@ -30,7 +30,7 @@ MOST_SHOTS = 1 << 16
 """256 patterns a side."""
 _MOST_BINNED = 64**2
 """Pixels that a camera file may bin; a binned pixel's black level and dark current are sums over them."""
-_UNVERSIONED = "0.3.0"
+UNVERSIONED = "0.3.0"
 
 # Bounds far from any camera, within which products of these numbers stay finite.
 Weight = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -67,7 +67,7 @@ class _Part(BaseModel):
     @classmethod
     def _of_0_3_0(cls, data: Any, info: pydantic.ValidationInfo) -> Any:
         """Drop unknown fields of version 0.3.0, which stated no format, because other programs added some."""
-        if info.context == _UNVERSIONED and isinstance(data, dict):
+        if info.context == UNVERSIONED and isinstance(data, dict):
             return {name: value for name, value in data.items() if name in cls.model_fields}
         return data
 
@@ -464,7 +464,7 @@ def checked_manifest(data: Any, model: type[Manifest], place: Path) -> Manifest:
         raise MitsimError(f"{place}: holds a {cut(kind_of(data))}, not a {kind}; give the right folder")
     if data.get("status") != "complete":
         raise MitsimError(f"{place}: the {kind} is {cut(str(data.get('status')))}; finish it with resume=True")
-    return validate(model, data, f"{place}/{MANIFEST}", None if "format" in data else _UNVERSIONED)
+    return validate(model, data, f"{place}/{MANIFEST}", None if "format" in data else UNVERSIONED)
 
 
 def kind_of(data: Any) -> str:
@@ -477,11 +477,6 @@ def resumable(folder: Path, kind: str) -> dict[str, Any]:
     if not isinstance(data, dict) or data.get("kind") != kind:
         raise MitsimError(f"resume=True: {folder}/{MANIFEST} is not that of a {kind}; use another folder")
     return data
-
-
-def read_head(folder: Path) -> RunHead:
-    data = resumable(folder, "capture")
-    return validate(RunHead, data, f"{folder}/{MANIFEST}", _UNVERSIONED)
 
 
 def write_manifest(folder: Path, manifest: RunHead | CalibrationManifest) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from mitsim.core import colour_files, manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import MosaicManifest
+from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder, remove_page
@@ -643,7 +644,8 @@ def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
     known: Mapping[str, str] = {}
     again = resume and (path / MANIFEST).is_file()
     if again:
-        before = manifests.read_head(path)
+        data, place = manifests.resumable(path, "capture"), f"{path}/{MANIFEST}"
+        before = validate(RunHead, data, place, manifests.UNVERSIONED)
         if before.configuration_sha256 != head.configuration_sha256:
             changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
             raise MitsimError(

@@ -348,7 +348,7 @@ def _calibration_in(place: h5py.Group, path: Path) -> Packed[CalibrationManifest
 def _colours_in(place: h5py.Group, kind: str, path: Path, beside: Sequence[str] = ()) -> tuple[str, ColourManifest]:
     """Return text and content of a colour.json of that ``kind``; ``beside`` are names beside the lines' folders."""
     text, data = _json_in(place, kind, path)
-    colours = colour_files.checked_colours(data, kind, path)
+    colours = colour_files.checked_colours(data, path, kind)
     taken = {colour_files.COLOUR, LOCK, *((manifests.MANIFEST, *beside) if kind == colour_files.MOSAIC else ())}
     for name in taken.intersection(colours.names):
         raise MitsimError(f"{path}: a line is called {name}; give it a name of its own")

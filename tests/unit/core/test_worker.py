@@ -392,4 +392,3 @@ def test_a_closed_stream_is_no_file(tmp_path: Path, number: int) -> None:
     else:
         assert (done.returncode, done.stdout, done.stderr) == (0, "out\n", "err\n" if number == 0 else "")
         assert (tmp_path / "kept").read_text() == ""
-
