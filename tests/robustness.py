@@ -7,7 +7,7 @@
         measured(error, at_most=1e-12, what="far field")    # holds the gate, and writes figure and gate down
 
 A row of the page is a test that measured: its name in words, the first paragraph of its docstring, figures and gates.
-Other marked tests are named below their table. The rest of the page is tests/robustness.md, where a table's name in
+Other marked tests are counted below their table. The rest of the page is tests/robustness.md, where a table's name in
 braces stands for it.
 """
 
@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -166,16 +167,18 @@ def page_of(template: str, rows: list[Row]) -> str:
 
 
 def table_of(rows: list[Row]) -> str:
-    """One row a test that measured something; the others by name below."""
+    """Return a row for each test that measured something, and the number of other tests by file."""
     lines = ["| case | measured | gate |", "|---|---|---|"]
     for row in rows:
         if row.figures:
             cells = f"{link(row)}. {row.text}".replace("|", "\\|"), *figures_of(row)
             lines.append(f"| {' | '.join(cells)} |")
     lines = lines if len(lines) > 2 else []
-    others = [link(row) for row in rows if not row.figures]
-    also = ["", f"{'Also held' if lines else 'Held'}: {'; '.join(others)}."] if others else []
-    return "\n".join([*lines, *(also if lines else also[1:]), ""])
+    others = Counter(row.file for row in rows if not row.figures)
+    if others:
+        files = ", ".join(f"{number} in [{Path(file).name}](../{file})" for file, number in others.items())
+        lines += [*([""] if lines else []), f"Tests without a figure: {files}."]
+    return "\n".join([*lines, ""])
 
 
 def link(row: Row) -> str:
