@@ -492,7 +492,8 @@ def test_the_page_of_figures_has_every_test_that_measures() -> None:
     page, missing = text_of("docs/robustness.md"), []
     for path in (ROOT / "tests").rglob("test_*.py"):
         source = path.read_text(encoding="utf-8")
-        mark = "" if re.search(r"^pytestmark = .*mark\.robustness\(", source, flags=re.M) else r"@pytest\.mark\.robust.*\n"
+        whole = re.search(r"^pytestmark = .*mark\.robustness\(", source, flags=re.M)
+        mark = "" if whole else r"@pytest\.mark\.robustness\(.*\n"
         names = re.findall(rf"^{mark}(?:@.*\n)*def test_(\w+)\([^)]*\bmeasured\b", source, flags=re.M)
         link = os.path.relpath(path, ROOT)
         missing += [name for name in names if f"[{name.replace('_', ' ')}](../{link})" not in page]
