@@ -28,110 +28,16 @@ from tests.hard.hostile import GOOD, MESH, OBJ, beside, file
 
 LONGEST = 5.0
 _ROOM = 6 << 30
-_MORE = """
-    <default name="size" value="5"/>
-    <texture type="checkerboard" id="squares"><rgb name="color0" value="0.1, 0.2, 0.3"/>
-        <transform name="to_uv"><scale x="3" y="4"/></transform></texture>
-    <bsdf type="twosided" id="two"><bsdf type="roughconductor"><float name="alpha" value="0.1"/>
-        <string name="material" value="Au"/></bsdf></bsdf>
-    <bsdf type="dielectric" id="glass"><float name="int_ior" value="1.5"/></bsdf>
-    <bsdf type="blendbsdf" id="blend"><float name="weight" value="0.3"/><ref id="paper"/><ref id="two"/></bsdf>
-    <bsdf type="principled" id="paint"><rgb name="base_color" value="0.5"/><float name="roughness" value="0.3"/></bsdf>
-    <bsdf type="mitsim_grating" id="grating"><float name="pitch" value="1600"/>
-        <string name="efficiencies" value="0.3, 0.15"/></bsdf>
-    <bsdf type="mitsim_glass" id="flint"><float name="index" value="1.62"/><float name="abbe" value="36"/></bsdf>
-    <bsdf type="plastic" id="coated"><ref name="diffuse_reflectance" id="squares"/></bsdf>
-    <bsdf type="bumpmap" id="bumps"><texture type="bitmap"><string name="filename" value="projector.png"/>
-        <boolean name="raw" value="true"/></texture><ref id="paper"/></bsdf>
-    <shape type="sphere"><point name="center" x="5" y="5" z="300"/><float name="radius" value="$size"/>
-        <ref id="two"/></shape>
-    <shape type="cylinder"><point name="p0" value="0, 0, 300"/><point name="p1" value="9, 0, 300"/>
-        <float name="radius" value="3"/><ref id="glass"/></shape>
-    <shape type="sphere"><point name="center" x="-5" y="5" z="300"/><float name="radius" value="2"/>
-        <ref id="flint"/></shape>
-    <shape type="disk"><transform name="to_world"><lookat origin="0, 0, 350" target="0, 0, 0" up="0, 1, 0"/>
-        </transform><ref id="grating"/></shape>
-    <shape type="cube"><transform name="to_world"><rotate x="1" y="1" angle="30"/><scale value="7"/>
-        <translate value="9, 9, 350"/></transform><ref id="blend"/></shape>
-    <shape type="ply"><string name="filename" value="mesh.ply"/><ref id="coated"/></shape>
-    <shape type="obj"><string name="filename" value="mesh.obj"/><ref id="bumps"/></shape>
-    <shape type="shapegroup" id="group"><shape type="sphere"/><shape type="rectangle"/></shape>
-    <shape type="instance"><ref id="group"/><transform name="to_world"><translate z="380"/></transform></shape>
-    <shape type="rectangle"><transform name="to_world"><translate z="390"/></transform>
-        <emitter type="area"><spectrum name="radiance" value="400:1, 700:2"/></emitter></shape>
-    <emitter type="constant"><rgb name="radiance" value="0.1"/></emitter>
-    <emitter type="point"><point name="position" x="0" y="9" z="9"/><rgb name="intensity" value="2"/></emitter>
-    <emitter type="spot"><float name="cutoff_angle" value="20"/><rgb name="intensity" value="2"/></emitter>
-    <medium type="homogeneous" id="fog"><rgb name="albedo" value="0.9"/><float name="scale" value="0.001"/>
-        <phase type="hg"><float name="g" value="0.3"/></phase></medium>
-    <shape type="sphere"><ref name="interior" id="fog"/><bsdf type="null"/></shape>
-    <alias id="paper" as="card"/><include filename="part.xml"/>
-"""
-RICH = GOOD.replace("<!--here-->", _MORE)
+RICH = GOOD.replace("<!--here-->", (Path(__file__).parent / "hostile" / "more.xml").read_text(encoding="utf-8"))
 PART = '<scene version="3.0.0"><shape type="sphere"><ref id="own"/></shape><bsdf type="diffuse" id="own"/></scene>'
-_VALUES = (
-    *(
-        "",
-        "0",
-        "-0",
-        "1",
-        "-1",
-        "2",
-        "1e9",
-        "-1e9",
-        "1e-9",
-        "1e38",
-        "1e39",
-        "-1e308",
-        "1e-45",
-        "nan",
-        "inf",
-        "-inf",
-        "0x10",
-    ),
-    *(
-        "1,2",
-        "1 2 3",
-        "1,2,3,4",
-        "0 0 0",
-        "true",
-        "false",
-        "$size",
-        "$",
-        "$$",
-        "\\$",
-        "..",
-        "/dev/zero",
-        "projector.png",
-    ),
-    *(
-        "mesh.ply",
-        "part.xml",
-        "scene.xml",
-        "diffuse",
-        "twosided",
-        "mask",
-        "sphere",
-        "bitmap",
-        "path",
-        "volpath",
-        "null",
-    ),
-    *("two", "paper", "group", "squares", "reflectance", "radius", "to_world", "filename", "x" * 3000, "é", "&#10;"),
-    *(
-        "999999999",
-        "-999999999",
-        "400:1",
-        "400:1,500:2",
-        "instance",
-        "shapegroup",
-        "merge",
-        "normalmap",
-        "hair",
-        "conductor",
-    ),
-    *("envmap", "directional", "rawconstant", "blackbody", "mesh_attribute", "principledthin", "pplastic", "measured"),
+_TEXTS = (
+    "|0|-0|1|-1|2|1e9|-1e9|1e-9|1e38|1e39|-1e308|1e-45|nan|inf|-inf|0x10|1,2|1 2 3|1,2,3,4|0 0 0|true|false|"
+    "$size|$|$$|\\$|..|/dev/zero|projector.png|mesh.ply|part.xml|scene.xml|diffuse|twosided|mask|sphere|bitmap|"
+    "path|volpath|null|two|paper|group|squares|reflectance|radius|to_world|filename|long|"
+    "é|&#10;|999999999|-999999999|400:1|400:1,500:2|instance|shapegroup|merge|normalmap|hair|conductor|envmap|"
+    "directional|rawconstant|blackbody|mesh_attribute|principledthin|pplastic|measured"
 )
+_VALUES = tuple("x" * 3000 if text == "long" else text for text in _TEXTS.split("|"))
 _WORDS = tuple(
     f"<{word}" for word in ("shape", "bsdf", "texture", "ref", "float", "scene", "path", "include", "!--", "![CDATA[")
 )

@@ -15,12 +15,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.scene.check import check_file
 from tests.hard.hostile import GOOD, OBJ, Case, ball, beside, file, mesh, picture, png, put, skin, swap
 from tests.hard.hostile.files import CASES as OF_FILES
-from tests.hard.hostile.numbers import CASES as OF_NUMBERS
 from tests.hard.hostile.text import CASES as OF_TEXT
 
 pytestmark = pytest.mark.robustness("Input")
 
-CASES = [*OF_TEXT, *OF_FILES, *OF_NUMBERS]
+CASES = [*OF_TEXT, *OF_FILES]
 
 LONGEST = 5.0
 """Seconds of processor time that any file may take; the slowest takes 0.1 s here."""

@@ -8,47 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-GOOD = """<?xml version="1.0" encoding="utf-8"?>
-<scene version="3.0.0">
-    <default name="albedo" value="0.5"/>
-    <integrator type="path"><integer name="max_depth" value="2"/></integrator>
-    <sensor type="mitsim_lensless" id="camera">
-        <transform name="to_world"><rotate y="1" angle="0"/></transform>
-        <float name="pixel_pitch" value="0.01172"/>
-        <string name="mask" value="separable"/>
-        <integer name="mask_order" value="9"/>
-        <float name="mask_feature" value="0.06"/>
-        <float name="mask_distance" value="2"/>
-        <float name="scene_distance" value="400"/>
-        <float name="fov" value="20"/>
-        <film type="hdrfilm">
-            <integer name="width" value="32"/> <integer name="height" value="32"/> <rfilter type="box"/>
-            <string name="pixel_format" value="luminance"/> <string name="component_format" value="float32"/>
-        </film>
-        <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
-    </sensor>
-    <emitter type="projector" id="projector">
-        <transform name="to_world"><translate x="60"/></transform>
-        <string name="fov_axis" value="x"/> <float name="fov" value="33.4"/> <float name="scale" value="111000"/>
-        <texture name="irradiance" type="bitmap">
-            <string name="filename" value="projector.png"/> <boolean name="raw" value="true"/>
-            <string name="filter_type" value="nearest"/> <string name="wrap_mode" value="clamp"/>
-        </texture>
-    </emitter>
-    <shape type="rectangle" id="sheet">
-        <transform name="to_world"><scale x="64" y="64"/> <translate z="400"/></transform>
-        <boolean name="flip_normals" value="true"/>
-        <bsdf type="diffuse" id="paper"><spectrum name="reflectance" value="$albedo"/></bsdf>
-    </shape>
-    <!--here-->
-</scene>
-"""
+GOOD = (Path(__file__).parent / "good.xml").read_text(encoding="utf-8")
 MESH = (
     "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 500\n9 0 500\n0 9 500\n3 0 1 2\n"
 )
 OBJ = "v 0 0 500\nv 9 0 500\nv 0 9 500\nf 1 2 3\n"
-PRINCIPLED = ("sheen", "sheen_tint", "spec_tint", "spec_trans", "flatness", "clearcoat", "clearcoat_gloss", "specular")
 Prepare = Callable[[Path], object]
 
 
