@@ -23,17 +23,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
 from mitsim.learn import networks, requests
-from mitsim.learn.networks import (
-    CLASSES,
-    WAYS,
-    Data,
-    Diagonal,
-    LearnedSolver,
-    UNet,
-    has_half,
-    read_network,
-    train_network,
-)
+from mitsim.learn.networks import Data, Diagonal, LearnedSolver, Trained, UNet, train_network
 from mitsim.learn.requests import METHODS, Training
 from mitsim.metrics import psnr
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
@@ -54,14 +44,24 @@ def _one_thread() -> Any:
     torch.set_num_threads(threads)
 
 
-def trained(path: Path, method: str = "unrolled", patterns: str = "uniform", **more: Any) -> LearnedSolver:
-    request = Training(method=method, steps=more.pop("steps", STEPS), seed=3)
-    return train_network(FakeStore(patterns=patterns), bench().calibrated(1), request, path, **more).model
+def trained(path: Path, method: str = "unrolled") -> Trained:
+    return train_network(FakeStore(), bench().calibrated(1), Training(method=method, steps=STEPS, seed=3), path)
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> LearnedSolver:
-    return trained(tmp_path_factory.mktemp("model") / "m.pt")
+    return trained(tmp_path_factory.mktemp("model") / "m.pt").model
+
+
+def summed(solver: Any, patterns: str = "uniform") -> tuple[Any, Any]:
+    """A picture's frames in the model of ``solver``: what is prepared, and the problem that they pose."""
+    camera = bench()
+    shots = camera.run(patterns, picture(1), 1)
+    prepared = solver.init(camera.calibrated(1), shots.patterns)
+    sums = prepared.accumulator()
+    for each in shots.pattern_measurements():
+        sums.add(each.frame, each.row, each.column)
+    return prepared, sums
 
 
 # -------- The network
@@ -74,25 +74,18 @@ def test_a_network_looks_at_images_in_eight_ways() -> None:
     network, images = UNet(1, 4).eval(), torch.randn((2, 1, 13, 18), generator=random)
     torch.nn.init.normal_(network.last.weight, generator=random)
     with torch.no_grad():
-        seen = [network(images, way) for way in range(WAYS)]
+        seen = [network(images, way) for way in range(networks.WAYS)]
         assert all(each.shape == images.shape for each in seen)
         assert min(float((a - b).abs().max()) for n, a in enumerate(seen) for b in seen[:n]) > 1e-3
         for values in network.parameters():
-            if values.ndim == 4 and values.shape[-1] == 3:
-                ring = values.mean(dim=(-2, -1), keepdim=True).expand_as(values)
-                values.copy_(ring)
-            elif values.ndim == 4:
+            if values.ndim == 4:
                 values.copy_(values.mean(dim=(-2, -1), keepdim=True).expand_as(values))
         for up, size in zip(network.up, (4, 8, 16), strict=True):
-            up.weight.copy_(
-                up.weight.reshape(size, 4, -1, 1, 1)
-                .mean(1, keepdim=True)
-                .expand(-1, 4, -1, -1, -1)
-                .reshape(up.weight.shape)
-            )
-            up.bias.copy_(up.bias.reshape(size, 4).mean(1, keepdim=True).expand(-1, 4).reshape(up.bias.shape))
+            for values in (up.weight, up.bias):  # four numbers for the four pixels of each
+                four = values.reshape(size, 4, -1)
+                values.copy_(four.mean(1, keepdim=True).expand_as(four).reshape(values.shape))
         square = images[..., :8, :8]
-        for way in range(WAYS):
+        for way in range(networks.WAYS):
             assert_allclose(network(square, way), network(square), atol=1e-5)
 
 
@@ -111,23 +104,15 @@ def test_half_precision_is_of_training_alone(monkeypatch: pytest.MonkeyPatch) ->
 def test_an_image_is_the_mean_over_all_ways(model: LearnedSolver) -> None:
     """And single precision makes it, whatever made the network. (Planted: seven of eight.)"""
     network = model.network
-    data, diagonal = _problem(model)
+    prepared, sums = summed(model)
+    problem, like = prepared.problem(sums), next(network.parameters())
+    data = Data.of(problem.projected[None], networks.datum_variance(problem), like)
+    diagonal = Diagonal.of(prepared, like)
     with torch.no_grad():
-        each = [network(data, diagonal, way) for way in range(WAYS)]
+        each = [network(data, diagonal, way) for way in range(networks.WAYS)]
         assert_allclose(network.images(data, diagonal), torch.stack(each).mean(0), atol=1e-6)
     assert float((each[1] - each[6]).abs().max()) > 1e-6
     assert not network.training
-
-
-def _problem(model: LearnedSolver) -> tuple[Data, Diagonal]:
-    """Data of a picture, and its camera's model."""
-    camera = bench()
-    prepared = model.init(camera.calibrated(1), camera.run("uniform", picture(1), 1).patterns)
-    sums = prepared.accumulator()
-    for shot in camera.run("uniform", picture(1), 1).pattern_measurements():
-        sums.add(shot.frame, shot.row, shot.column)
-    problem, like = prepared.problem(sums), next(model.network.parameters())
-    return Data.of(problem.projected[None], networks.datum_variance(problem), like), Diagonal.of(prepared, like)
 
 
 # -------- The camera's model
@@ -136,12 +121,7 @@ def _problem(model: LearnedSolver) -> tuple[Data, Diagonal]:
 def test_the_step_of_the_frames_is_the_closed_form() -> None:
     """Of a black start the solver's own image at that lambda, of another the least squares written out; a dot test.
     (Planted: rho beside sigma, not beside its square; the basis of columns not transposed.)"""
-    camera = bench()
-    shots, factors = camera.run("dots:3", picture(1), 1), camera.calibrated(1)
-    prepared = SOLVERS["tikhonov"].init(factors, shots.patterns)
-    sums = prepared.accumulator()
-    for each in shots.pattern_measurements():
-        sums.add(each.frame, each.row, each.column)
+    prepared, sums = summed(SOLVERS["tikhonov"], "dots:3")
     problem, variance, lam = prepared.problem(sums), 7.0, 3e3
     data, own = Data.of(problem.projected[None], variance, DOUBLE), Diagonal.of(prepared, DOUBLE)
     rho = torch.tensor(lam / variance, dtype=torch.float64)
@@ -164,9 +144,7 @@ def test_the_step_of_the_frames_is_the_closed_form() -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_learns(method: str, tmp_path: Path) -> None:
     """Of a few pairs, on pairs that did not teach, and on frames of one more. (Planted: truths of other pairs.)"""
-    made = train_network(
-        FakeStore(), bench().calibrated(1), Training(method=method, steps=STEPS, batch=4, seed=3), tmp_path / "m.pt"
-    )
+    made = trained(tmp_path / "m.pt", method)
     assert made.curve[0][0] == 0 and max(value for _, value in made.curve) > made.curve[0][1] + 0.5
     blank = replace(made.model, network=networks.first_network(Training(method=method), (16, 16)))
     before, after = (psnr(image_of(each).image, picture(5)) for each in (blank, made.model))
@@ -182,7 +160,7 @@ def test_an_interrupted_training_goes_on_bit_equal(tmp_path: Path, monkeypatch: 
     def weights(name: str, **more: Any) -> dict[str, np.ndarray]:
         made = train_network(store, factors, request, tmp_path / name, **more)
         assert not (tmp_path / f"{name}.unfinished").exists()
-        state = read_network(tmp_path / name, "cpu").network.state_dict()
+        state = networks.read_network(tmp_path / name, "cpu").network.state_dict()
         return {"curve": np.array(made.curve), **{key: values.numpy() for key, values in state.items()}}
 
     whole = weights("a.pt")
@@ -200,8 +178,9 @@ def test_an_interrupted_training_goes_on_bit_equal(tmp_path: Path, monkeypatch: 
     assert not (tmp_path / "c.pt").exists() and parts == [step / 6 for step in (1, 2, 3, 4)]
     with pytest.raises(MitsimError, match="other pairs, factors or options"):
         train_network(store, factors, request.model_copy(update={"seed": 2}), tmp_path / "c.pt", resume=True)
+    half = networks.has_half
     with monkeypatch.context() as patch, pytest.raises(MitsimError, match="numbers of other precision"):
-        patch.setattr(networks, "has_half", lambda device: not has_half(device))
+        patch.setattr(networks, "has_half", lambda device: not half(device))
         train_network(store, factors, request, tmp_path / "c.pt", resume=True)
     unfinished = tmp_path / "d.pt.unfinished"
     unfinished.write_bytes((tmp_path / "c.pt.unfinished").read_bytes()[:-2000])
@@ -272,31 +251,25 @@ def test_the_stated_psnr_is_of_photographs_that_neither_teach_nor_choose(
 
 
 def test_trainings_that_are_refused(tmp_path: Path) -> None:
-    factors, request = bench().calibrated(1), Training(method="unrolled", steps=2)
-    with pytest.raises(MitsimError, match="holds 7 pairs; give at least 8"):
-        train_network(FakeStore(7), factors, request, tmp_path / "m.pt")
-    with pytest.raises(MitsimError, match="its pairs show 2 photographs; give at least 3"):
-        train_network(FakeStore(8, photographs=2), factors, request, tmp_path / "m.pt")
-    other = replace(factors, left=factors.left[:, :8])
-    with pytest.raises(MitsimError, match="calibrate this camera"):
-        train_network(FakeStore(8), other, request, tmp_path / "m.pt")
-    with pytest.raises(MitsimError, match=r"would take about .* s; allowed are 0\.01 s"):
-        train_network(FakeStore(8), factors, request, tmp_path / "m.pt", Job(limits=Limits(seconds=0.01)))
-    prepared = SOLVERS["tikhonov"].init(factors, FakeStore(8).patterns)
-    held = 8 * (256 + prepared.sigma.size) * 4  # truths and data of 8 pairs in 32 bits
-    networks.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=1.01 * held)))
-    with pytest.raises(MitsimError, match=r"reading 8 pairs: would take about .* of memory"):
-        networks.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=0.99 * held)))
-    with pytest.raises(MitsimError, match="ran away at step"):
-        train_network(HotStore(8), factors, request, tmp_path / "m.pt")
+    factors, store = bench().calibrated(1), FakeStore(8)
+    hot = FakeStore(8)
+    hot._truths = [np.full_like(truth, np.nan) for truth in hot._truths]
+    for pairs, camera, seconds, words in (
+        (FakeStore(7), factors, 1e5, "holds 7 pairs; give at least 8"),
+        (FakeStore(8, photographs=2), factors, 1e5, "its pairs show 2 photographs; give at least 3"),
+        (store, replace(factors, left=factors.left[:, :8]), 1e5, "calibrate this camera"),
+        (store, factors, 0.01, r"would take about .* s; allowed are 0\.01 s"),
+        (hot, factors, 1e5, "ran away at step"),
+    ):
+        job = Job(limits=Limits(seconds=seconds))
+        with pytest.raises(MitsimError, match=words):
+            train_network(pairs, camera, Training(method="unrolled", steps=2), tmp_path / "m.pt", job)
     assert not (tmp_path / "m.pt").exists()
-
-
-class HotStore(FakeStore):
-    """Pairs with a truth that is no number."""
-
-    def truth(self, index: int) -> np.ndarray:
-        return np.full_like(super().truth(index), np.nan)
+    prepared = SOLVERS["tikhonov"].init(factors, store.patterns)
+    held = 8 * (256 + prepared.sigma.size) * 4  # truths and data of 8 pairs in 32 bits
+    networks.Sums.of(store, prepared, Job(limits=Limits(memory_bytes=1.01 * held)))
+    with pytest.raises(MitsimError, match=r"reading 8 pairs: would take about .* of memory"):
+        networks.Sums.of(store, prepared, Job(limits=Limits(memory_bytes=0.99 * held)))
 
 
 # -------- Images by a network
@@ -348,14 +321,14 @@ def test_another_bench_is_flagged(model: LearnedSolver) -> None:
     others = Capture(shots.manifest.model_copy(update=named), memory=shots._memory)
     elsewhere = replace(factors, manifest=factors.manifest.model_copy(update=named))
     assert "trained for another camera: mask differ" in str(reconstruct(others, elsewhere, method=model).status)
-    network = CLASSES["flatnet"]((16, 16))
+    network = networks.CLASSES["flatnet"]((16, 16))
     with pytest.raises(MitsimError, match=r"trained for another camera .mask differ., and its weights stand for"):
         reconstruct(others, elsewhere, method=replace(model, network=network))
     moved = image_of(model, shift=0.2)
     assert not moved.ok and "trained with a calibration that differs by" in str(moved.status)
     dim = image_of(model, peak=500.0)
     assert not dim.ok and "trained with noise of" in str(dim.status)
-    blind = CLASSES["unrolled"]((16, 16))  # whose frames count for nothing at the end
+    blind = networks.CLASSES["unrolled"]((16, 16))  # whose frames count for nothing at the end
     blind.load_state_dict(model.network.state_dict())
     with torch.no_grad():
         blind.log_rho += 30
@@ -366,28 +339,21 @@ def test_another_bench_is_flagged(model: LearnedSolver) -> None:
 def test_a_file_that_is_none_is_refused(damage: str, model: LearnedSolver, tmp_path: Path) -> None:
     path = tmp_path / "m.pt"
     model.save(path)
-    held = torch.load(path, weights_only=True)
-    if damage == "empty":
-        path.write_bytes(b"")
-    elif damage == "cut":
-        path.write_bytes(path.read_bytes()[:-5000])
-    elif damage == "pickle":
-        path.write_bytes(pickle.dumps(Path("x")))
-    elif damage == "tensors":
-        torch.save({"x": torch.zeros(3)}, path)
-    elif damage == "nan":
-        held["weights"]["log_start"][...] = float("nan")
-        torch.save(held, path)
-    elif damage == "method":
-        held["manifest"] = held["manifest"].replace('"unrolled"', '"rolled"')
-        torch.save(held, path)
-    elif damage == "newer":
-        held["manifest"] = json.dumps({**json.loads(held["manifest"]), "format": 99})
-        torch.save(held, path)
-    else:
-        path.unlink()
-        if damage == "folder":
-            path.mkdir()
+    data, held = path.read_bytes(), torch.load(path, weights_only=True)
+    manifest, unknown = json.loads(held["manifest"]), {"log_start": torch.tensor(float("nan"))}
+    path.unlink()
+    if damage in (spoilt := {"empty": b"", "cut": data[:-5000], "pickle": pickle.dumps(Path("x"))}):
+        path.write_bytes(spoilt[damage])
+    others = {
+        "tensors": {"x": torch.zeros(3)},
+        "nan": {**held, "weights": {**held["weights"], **unknown}},
+        "method": {**held, "manifest": json.dumps({**manifest, "method": "rolled"})},
+        "newer": {**held, "manifest": json.dumps({**manifest, "format": 99})},
+    }
+    if damage in others:
+        torch.save(others[damage], path)
+    if damage == "folder":
+        path.mkdir()
     with pytest.raises(MitsimError, match=r"m\.pt") as refused:
         verbs.load_network(path)
     assert "\n" not in str(refused.value)

@@ -222,12 +222,13 @@ def test_causes_are_found_as_they_were_planted() -> None:
 
 
 def test_files_are_found_or_a_line_says_where_they_are_from(tmp_path: Path) -> None:
-    with pytest.raises(MitsimError, match=r"--data FOLDER with flatcam/fc_6\.png.*flatnet"):
-        find_files(None)
-    with pytest.raises(MitsimError, match="no such folder"):
-        find_files(tmp_path / "none")
-    with pytest.raises(MitsimError, match="has no captures"):
-        find_files(tmp_path)
+    for folder, words in (
+        (None, r"--data FOLDER with flatcam/fc_6\.png.*flatnet"),
+        (tmp_path / "none", "no such folder"),
+        (tmp_path, "has no captures"),
+    ):
+        with pytest.raises(MitsimError, match=words):
+            find_files(folder)
     (tmp_path / "flatcam").mkdir()
     for name in ("fc_6.png", "rec_6.png", "fc_7.png"):
         (tmp_path / "flatcam" / name).touch()
