@@ -15,12 +15,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from mitsim.core.errors import MitsimError
+from mitsim.report import plots
 from mitsim.studies.framework import campaign
-from mitsim.studies.framework.campaign import StudyResult, Where, merge, run_experiment, shard_of
+from mitsim.studies.framework.campaign import StudyResult, Where, merge, run_experiment, shard_of, study_folder
 from mitsim.studies.framework.experiment import Scope, Setup
 from mitsim.studies.framework.panels import write_page
+from mitsim.verbs import study
+from tests.unit.studies.test_colour_by_line import main
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 
@@ -58,6 +62,12 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
 
     yield call
     sys.modules.pop(TOY, None)
+
+
+@pytest.fixture
+def copied(run: Run, whole: Whole, tmp_path: Path) -> Path:
+    """The folder of the whole study, which may be changed."""
+    return Path(shutil.copytree(whole[1], tmp_path / "out"))
 
 
 def begun(folder: Path) -> list[str]:
@@ -174,82 +184,6 @@ def test_what_a_point_refuses_is_one_line_and_the_rest_is_kept(run: Run, tmp_pat
     assert begun(tmp_path) == ["c3", "d1", "d2", "d3"]
 
 
-def test_a_damaged_point_is_named(run: Run, tmp_path: Path, whole: Whole) -> None:
-    shutil.copytree(whole[1], tmp_path / "out")
-    file = sorted((tmp_path / "out" / "points").iterdir())[0]
-    for content, reason in ((file.read_bytes()[:100], "not a zip"), (b"", "it is empty: the disk was full")):
-        file.write_bytes(content)
-        with pytest.raises(MitsimError, match=f"{file.name}: cannot be read as a point of a study .*{reason}.* remove"):
-            run()
-
-
-def test_no_module_is_imported_because_a_file_names_it(
-    run: Run, tmp_path: Path, whole: Whole, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither of a study, nor of one among all. (Planted: the file's name taken.)"""
-    folder = tmp_path / "modules"
-    folder.mkdir()
-    (folder / "harmless.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
-    (folder / "lab").mkdir()
-    (folder / "lab" / "study.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
-    monkeypatch.syspath_prepend(str(folder))
-    part = tmp_path / "part"
-    shutil.copytree(whole[1], part)
-    reported = json.loads((part / "toy.json").read_text())
-    for name in ("lab.study", "harmless", "..harmless", "os.path", ["lab.study"], {"a": 1}, None, 3, "\x1b[2J.a"):
-        (part / "toy.json").write_text(json.dumps({**reported, "study": name}))
-        for experiment in (None, TOY):
-            with pytest.raises(MitsimError, match=r"is of the study .*merged by its name") as refusal:
-                merge([part], tmp_path / "joined", experiment)
-            assert str(refusal.value).isprintable()
-    assert not (tmp_path / "ran").exists() and not (tmp_path / "joined").exists()
-
-
-def test_parts_of_other_versions_are_not_signed_by_this_one(run: Run, tmp_path: Path, whole: Whole) -> None:
-    """Though all parts are of the same. (Planted: parts held against each other alone.)"""
-    parts = [tmp_path / "a", tmp_path / "b"]
-    for part in parts:
-        shutil.copytree(whole[1], part)
-        reported = json.loads((part / "toy.json").read_text())
-        (part / "toy.json").write_text(json.dumps({**reported, "versions": {"mitsim": "0.1"}}))
-    with pytest.raises(MitsimError, match="was measured by other versions"):
-        merge(parts, tmp_path / "joined", TOY)
-    assert not (tmp_path / "joined").exists()
-
-
-def test_a_point_of_a_hostile_part_takes_no_memory(run: Run, tmp_path: Path, whole: Whole) -> None:
-    """Half a terabyte claimed by a header, many arrays, objects of Python. (Planted: read by numpy, which allocates
-    what a header claims.)"""
-    shutil.copytree(whole[1], tmp_path / "out")
-    file = sorted((tmp_path / "out" / "points").iterdir())[0]
-    claims = npy_header((1 << 36,), "<f8") + bytes(1 << 20)
-    many = npy_header((1 << 20,), "|u1") + bytes(1 << 20)
-    for parts, reason in (
-        ({"rows.npy": claims}, "claims 549755813888 bytes"),
-        ({f"{number}.npy": b"" for number in range(10_001)}, "more than 10000 arrays"),
-        ({"rows.npy": npy_header((1,), "|O") + pickle.dumps([1])}, "objects of Python"),
-        ({"rows.npy": b"hello"}, "magic string"),
-        ({"other.npy": many}, "rows"),
-    ):
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
-            for name, content in parts.items():
-                packed.writestr(name, content)
-        with pytest.raises(MitsimError, match=f"cannot be read as a point of a study .*{reason}"):
-            run()
-
-
-def test_a_zip_bomb_is_refused_before_it_is_unpacked(
-    run: Run, tmp_path: Path, whole: Whole, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(whole[1], tmp_path / "out")
-    file = sorted((tmp_path / "out" / "points").iterdir())[0]
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
-        packed.writestr("rows.npy", npy_header((1 << 25,), "|u1") + bytes(1 << 25))
-    monkeypatch.setattr("mitsim.core.job.free_memory", lambda: 2**26)
-    with pytest.raises(MitsimError, match=f"{file.name}: would take about 64 MiB of memory"):
-        run()
-
-
 def npy_header(shape: tuple[int, ...], kind: str) -> bytes:
     """The beginning of an NPY file that claims such an array."""
     held = io.BytesIO()
@@ -257,7 +191,69 @@ def npy_header(shape: tuple[int, ...], kind: str) -> bytes:
     return held.getvalue()
 
 
-@pytest.mark.slow
+def packed(**parts: bytes) -> bytes:
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in parts.items():
+            file.writestr(f"{name}.npy", content)
+    return held.getvalue()
+
+
+UNREAD = "cannot be read as a point of a study .*"
+DAMAGED = {
+    UNREAD + "not a zip.* remove": packed(rows=b"hello")[:50],
+    UNREAD + "it is empty: the disk was full.* remove": b"",
+    UNREAD + "claims 549755813888 bytes": packed(rows=npy_header((1 << 36,), "<f8") + bytes(1 << 20)),
+    UNREAD + "more than 10000 arrays": packed(**{str(number): b"" for number in range(10_001)}),
+    UNREAD + "objects of Python": packed(rows=npy_header((1,), "|O") + pickle.dumps([1])),
+    UNREAD + "magic string": packed(rows=b"hello"),
+    UNREAD + "rows": packed(other=npy_header((1 << 20,), "|u1") + bytes(1 << 20)),
+    "would take about 64 MiB of memory": packed(rows=npy_header((1 << 25,), "|u1") + bytes(1 << 25)),
+}
+
+
+@pytest.mark.parametrize("reason", DAMAGED)
+def test_a_damaged_or_hostile_point_is_named_and_takes_no_memory(
+    run: Run, copied: Path, monkeypatch: pytest.MonkeyPatch, reason: str
+) -> None:
+    """(Planted: read by numpy, which allocates what a header claims.)"""
+    file = sorted((copied / "points").iterdir())[0]
+    file.write_bytes(DAMAGED[reason])
+    monkeypatch.setattr("mitsim.core.job.free_memory", lambda: 2**26)
+    with pytest.raises(MitsimError, match=f"{file.name}: {reason}"):
+        run()
+
+
+def test_no_module_is_imported_because_a_file_names_it(
+    copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither of a study, nor of one among all. (Planted: the file's name taken.)"""
+    for file in (tmp_path / "modules" / "harmless.py", tmp_path / "modules" / "lab" / "study.py"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
+    reported = json.loads((copied / "toy.json").read_text())
+    for name in ("lab.study", "harmless", "..harmless", "os.path", ["lab.study"], {"a": 1}, None, 3, "\x1b[2J.a"):
+        (copied / "toy.json").write_text(json.dumps({**reported, "study": name}))
+        for experiment in (None, TOY):
+            with pytest.raises(MitsimError, match=r"is of the study .*merged by its name") as refusal:
+                merge([copied], tmp_path / "joined", experiment)
+            assert str(refusal.value).isprintable()
+    assert not (tmp_path / "ran").exists() and not (tmp_path / "joined").exists()
+
+
+def test_parts_of_other_versions_are_not_signed_by_this_one(run: Run, copied: Path, whole: Whole) -> None:
+    """Though all parts are of the same; nor is it resumed. (Planted: parts held against each other alone.)"""
+    reported = json.loads((copied / "toy.json").read_text())
+    (copied / "toy.json").write_text(json.dumps({**reported, "versions": {**reported["versions"], "mitsim": "0.1"}}))
+    for parts in ([copied, copied], [whole[1], copied]):
+        with pytest.raises(MitsimError, match=r"is of another study or scope than .* was measured by other versions"):
+            merge(parts, copied.parent / "joined", TOY)
+    assert not (copied.parent / "joined").exists()
+    with pytest.raises(MitsimError, match="measured by other versions"):
+        run()
+
+
 def test_bad_folders_are_refused(run: Run, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").touch()
@@ -265,16 +261,6 @@ def test_bad_folders_are_refused(run: Run, tmp_path: Path) -> None:
         run("other")
     with pytest.raises(MitsimError, match="holds no part of a study"):
         merge([tmp_path / "other"], tmp_path / "joined")
-    run("new")
-    head = tmp_path / "new" / "toy.json"
-    reported = json.loads(head.read_text())
-    head.write_text(json.dumps({**reported, "versions": {**reported["versions"], "mitsim": "0.1"}}))
-    with pytest.raises(MitsimError, match="measured by other versions"):
-        run("new")
-    run("fresh")
-    with pytest.raises(MitsimError, match="is of another study or scope than"):
-        merge([tmp_path / "fresh", tmp_path / "new"], tmp_path / "joined")
-    assert not (tmp_path / "joined").exists()
 
 
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "a/b", "1/2/3", "-1/2", "1/0"])
@@ -294,3 +280,58 @@ def test_a_cluster_gives_the_same(run: Run, tmp_path: Path) -> None:
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
     with pytest.raises(MitsimError, match="no Dask scheduler answers there"):
         run("nobody", scheduler="tcp://127.0.0.1:9")
+
+
+# -------- Folders and names of all studies
+
+
+def test_a_figure_without_axes_is_not_written(tmp_path: Path) -> None:
+    """(Planted: it is.)"""
+    figures = {"toy.png": plots.singular_values({"a": [2.0, 1.0]}), "none.png": Figure()}
+    assert [*campaign.write_figures(tmp_path, figures)] == ["toy.png"] == [path.name for path in tmp_path.iterdir()]
+
+
+def test_findings_that_may_not_be_trusted_end_with_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """(Planted: no warnings on the command line.)"""
+    for warnings, status in (((), 0), (("a cause is missing",), 1)):
+        found = StudyResult("calibration", "out", warnings=warnings)
+        monkeypatch.setattr("mitsim.study", lambda *_, found=found, **__: found)
+        assert main(["study", "calibration", "-o", "out"]) == status
+        assert ("mitsim: warning: a cause is missing" in capsys.readouterr().err) == bool(status)
+
+
+def write(folder: Path, name: str) -> None:
+    with study_folder(folder, name) as place:
+        (place / f"{name}.json").write_text(json.dumps({"kind": name}))
+
+
+def test_a_study_replaces_an_earlier_one_of_its_name_alone(tmp_path: Path) -> None:
+    write(tmp_path / "out", "toy")
+    write(tmp_path / "out", "toy")
+    with pytest.raises(MitsimError, match="holds files already"):
+        write(tmp_path / "out", "other")
+    (tmp_path / "out" / "letter.txt").write_text("keep me")
+    with pytest.raises(MitsimError, match="holds files already"):
+        write(tmp_path / "out", "toy")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["letter.txt", "toy.json"]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"kind": "recipe"}', '{"rows": []}'])
+def test_a_json_of_something_else_is_no_earlier_study(tmp_path: Path, text: str) -> None:
+    (tmp_path / "toy.json").write_text(text)
+    with pytest.raises(MitsimError, match=r"toy\.json|holds files"), study_folder(tmp_path, "toy"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["toy.json"]
+
+
+def test_a_study_that_fails_leaves_no_new_folder(tmp_path: Path) -> None:
+    with pytest.raises(MitsimError, match="no light"), study_folder(tmp_path / "out", "toy"):
+        raise MitsimError("no light")
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_name_is_refused_with_the_studies() -> None:
+    with pytest.raises(MitsimError, match=r"'weather'.*patterns, .*calibration"):
+        study("weather")

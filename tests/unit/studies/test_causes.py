@@ -23,12 +23,8 @@ pytestmark = pytest.mark.usefixtures("kept_plans")
 FAMILY = "dots:4"
 PRINT = np.random.default_rng(4).integers(20, 230, (48, 48))
 TURNED = '<rotate y="1" angle="-9"/>'
-PROJECTOR = """name = "contrast 100, blurred, with speckle"
-effective_wavelength_nm = 562.0
-contrast_ratio = 100.0
-blur_pixels = 0.6
-speckle_contrast = 0.05
-"""
+VALUES = {"effective_wavelength_nm": 562.0, "contrast_ratio": 100.0, "blur_pixels": 0.6, "speckle_contrast": 0.05}
+PROJECTOR = "name = 'contrast 100, blurred, with speckle'\n" + "".join(f"{k} = {v}\n" for k, v in VALUES.items())
 
 
 def frames(light: SampledLight) -> FloatArray:
@@ -61,16 +57,8 @@ def test_nothing_taken_out_is_the_light_itself(far: SampledLight) -> None:
     ablated = Ablation(far)
     assert ablated.without(frozenset()) is far
     assert ablated.without(frozenset({"ambient", waterfall.KEYSTONE, waterfall.GLOSS})) is far, "which it does not have"
-    assert ablated.effects == (
-        waterfall.FALLOFF,
-        waterfall.DIFFRACTION,
-        waterfall.DEPTH,
-        waterfall.DETAIL,
-        waterfall.BLACK_LEVEL,
-        waterfall.DEFOCUS,
-        waterfall.SPECKLE,
-        waterfall.RENDER_NOISE,
-    )
+    own = ("falloff", "diffraction", "depth", "detail", "black level", "defocus", "speckle", "render noise")
+    assert ablated.effects == own
 
 
 def test_the_same_paths_are_traced_again(far: SampledLight) -> None:
@@ -146,9 +134,8 @@ def test_light_that_moves_keeps_its_glare(shared_scene: Callable[..., Path], var
     light = ms.open_bench(path, variant, projector=device).light(FAMILY, accuracy=1e-2)
     assert 0.15 < light.bench.projector.glare < 0.25
     for effect in (waterfall.DEFOCUS, waterfall.RENDER_NOISE):
-        assert frames(Ablation(light).without(frozenset({effect}))).sum() == pytest.approx(
-            frames(light).sum(), rel=0.02
-        )
+        without = frames(Ablation(light).without(frozenset({effect})))
+        assert without.sum() == pytest.approx(frames(light).sum(), rel=0.02)
 
 
 def test_falloff_is_the_fourth_power_of_the_cosine(far: SampledLight) -> None:
@@ -210,9 +197,8 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     sharp = SharpPixels((5,), 3, (-0.05, 0.05, -0.05, 0.05))
     simulation = Simulation(far.bench, replace(far.simulation.settings, sharp=sharp))
     one, zero = np.ones(1), np.zeros(1, np.int64)
-    path_samples = PathSamples(
-        zero + 5, zero + 2, zero + 1, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16)
-    )
+    kind = np.full(1, DIRECT, np.int16)
+    path_samples = PathSamples(zero + 5, zero + 2, zero + 1, 0 * one, 0 * one, one / 400, one, kind)
     labels = np.arange(far.bench.n**2)
     bundle = simulation.grids["sharp"].bundle
     accumulated, weights = bundle.accumulate(path_samples, labels, 1), simulation.mean_weights(bundle.anchors)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,18 @@ QUICK = "nonuniform", "defects", "bent"
 """Cameras of the quick tests, one of each kind of fault; the fits of few codes take up to a minute."""
 QUICK_LAMPS = "scattering", "weakly linear"
 """Light that scatters, and light that drifts."""
+
+
+def exchange(one: dict[str, Any], other: dict[str, Any]) -> None:
+    one["files"], other["files"] = other["files"], one["files"]
+
+
+def relisted(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """Write the list of a ``folder`` anew, with a ``change``."""
+    listed = json.loads((folder / "session.json").read_text())
+    change(listed)
+    (folder / "session.json").write_text(json.dumps(listed))
+    return folder
 
 
 def off_by(done: Characterisation, name: str) -> dict[str, float]:
@@ -125,9 +138,8 @@ def test_light_that_is_uneven_or_smoothed_somewhat_is_said(tmp_path: Path) -> No
     def smoothed(frame: np.ndarray) -> np.ndarray:
         return np.rint(0.94 * frame + 0.06 * np.roll(frame, 1, axis=1))
 
-    done = characterise_frames(
-        load_flats(write_flats(tmp_path / "b", camera("saturating ADC"), side=192, read=smoothed))
-    )
+    flats = load_flats(write_flats(tmp_path / "b", camera("saturating ADC"), side=192, read=smoothed))
+    done = characterise_frames(flats)
     assert any("noise of neighbouring pixels is correlated by" in line for line in done.about), done.about
 
 
@@ -200,10 +212,7 @@ def test_sets_and_hot_pixels_are_named_and_good_frames_are_not(tmp_path: Path) -
     """
     folder = write_flats(tmp_path / "a", camera("saturating ADC"), side=64, steps=10, stack=4)
     assert not characterise_frames(load_flats(folder)).about
-    facts = json.loads((folder / "session.json").read_text())
-    first, last = facts["lit"][5], facts["lit"][6]
-    first["files"], last["files"] = last["files"], first["files"]
-    (folder / "session.json").write_text(json.dumps(facts))
+    relisted(folder, lambda each: exchange(each["lit"][5], each["lit"][6]))
     lines = characterise_frames(load_flats(folder)).about
     assert "lit_06_00.npy to lit_06_01.npy are 1.17 times as bright" in lines[0]
     assert "0.857 times" in lines[1]
@@ -238,9 +247,8 @@ def test_offsets_that_rounding_hides_are_found_or_said_to_be_hidden(
     (Planted: the fit's variance of offsets replaced by that of mean readings.)
     """
     few = {"bits": 8, "full_well_e": 11_000.0, "gain_dn_per_e": 0.02, "dsnu_pixel_e": 4.0}
-    model = camera("plain").model_copy(
-        update={**few, "read_noise_e": read_noise_e, "black_level_dn": black_level_dn, "dark_current_e_per_s": 0.0}
-    )
+    few |= {"read_noise_e": read_noise_e, "black_level_dn": black_level_dn, "dark_current_e_per_s": 0.0}
+    model = camera("plain").model_copy(update=few)
     done = characterise_frames(load_flats(write_flats(tmp_path / "f", model, side=96, steps=10, stack=16)))
     row = next(row for row in done.fields if row.name == "dsnu_pixel_e")
     assert abs(row.found - 4.0) < 5 * row.standard_error and row.standard_error < 0.5, row
@@ -257,44 +265,24 @@ def test_offsets_that_leave_no_trace_are_hidden(tmp_path: Path) -> None:
     assert row.found == 0 and row.standard_error > 3
 
 
-def exchange(one: dict[str, Any], other: dict[str, Any]) -> None:
-    one["files"], other["files"] = other["files"], one["files"]
-
-
 Mistake = Callable[[dict[str, Any]], object]
 WRONG: dict[str, tuple[Mistake, str]] = {
-    "alone": (lambda listed: listed["lit"][3]["files"].pop(), "lit.3 holds lit_03_00.npy alone"),
-    "without dark": (lambda listed: listed["dark"].pop(2), "is exposed for 0.0075 s, and no dark set is"),
-    "unequal": (
-        lambda listed: (
-            listed["lit"][3].update(files=["lit_03_00.npy", "lit_09_01.npy"]),
-            listed["lit"][9].update(files=["lit_09_00.npy", "lit_03_01.npy"]),
-        ),
-        "of their light; take the frames of a set with one exposure",
-    ),
-    "only saturated": (
-        lambda listed: listed.update(lit=listed["lit"][-2:]),
-        "all sets under light hold saturated numbers",
-    ),
-    "twice": (lambda listed: listed["lit"][3].update(files=listed["lit"][2]["files"]), "is listed twice"),
-    "copied": (
-        lambda listed: listed["lit"][3].update(files=["lit_03_00.npy", "copy.npy"]),
-        "lit_03_00.npy and copy.npy are equal in every number",
-    ),
-    "swapped": (
-        lambda listed: exchange(listed["lit"][4], listed["lit"][8]),
-        "lit_08_00.npy to lit_08_01.npy are 1.8 times as bright as the other sets",
-    ),
-    "dark is lit": (
-        lambda listed: exchange(listed["lit"][5], listed["dark"][5]),
-        "is no brighter than the dark frames",
-    ),
-    "too few bits": (lambda listed: listed.update(bits=10), "numbers of 10 bits are 0 to 1023"),
-    "photons of another lamp": (
-        lambda listed: listed.update(photons_per_s=listed["photons_per_s"] / 4),
-        "electrons a photon; at most 1 is possible",
-    ),
-}
+    "alone": (lambda each: each["lit"][3]["files"].pop(), "lit.3 holds lit_03_00.npy alone"),
+    "without dark": (lambda each: each["dark"].pop(2), "is exposed for 0.0075 s, and no dark set is"),
+    "unequal": (lambda each: (each["lit"][3].update(files=["lit_03_00.npy", "lit_09_01.npy"]),
+                              each["lit"][9].update(files=["lit_09_00.npy", "lit_03_01.npy"])),
+                "of their light; take the frames of a set with one exposure"),
+    "only saturated": (lambda each: each.update(lit=each["lit"][-2:]), "all sets under light hold saturated numbers"),
+    "twice": (lambda each: each["lit"][3].update(files=each["lit"][2]["files"]), "is listed twice"),
+    "copied": (lambda each: each["lit"][3].update(files=["lit_03_00.npy", "copy.npy"]),
+               "lit_03_00.npy and copy.npy are equal in every number"),
+    "swapped": (lambda each: exchange(each["lit"][4], each["lit"][8]),
+                "lit_08_00.npy to lit_08_01.npy are 1.8 times as bright as the other sets"),
+    "dark is lit": (lambda each: exchange(each["lit"][5], each["dark"][5]), "is no brighter than the dark frames"),
+    "too few bits": (lambda each: each.update(bits=10), "numbers of 10 bits are 0 to 1023"),
+    "photons of another lamp": (lambda each: each.update(photons_per_s=each["photons_per_s"] / 4),
+                                "electrons a photon; at most 1 is possible"),
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -304,12 +292,11 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("mistake", "words"), WRONG.values(), ids=WRONG)
 def test_a_list_s_mistakes_are_refused_in_one_line(bench: Path, mistake: Mistake, words: str, tmp_path: Path) -> None:
-    listed = json.loads((bench / "session.json").read_text())
-    mistake(listed)
     for frame in bench.glob("*.npy"):
         (tmp_path / frame.name).symlink_to(frame)
     (tmp_path / "copy.npy").symlink_to(bench / "lit_03_00.npy")
-    (tmp_path / "session.json").write_text(json.dumps(listed))
+    shutil.copyfile(bench / "session.json", tmp_path / "session.json")
+    relisted(tmp_path, mistake)
     with pytest.raises(MitsimError) as caught:
         characterise_frames(load_flats(tmp_path), tmp_path / "out")
     assert words in str(caught.value) and "\n" not in str(caught.value)
@@ -319,24 +306,18 @@ def test_a_list_s_mistakes_are_refused_in_one_line(bench: Path, mistake: Mistake
 def test_darks_of_another_exposure_are_named(tmp_path: Path) -> None:
     """The shortest and the longest dark pair are listed for each other; one saturated set is enough for a full well."""
     folder = write_flats(tmp_path / "frames", camera("plain"))
-    facts = json.loads((folder / "session.json").read_text())
-    facts["lit"] = facts["lit"][:10] + facts["lit"][-1:]
-    (folder / "session.json").write_text(json.dumps(facts))
+    relisted(folder, lambda each: each.update(lit=each["lit"][:10] + each["lit"][-1:]))
     done = characterise_frames(load_flats(folder))
     off = off_by(done, "plain")
     assert not done.about and "full_well_e" in off and all(abs(value) < 5 for value in off.values()), off
-    first, last = facts["dark"][0], facts["dark"][-1]
-    first["files"], last["files"] = last["files"], first["files"]
-    (folder / "session.json").write_text(json.dumps(facts))
+    relisted(folder, lambda each: exchange(each["dark"][0], each["dark"][-1]))
     (line,) = characterise_frames(load_flats(folder)).about
     assert "dark means do not rise with exposure: dark_15" in line and "dark_current_e_per_s" in line
 
 
 def test_one_exposure_tells_gain_and_noise_and_says_what_it_does_not(tmp_path: Path) -> None:
     listed = write_flats(tmp_path / "frames", camera("plain"))
-    facts = json.loads((listed / "session.json").read_text())
-    facts |= {"lit": facts["lit"][6:7], "dark": facts["dark"][6:7]}
-    (listed / "session.json").write_text(json.dumps(facts))
+    relisted(listed, lambda each: each.update(lit=each["lit"][6:7], dark=each["dark"][6:7]))
     done = characterise_frames(load_flats(listed), tmp_path / "out")
     off = off_by(done, "plain")
     assert all(abs(off[field]) < 5 for field in ("gain_dn_per_e", "read_noise_e", "quantum_efficiency")), off

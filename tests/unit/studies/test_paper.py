@@ -15,16 +15,7 @@ from mitsim.report.pages import Value
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, batches, run_experiment
 from mitsim.studies.framework.claims import UNDECIDED, Judged, Level, stated
-from mitsim.studies.framework.experiment import (
-    Claim,
-    Point,
-    Results,
-    Scope,
-    Setup,
-    find_experiment,
-    measures_of,
-    values_of,
-)
+from mitsim.studies.framework.experiment import Claim, Results, Scope, Setup, find_experiment, measures_of, values_of
 from mitsim.studies.framework.panels import flag_warnings, section_of, write_page
 from mitsim.studies.light_studies import ERROR_SOURCES
 
@@ -51,11 +42,8 @@ MEASURED: dict[str, Value] = {
     **{f"{cause}_db": 30.0 for cause in ERROR_SOURCES},
 }  # fmt: skip
 """Columns of any study, each with a number that it may have."""
-VARIED: dict[str, list[dict[str, Value]]] = {
-    "quality": [{"exposure": exposure} for exposure in ("equal peak", "equal frame")],
-    "multishot": [{"exposure": exposure} for exposure in ("equal peak", "equal frame")],
-}
-"""Rows of one point, by its part or study."""
+VARIED: list[dict[str, Value]] = [{"exposure": "equal peak"}, {"exposure": "equal frame"}]
+"""Rows of one point of the studies that have two."""
 
 
 @pytest.mark.parametrize("name", [name for name in PAPER if name != "waterfall"])
@@ -69,7 +57,7 @@ def test_claims_and_panels_fit_the_rows_of_their_study(name: str, quick: bool) -
         own: dict[str, Value] = {"point": point.key, "scene": point.setup.scene}
         if print_.startswith("bars"):
             own |= {"pairs_a_mm": float(print_.split()[1]), "contrast": 0.5}
-        part = VARIED.get(str(values.get("part", name)), [{}])
+        part = VARIED if values.get("part", name) in ("quality", "multishot") else [{}]
         rows += [{**MEASURED, **own, **point.row(**each)} for each in part]
     results = Results(rows, scope=scope)
     claims = experiment.judge(results)
@@ -168,7 +156,7 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
 def test_a_page_states_the_accuracy_that_light_was_traced_to() -> None:
     """(Planted: that of the scope, three times as fine.)"""
     experiment = find_experiment("reflectivity")
-    point: Point = experiment.points(WHOLE)[0]
+    point = experiment.points(WHOLE)[0]
     results = Results([{"point": point.key}])
     assert "good to 0.003 " in section_of(experiment, "reflectivity", (), {}, replace(results, scope=WHOLE)).count
 
@@ -186,29 +174,19 @@ def test_figures_of_gloss_have_each_image_under_its_title() -> None:
     assert shown == [lightness(np.array(levels[name])) for name in names] * 2
 
 
-@pytest.mark.parametrize(
-    ("text", "values"),
-    [
-        ("roughness=0.1:0.5:5", ("0.1", "0.2", "0.3", "0.4", "0.5")),
-        ("sheet_z=390:410:2", ("390", "410")),
-        ("mask=separable,flatcam", ("separable", "flatcam")),
-        ("patterns=dots:4,dots:7", ("dots:4", "dots:7")),
-    ],
-)
-def test_what_a_sweep_varies(text: str, values: tuple[str, ...]) -> None:
-    assert values_of(text) == (text.split("=")[0], values)
+def test_what_a_sweep_varies_and_measures() -> None:
+    assert values_of("roughness=0.1:0.5:5") == ("roughness", ("0.1", "0.2", "0.3", "0.4", "0.5"))
+    assert values_of("mask=separable,flatcam") == ("mask", ("separable", "flatcam"))
+    assert values_of("patterns=dots:4,dots:7") == ("patterns", ("dots:4", "dots:7"))
+    assert measures_of("psnr,misfit") == ("psnr", "misfit")
+    with pytest.raises(MitsimError, match="--measure 'speed': use psnr, ssim"):
+        measures_of("psnr,speed")
 
 
 @pytest.mark.parametrize("text", ["", "roughness", "roughness=", "=1:2:3", "z=1:2:x", "z=1:2:1", "z=1:2:99999"])
 def test_a_sweep_that_cannot_be_read_is_one_line(text: str) -> None:
     with pytest.raises(MitsimError, match=f"--over {re.escape(repr(text))}: "):
         values_of(text)
-
-
-def test_measures_have_names() -> None:
-    assert measures_of("psnr,misfit") == ("psnr", "misfit")
-    with pytest.raises(MitsimError, match="--measure 'speed': use psnr, ssim"):
-        measures_of("psnr,speed")
 
 
 @pytest.mark.slow

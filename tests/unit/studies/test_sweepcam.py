@@ -153,15 +153,8 @@ def test_a_gain_within_the_noise_is_none(gain: float, verdict: str) -> None:
     frames = {("uniform frames", 1): 22.0, ("uniform frames", 49): 25.0, ("SweepCam", 49): 25.0 + gain}
     frames |= {("shifting dots", 49): 34.0}
     rows = [
-        {
-            "model": model,
-            "exposure": exposure,
-            "patterns": name,
-            "frames": count,
-            "psnr_db": decibels,
-            "picture": each,
-        }
-        for (name, count), decibels in frames.items()
+        {"model": model, "exposure": exposure, "patterns": name, "frames": count, "psnr_db": level, "picture": each}
+        for (name, count), level in frames.items()
         for each, model, exposure in product(("coins", "page"), MODELS, (EQUAL_PEAK, EQUAL_FRAME))
     ]
     *others, moved_or_not = experiment.judge(Results(rows))

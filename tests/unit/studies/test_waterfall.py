@@ -13,23 +13,10 @@ from mitsim.light.passes import Simulation
 from mitsim.metrics import psnr
 from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED
 from mitsim.report.lit_scene import LitScene
+from mitsim.studies import waterfall_study as waterfall
 from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.waterfall_study import (
-    ALONE,
-    DEPTH,
-    EFFECTS,
-    FALLOFF,
-    IN_ORDER,
-    LEFT_OUT,
-    QUANTISATION,
-    SATURATION,
-    STUDY,
-    Levels,
-    ends,
-    fills_well,
-    sensor_without,
-)
+from mitsim.studies.waterfall_study import EFFECTS, IN_ORDER, LEFT_OUT, STUDY, Levels
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
 
@@ -64,7 +51,7 @@ def levels(studio: Studio, setup: Setup) -> Levels:
 def test_effects_are_those_that_the_scene_has(studio: Studio, setup: Setup, levels: Levels) -> None:
     """Without any, the image is the idealised one of other studies, to what sampling leaves. (Planted: another
     exposure.)"""
-    assert DEPTH in levels.effects and SATURATION not in levels.effects
+    assert waterfall.DEPTH in levels.effects and waterfall.SATURATION not in levels.effects
     wanted = studio.image(setup, IDEALISED, FAMILY, 3).quality.psnr_db
     assert psnr(levels.image(frozenset()).image, levels.lit.truth) == pytest.approx(wanted, abs=0.3) and wanted > 30
 
@@ -73,7 +60,7 @@ def test_falloff_costs_what_it_takes_from_the_truth(levels: Levels) -> None:
     """With the model assumed the image is the truth times the brightness of the white board: error X (b - 1), b of mean
     1, beside that of noise. (Planted: the brightness of the whole frame.)"""
     truth = levels.lit.truth
-    without, having = (levels.image(on).image for on in (frozenset[str](), frozenset({FALLOFF})))
+    without, having = (levels.image(on).image for on in (frozenset[str](), frozenset({waterfall.FALLOFF})))
     flux = levels.lit.light.apparent.board_flux.reshape(truth.shape)
     wanted = np.square(truth * (flux / flux.mean() - 1)).mean()
     noise, found = (np.square(image - truth).mean() for image in (without, having))
@@ -93,7 +80,7 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
     squares = []
     for seed in range(SEEDS):
         own = Levels(other, FAMILY, seed)
-        rounded, exact = (own.image(on).image for on in (frozenset({QUANTISATION}), frozenset[str]()))
+        rounded, exact = (own.image(on).image for on in (frozenset({waterfall.QUANTISATION}), frozenset[str]()))
         squares.append(float(np.square(rounded - exact).mean()))
     frames = other.idealised_frames(bench.family(FAMILY), 0)
     model, step_s = frames.prepare(), camera.sensor.gain_dn_per_e * frames.seconds(EQUAL_PEAK)
@@ -119,11 +106,11 @@ def test_steps_add_up_to_the_whole(studio: Studio, setup: Setup) -> None:
 
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_ways_differ_by_the_effect_alone(effect: str) -> None:
-    for way in (ALONE, IN_ORDER, LEFT_OUT):
-        before, after = ends(way, effect)
+    for way in (waterfall.ALONE, IN_ORDER, LEFT_OUT):
+        before, after = waterfall.ends(way, effect)
         assert after - before == {effect} and before < after
-    assert ends(IN_ORDER, EFFECTS[0])[0] == ends(ALONE, effect)[0] == frozenset()
-    assert ends(IN_ORDER, EFFECTS[-1])[1] == ends(LEFT_OUT, effect)[1] == frozenset(EFFECTS)
+    assert waterfall.ends(IN_ORDER, EFFECTS[0])[0] == waterfall.ends(waterfall.ALONE, effect)[0] == frozenset()
+    assert waterfall.ends(IN_ORDER, EFFECTS[-1])[1] == waterfall.ends(LEFT_OUT, effect)[1] == frozenset(EFFECTS)
 
 
 def sensor() -> SensorModel:
@@ -132,23 +119,24 @@ def sensor() -> SensorModel:
 
 def test_a_sensor_without_saturation_keeps_its_steps() -> None:
     own = sensor()
-    open_ended = sensor_without(own, frozenset({SATURATION}))
+    open_ended = waterfall.sensor_without(own, frozenset({waterfall.SATURATION}))
     assert open_ended.superpixel_full_well_e == 1024 * own.superpixel_full_well_e
     assert open_ended.largest_dn is not None and open_ended.largest_dn > 100 * (own.largest_dn or 0)
     assert open_ended.gain_dn_per_e == own.gain_dn_per_e
-    smooth = sensor_without(own, frozenset({QUANTISATION}))
+    smooth = waterfall.sensor_without(own, frozenset({waterfall.QUANTISATION}))
     assert smooth.bits is None and smooth.full_well_e == own.full_well_e
-    assert sensor_without(own, frozenset()) == own
-    assert (sensor_without(own.model_copy(update={"binning": 64}), frozenset({SATURATION})).largest_dn or 0) < 2**32
+    assert waterfall.sensor_without(own, frozenset()) == own
+    binned = waterfall.sensor_without(own.model_copy(update={"binning": 64}), frozenset({waterfall.SATURATION}))
+    assert (binned.largest_dn or 0) < 2**32
 
 
 def test_saturation_is_called_for_where_light_can_reach_the_end() -> None:
     """0.8 of 129 440 electrons are 70 deviations below the end, of 40 electrons one; so is an ADC that ends at 0.82."""
     own = sensor()
-    assert not fills_well(own, 0.0) and fills_well(own, 0.1)
-    assert fills_well(own.model_copy(update={"full_well_e": 10.0}), 0.0)
+    assert not waterfall.fills_well(own, 0.0) and waterfall.fills_well(own, 0.1)
+    assert waterfall.fills_well(own.model_copy(update={"full_well_e": 10.0}), 0.0)
     short = own.model_copy(update={"gain_dn_per_e": own.gain_dn_per_e / 0.805})
-    assert fills_well(short, 0.0)
+    assert waterfall.fills_well(short, 0.0)
 
 
 def invented() -> Results:
@@ -160,7 +148,7 @@ def invented() -> Results:
             "with_db": 49.0 - (EFFECTS.index(effect) if way == IN_ORDER else 0),
         }
         for seed in (0, 1)
-        for way in (ALONE, IN_ORDER)
+        for way in (waterfall.ALONE, IN_ORDER)
         for effect in EFFECTS
     ]  # fmt: skip
     return Results(rows, {(f"{IN_ORDER}{EFFECTS[-1]}0", name): np.full((2, 2), 0.5)
