@@ -35,36 +35,6 @@ def test_points_differ_and_share_light(name: str) -> None:
     assert experiment.name == name and experiment.question.endswith("?") and name in EXPERIMENTS
 
 
-MEASURED: dict[str, Value] = {
-    "psnr_db": 20.0, "ssim": 0.5, "flagged": True, "reason": "", "pixels": 64,
-    "patterns_count": 4, "kind": "dots", "range_high": 0.1, "gain_db": 1.0, "artefacts_db": 18.0, "psnr_matt_db": 20.0,
-    "ser_over_law": 1.0, "iterative_s": 10.0, "direct_s": 1.0, "separable_s": 0.1,
-    **{f"{cause}_db": 30.0 for cause in ERROR_SOURCES},
-}  # fmt: skip
-"""Columns of any study, each with a number that it may have."""
-VARIED: list[dict[str, Value]] = [{"exposure": "equal peak"}, {"exposure": "equal frame"}]
-"""Rows of one point of the studies that have two."""
-
-
-@pytest.mark.parametrize("name", [name for name in PAPER if name != "waterfall"])
-@pytest.mark.parametrize("quick", [False, True])
-def test_claims_and_panels_fit_the_rows_of_their_study(name: str, quick: bool) -> None:
-    """Every claim is judged and a figure drawn where all images of a study are alike. (Planted: a column misspelt in a
-    claim.)"""
-    experiment, scope, rows = find_experiment(name), Scope(Setup(), ("coins", "page"), quick=quick), []
-    for point in experiment.points(scope):
-        print_, values = str(point.setup.picture), dict(point.values)
-        own: dict[str, Value] = {"point": point.key, "scene": point.setup.scene}
-        if print_.startswith("bars"):
-            own |= {"pairs_a_mm": float(print_.split()[1]), "contrast": 0.5}
-        part = VARIED if values.get("part", name) in ("quality", "multishot") else [{}]
-        rows += [{**MEASURED, **own, **point.row(**each)} for each in part]
-    results = Results(rows, scope=scope)
-    claims = experiment.judge(results)
-    assert claims and all(claim.verdict and (claim.idealised or claim.rendered) for claim in claims)
-    assert experiment.draw(results) or name == "reflectivity"
-
-
 def judged(claim: Level, **means: float) -> Claim:
     """The ``claim``, judged by two prints a tenth of a decibel apart of each ``model__exposure``."""
     rows: list[dict[str, Value]] = [
