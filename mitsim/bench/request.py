@@ -114,8 +114,7 @@ class Exposure:
             remedy = "capture and calibrate by --colour mosaic (capture_mosaic, calibrate_mosaic)"
             raise MitsimError(f"{problem}; {remedy}, make pairs by another")
         if self.seconds is None and not math.isfinite(sensor.full_well_e):
-            problem = f"camera {camera_file}: full_well_e is inf, so there is no full well to fill"
-            raise MitsimError(f"{problem}; give a finite one, or an exposure in seconds")
+            raise MitsimError(f"camera {camera_file}: full_well_e is inf; give a finite one, or an exposure in seconds")
 
     def choose(self, devices: Devices, peak_irradiance: float) -> float:
         """Return the exposure time [s] for a brightest expected pixel of ``peak_irradiance`` [W m^-2]."""
@@ -346,8 +345,7 @@ class Opening(LitScene):
             problem = f"mosaic: camera {camera} has no mosaic of colour filters"
             raise ArgumentError("colour", f"{problem}; give one that has, such as imx249_rggb, or use colour lines")
         if colour not in (NO, MOSAIC) and sensor.mosaic is not None:
-            problem = f"{colour}: camera {camera} has a mosaic {sensor.mosaic}, whose frames show all lines at once"
-            raise ArgumentError("colour", f"{problem}; use colour mosaic")
+            raise ArgumentError("colour", f"{colour}: camera {camera} has a mosaic {sensor.mosaic}; use colour mosaic")
         if colour != NO:
             from mitsim.devices.projector import ProjectorModel  # here: it imports numpy
 
@@ -475,5 +473,4 @@ def check_ending(path: Path, sensor: SensorModel) -> None:
         raise MitsimError(f"output {path}: give a name that ends in {', '.join(ENDINGS)}")
     if ending == ".png" and (sensor.largest_dn is None or sensor.largest_dn > _LARGEST_PNG):
         numbers = "real numbers" if sensor.largest_dn is None else f"numbers up to {sensor.largest_dn}"
-        problem = f"output {path}: sensor {sensor.name!r} gives {numbers}, 16 bits end at {_LARGEST_PNG}"
-        raise MitsimError(f"{problem}; use .exr")
+        raise MitsimError(f"output {path}: sensor {sensor.name!r} gives {numbers}, beyond 16 bits; use .exr")

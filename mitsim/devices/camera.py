@@ -410,8 +410,7 @@ class MaskProfile(Configuration):
             words = f"random mask of {side} features, open part {self.open_part:g}, seed {self.seed}"
         else:
             if 2**self.order - 1 > LARGEST:
-                problem = f"mask {self.kind} of order {self.order}: flaws are worked out for at most {LARGEST} features"
-                raise MitsimError(f"{problem} a side; give an order up to 12")
+                raise MitsimError(f"mask {self.kind}: flaws are worked out for orders up to 12; got {self.order}")
             terms = mls_mask(cast("MaskKind", self.kind), feature, self.order).terms
             values = np.asarray(sum(weight * np.outer(rows, columns) for weight, rows, columns in terms))
             words = f"{self.kind}, order {self.order}"
@@ -433,8 +432,7 @@ class MaskProfile(Configuration):
             # lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask at distance d.
             path, near, far = folder / str(self.file), camera.mask_distance, self.psf_distance_mm or 0.0
             if far <= near:
-                problem = f"mask psf: psf_distance_mm is {far:g}; the point must lie beyond the mask"
-                raise MitsimError(f"{problem}, at {near:g} mm")
+                raise MitsimError(f"mask psf: psf_distance_mm is {far:g}; give more than the mask's {near:g} mm")
             light = load_psf(path, self.psf_reduce, LARGEST // 2)
             feature, values = make_square(light, self.feature_mm * self.psf_reduce * (1 - near / far))
             values *= float(self.aperture_mm2 or 0.0) / (values.sum() * feature**2)

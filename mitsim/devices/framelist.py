@@ -154,8 +154,7 @@ class FrameList(Configuration):
     @model_validator(mode="after")
     def _saturation_is_known(self) -> FrameList:
         if len(self.exposure_ladder) > 1 and self.digital.saturation_dn is None:
-            problem = "digital.saturation_dn: is not given"
-            raise ValueError(f"{problem}; an exposure_ladder needs it, to leave out what is saturated")
+            raise ValueError("digital.saturation_dn: is not given; an exposure_ladder needs it, for what is saturated")
         return self
 
 
@@ -273,18 +272,15 @@ def load_frames(folder: Path | str) -> SessionFrames:
             raise _refusal(folder, f"{_words(key)} is there twice, {shots[key].file} and {frame.file}; leave one out")
         shots[key] = frame
     if missing := [key for key in wanted if key not in shots]:
-        problem = f"{len(missing)} of {len(wanted)} frames are missing, first {_words(missing[0])}"
-        raise _refusal(folder, f"{problem}; take them, and name them in the list")
+        raise _refusal(folder, f"{len(missing)} of {len(wanted)} frames are missing, as {_words(missing[0])}; add them")
     session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
     _check_files(folder, session.files)
     every: tuple[StripeFile | DarkFile, ...] = (*session.shots.values(), *session.dark)
     for each in every:
         if each.exposure >= rungs:
-            problem = f"{each.file} is of exposure {each.exposure}, but exposure_ladder has {rungs}"
-            raise _refusal(folder, f"{problem}; give 0 to {rungs - 1}")
+            raise _refusal(folder, f"{each.file} is of exposure {each.exposure}; exposure_ladder has 0 to {rungs - 1}")
         if rungs > 1 and each.exposure_s is not None:
-            problem = f"{each.file} states exposure_s, and exposure_ladder as well"
-            raise _refusal(folder, f"{problem}; leave it out, and give the number `exposure`")
+            raise _refusal(folder, f"{each.file} states exposure_s beside exposure_ladder; give the number `exposure`")
     for (side, index, sign, exposure, repeat), shot in session.shots.items():
         other = session.shots[side, index, sign if repeat or not session.pairs else -sign, exposure, 0]
         seconds, expected = session.exposure_s(shot), session.exposure_s(other)
@@ -294,8 +290,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
     exposures = {session.exposure_s(shot) for shot in session.shots.values()}
     without = exposures - {session.exposure_s(frame) for frame in session.dark}
     if session.dark and without and not session.pairs:
-        problem = f"no dark frame is exposed for {min(without):g} s, as other frames are"
-        raise _refusal(folder, f"{problem}; take one for each exposure, or none")
+        raise _refusal(folder, f"no dark frame is exposed for {min(without):g} s, as others are; take one, or none")
     return session
 
 
@@ -317,8 +312,7 @@ def capacity_of(sensor: SensorModel) -> float:
     if sensor.largest_dn is not None:
         full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
     if not math.isfinite(full):
-        problem = f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it"
-        raise MitsimError(f"{problem}; give full_well_e or bits")
+        raise MitsimError(f"camera {sensor.name!r}: no light saturates it; give full_well_e or bits")
     return full
 
 
@@ -497,8 +491,7 @@ def load_known(path: Path | str) -> KnownCaptures:
             how, first_how = (preparation_of(each, path) for each in (manifest, ours))
             unlike = next((field for field in _PLACING if getattr(how, field) != getattr(first_how, field)), None)
             if unlike is not None:
-                remedy = "so its pixels see other parts of the mask; import both alike"
-                raise MitsimError(f"{run} was imported with another {unlike} than {first}, {remedy}")
+                raise MitsimError(f"{run} was imported with another {unlike} than {first}; import both alike")
             sides, own = ([len(rows) for rows in (each.patterns.P_L, each.patterns.P_R)] for each in (manifest, ours))
             if sides != own:
                 pixels = f"{sides[0]} x {sides[1]} scene pixels, but {first} {own[0]} x {own[1]}"

@@ -409,7 +409,6 @@ def line_units(sensor: SensorModel, lines: Lines) -> tuple[float, ...]:
     for wavelength in lines.wavelengths_nm:
         efficiency = sensor.efficiency(wavelength)
         if efficiency == 0:
-            problem = f"sensor {sensor.name!r}: is blind at {wavelength:g} nm, a line of the projector"
-            raise MitsimError(f"{problem}; use another camera")
+            raise MitsimError(f"sensor {sensor.name!r}: is blind at {wavelength:g} nm, a line of the projector")
         units.append(1 / (efficiency * wavelength))
     return tuple(units)

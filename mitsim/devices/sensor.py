@@ -178,8 +178,7 @@ class SensorModel(Configuration, defer_build=True):
             needed = "dark_current_temperature_c and dark_doubling_c; give both, or leave it out"
             raise ValueError(f"temperature_c {self.temperature_c:g} moves the dark current only with {needed}")
         if self.dark_current_spread_e_per_s and not self.dark_current_e_per_s:
-            problem = f"dark_current_spread_e_per_s {self.dark_current_spread_e_per_s:g} is of a dark current of 0"
-            raise ValueError(f"{problem}; give dark_current_e_per_s")
+            raise ValueError("dark_current_spread_e_per_s is of a dark current of 0; give dark_current_e_per_s, too")
         if self.line_time_us is not None and self.shutter == "global":
             raise ValueError(f"line_time_us {self.line_time_us:g} is of a rolling shutter; set shutter 'rolling'")
         if self.binned_full_well_e is not None and not self.binning_on_chip:
@@ -440,8 +439,7 @@ class EfficiencyCurve(Configuration):
         """Return the electrons per photon; raise MitsimError outside the curve."""
         first, last = self.wavelengths_nm[0], self.wavelengths_nm[-1]
         if not first <= wavelength_nm <= last:
-            problem = f"got {wavelength_nm:g} nm; the curve of quantum efficiency is of {first:g} to {last:g} nm"
-            raise MitsimError(f"{problem}; use light of these")
+            raise MitsimError(f"got {wavelength_nm:g} nm; the curve is of {first:g} to {last:g} nm; use light of these")
         # numpy is avoided because its import takes half the time of a refusal.
         above = max(1, bisect_left(self.wavelengths_nm, wavelength_nm))
         below, beyond = self.wavelengths_nm[above - 1 : above + 1]

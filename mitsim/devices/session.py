@@ -43,8 +43,7 @@ class BoardShape(Configuration):
         if self.bow_mm and self.size_mm is None:
             raise ValueError(f"bow_mm: got {self.bow_mm:g} without size_mm, from whose edges it is measured; give both")
         if self.size_mm is not None and abs(self.bow_mm) > 0.1 * self.size_mm:
-            problem = f"bow_mm: got {self.bow_mm:g} on a board of {self.size_mm:g} mm"
-            raise ValueError(f"{problem}; allowed is up to a tenth of it")
+            raise ValueError(f"bow_mm: got {self.bow_mm:g}; allowed is up to a tenth of size_mm {self.size_mm:g}")
         return self
 
     @property
@@ -252,8 +251,7 @@ class SessionRecipe(Configuration):
 
     def of_one_depth(self) -> SessionRecipe:
         if self.depths:
-            problem = f"recipe: has {len(self.depths)} depths, and this makes one calibration"
-            raise MitsimError(f"{problem}; use calibrate_depths, or leave depths out")
+            raise MitsimError(f"recipe: has {len(self.depths)} depths; use calibrate_depths, or leave depths out")
         return self
 
 

@@ -367,8 +367,7 @@ def check_file(
     for node in nodes:
         _check_node(checked, node, variant)
     for tag in checked.tags_of(_ON_SHAPES):
-        problem = "it is the light of a shape"
-        raise tag.refusal("emitter", repr(tag.attributes.get("type")), f"{problem}; put it into one")
+        raise tag.refusal("emitter", repr(tag.attributes.get("type")), "it is the light of a shape; put it into one")
     _check_sizes(checked)
     checked.unfit = find_unfit(outline, nodes)
     return checked
@@ -436,8 +435,7 @@ def _check_property(checked: CheckedScene, node: mi.parser.SceneNode, name: str)
             raise tag.refusal(name, got, rule)
         error = float(np.abs(turn.T @ turn - np.eye(3)).max())
         if name == "to_world" and plugin in _RIGID and not (error < _RIGID_ERROR and np.linalg.det(turn) > 0):
-            rule = "a camera or projector is moved and turned only: no scaling, no mirroring"
-            raise tag.refusal(name, f"R^T R {error:.2g} from 1", rule)
+            raise tag.refusal(name, f"R^T R {error:.2g} from 1", "a camera or projector is moved and turned only")
     elif kind == _Type.ResolvedReference:
         inner = nodes[node.props[name].index()]
         within = inner.props.plugin_name()
@@ -459,8 +457,7 @@ def _check_property(checked: CheckedScene, node: mi.parser.SceneNode, name: str)
         if name not in ("filename", "material") and ("/" in text or ".." in text):
             raise tag.refusal(name, repr(text), "only filename may hold a path")
     elif name == "hide_emitters" and node.props[name]:
-        rule = "the reference alone would leave out lamps that the sensor sees; remove it, or those lamps"
-        raise tag.refusal(name, "true", rule)
+        raise tag.refusal(name, "true", "the reference alone would leave out lamps that the sensor sees; remove it")
     elif kind != _Type.Bool:
         table = outline.tag(node).name in ("texture", "spectrum") and name in TABLES
         light = table or kind in (_Type.Color, _Type.Spectrum, _Type.String)

@@ -51,8 +51,7 @@ def check_image(path: Path) -> tuple[int, bool]:
         header = exr.read_header(path)
         width, height, grey = header.width, header.height, header.channels < 3
         if header.types not in ({"half"}, {"float"}):  # Mitsuba converts all to the first one, in silence
-            problem = f"its channels are {' and '.join(sorted(header.types))}"
-            raise ValueError(f"{problem}; save all as float, or all as half")
+            raise ValueError(f"its channels are {' and '.join(sorted(header.types))}; save all as float, or as half")
     elif start.startswith(b"#?"):
         # This is the first line that Mitsuba could read as the size.
         size = next((line for line in start.split(b"\n") if b"-Y" in line), b"")
@@ -180,8 +179,7 @@ def _ply_header(header: bytes) -> tuple[str | None, dict[str, tuple[int, _Proper
             case ["property", *_, name] if parts and len(words) in (3, 5) and {*kinds} <= _PLY_TYPES.keys():
                 parts[[*parts][-1]][1].append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))
             case _:
-                problem = f"has a header line that is not understood ({' '.join(words)[:40]!r})"
-                raise ValueError(f"{problem}; remove it, or export the mesh again")
+                raise ValueError(f"has a header line that is not understood ({' '.join(words)[:40]!r}); remove it")
     if order == "" or not {"vertex", "face"} <= parts.keys():
         raise ValueError("has no format, or no elements vertex and face; export vertices and triangles")
     for element, (rows, properties) in parts.items():

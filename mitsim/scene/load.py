@@ -69,8 +69,7 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
     """
     parameters = mi.traverse(projector)
     if "irradiance.data" not in parameters:
-        problem = f"{where}: the projector's irradiance is not a bitmap"
-        raise MitsimError(f"{problem}; give a raw bitmap texture whose white texels are the projector's pixels")
+        raise MitsimError(f"{where}: the projector's irradiance is no bitmap; give one with its pixels as white texels")
     texels = np.array(parameters["irradiance.data"])
     lit = texels.reshape(texels.shape[0], texels.shape[1], -1).max(axis=-1) > 0
     rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
@@ -78,8 +77,7 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
         raise MitsimError(f"{where}: the projector's bitmap is all black; its white texels are the projector's pixels")
     height, width = int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1
     if height != width or not lit[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all():
-        problem = f"{where}: the lit texels of the projector's bitmap span {height}x{width} and must fill a square"
-        raise MitsimError(f"{problem}; paint the window white")
+        raise MitsimError(f"{where}: the projector's lit texels span {height}x{width} and must fill a square")
     z = camera.geometry.scene_distance
     window = width, int(rows[0]), int(columns[0]), (int(lit.shape[0]), int(lit.shape[1]))
     corners = _window_corners(where, projector, camera, window, z)
@@ -135,8 +133,7 @@ def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window
     mapped = np.stack([columns, rows, np.ones(4)], axis=1) @ homography.T
     points = mapped[:, :2] / mapped[:, 2:]
     if not np.isfinite(points).all():
-        problem = f"{where}: the projector does not light the plane at {z:g} mm from the camera"
-        raise MitsimError(f"{problem}; aim it at the scene")
+        raise MitsimError(f"{where}: the projector does not light the plane at {z:g} mm; aim it at the scene")
     return np.stack([-points[:, 1] / z, -points[:, 0] / z], axis=1)
 
 
@@ -620,8 +617,7 @@ def with_own_files(checked: check.CheckedScene) -> Iterator[None]:
             try:
                 mi.Bitmap(values[..., None]).write(str(made))
             except RuntimeError as error:
-                rule = "set TMPDIR to another folder"
-                raise MitsimError(f"picture {name}: {made} cannot be written ({error}); {rule}") from None
+                raise MitsimError(f"picture {name}: {made} cannot be written ({error}); set TMPDIR") from None
             node.props["filename"], node.props["raw"] = str(made), True
         yield
 
@@ -636,8 +632,7 @@ def _place_object(props: mi.Properties, path: Path) -> str:
         smooth, unread = kinds[kind](path)
         data = mi.traverse(mi.load_dict({"type": kind[1:], "filename": str(path)}))
     except (ValueError, RuntimeError, OSError) as error:
-        said = str(error).strip().splitlines()[-1]
-        raise MitsimError(f"object {path}: the file {said}") from None
+        raise MitsimError(f"object {path}: the file {str(error).strip().splitlines()[-1]}") from None
     props.set_plugin_name(kind[1:])
     props["filename"] = str(path)
     props["face_normals"] = not smooth  # Mitsuba would smooth the edges of a mesh that states no normals

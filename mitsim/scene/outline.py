@@ -78,8 +78,7 @@ class Outline:
         self._opened = self._elements = 0
         for name, value in defines.items():
             if "$" in value or "\\" in value or not value.isprintable():
-                problem = f"parameter {cut(name)}={cut(value)!r}: give a plain value without $"
-                raise MitsimError(f"{problem}, backslash or line breaks")
+                raise MitsimError(f"parameter {cut(name)}={cut(value)!r}: give one without $, backslash or line breaks")
         if not path.is_file():
             raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
         self.files.used[path] = None
@@ -119,8 +118,7 @@ class Outline:
         except OSError as error:
             raise MitsimError(f"{path}: cannot be read ({error.strerror}); check the file") from None
         if len(content) > _MOST_BYTES:
-            problem = f"{path}: over {_MOST_BYTES >> 20} MiB"
-            raise MitsimError(f"{problem}; a scene is smaller, its meshes have files of their own")
+            raise MitsimError(f"{path}: over {_MOST_BYTES >> 20} MiB; a scene is smaller, give meshes their own files")
         try:
             content.decode("utf-8")
             wrong = content.find(b"\0")  # where Mitsuba's parser would end
@@ -159,8 +157,7 @@ class Outline:
                     refuse(f"the root element is <{cut(name)}>; a Mitsuba scene starts with <scene>")
                 version = attributes.get("version", "")
                 if not _VERSION.fullmatch(version):
-                    rule = 'give the scene version="3.0.0"; 2 and 3 are read'
-                    raise tag.refusal("version", version or "none", rule)
+                    raise tag.refusal("version", version or "none", 'give version="3.0.0"; 2 and 3 are read')
             elif name not in ("default", "include") and texts.get("name"):
                 key = file, open_tags[-1], texts["name"]
                 if key in self._tags:
@@ -186,8 +183,9 @@ class Outline:
                 if inner.resolve() in open_files:
                     raise tag.refusal("include", inner.name, "it comes back to itself; remove one of the two")
                 if self._opened > _MOST_INCLUDES or len(open_files) > _DEEPEST_INCLUDE:
-                    rule = f"{_MOST_INCLUDES} includes, {_DEEPEST_INCLUDE} deep, are allowed; join some"
-                    raise tag.refusal("include", inner.name, rule)
+                    raise tag.refusal(
+                        "include", inner.name, f"{_MOST_INCLUDES} includes, {_DEEPEST_INCLUDE} deep, are allowed"
+                    )
                 self._read(inner, path.parent, open_files)
             elif name == "spectrum" and "filename" in texts:
                 name = texts["filename"]
@@ -252,7 +250,7 @@ def one_line(error: BaseException) -> str:
 # -------- The files of a scene
 
 _NATIVE = (".so", ".dylib", ".dll")
-_MOST_BYTES_OF_A_SCENE = 512 << 20
+_MOST_FILE = 512 << 20
 """Room for the largest environment map, 400 MiB."""
 _MOST_SPECTRUM = 1 << 20
 """Some 50 000 lines; measured spectra have 1000."""
@@ -305,9 +303,8 @@ class SceneFiles:
         if not (inside or self.outside or path in self.own):
             rule = f"files lie in the scene's folder {self.folder}; copy it there, or use --allow-outside-files"
             raise tag.refusal("filename", repr(name), rule)
-        if not stat.S_ISREG(status.st_mode) or not 0 < status.st_size <= _MOST_BYTES_OF_A_SCENE:
-            rule = f"a plain file of 1 byte to {_MOST_BYTES_OF_A_SCENE >> 20} MiB is needed"
-            raise tag.refusal("filename", repr(name), rule)
+        if not stat.S_ISREG(status.st_mode) or not 0 < status.st_size <= _MOST_FILE:
+            raise tag.refusal("filename", repr(name), f"a plain file of 1 byte to {_MOST_FILE >> 20} MiB is needed")
         self.used[path] = None
         return path
 

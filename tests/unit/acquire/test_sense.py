@@ -101,7 +101,7 @@ def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
 
 def test_a_png_holds_16_bits(tmp_path: Path) -> None:
     for model in (sensor(bits=None), sensor(bits=16, binning=2)):
-        with pytest.raises(MitsimError, match="16 bits end"):
+        with pytest.raises(MitsimError, match="beyond 16 bits"):
             check_ending(tmp_path / "x.png", model)
     with pytest.raises(MitsimError, match="ends in"):
         check_ending(tmp_path / "x.jpg", sensor())

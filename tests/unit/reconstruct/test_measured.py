@@ -148,7 +148,7 @@ def entries(**changes: Any) -> list[dict[str, Any]]:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"frames": entries()[:-2]}, "2 of 16 frames are missing, first vertical stripes 3 of sign +1"),
+        ({"frames": entries()[:-2]}, "2 of 16 frames are missing, as vertical stripes 3 of sign +1"),
         ({"frames": entries(index=0)}, "horizontal stripes 0 of sign -1 is there twice, f_1.png and f_3.png"),
         ({"frames": entries(file="f_2.png")}, "f_2.png is listed twice"),
         ({"frames": entries(file="g.png")}, "g.png is listed, but no file"),
@@ -223,7 +223,7 @@ def test_one_uniform_exposure_without_a_dark_frame_is_refused(tmp_path: Path) ->
     ("listed", "change", "words"),
     [
         ({}, {"exposure": 1}, "which no such session has"),
-        ({"exposure_ladder": [1, 2]}, {"exposure_s": 0.5}, "exposure_ladder as well; leave it out"),
+        ({"exposure_ladder": [1, 2]}, {"exposure_s": 0.5}, "beside exposure_ladder; give the number"),
         ({"exposure_ladder": [1, 2], "digital": {**DIGITAL, "saturation_dn": None}}, {}, "saturation_dn: is not given"),
         ({"exposure_ladder": [1, 1]}, {}, "rising numbers"),
     ],

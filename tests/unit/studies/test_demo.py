@@ -119,6 +119,6 @@ def test_what_does_not_fit_is_refused_before_an_earlier_demo_is_removed(
     bottomless = replace(
         bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf}))
     )
-    with pytest.raises(MitsimError, match="no full well to fill"):
+    with pytest.raises(MitsimError, match="full_well_e is inf"):
         demo(bottomless, earlier, Request.of(patterns="dots:2"))
     assert (earlier / "report.html").read_text() == "yesterday's"
