@@ -183,9 +183,8 @@ class Outline:
                 if inner.resolve() in open_files:
                     raise tag.refusal("include", inner.name, "it comes back to itself; remove one of the two")
                 if self._opened > _MOST_INCLUDES or len(open_files) > _DEEPEST_INCLUDE:
-                    raise tag.refusal(
-                        "include", inner.name, f"{_MOST_INCLUDES} includes, {_DEEPEST_INCLUDE} deep, are allowed"
-                    )
+                    rule = f"{_MOST_INCLUDES} includes, {_DEEPEST_INCLUDE} deep, are allowed; join some"
+                    raise tag.refusal("include", inner.name, rule)
                 self._read(inner, path.parent, open_files)
             elif name == "spectrum" and "filename" in texts:
                 name = texts["filename"]

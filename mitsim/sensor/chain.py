@@ -47,13 +47,9 @@ def electrons_from_irradiance(
 
 
 def exposure_for_peak(peak_irradiance: float, fraction: float, model: SensorModel, wavelength_nm: float) -> float:
-    if not 0 < fraction <= 1:
-        raise MitsimError(f"exposure: got fraction {fraction} of full well; allowed is above 0, up to 1")
     if not 0 < peak_irradiance < np.inf:
-        raise MitsimError(
-            f"exposure: the peak irradiance is {peak_irradiance} W/m^2; it must be above 0 and finite; "
-            "check that light reaches the sensor"
-        )
+        problem = f"exposure: the peak irradiance is {peak_irradiance} W/m^2"
+        raise MitsimError(f"{problem}; it must be above 0 and finite; check that light reaches the sensor")
     if not np.isfinite(model.full_well_e):
         raise MitsimError(f"exposure: sensor {model.name!r} has no full well to fill; give it in seconds")
     rate = peak_irradiance * _electrons_per_joule_m2(model, wavelength_nm)

@@ -8,19 +8,10 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.errors import MitsimError
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def test_a_camera_of_another_pitch_is_refused(small_scene: Callable[..., Path]) -> None:
-    path = small_scene(pitch=0.01)
-    with pytest.raises(MitsimError, match=r"11\.72 um, but .* has 10 um") as caught:
-        open_bench(path)
-    assert "imx249.toml" in str(caught.value) and str(path) in str(caught.value)
-    assert open_bench(path, for_render=True).n == 16
 
 
 def test_identity_and_provenance(small_scene: Callable[..., Path]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from mitsim.bench.effects import SWITCHES
 from mitsim.bench.request import HIGHEST_ACCURACY, LONGEST_S, LOWEST_ACCURACY, Exposure, Request
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S
@@ -20,10 +21,26 @@ def test_what_is_asked_by_default() -> None:
     assert Request.of(exposure=0.01).timing == Exposure(0.01, 0.8)
 
 
-def test_effects_may_be_written_as_on_the_command_line() -> None:
-    assert Request.of(effects="+ambient,-diffraction").effects == {"ambient": True, "diffraction": False}
-    assert Request.of(effects={"ambient": True}).effects == {"ambient": True}
-    assert Request.of(effects="").effects == {}
+@pytest.mark.parametrize(
+    ("asked", "chosen"),
+    [
+        *(("", {}), ("+ambient", {"ambient": True}), ({"ambient": True}, {"ambient": True})),
+        ("+ambient,-diffraction", {"ambient": True, "diffraction": False}),
+        *((" -anchors , +layers,", {"anchors": False, "layers": True}), ("-blur,-blur", {"blur": False})),
+        ("+mask-thickness,-black-level", {"mask-thickness": True, "black-level": False}),
+    ],
+)
+def test_effects_may_be_written_as_on_the_command_line(asked: Any, chosen: dict[str, bool]) -> None:
+    assert Request.of(effects=asked).effects == chosen
+
+
+@pytest.mark.parametrize(
+    "text", ["ambient", "+", "-", "+fog", "*ambient", "+ambient,blur", "++ambient", "+cells", "+-"]
+)
+def test_names_that_are_no_effects_are_refused_with_those_that_are(text: str) -> None:
+    with pytest.raises(MitsimError, match=r"^effects") as caught:
+        Request.of(effects=text)
+    assert all(name in str(caught.value) for name in SWITCHES) and "\n" not in str(caught.value)
 
 
 def test_a_request_is_a_value() -> None:
@@ -49,10 +66,8 @@ def test_seconds_or_an_accuracy() -> None:
 @pytest.mark.parametrize(
     ("argument", "ends"),
     [
-        ("seconds", (5e-324, LONGEST_S)),
-        ("accuracy", (LOWEST_ACCURACY, HIGHEST_ACCURACY)),
-        ("exposure", EXPOSURE_S),
-        ("exposure_fraction", EXPOSURE_FRACTION),
+        *(("seconds", (5e-324, LONGEST_S)), ("accuracy", (LOWEST_ACCURACY, HIGHEST_ACCURACY))),
+        *(("exposure", EXPOSURE_S), ("exposure_fraction", EXPOSURE_FRACTION)),
     ],
 )
 def test_the_ends_of_a_range_are_within_it(argument: str, ends: tuple[float, float]) -> None:
@@ -67,8 +82,7 @@ def test_the_ends_of_a_range_are_within_it(argument: str, ends: tuple[float, flo
         *(("accuracy", value, "from 1e-06 to 0.3") for value in (0.0, -1e-3, 0.5, math.nan, math.inf)),
         *(("exposure", value, "to 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
         *(("exposure_fraction", value, "to 1") for value in (0.0, -0.5, 1.01, math.nan)),
-        *(("effects", value, "diffraction") for value in ("fog", "+fog", "diffraction", {"fog": True})),
-        ("effects", "+ambient,-ambient", "keep one"),
+        *(("effects", {"fog": True}, "diffraction"), ("effects", "+ambient,-blur,-ambient", "keep one")),
         *(("ambient_frame", value, "give 'auto', 'yes' or 'no'") for value in ("maybe", "", True)),
     ],
 )

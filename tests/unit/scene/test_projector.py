@@ -35,13 +35,12 @@ def test_the_lit_square_is_the_window(tmp_path: Path, mode: str) -> None:
 def test_what_only_the_renderer_tells_is_left_to_it(tmp_path: Path) -> None:
     """A window that is no square, alpha, a dark picture, one that is no PNG, and none at all. (Planted: a box of alpha,
     which is 255 everywhere.)"""
-    assert lit_side(picture(tmp_path / "x.png", "L", (6, 5))) is None
-    assert lit_side(picture(tmp_path / "x.png", "RGBA")) is None
-    assert lit_side(picture(tmp_path / "x.png", "L", value=0)) is None
-    (tmp_path / "x.png").write_bytes((tmp_path / "x.png").read_bytes()[:60])
-    assert lit_side(tmp_path / "x.png") is None
-    (tmp_path / "x.png").write_text("no picture")
-    assert lit_side(tmp_path / "x.png") is None
+    place = tmp_path / "x.png"
+    for mode, size, value in (("L", (6, 5), 1), ("RGBA", (6, 6), 1), ("L", (6, 6), 0)):
+        assert lit_side(picture(place, mode, size, value)) is None
+    for content in (place.read_bytes()[:60], b"no picture"):
+        place.write_bytes(content)
+        assert lit_side(place) is None
     assert lit_side(tmp_path / "none.png") is None
 
 
@@ -135,22 +134,14 @@ def test_a_window_of_no_width_is_refused(small_scene: Callable[..., Path], fov: 
         load_scene(path)
 
 
-def hollow() -> np.ndarray:
-    canvas = np.zeros((N, 2 * N))
-    canvas[:, N:] = 255
-    canvas[5, 20] = 0
-    return canvas
-
-
-def oblong() -> np.ndarray:
-    canvas = np.zeros((N, 2 * N))
-    canvas[:8, N:] = 255
-    return canvas
+OBLONG = np.pad(np.full((N // 2, N), 255.0), ((0, N // 2), (N, 0)))
+HOLLOW = np.pad(np.full((N, N), 255.0), ((0, 0), (N, 0)))
+HOLLOW[5, 20] = 0
 
 
 @pytest.mark.parametrize(
     ("canvas", "fragment"),
-    [(np.zeros((N, 2 * N)), "all black"), (oblong(), "8x16 and must fill a square"), (hollow(), "must fill a square")],
+    [(np.zeros((N, 2 * N)), "all black"), (OBLONG, "8x16 and must fill a square"), (HOLLOW, "must fill a square")],
     ids=["black", "oblong", "hollow"],
 )
 def test_a_window_is_a_filled_square(small_scene: Callable[..., Path], canvas: np.ndarray, fragment: str) -> None:

@@ -47,16 +47,10 @@ def test_the_exposure_fills_the_fraction_asked_for() -> None:
     assert chain.add_dark_current(light, seconds, model) == pytest.approx(0.8 * 4000.0, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("peak", "fraction", "message"),
-    [
-        *((0.0, 0.5, "light reaches"), (math.nan, 0.5, "light reaches"), (math.inf, 0.5, "light reaches")),
-        *((1.0, 0.0, "fraction 0"), (1.0, 1.5, "fraction 1.5")),
-    ],
-)
-def test_an_impossible_exposure_is_refused(peak: float, fraction: float, message: str) -> None:
-    with pytest.raises(MitsimError, match=message):
-        chain.exposure_for_peak(peak, fraction, sensor(), 550.0)
+@pytest.mark.parametrize("peak", [0.0, math.nan, math.inf])
+def test_an_impossible_exposure_is_refused(peak: float) -> None:
+    with pytest.raises(MitsimError, match="light reaches"):
+        chain.exposure_for_peak(peak, 0.5, sensor(), 550.0)
 
 
 @pytest.mark.parametrize("bad", [-1e-9, math.nan, math.inf])
