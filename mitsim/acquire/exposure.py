@@ -74,20 +74,12 @@ class Exposer:
         return saturated_pixels(digital, electrons, self.exposure_s, self.devices.sensor) > 0
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
-        positive: FloatArray | None = None
-
         def measure(item: tuple[Shot, Frame]) -> FloatArray:
             shot, frame = item
             return self.rate(self.digital(self.shot_electrons(frame, *shot.names), *shot.names))
 
-        for shots in in_chunks(zip(family.shots, expected, strict=True)):
-            rates = in_threads(measure, shots)
-            for (shot, _), rate in zip(shots, rates, strict=True):
-                if shot.sign == 1:
-                    positive = rate
-                    continue
-                yield rate if positive is None else positive - rate, shot.row, shot.column
-                positive = None
+        chunks = in_chunks(zip(family.shots, expected, strict=True))
+        return family.measurements(rate for shots in chunks for rate in in_threads(measure, shots))
 
 
 def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:

@@ -8,7 +8,7 @@ imported only where patterns are made.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import count, product
@@ -97,6 +97,18 @@ class PatternFamily:
 
         pattern = np.outer(self.left[:, shot.row], self.right[:, shot.column]).astype(np.float64)
         return np.asarray(pattern if shot.sign == 0 else (1 + shot.sign * pattern) / 2)
+
+    def measurements(self, rates: Iterable[FloatArray]) -> Iterator[tuple[FloatArray, int, int]]:
+        """Yield the measurement, row and column of each pattern from the ``rates`` of all shots in their order.
+
+        The measurement of a signed pattern is the difference of its two shots.
+        """
+        positive = None
+        for shot, rate in zip(self.shots, rates, strict=True):
+            if shot.sign == 1:
+                positive = rate
+            else:
+                yield rate if positive is None else positive - rate, shot.row, shot.column
 
     @cached_property
     def lighting(self) -> Lighting:

@@ -374,14 +374,9 @@ class PairStore:
 
     def _measurements(self, rates: Iterable[FloatArray], off: FloatArray | float) -> Frames:
         """Return differences of signed patterns, and other shots less the light `off`."""
-        found, shots = [], self.manifest.family.shots
-        positive: FloatArray | float = 0.0
-        for rate, shot in zip(rates, shots, strict=True):
-            if shot.sign == 1:
-                positive = rate
-            else:
-                found.append(np.asarray(positive - rate if shot.sign else rate - off, dtype=np.float32))
-        return np.stack(found)
+        family = self.manifest.family
+        seen = family.measurements(rates if family.signed else (rate - off for rate in rates))
+        return np.stack([measurement.astype(np.float32) for measurement, _, _ in seen])
 
     def _light_of(self, index: int) -> tuple[Iterable[FloatArray], FloatArray, float, float]:
         """Return the light of each shot and of lamps [electrons/s], the exposure [s] and the speckle's contrast."""

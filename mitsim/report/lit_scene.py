@@ -172,13 +172,9 @@ class Unexposed:
     def clear(self, lam: float) -> FloatArray:
         model, exposer, expected = self.prepare(), self.exposer(1.0), self.expected
         off = exposer.electrons(expected.projector_off) if takes_ambient_frame("auto", self.family, expected) else 0.0
-        sums, positive = model.accumulator(), np.zeros(())
-        for shot, frame in zip(self.family.shots, expected, strict=True):
-            rate = exposer.electrons(frame) - off
-            if shot.sign == 1:
-                positive = rate
-            else:
-                sums.add(positive - rate if shot.sign else rate, shot.row, shot.column)
+        sums = model.accumulator()
+        for measurement in self.family.measurements(exposer.electrons(frame) - off for frame in expected):
+            sums.add(*measurement)
         return model.solve(sums, lam).image
 
     def exposer(self, seconds: float) -> Exposer:

@@ -213,14 +213,10 @@ def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
 def _measured(
     exposer: Exposer, family: PatternFamily, rates: Sequence[FloatArray]
 ) -> Iterator[tuple[FloatArray, int, int]]:
-    positive: FloatArray | None = None
-    for shot, rate in zip(family.shots, rates, strict=True):
-        noisy = exposer.rate(exposer.digital(rate * exposer.exposure_s, *shot.names))
-        if shot.sign == 1:
-            positive = noisy
-            continue
-        yield noisy if positive is None else positive - noisy, shot.row, shot.column
-        positive = None
+    shown = zip(family.shots, rates, strict=True)
+    return family.measurements(
+        exposer.rate(exposer.digital(rate * exposer.exposure_s, *shot.names)) for shot, rate in shown
+    )
 
 
 # -------- The study
