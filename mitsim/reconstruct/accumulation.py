@@ -17,7 +17,7 @@ calibrated distance moves light likewise and is included."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -27,7 +27,7 @@ from scipy.ndimage import gaussian_filter
 
 from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import Digital, FactorNoise, RunManifest
+from mitsim.core.manifests import FactorNoise, RunManifest
 from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import BYTES_A_NUMBER, TIKHONOV, keeps_frames, slab_numbers
@@ -38,10 +38,6 @@ EDGES = 2.9
 """Energy of edges over that of the ramp: a dipole t (1 - t) / 2 has the mean square 1/120; slopes around it add 1/346.
 """
 PRINT = (1 + EDGES) / 2
-_ALIKE = 0.5
-_LEAST_EIGENVALUE = 0.01
-_SIGNIFICANT = 3.0
-_NEAR = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +104,7 @@ def factor_slope(factor: FloatArray) -> FloatArray:
     correlation = np.fft.irfft((spectra[1:] * spectra[:-1].conj()).sum(axis=0), 2 * rows)
     place = int(np.argmax(correlation))
     before, peak, after = correlation[np.arange(place - 1, place + 2) % (2 * rows)]
-    if peak > _ALIKE * float(np.square(shadows).sum()) and before + after < 2 * peak:
+    if peak > 0.5 * float(np.square(shadows).sum()) and before + after < 2 * peak:
         whole = place if place < rows else place - 2 * rows
         shift = whole + 0.5 * float((before - after) / (before - 2 * peak + after))
         if abs(shift) >= 1:
@@ -134,9 +130,9 @@ def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[Fl
         difference = gain * halves.differences[axis]
         beyond = float(np.square(difference).sum()) - level * float(spread.sum())
         chance = level * float(np.sqrt(2 * np.square(spread).sum()))
-        if expected > _LEAST_EIGENVALUE * struck and beyond > _SIGNIFICANT * chance:
+        if expected > 0.01 * struck and beyond > 3.0 * chance:
             excess = np.square(model.prepared.image(difference)) - variance * float(spread.sum() / weights.sum())
-            total += struck / expected * gaussian_filter(excess, _NEAR, mode="nearest")
+            total += struck / expected * gaussian_filter(excess, 2.0, mode="nearest")
     return np.maximum(total, 0.0)
 
 
@@ -161,9 +157,8 @@ class FrameNoise:
         counts = len(manifest.patterns.P_L[0]), len(manifest.patterns.P_R[0])
         self.variance: FloatArray = np.zeros(counts)
         self.means: FloatArray = np.zeros(counts)
-        self.rows: FloatArray
-        self.columns: FloatArray
-        self.rows, self.columns = (np.zeros((*counts, 0)) for _ in range(2))
+        self.rows: FloatArray = np.zeros((*counts, 0))
+        self.columns: FloatArray = np.zeros((*counts, 0))
         self.power, self.shots, self.saturated, self.readings = 0.0, 1, 0, 0
         self.light: FloatArray = np.zeros((0, 0))
 
@@ -224,33 +219,21 @@ def factor_energy(
     return total
 
 
-@dataclass(frozen=True, eq=False)
-class Lack:
-    model: Model
-    terms: tuple[SeparableTerm, ...]
-    image: FloatArray
-
-    @property
-    def energy(self) -> float:
-        left, right = (lit @ lit.T for lit in self.model.patterns)
-        total = 0.0
-        for a, b in self.terms:
-            for c, d in self.terms:
-                total += float(np.vdot(self.image, ((a.T @ c) * left) @ self.image @ ((d.T @ b) * right)))
-        return max(total - float(np.square(self.struck).sum()), 0.0)
-
-    @cached_property
-    def struck(self) -> FloatArray:
-        total = np.zeros_like(self.model.prepared.sigma)
-        for term in self.terms:
-            responses = []
-            for side, factor, patterns in zip(self.model.sides, term, self.model.patterns, strict=True):
-                seen = np.zeros((len(side.singular), factor.shape[1]))
-                for slab, lit in zip(side.slabs, patterns.T, strict=True):
-                    seen[slab.columns] += (slab.matrix.T @ factor) * lit
-                responses.append(seen)
-            total += responses[0] @ self.image @ responses[1].T
-        return total
+def lacking_light(model: Model, terms: Sequence[SeparableTerm], image: FloatArray) -> tuple[FloatArray, float]:
+    """Return the data (r, r') of an ``image`` by ``terms`` that the factors lack, and their energy beyond the range."""
+    left, right = (lit @ lit.T for lit in model.patterns)
+    struck, energy = np.zeros_like(model.prepared.sigma), 0.0
+    for term in terms:
+        for c, d in terms:
+            energy += float(np.vdot(image, ((term[0].T @ c) * left) @ image @ ((d.T @ term[1]) * right)))
+        responses = []
+        for side, factor, patterns in zip(model.sides, term, model.patterns, strict=True):
+            seen = np.zeros((len(side.singular), factor.shape[1]))
+            for slab, lit in zip(side.slabs, patterns.T, strict=True):
+                seen[slab.columns] += (slab.matrix.T @ factor) * lit
+            responses.append(seen)
+        struck += responses[0] @ image @ responses[1].T
+    return struck, max(energy - float(np.square(struck).sum()), 0.0)
 
 
 # ---- Frames added up ----
@@ -297,10 +280,6 @@ class Accumulation:
         return self.model.prepared
 
     @property
-    def digital(self) -> Digital:
-        return self.shots.manifest.digital
-
-    @property
     def weights(self) -> FloatArray:
         problem = self.prepared.problem(self.frames)
         return np.where(problem.sigma > 0, problem.projected, 0.0)
@@ -316,8 +295,8 @@ class Accumulation:
     def solution(self, lam: float | Literal["auto"]) -> Solution:
         return self.solver.compute(self.prepared, self.frames, lam, **self.iterative)
 
-    def lack(self, image: FloatArray) -> Lack | None:
-        return Lack(self.model, self.factors.lacking, image) if self.factors.lacking else None
+    def lack(self, image: FloatArray) -> tuple[FloatArray, float] | None:
+        return lacking_light(self.model, self.factors.lacking, image) if self.factors.lacking else None
 
     def factor_energy(self, image: FloatArray) -> float | None:
         stated = self.factors.manifest.noise

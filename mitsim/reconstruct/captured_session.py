@@ -39,7 +39,6 @@ from mitsim.reconstruct.session_check import check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
-_LIT = 0.01
 
 
 # ---- From the frames of a real session to factors ----
@@ -298,7 +297,7 @@ class _Readings:
             uniform = self._read(self.session.repeats_of((SIDES[0], 0, UNIFORM)), True).rate.mean()
             parts = (levels - np.median(levels)) / uniform
             worst = int(np.argmax(np.abs(parts)))
-            if abs(parts[worst]) > _LIT:
+            if abs(parts[worst]) > 0.01:
                 raise MitsimError(
                     f"frames {self.session.folder}: {frames[worst].file}, with the projector off, has "
                     f"{parts[worst]:+.1%} of a uniform frame's light more than the median of {len(frames)} such "
@@ -375,8 +374,6 @@ def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, 
 # ---- One frame at several exposure times ----
 
 Chosen = npt.NDArray[np.bool_] | bool
-_ROOM = 5.0
-_STRIPES_LIGHT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,10 +392,10 @@ class Ladder:
         usable = np.ones((len(digitals), *uniform.shape), dtype=bool)
         variance = np.empty(usable.shape)
         for rung, digital in enumerate(digitals):
-            variance[rung] = digital.variance(_STRIPES_LIGHT * light)
+            variance[rung] = digital.variance(0.5 * light)
             if rung and digital.saturation_dn is not None:
                 unit = digital.gain_dn_per_e * digital.exposure_s
-                brightest = uniform + digital.dark_current_e_per_s + _ROOM * np.sqrt(error + digital.variance(light))
+                brightest = uniform + digital.dark_current_e_per_s + 5.0 * np.sqrt(error + digital.variance(light))
                 usable[rung] = brightest * unit + digital.black_level_dn < digital.saturation_dn
         if merge == "longest":
             longest = len(digitals) - 1 - np.argmax(usable[::-1], axis=0)

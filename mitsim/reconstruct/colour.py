@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
 
 PLANES = ((0, 0), (0, 1), (1, 0), (1, 1))
-_TOLERANCE = 1e-7
-_MOST_STEPS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +120,7 @@ class JointMosaic:
             turned /= lines[:, None, None] * np.outer(rows, columns) + lam
             return np.asarray(np.tensordot(mixed, left @ turned @ right.T, axes=1))
 
-        return conjugate_gradients(self.normal, gathered, lam, precondition, _TOLERANCE, _MOST_STEPS)
+        return conjugate_gradients(self.normal, gathered, lam, precondition, 1e-7, 1000)
 
     @cached_property
     def _grams(self) -> list[FloatArray]:

@@ -60,8 +60,6 @@ from mitsim.reconstruct.solver import (
 
 _NEIGHBOURS = 4
 _DEGREE = 4
-_PAIRS = 32
-_HIDDEN = 0.5
 LEAST_PART = 0.5
 
 
@@ -102,7 +100,7 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
         less = {"left": noise.left * sides[0].noise(shift), "right": noise.right * sides[1].noise(shift)}
         manifest = manifest.model_copy(update={"noise": noise.model_copy(update=less)})
     moved = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
-    seen = [float((side.hidden_part(shift) < _HIDDEN).mean()) for side in sides]
+    seen = [float((side.hidden_part(shift) < 0.5).mean()) for side in sides]
     return MovedFactors(moved, rows, columns, sensor, 1 - seen[0] * seen[1])
 
 
@@ -209,7 +207,7 @@ class FactorOfDepths:
     def _falloff(self) -> FloatArray:
         rows, count = self.factor.shape
         unlike, changes = [np.zeros(1)], [np.zeros((1, _DEGREE + 1))]
-        apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
+        apart = np.arange(1, rows // 2, max(1, rows // 32))
         between = CubicSpline(np.arange(count), self.factor, axis=1)
         for offset in (*apart, *-apart):
             column = np.arange(count) - offset * self._step
@@ -230,7 +228,6 @@ class FactorOfDepths:
 _SPLINE_ROWS = 5
 """Rows to either side that a row's spline is fitted to: 2, 3 and 5 leave 1.9e-3, 1.7e-3 and 1.5e-3."""
 _SPLINE_KNOTS = 4
-_STIFFNESS = 1e-2
 
 
 class ColumnSpline:
@@ -250,7 +247,7 @@ class ColumnSpline:
             parts = np.where((place >= 0) & (place <= self._last), weights, 0.0).ravel()
             columns, equations = (start + np.arange(4)[:, None]).ravel(), np.tile(np.arange(place.size), 4)
             design = sparse.csr_array((parts, (equations, columns)), shape=(place.size, size))
-            normal, bands = design.T @ design + _STIFFNESS * bends.T @ bends, np.zeros((4, size))
+            normal, bands = design.T @ design + 1e-2 * bends.T @ bends, np.zeros((4, size))
             for k in range(4):
                 bands[k, : size - k] = normal.diagonal(-k)
             seen = factor[own[:, None] + neighbours].reshape(len(own), -1)
@@ -275,13 +272,9 @@ class ColumnSpline:
 
 RANGE = 0.25
 """Searched part of 1/z on either side: 320 to 533 mm for 400."""
-_FEWEST = 32
 _RESOLUTION = 0.01
-_LEAST_RISE = 2e-5
-_SIMILAR = 2.0
 _OPPOSED = 4.0
 """Times the unexplained energy S by which depths must differ: the wrong one wins if 2 r.d > |r|^2, so |r|^2 < 4 S."""
-_LAMBDA = 1e-3
 
 
 @dataclass(frozen=True)
@@ -361,8 +354,6 @@ class DepthMap:
 
 # ---- A basis that factors of all depths share ------------------------------------------------------------------------
 
-_LEFT_OUT = 1e-6
-
 
 class CommonBasis:
     """Frames of a capture, and factors of any depth within a range, on a basis that depths share.
@@ -391,7 +382,7 @@ class CommonBasis:
             energies, vectors = np.linalg.eigh(sum(each @ each.T for each in own))
             lost = np.cumsum(np.maximum(energies, 0.0))
             self._parts.append(part)
-            self._bases.append(vectors[:, -int((lost > _LEFT_OUT * lost[-1]).sum()) :])
+            self._bases.append(vectors[:, -int((lost > 1e-6 * lost[-1]).sum()) :])
         (rows, columns), (left, right) = self._parts, self._bases
         counts = [patterns.shape[1] for patterns in self.patterns]
         self.stack = np.zeros((counts[0], left.shape[1], counts[1], right.shape[1]))
@@ -506,13 +497,13 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
         return basis.energy - float(np.square(project_frames(left, right, basis.stack)[measured]).sum())
 
     # Every valley that may be the lowest is followed to its bottom.
-    steps = max(int(np.ceil((tried[1] - tried[0]) / pixel)), _FEWEST)
+    steps = max(int(np.ceil((tried[1] - tried[0]) / pixel)), 32)
     shifts = np.linspace(*tried, steps + 1)
     scores = np.array([left_over(shift) for shift in shifts])
     beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
     least, below, valleys = np.inf, np.inf, list[tuple[float, float]]()
     for index in sorted(map(int, np.flatnonzero(scores <= beside)), key=lambda index: float(scores[index])):
-        if scores[index] - _SIMILAR * below > least:
+        if scores[index] - 2.0 * below > least:
             break
         bounds = shifts[max(index - 1, 0)], shifts[min(index + 1, steps)]
         found = minimize_scalar(left_over, bounds=bounds, method="bounded", options={"xatol": _RESOLUTION * pixel})
@@ -532,7 +523,7 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
         sums = prepared.accumulator()
         for each in basis.frames:
             sums.add(each.frame, each.row, each.column)
-        image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
+        image = prepared.solve(sums, 1e-3 * prepared.problem(sums).scale).image
         expected = float(basis.noise.variance.mean()) * (basis.data - image.size) + basis.part * basis.noise.rendering
         expected += basis.smoothing(shift) * factor_energy(prepared, basis.patterns, stated, image)
         misfit = max(least - expected, 0.0)
@@ -552,7 +543,7 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
             "were asked for, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
             "NEAR:FAR or depth_range, or calibrate nearer to it."
         )
-    elif not (error < pixel and rise > max(indifferent(rise), _LEAST_RISE * basis.energy)):
+    elif not (error < pixel and rise > max(indifferent(rise), 2e-5 * basis.energy)):
         doubt = "These patterns hardly tell depth: use shifting dots."
     elif alternatives:
         named = " and ".join(
@@ -573,12 +564,9 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
 _ROUNDS, _BESIDE, _STEP_POOLED = 6, 5, 3.0
 _FIRST_LENGTH, _SHORTEST = 0.3, 0.1
 """Parts of the step, which is too long because pixels that are lit together share light."""
-_SURE = 25.0
-_RIVAL, _ASTRAY = 2.0, 0.05
 _RELIABLE = 0.5
 SPARE = 2.0
 _MEDIAN = 5
-_SMALL, _LARGEST = 1e-3, 1e-2
 
 
 @single_threaded_blas()
@@ -610,7 +598,7 @@ def depth_map(
         more = sorted({(sharpest, offset) for offset in offsets} - tried.keys())
         tried |= {begin: pixels.solve(arrivals.most(*begin)[0]).left_over for begin in more}
     best = min(tried, key=lambda begin: tried[begin])
-    rivals = [other for other, left in tried.items() if left < _RIVAL * tried[best]]
+    rivals = [other for other, left in tried.items() if left < 2.0 * tried[best]]
     shift, confidence = arrivals.most(*best)
     shift, found = _improve(pixels, shift, (best[1] * pixel - width / 2, best[1] * pixel + width / 2), pixel)
     # The depths are doubted where they explain no more than the calibrated one, or where others explain as much.
@@ -626,7 +614,7 @@ def depth_map(
         spared = not arrivals.limited or width - span >= SPARE * pixel
         ties = [(other.mm, other.difference**2 * basis.energy) for other in plane.alternatives]
         others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
-        if max(float(each.mean()) for each in away) > _ASTRAY or not spared:
+        if max(float(each.mean()) for each in away) > 0.05 or not spared:
             period = width / pixel
             why = f"Depths a period of the dots away, {period:.0f} projector pixels, explain nearly as much"
             if not spared:
@@ -646,7 +634,7 @@ def depth_map(
         found = pixels.solve(shift)
     if lam == "auto":
         power = max(float(np.square(found.image).mean()), np.finfo(float).tiny)
-        solved = pixels.solve(shift, min(pixels.variance(found) / power, _LARGEST * pixels.scale))
+        solved = pixels.solve(shift, min(pixels.variance(found) / power, 0.01 * pixels.scale))
     else:
         solved = pixels.solve(shift, lam)
     sizes, smoothing = (basis.energy, basis.data, basis.part), basis.smoothing(float(np.median(shift)))
@@ -672,7 +660,7 @@ def _improve(
     for _ in range(_ROUNDS):
         others = [of(shift, _BESIDE) for of in (minimum_filter, maximum_filter, median_filter)]
         gains = pixels.gains(shift, solved.image, others)
-        sure = gains.max(axis=0) > _SURE * pixels.variance(solved)
+        sure = gains.max(axis=0) > 25.0 * pixels.variance(solved)
         there = np.where(sure, np.choose(gains.argmax(axis=0), others), shift)
         now = pixels.solve(there)
         if now.left_over >= solved.left_over:
@@ -709,7 +697,7 @@ class PixelDepths:
         self.scale = left * right
 
     def solve(self, shift: FloatArray, lam: float | None = None) -> Solved:
-        lam = _SMALL * self.scale if lam is None else lam
+        lam = 0.001 * self.scale if lam is None else lam
         image, left_over = np.zeros(shift.shape), self._basis.outside
         for frame, lit, left, right in self._columns_of_frames(shift):
             normal, data = (left @ left.T) * (right @ right.T), ((left @ frame) * right).sum(axis=1)
@@ -756,9 +744,6 @@ _LAMBDAS = 1e-5, 1e-6, 1e-7
 """Lambdas over the largest sigma^2 where light arrives: smaller ones add noise, larger ones blur dots."""
 _OFFSETS = -1.0, -0.5, 0.5, 1.0
 _POOLED = 1.0
-_BESIDE_LARGEST = 2
-_LEAST_PARALLAX = 0.5
-_NEIGHBOURHOOD = 2.0
 
 
 class Arrivals:
@@ -768,7 +753,7 @@ class Arrivals:
         if not all(map(_are_dots, shots.patterns)):
             raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
         moves, span = _moves(factors), ends[1] - ends[0]
-        self._open = [bool(move * span > _LEAST_PARALLAX) for move in moves]
+        self._open = [bool(move * span > 0.5) for move in moves]
         if not any(self._open):
             raise MitsimError(
                 f"focus map: camera and projector of calibration {factors.name} have no baseline, so depth moves no "
@@ -777,7 +762,7 @@ class Arrivals:
         self.pixel = 1 / float(moves.max())
         self.width = min(span, _period(np.where(self._open, moves, 0.0), shots.patterns))
         self.limited = self.width < span
-        self.reach = beside + self.width / 2 + (max(_OFFSETS) + _BESIDE_LARGEST) * self.pixel
+        self.reach = beside + self.width / 2 + (max(_OFFSETS) + 2) * self.pixel
         self.basis = basis = CommonBasis(shots, factors, (-self.reach, self.reach))
         self._margin = int(np.ceil(self.reach / self.pixel)) + 1
         # Along the baseline each dot's frames have an image of their own, of all pixels as if they were lit.
@@ -813,7 +798,7 @@ class Arrivals:
         light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
         place, step, peak = light.argmax(axis=0), shifts[1] - shifts[0], light.max(axis=0)
         beside = np.arange(count)[:, None, None] - place
-        near = np.abs(beside) <= round(_NEIGHBOURHOOD * self.pixel / step)
+        near = np.abs(beside) <= round(2.0 * self.pixel / step)
         own, other = np.where(near, light, 0.0), np.where(near, 0.0, light).max(axis=0)
         dark = peak <= np.finfo(float).tiny
         centroid = (own * beside).sum(axis=0) / np.where(dark, 1.0, own.sum(axis=0))

@@ -37,11 +37,9 @@ SEPARABLE_RESIDUAL = 0.01
 
 UNKNOWN_NOISE = 0.05
 
-NOISE_MODEL = 0.2
 
 LARGEST_ERROR = 0.1
 _NUMBERS_AT_ONCE = 2**15
-_NEGATIVE = 0.1
 _TURNS, _TURNED = 30, 1e-13
 
 
@@ -111,9 +109,6 @@ class StripeSums:
         self.ambient = np.zeros((self.vectors.shape[1], 3))
         self.lights = np.zeros((len(self.vectors), 0))
 
-    def add(self, response: npt.ArrayLike) -> None:
-        self.put(self.fit_response(response, self.done))
-
     def fit_response(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
         across, shape, given = self.side == "horizontal", (len(self.vectors), len(self.common)), np.asarray(response)
         response = _response(given, f"{self.side} response {number}", shape if across else shape[::-1], self.centre)
@@ -168,7 +163,7 @@ def stripe_sums(
 
 
 def upright(response: FloatArray, light: npt.ArrayLike) -> FloatArray:
-    negative = np.sum(light) < -_NEGATIVE * np.abs(light).sum()
+    negative = np.sum(light) < -0.1 * np.abs(light).sum()
     return -response if negative else response
 
 
@@ -230,7 +225,7 @@ def factors_of_sums(
     noise = float(np.sqrt((left.misfit + right.misfit) / spare))
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
-    allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, NOISE_MODEL * float(np.sqrt(expected)))
+    allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, 0.2 * float(np.sqrt(expected)))
     n, predicted, rank = len(signs), list[float](), list[int]()
     singular = [np.asarray(np.linalg.svd(factor, compute_uv=False)) for factor in phi]
     condition = max(squared_condition(factor, values) for factor, values in zip(phi, singular, strict=True))

@@ -54,9 +54,6 @@ from mitsim.reconstruct.factors import (
 )
 from mitsim.reconstruct.solver import Status, Verdict, centre_columns, centre_frame
 
-_MOST_TRIED = 3
-
-
 # ---- What is seen ----------------------------------------------------------------------------------------------------
 
 TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
@@ -152,7 +149,6 @@ class Side:
 
 # ---- The fit ---------------------------------------------------------------------------------------------------------
 
-_TURNS, _STILL = 20, 1e-5
 _NO_LIGHT = "known pictures: have no light, or an even one, and tell nothing of the camera; give others"
 _VAGUE, _SMALLEST, _LARGEST = 1e-3, 1e-9, 1e6
 
@@ -195,9 +191,7 @@ class Codes:
 
 
 @single_threaded_blas()
-def fit_codes(
-    exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS
-) -> Codes:
+def fit_codes(exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = 20) -> Codes:
     sizes = zip(exposures[0].frame.shape, exposures[0].scene.shape, shape.scales, strict=True)
     left, right = (Side(sensor, scene, scale, shape.terms, shape.centre) for sensor, scene, scale in sizes)
     sides = left, right
@@ -265,7 +259,7 @@ def fit_codes(
         ]
         variances, before = np.asarray(left_over), explained
         explained = 1 - float(np.mean(variances / energies))
-        if explained - before < _STILL:
+        if explained - before < 1e-05:
             break
     # The error of all numbers of a factor, by the covariance of its code.
     for axis, (side, covariance) in enumerate(zip(sides, covariances, strict=True)):
@@ -291,13 +285,9 @@ def fit_codes(
 
 # ---- Orientation and scale, by spectra -------------------------------------------------------------------------------
 
-_FREQUENCIES = 20
 _COMPARED = 2
 _STEP, _FINE, _STEPS = 1.1, 1.03, 10
 _WIDEST, _NARROWEST = 1.0, 0.03
-_FIRST_TURNS, _SCALE_TURNS = 2, 3
-_CERTAIN = 1.2
-_TOLERANCE = 0.05
 
 
 class _Spectra:
@@ -325,7 +315,7 @@ class _Spectra:
 
 
 def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
-    order = np.arange(1, _FREQUENCIES + 1)
+    order = np.arange(1, 21)
     places = np.multiply.outer(np.concatenate([order, -order]), np.arange(count))
     return np.asarray(np.exp(-2j * np.pi / period * places))
 
@@ -357,18 +347,18 @@ def find_pose(
         own, place = scenes[name], max(zip(scores[name] - usual, places, strict=True))[1]
         if scales is None:
             place = _refine(lambda at, own=own: -spectra.compare(own, at)[0], place, _STEP)  # type: ignore[misc]
-        fitted = fit_codes([each.turn_scene(name) for each in some], Shape(place, 1, True), turns=_FIRST_TURNS)
+        fitted = fit_codes([each.turn_scene(name) for each in some], Shape(place, 1, True), turns=2)
         tried.append((fitted.evidence, fitted.explained, name, place))
     _, explained, best, place = max(tried)
     pose, others = Pose(best, place), [part for _, part, name, _ in tried if name != best]
     if others:
-        pose = replace(pose, margin=explained - max(others), certain=1 - max(others) > _CERTAIN * (1 - explained))
+        pose = replace(pose, margin=explained - max(others), certain=1 - max(others) > 1.2 * (1 - explained))
     if scales is not None:
         return pose
     turned = [each.turn_scene(pose.orientation) for each in exposures]
 
     def misfit(at: tuple[float, float]) -> float:
-        return -fit_codes(turned, Shape(at, 1, True), turns=_SCALE_TURNS).evidence
+        return -fit_codes(turned, Shape(at, 1, True), turns=3).evidence
 
     for _ in range(_STEPS):
         before, pose = pose.scales, replace(pose, scales=_refine(misfit, pose.scales, _FINE))
@@ -380,7 +370,7 @@ def find_pose(
 def _refine(
     misfit: Callable[[tuple[float, float]], float], start: tuple[float, float], reach: float
 ) -> tuple[float, float]:
-    options, bounds = {"xatol": np.log(reach) * _TOLERANCE}, (-np.log(reach), np.log(reach))
+    options, bounds = {"xatol": np.log(reach) * 0.05}, (-np.log(reach), np.log(reach))
     row = minimize_scalar(
         lambda x: misfit((start[0] * np.exp(x), start[1])), bounds=bounds, method="bounded", options=options
     )
@@ -392,8 +382,6 @@ def _refine(
 
 
 # ---- How many codes: by frames that are held out ---------------------------------------------------------------------
-
-_GAIN = 0.02
 
 
 def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> tuple[int, tuple[float, ...]]:
@@ -413,7 +401,7 @@ def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> tupl
             gains = dict.fromkeys((each.plane for each in left_out), usual) | codes.gains
             parts.append(replace(codes, gains=gains).explains(left_out))
         found.append(float(np.mean(parts)))
-        if len(found) > 1 and 1 - found[-1] > (1 - _GAIN) * (1 - found[-2]):
+        if len(found) > 1 and 1 - found[-1] > (1 - 0.02) * (1 - found[-2]):
             return terms - 1, tuple(found)
     return most, tuple(found)
 
@@ -477,7 +465,7 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
     job.progress("choice", 0.5)
     with job.clock.stage("choice"):
         if not terms:
-            terms, held_out = choose_terms(turned, Shape(pose.scales, 1, listed.centre), min(_MOST_TRIED, MOST_TERMS))
+            terms, held_out = choose_terms(turned, Shape(pose.scales, 1, listed.centre), min(3, MOST_TERMS))
     job.progress("fit", 0.8)
     with job.clock.stage("fit"):
         codes = fit_codes(turned, Shape(pose.scales, terms, listed.centre))
@@ -586,7 +574,6 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
 # ---- Frames and pictures ---------------------------------------------------------------------------------------------
 
 _REFLECTANCE = "reflectance"
-_COPIES = 4
 
 
 class _KnownFrames:
@@ -625,7 +612,7 @@ class _KnownFrames:
                 for each in shots.pattern_measurements(shape):
                     if not self.exposures:
                         count = len(listed.known) * len(manifests) * left.shape[1] * right.shape[1]
-                        held = Cost(memory_bytes=_COPIES * float(each.frame.nbytes) * count)
+                        held = Cost(memory_bytes=4 * float(each.frame.nbytes) * count)
                         held.check(f"list {captures.path}: its frames", Limits())
                     frame = centre_frame(each.frame) if listed.centre else each.frame
                     shape = frame.shape[0], frame.shape[1]

@@ -63,15 +63,10 @@ from mitsim.reconstruct.uncertainty import Propagation
 
 # ---- The picture of shifting dots -----------------------------------------------------------------------------------
 
-_PRIOR_POWER, _PRIOR_SHIFT = 0.1, 0.5
 _SCALES = 8.0, 3.0, 1.0, 1.0
 _PIXELS, _FEWEST = 2500, 4
 _WINDOWS, _LONGEST = (3, 5), 4
-_FEW, _OF_NORMAL = 0.2, 0.253
-_BLACK, _DARKER = 6.0, 1.5
 _CLIPPED, _FIXED = 3.0, 1e12
-_UNDERSTATED = 2.0
-_UNMOVED, _SHARED = 0.3, 0.25
 
 
 class PictureCheck:
@@ -100,7 +95,7 @@ class PictureCheck:
         # Differences along a line of pixels that the same frame lights share their error.
         along = [axis for axis in (0, 1) if (np.diff(frame_of, axis=axis) == 0).all()]
         self._line_of: IndexArray = np.indices(image.shape)[1 - along[0]].ravel() if along else np.arange(image.size)
-        self.power, self.power_error = self._fit(image, [image], _PRIOR_POWER, _SCALES)
+        self.power, self.power_error = self._fit(image, [image], 0.1, _SCALES)
         self._even = image * (1 - self.power[frame_of])
         left_over = self._differences(self._even)
         differences = left_over / self._scale(left_over, self._pixels)
@@ -111,7 +106,7 @@ class PictureCheck:
         number = np.bincount(lines := self._line_of[self._pixels])
         shared = (np.bincount(lines, moved) / np.maximum(number, 1))[lines] * moved
         parts = np.bincount(own, shared, self._count) / (np.bincount(own, moved**2, self._count) + 1e-300)
-        alike = max(float(np.quantile(parts, _UNMOVED)) * number.max(), 1.0)
+        alike = max(float(np.quantile(parts, 0.3)) * number.max(), 1.0)
         lit = np.maximum(np.bincount(own, minlength=self._count), 1)
         lack = -self._differences(image)
         means, shown, missing, squares, noises = (
@@ -121,17 +116,17 @@ class PictureCheck:
         away = means - np.median(means)
         self.foreign = away / np.maximum(robust_scatter(means), np.sqrt(alike * roughness.var() / lit))
         # A black frame decides nothing of its own power, but its mean is far below the predicted one.
-        black = (np.square(shown) < _BLACK**2 * noises / lit) & (missing > shown)
+        black = (np.square(shown) < 6.0**2 * noises / lit) & (missing > shown)
         chance = np.sqrt(alike * np.maximum(squares - np.square(missing), 0.0) / lit) + 1e-300
-        self.foreign = np.maximum(self.foreign, np.where(black, _DARKER * missing / chance, 0.0))
-        self.decides = bool(black.any() or alike - 1 <= _SHARED * (number.max() - 1))
+        self.foreign = np.maximum(self.foreign, np.where(black, 1.5 * missing / chance, 0.0))
+        self.decides = bool(black.any() or alike - 1 <= 0.25 * (number.max() - 1))
         common = float(shared.sum() / (np.square(moved).sum() + 1e-300)) if along else 0.0
         self.disturbed = self._disturbance(moved, periods, common)
 
     @cached_property
     def place(self) -> tuple[FloatArray, FloatArray]:
         # Looked for in the picture without the powers, because in even parts these look like a slope.
-        place, error = self._fit(self._even, [*np.gradient(self._even)], _PRIOR_SHIFT)
+        place, error = self._fit(self._even, [*np.gradient(self._even)], 0.5)
         return place.reshape(2, -1), error.reshape(2, -1)
 
     def uncertainty(self, image: FloatArray) -> FloatArray:
@@ -143,7 +138,7 @@ class PictureCheck:
         found, errors = (
             np.stack([own, *others]) for own, others in zip((self.power, self.power_error), self.place, strict=True)
         )
-        scatter, known = np.var(found, axis=1), np.mean(np.square(_UNDERSTATED * errors), axis=1)
+        scatter, known = np.var(found, axis=1), np.mean(np.square(2.0 * errors), axis=1)
         power, *moves = np.sqrt(np.maximum(scatter - known, scatter * np.sqrt(2 / self._count)))
         variance = np.square(image * power)
         for axis, move in enumerate(moves):  # to either side, because a slope over both misses the finest print
@@ -170,8 +165,8 @@ class PictureCheck:
                 total, number = (np.stack([part[k : k + length].sum(axis=0) for k in runs]) for part in (light, lit))
                 scores = np.abs(total) / np.sqrt(np.maximum(number, dots**2 * length / 2) * usual + 1e-300)
                 # A texture with a period of its own deviates in most frames, and a disturbance in few.
-                few = int(_FEW * (len(scores) - 1))
-                scores /= np.maximum(np.partition(scores, few, axis=0)[few] / _OF_NORMAL, 1.0)
+                few = int(0.2 * (len(scores) - 1))
+                scores /= np.maximum(np.partition(scores, few, axis=0)[few] / 0.253, 1.0)
                 for k, worst in enumerate(scores.max(axis=(1, 2))):
                     found[k : k + length] = np.maximum(found[k : k + length], worst)
         return found
@@ -235,10 +230,7 @@ class PictureCheck:
 
 # ---- Defective pixels -----------------------------------------------------------------------------------------------
 
-_SPREADS = 7.0
 _AROUND, _CROWD = 3, 0.35
-_MOST, _LEAKS = 0.02, 0.1
-_LEAST_VARIANCE, _MOST_VARIANCE = 1e-3, 4.0
 _ROUNDS, _PLACES_SHOWN = 8, 5
 
 
@@ -306,14 +298,14 @@ def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defec
 
 def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects | None:
     mean = float(variance.mean()) or 1.0
-    ratio = squares / np.clip(variance, _LEAST_VARIANCE * mean, _MOST_VARIANCE * mean)
+    ratio = squares / np.clip(variance, 0.001 * mean, 4.0 * mean)
     limit, typical, most, width = _limit(count), (1 - 2 / (9 * count)) ** 3, float(ratio.max()), 2 * _AROUND + 1
     # What the scene's light is off by at a pixel may be the same in all frames: the square of one number.
     # What bright ones are off by leaks into others: these first.
     least = limit + _limit(1) * max(float(np.median(ratio)) / typical - 1, 0.0)
-    off = (ratio > least) & (ratio > _LEAKS * most)
+    off = (ratio > least) & (ratio > 0.1 * most)
     places = np.argwhere(off)
-    if not most > limit or not 0 < len(places) <= _MOST * ratio.size:
+    if not most > limit or not 0 < len(places) <= 0.02 * ratio.size:
         return None
     padded = np.pad(ratio, _AROUND, mode="reflect")
     around = np.array([np.median(padded[row : row + width, column : column + width]) for row, column in places])
@@ -326,25 +318,17 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
 
 def _limit(count: int) -> float:
     """Return the quantile of a chi-square of ``count`` degrees of freedom over ``count`` (Wilson and Hilferty 1931)."""
-    return float((1 - 2 / (9 * count) + _SPREADS * np.sqrt(2 / (9 * count))) ** 3)
+    return float((1 - 2 / (9 * count) + 7.0 * np.sqrt(2 / (9 * count))) ** 3)
 
 
 # ---- Single frames ---------------------------------------------------------------------------------------------------
 
 OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
-_CLOSING = 4e-3
-_TURNED, _SIDE = 0.5, 0.3
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
-_FOREIGN, _DISTURBED = 6.5, 7.5
-_FLICKERS, _POWER = 15.0, 0.01
-_FEWEST_PAIRS = 4
 _DOTS = "under dots each scene pixel is in one frame, so that only the picture shows a change of lamp, camera or scene."
 _LEAKING = "Light of the room cancels. A projector that leaks it since it was calibrated darkens the image as much."
 _REMEDY = "A closing frame (--closing-frame uniform) decides it."
-_LEAK = 5e-3
-_RESTORED, _SCATTERS = 0.9, 4.0
-_OUTLIER, _DIMMED = 6.5, 0.02
 
 
 @dataclass(frozen=True)
@@ -395,23 +379,23 @@ class FrameCheck:
             words = f"has {readings} readings at its largest number"
             found.append(self._fault("clipped", [self._number[shot]], words))
         if picture is not None:
-            foreign = np.flatnonzero(picture.foreign > _FOREIGN * self._doubt)
+            foreign = np.flatnonzero(picture.foreign > 6.5 * self._doubt)
             if len(foreign):
                 words = "show another picture than the frames around, dot by dot"
                 powers.append(self._fault("picture", foreign, words))
-            disturbed = np.flatnonzero(picture.disturbed > _DISTURBED * self._doubt)
+            disturbed = np.flatnonzero(picture.disturbed > 7.5 * self._doubt)
             # Gloss is seen in some frames, too, but its light has no image: no frame is at fault.
             if len(disturbed) and not len(foreign) and self._excess < OFF**2 * float(sums.shots.sum()):
                 strongest = disturbed[np.argsort(-picture.disturbed[disturbed])][:8]
                 words = "show a part of the scene otherwise than the frames around"
                 powers.append(self._fault("picture", strongest, words))
-            powers += self._powers(picture.power, picture.power_error, range(count), _FLICKERS)
-        if len(sums.powers) >= _FEWEST_PAIRS and noise.stated:
+            powers += self._powers(picture.power, picture.power_error, range(count), 15.0)
+        if len(sums.powers) >= 4 and noise.stated:
             power, error = np.concatenate([*sums.powers.values()], axis=1)
             numbers = [self._number[(*pattern, sign)] for pattern in sums.powers for sign in (1, -1)]
             powers += self._powers(power, error, numbers, CHANCE)
         # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
-        if by_model and by_model[0].part >= _SCATTERS * max((fault.part for fault in powers), default=0.0):
+        if by_model and by_model[0].part >= 4.0 * max((fault.part for fault in powers), default=0.0):
             found += by_model
         patterns = [(shot.row, shot.column) for shot in self._shots]
         named = {patterns[number] for fault in found for number in fault.numbers}
@@ -433,29 +417,29 @@ class FrameCheck:
             bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
             # Gloss is in the even pattern above all. A wrong frame of it changes the sum of its pair, too, and
             # exchanged halves leave twice its light.
-            if sums.powers and even and part[even] < _TURNED and not (tests[1][0] > CHANCE * tests[1][1])[even]:
+            if sums.powers and even and part[even] < 0.5 and not (tests[1][0] > CHANCE * tests[1][1])[even]:
                 bad[even] = False
             # By the model, single frames are at fault only if they explain the misfit of the run.
-            least = _RESTORED * self._excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
+            least = 0.9 * self._excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
             if number or bad.sum() > self._most or beyond[bad].sum() >= least:
                 off = np.maximum(off, np.where(bad, part, 0.0))
         for row, column in (
             np.argwhere(off)[np.argsort(-off[off > 0])].tolist() if (off > 0).sum() <= self._most else ()
         ):
             side = sums.side[row, column]  # it decides which half is at fault
-            signs = [1, -1] if abs(side) < _SIDE else [int(np.sign(side))]
+            signs = [1, -1] if abs(side) < 0.3 else [int(np.sign(side))]
             numbers = [self._number[row, column, sign] for sign in (signs if self._signed else [0])]
             size = float(np.sqrt(off[row, column]))
             yield self._fault("model", numbers, f"differ by {size:.1%} from what the other frames predict", size)
 
     def _powers(self, power: FloatArray, error: FloatArray, of: Sequence[int], errors: float) -> Iterator[FrameFault]:
         scatter, middle = robust_scatter(power), float(np.median(power))
-        single = np.abs(power - middle) > np.maximum(_OUTLIER * np.maximum(error, scatter), _DIMMED)
+        single = np.abs(power - middle) > np.maximum(6.5 * np.maximum(error, scatter), 0.02)
         if single.any() and single.sum() <= max(1, _MOST_BAD * len(power)):
             for index in np.flatnonzero(single):
                 words = f"has {1 + power[index] - middle:.2f} times the light that the others predict"
                 yield self._fault("power", [of[int(index)]], words)
-        elif single.any() or scatter > max(_POWER, errors * float(np.median(error))):
+        elif single.any() or scatter > max(0.01, errors * float(np.median(error))):
             words = f"differ by {float(np.std(power)):.2%} in their power"
             yield self._fault("power", range(len(self._shots)), words, scatter)
 
@@ -484,7 +468,7 @@ class FrameCheck:
         energy = max(sum_of_squares(predicted), TINY)
         beyond = sum_of_squares(closing.light - predicted) - float(variance.sum())
         part = float(np.sqrt(max(beyond, 0.0) / energy))
-        if beyond > CHANCE * float(np.sqrt(2 * np.square(variance).sum())) and part > _CLOSING:
+        if beyond > CHANCE * float(np.sqrt(2 * np.square(variance).sum())) and part > 4e-3:
             words = f"{part:.1%} of the closing frame differs from the frames before it, and its power is "
             words += f"{np.vdot(closing.light, predicted) / energy:.3f} of theirs: lamp, camera or scene changed"
             yield FrameFault("closing", tuple(range(len(self._shots))), (), words, part)
@@ -506,7 +490,7 @@ class FrameCheck:
         contrast = float(self._sums.contrast[whole]) if whole and self._sums.powers else 1.0
         leak = (1 - contrast) / (1 + contrast)
         words = f"the dark half of the even pattern has {leak:.1%} of the light of the bright one. {_LEAKING} {_REMEDY}"
-        return ({"words": words, "leak": leak},) if leak > _LEAK else ()
+        return ({"words": words, "leak": leak},) if leak > 5e-3 else ()
 
     def _fault(self, kind: str, numbers: Iterable[int], words: str, part: float = 0.0) -> FrameFault:
         numbers = tuple(sorted(int(number) for number in numbers))
@@ -525,7 +509,6 @@ class FrameCheck:
 UNEXPLAINED = 3.5e-3
 """Unexplained part of the measurements, rms, at most: prints leave up to 3e-3; 2 mm off 400 leaves 4.2e-3 or more."""
 GROSS, GROSS_CHI_SQUARE = 0.1, 4.0
-_LAMBDA_BESIDE = 1e-3
 _SHOWN, _MOSTLY = 4, 0.5
 
 
@@ -655,18 +638,22 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     factor_energy, of_ramps = data.factor_energy(image), print_energy(data.model, image)
     beside, known = noise.rendering + (factor_energy or 0.0), factor_energy is not None
     stated = float(noise.variance.sum()) * noise.light.size * prepared.spare
-    lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
+    lam = solution.lam if data.solver.linear else 1e-3 * prepared.problem(data.frames).scale
     sums = Residuals(data)
     test, energy, whole = sums.noise_test, max(float(sums.energy.sum()), TINY), float(sums.squares.sum())
     # Numbers without an ADC may be means of many shots.
-    off = test is not None and test.off(noise, whole, stated, beside) and bool(test.ratio >= 1 or data.digital.step_dn)
+    off = (
+        test is not None
+        and test.off(noise, whole, stated, beside)
+        and bool(test.ratio >= 1 or data.shots.manifest.digital.step_dn)
+    )
     ratio = 1.0 if test is None or (noise.stated and not off) else test.ratio if off else max(test.ratio, 1.0)
     energies = sums.residual, sums.energy, sums.expected_energy(ratio, factor_energy or 0.0), sums.pixels
     found, excess = weigh(energies, known, noise, of_ramps)
     chi_square = whole / max(stated + beside, TINY) if off else found.chi_square  # by the stated noise
-    found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, chi_square=chi_square)
+    found = replace(found, noise=test, gain=data.shots.manifest.digital.gain_dn_per_e, chi_square=chi_square)
     if lack := data.lack(image):
-        found = replace(found, predicted=float(np.sqrt(lack.energy / energy)))
+        found = replace(found, predicted=float(np.sqrt(lack[1] / energy)))
     if with_defects and noise.stated and not sums.clipped and (defects := find_defects(data, sums.squares, ratio)):
         return replace(found, defects=defects)  # the caller leaves them out, and tries again
     check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)

@@ -65,7 +65,6 @@ from mitsim.reconstruct.solvers import Prior, lengths, slopes_adjoint, slopes_of
 Array = npt.NDArray[Any]
 Operator = Callable[[FloatArray], FloatArray]
 
-_MU = 10.0
 _COARSE_STEPS, _LEAST_SIDE = 60, 32
 _SMOOTH = 1e-3
 _FIRST_SMOOTH, _SHARPENED = 10.0, 0.3
@@ -197,7 +196,7 @@ class ShiftedLight:
 
     def divisor(self, ridge: float, slope_weight: float) -> Array:
         """Return 1 / (|H|^2 + mu + ridge - slope_weight Laplacian), the preconditioner under uniform light."""
-        total = np.square(np.abs(self.spectrum)) + _MU * float(np.square(self.psf).sum()) + ridge
+        total = np.square(np.abs(self.spectrum)) + 10.0 * float(np.square(self.psf).sum()) + ridge
         if slope_weight:
             rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in self.grid)
             total += slope_weight * (rows[:, None] + columns[: total.shape[1]])
@@ -393,16 +392,11 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
 
 # ---- Noise, weight and misfit ----------------------------------------------------------------------------------------
 
-_NUMBERS = 24
 _RIDGE, _WEIGHT = 50.0, 1.2
 """Lambda over the mean square of a pixel's light, by relative error; TV's weight in units of the gradient's error."""
-_CLEARLY = 2.0
 _SIDE, _STEPS = 128, 60
-_BLOCKS, _KEPT = 12, 8
 _HALVES = range(-16, 7)
 _TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
-_MODEL_ERROR, _ROUGH, _LEFT = 0.01, (3.0, 0.3), 4.0
-_ALIKE = 0.9
 
 
 def frame_noise(frame: Array) -> float:
@@ -431,8 +425,8 @@ def frame_error(light: ShiftedLight, frames: Array) -> float:
     if light.patterns is not None:
         return noise
     small, seen, _ = _shrink(light, frames)
-    row, column = np.indices(small.sensor) // max(min(small.sensor) // _BLOCKS, 1)
-    counted = (row + 3 * column) % _KEPT > 0
+    row, column = np.indices(small.sensor) // max(min(small.sensor) // 12, 1)
+    counted = (row + 3 * column) % 8 > 0
     part = replace(small, seen=counted.astype(small.precision))
 
     @cache
@@ -448,7 +442,7 @@ def frame_error(light: ShiftedLight, frames: Array) -> float:
     # The vertex of the parabola through these three.
     place = best + (before - after) / 2 / max(before - 2 * here + after, 1e-300)
     level = mean * 10 ** (place / 2) / _RIDGE
-    return level if level > _CLEARLY * noise else noise
+    return level if level > 2.0 * noise else noise
 
 
 def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> PointSpreadFit:
@@ -458,7 +452,7 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
     tiles = [tile for strip in strips for tile in np.array_split(strip, columns, axis=1)]
     measured = float(np.mean([frame_noise(tile) ** 2 for tile in tiles])) if variance is None else variance / factor**2
     noise = max(measured, 1e-300)
-    error = math.hypot(math.sqrt(noise), _MODEL_ERROR * float(seen.mean()))
+    error = math.hypot(math.sqrt(noise), 0.01 * float(seen.mean()))
 
     def cost(psf: FloatArray, rough: float) -> tuple[float, float]:
         camera = replace(small, psf=np.ascontiguousarray(psf))
@@ -466,14 +460,14 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
         found = minimise(camera, seen, prior, 2 * _STEPS, 0.002)
         return found.objective, float(np.mean(np.square(camera.image_of(found.image) - seen))) / noise
 
-    rough, fine = _ROUGH
+    rough, fine = (3.0, 0.3)
     (objective, left), (alternative, chi_square) = cost(small.psf, rough), cost(small.psf, fine)
-    rough, objective = (fine, alternative) if left > _LEFT else (rough, objective)
+    rough, objective = (fine, alternative) if left > 4.0 else (rough, objective)
     others, grid = dict[str, float](), [2 * size for size in small.psf.shape]
     for name, (down, across) in _TURNED.items():
         copy = small.psf[::down, ::across]
         shifted = fft.irfft2(fft.rfft2(small.psf, grid) * fft.rfft2(copy, grid).conj(), grid)
-        if shifted.max() < _ALIKE * math.sqrt(float(np.square(small.psf).sum() * np.square(copy).sum())):
+        if shifted.max() < 0.9 * math.sqrt(float(np.square(small.psf).sum() * np.square(copy).sum())):
             others[name] = cost(copy, rough)[0]
     reading = min(others, key=lambda name: others[name], default="")
     energy = max(float(np.mean(np.square(seen, dtype=np.float64))), 1e-300)
@@ -599,7 +593,7 @@ def reconstruct_psf_request(
         sensor = rows // reduce, columns // reduce
         camera = ShiftedLight(light, sensor, None if uniform else shots.patterns, np.float32)
         numbers = camera.grid[0] * camera.grid[1] + camera.count * sensor[0] * sensor[1]
-        Cost(memory_bytes=4.0 * _NUMBERS * numbers).check(f"{shots.name}: its image", Limits())
+        Cost(memory_bytes=4.0 * 24 * numbers).check(f"{shots.name}: its image", Limits())
         frames, variance = np.empty((camera.count, *sensor), np.float32), 0.0
         for each in shots.pattern_measurements((rows, columns)):
             frames[each.row * right.shape[1] + each.column] = reduce_frame(each.frame, reduce)

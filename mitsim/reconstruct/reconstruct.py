@@ -46,7 +46,6 @@ _TURNED, _EQUAL = 0.85, 0.98
 """Cost ratios of the best turned copy below which it is recommended, and below which the light is wrong."""
 _LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
 """Least cost ratio of right light: the first times chi-square to the second; noise explains frames below the last."""
-_OFF = 1 / 8
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ class PointSpreadFit:
         if self.unexplained > GROSS and self.chi_square > GROSS_CHI_SQUARE:
             return f"Misfit: {left}", same
         rows, columns = self.off
-        if max(abs(rows) / self.size[0], abs(columns) / self.size[1]) > _OFF:
+        if max(abs(rows) / self.size[0], abs(columns) / self.size[1]) > 0.125:
             return (
                 f"Misfit: the point's light is centred {rows:+.0f} rows and {columns:+.0f} columns from the middle of "
                 "its picture, and the image is displaced as much",
@@ -340,9 +339,6 @@ def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | floa
 
 # ---- From shots and factors to an image ------------------------------------------------------------------------------
 
-_DEFECT_ROUNDS = 6
-_BETTER = 0.5
-
 
 @takes(ImageRequest)
 def reconstruct(
@@ -466,7 +462,7 @@ def _judge(
     found = find_misfit(data, solution)
     if found and found.defects:
         defects, now, whole = None, found, data
-        for _ in range(_DEFECT_ROUNDS):
+        for _ in range(6):
             if now.defects is None:
                 break
             defects = now.defects.with_others(defects)
@@ -475,14 +471,12 @@ def _judge(
             now = find_misfit(data, solution) or now
         if now.flagged:
             now = find_misfit(data, solution, with_defects=False) or now
-        if now.flagged and now.unexplained > _BETTER * found.unexplained:
+        if now.flagged and now.unexplained > 0.5 * found.unexplained:
             data, solution = whole, whole.solution(lam)
             found = find_misfit(data, solution, with_defects=False)
         else:
             found = replace(now, defects=defects)
     explained = data.factors.status.verdict is not Verdict.NOT_SEPARABLE and not (found and found.flagged)
     if data.solver.linear and lam == "auto" and (data.factors.lacking or not explained):
-        lack = data.lack(solution.image)
-        known = (lack.struck, lack.energy) if lack else None
-        solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
+        solution = data.prepared.solve(data.frames, lam, explained=explained, lack=data.lack(solution.image))
     return data, solution, found

@@ -35,9 +35,6 @@ from mitsim.reconstruct.solver import IndexArray, Prepared, group_pixels, prepar
 
 # ---- Other readings of the data -------------------------------------------------------------------------------------
 
-_FITS, _AT_MOST = 0.05, 2e-2
-_FIT_ALIKE, _ROWS = 0.02, 4.0
-_LAMBDA, _NEGATIVE = 1e-3, 0.5
 
 _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "as they are": lambda frame: frame,
@@ -69,16 +66,16 @@ class Reading:
 def is_negative(prepared: Prepared, patterns: tuple[FloatArray, FloatArray], weights: FloatArray) -> bool:
     """Return True if scene pixels that are lit together are negative in the mean, as with exchanged halves of pairs."""
     sigma, groups = prepared.sigma, [[group.pixels for group in group_pixels(side)] for side in patterns]
-    image = prepared.image(weights * sigma / (np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2 + TINY))
+    image = prepared.image(weights * sigma / (np.square(sigma) + 0.001 * float(sigma.max()) ** 2 + TINY))
     means = np.array([[image[np.ix_(rows, columns)].mean() for columns in groups[1]] for rows in groups[0]])
-    return bool(means.min() < -_NEGATIVE * np.abs(means).max())
+    return bool(means.min() < -0.5 * np.abs(means).max())
 
 
 def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Reading, ...]:
     """Return the readings that restore the fit of a run, the best first; empty if none does."""
     manifest, patterns, signed = data.shots.manifest, data.shots.patterns, data.noise.shots == 2
     sides, captures = (data.factors.left, data.factors.right), manifest.patterns.captures
-    part = tuple(slice(None, None, max(int(len(side) / (_ROWS * side.shape[1])), 1)) for side in sides)
+    part = tuple(slice(None, None, max(int(len(side) / (4.0 * side.shape[1])), 1)) for side in sides)
     left, right = (np.asarray(side)[rows] for side, rows in zip(sides, part, strict=True))
     prepared = prepare(left, right, *patterns, centre=data.prepared.centre)
     if prepared.spare <= 0:
@@ -117,7 +114,7 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     unexplained = min(max(now - allowed, 0.0), whole)
     if unexplained <= chance / 2:
         return ()
-    limit = allowed + max(min(_FITS * unexplained, _AT_MOST**2 * whole), min(chance, unexplained / 2))
+    limit = allowed + max(min(0.05 * unexplained, 0.02**2 * whole), min(chance, unexplained / 2))
     good: list[Reading] = []
     # One change is tried before two.
     for stage in (
@@ -130,20 +127,16 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
             known = None if name == _TAKEN or name in _STEPS else name
             good.append(Reading(" and ".join(words), fit(turn, orders[name])[1], known))
         good = sorted((each for each in good if each.left < limit), key=lambda each: each.left)
-    alike = [each for each in good if each.left <= good[0].left * (1 + _FIT_ALIKE) + chance]
+    alike = [each for each in good if each.left <= good[0].left * (1 + 0.02) + chance]
     return tuple(replace(each, left=float(np.sqrt(max(each.left - allowed, 0.0) / whole))) for each in alike)
 
 
 CHANCE = 6.0
 """Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
 TINY = 1e-300
-_TILES = 8
 _NOISE_TILE, _NOISE_TILES = 16, 1500
 _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
-_STRUCTURE, _CORRELATED = 0.5, (70 / 36) ** 2
 _PAIR_ROWS, _SAMPLE = 96, 20_000
-_BRIGHT, _ALIKE = 50.0, 1e-3
-_PLACE, _PLACE_ENERGY = 7.0, 0.02
 
 
 # ---- Findings ----
@@ -169,7 +162,7 @@ class NoiseTest:
         little = whole - beside < (1 - _NOISE_OFF - chance) * stated
         if little and self.ratio < 1 - _NOISE_OFF + CHANCE / 2 * self.error:
             return True
-        white = whole < (1 + _STRUCTURE) * self.ratio * stated + beside
+        white = whole < (1 + 0.5) * self.ratio * stated + beside
         more = whole > (1 + _NOISE_OFF + chance) * stated + beside
         seen = self.ratio > (1 + beside / max(stated, TINY)) * (1 + _NOISE_OFF) + CHANCE / 2 * self.error
         return white and more and seen
@@ -210,7 +203,7 @@ class Residuals:
         self._prepared, self._sides = prepared, (prepared.left, prepared.right)
         sides = self._sides
         sizes, counts = ([getattr(side, name) for side in sides] for name in ("sensor_size", "pattern_count"))
-        edges = [np.linspace(0, size, min(_TILES, size) + 1).astype(np.intp) for size in sizes]
+        edges = [np.linspace(0, size, min(8, size) + 1).astype(np.intp) for size in sizes]
         self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         self.leave_out, self.shots, self.free, self.rest, self.side, self.contrast = np.zeros((6, *counts))
@@ -264,8 +257,8 @@ class Residuals:
             halves, variance = np.stack([total + difference, total - difference]) / 2, 2 * self.noise.variance[pattern]
             normal = halves @ halves.T
             powers, errors = np.zeros((2, 2)) + [[0.0], [np.inf]]
-            bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
-            if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
+            bright = np.diag(normal).min() > 50.0 * variance * total.size / 4
+            if bright and np.linalg.det(normal) > 0.001 * np.diag(normal).max() ** 2:
                 inverse = np.linalg.inv(normal)
                 powers, errors = np.stack([inverse @ (halves @ beyond), np.sqrt(variance * np.diag(inverse))])
             rest = beyond - powers @ halves
@@ -292,7 +285,7 @@ class Residuals:
         found, light = np.concatenate(self._noises, axis=1)
         if not found.any():
             return None
-        freedom = self._tile_pixels / _CORRELATED
+        freedom = self._tile_pixels / (70 / 36) ** 2
         spread = float(np.sqrt(2 / freedom))
         stated = np.maximum(self.noise.of(light, self.noise.shots), TINY)
         ratios = found / stated / (1 - 2 / (9 * freedom)) ** 3
@@ -333,8 +326,8 @@ class Residuals:
             spread = 2 / (9 * np.maximum(free, 0.5))
             away = _deviations((np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread))
             usual = np.median((squares / own).ravel()[:: max(own.size // _SAMPLE, 1)])
-            beyond[name] = np.where(away > _PLACE, squares - usual * own, 0.0)
-        least = _PLACE_ENERGY * float(whole[1].sum())
+            beyond[name] = np.where(away > 7.0, squares - usual * own, 0.0)
+        least = 0.02 * float(whole[1].sum())
         found = []
         for name, each in beyond.items():
             if each.sum() > least:

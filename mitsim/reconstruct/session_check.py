@@ -35,16 +35,10 @@ from mitsim.reconstruct.solver import robust_scatter
 
 _MOVES = (0, -1), (1, -1), (-1, -1), (2, -1)
 """Turns and sign of the frequencies that pixels alias to k in [0, pi]; masks of two pixels a feature need them."""
-_DEGREE = 3
 _LINES = 8
-_FREQUENCIES = 64
-_FARTHEST = 0.6
 _ENOUGH = 16, 40
 _PREDICTED = 0.15
 """Limit of the relative squared deviation of a tenth of the patterns: 0.03 with three exchanged pairs of 32."""
-_KNOWN = 0.1
-_ROUNDING = 1e-12
-_FITS = 3
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -75,18 +69,18 @@ class MovingShadow:
         signs = signs / np.sqrt(count)
         taper = np.square(np.sin(np.pi * (np.arange(len(vectors)) + 0.5) / len(vectors)))
         spectra = np.fft.rfft((vectors - taper @ vectors / taper.sum()) * taper[:, None], axis=0)[1:]
-        stride = -(-len(spectra) // _FREQUENCIES)
+        stride = -(-len(spectra) // 64)
         self.angles: FloatArray = 2 * np.pi * np.arange(1, len(spectra) + 1)[::stride] / len(vectors)
         spectra = spectra[::stride]
         columns = spectra @ signs.T
         # The step of the shadow from column to column is the one whose phases have most power.
         power = np.square(np.abs(np.fft.fft(columns, 8 * n, axis=1)))
-        most = int(_FARTHEST * len(vectors))
+        most = int(0.6 * len(vectors))
         steps = np.linspace(-most, most, 40 * most + 1) / n
         places = np.rint(-np.outer(steps, self.angles) * (8 * n / (2 * np.pi))).astype(np.int64) % (8 * n)
         step = float(steps[int(np.argmax(power[np.arange(len(self.angles)), places].sum(axis=1)))])
         # The modes are these phases, and those of aliases, times slow polynomials.
-        degree = max(min(_DEGREE, n // _LINES - 1), 0)
+        degree = max(min(3, n // _LINES - 1), 0)
         slow, aliases = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree), list[ComplexArray]()
         for turns, sign in _MOVES[: max(1, 3 * n // _LINES // (degree + 1))]:
             phase = np.exp(1j * step * np.outer(2 * np.pi * turns + sign * self.angles, np.arange(n)))
@@ -96,7 +90,7 @@ class MovingShadow:
         # Squared length of each pattern's stripes beyond the modes.
         own = np.maximum(n / count - np.square(np.abs(np.matmul(turned, signs))).sum(axis=1), 1e-9)
         left = np.zeros_like(spectra)
-        for index in [0, *[*unknown] * _FITS]:
+        for index in [0, *[*unknown] * 3]:
             spectra[:, index] -= left[:, index] / own[:, index]
             columns = spectra @ signs.T
             rest = columns - np.matmul(modes, np.matmul(turned, columns[..., None]))[..., 0]
@@ -104,7 +98,7 @@ class MovingShadow:
         self.spectra, self._left, self._own = spectra, left, own
         squares = np.square(np.abs(spectra))
         deviations = (np.square(np.abs(left)) / own).sum(axis=0)
-        self._unit = (float(np.median(deviations)) + _ROUNDING * float(squares.sum(axis=0).mean())) or 1.0
+        self._unit = (float(np.median(deviations)) + 1e-12 * float(squares.sum(axis=0).mean())) or 1.0
         self.deviations = deviations / self._unit
         self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), 1e-300)
         self.shares, variances = self.along(spectra)
@@ -115,7 +109,7 @@ class MovingShadow:
         kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-9)
         seen = (kept * np.square(np.abs(columns)).mean(axis=1, keepdims=True)).sum(axis=0)
         lines = (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, 1e-300)
-        self.lines = lines * (kept.mean(axis=0) > _KNOWN)
+        self.lines = lines * (kept.mean(axis=0) > 0.1)
 
     def along(self, shapes: ComplexArray) -> tuple[FloatArray, FloatArray]:
         size = np.maximum((np.square(np.abs(shapes)) * self._own).sum(axis=0), 1e-300)
@@ -130,15 +124,12 @@ _DEVIATIONS = 8.0
 _STRAYS = 4.265
 """Standard deviations from which places move: one side in 1e5 by chance."""
 _SURE = 5.0
-_ALONE = 0.9
 _SLIGHT = 0.02
-_NEAR = 5
 _WRONG, _UNLIKE = 40.0, 0.03
 """Two squared deviations from which a pattern is wrong: none of 860 good sides of 64 or 128 patterns exceeds 20 in
 both."""
 _FOREIGN = 0.5, 15.0, 15.0
 """Limits of a foreign pattern: good ones have 0.25 at 6 (64 patterns), swapped ones about 1 at 23 and 30."""
-_UNEXPLAINED = 0.05
 _TURNED = 0.7
 _LINE = 0.15
 """Limit of a line's squared deviation over the mean square: good cameras of 32 lines reach 0.003."""
@@ -151,7 +142,6 @@ _POWER = "frames are of different power; use a steadier lamp, or pairs"
 _OFFSET = "the uniform frame does not fit those of patterns; keep lamp and ambient light steady, or take pairs"
 _REPLACED = "a frame of a pair is wrong; take it again"
 _UNEQUAL = "the two do not add up to what others do"
-_STEP = 5.0
 
 
 def frame_words(half: Half) -> str:
@@ -324,10 +314,10 @@ class _Side:
         excess = beyond * (beyond.sum() > _SURE * noise * np.sqrt(2 * spare * len(squares)))
         middle = max(float(np.median(squares)), noise * spare)
         bad = squares > middle + _DEVIATIONS * max(robust_scatter(squares), middle * np.sqrt(2 / spare))
-        return bad | self.odd() | (np.abs(ratios) > _ALONE), excess, *measured, *variances  # no division by power 0
+        return bad | self.odd() | (np.abs(ratios) > 0.9), excess, *measured, *variances  # no division by power 0
 
     def odd(self) -> npt.NDArray[np.bool_]:
-        least = _UNEXPLAINED * np.maximum(self.sums.energies, np.median(self.sums.energies))
+        least = 0.05 * np.maximum(self.sums.energies, np.median(self.sums.energies))
         middle = float(np.median(self.misfits))
         # Few misfits hardly show their scatter, which is that of squares of noise at least.
         scatter = max(robust_scatter(self.misfits), float(np.sqrt(2 * self.variance * max(middle, 0.0))))
@@ -393,7 +383,7 @@ class _Check:
         for axis, index in zip(*np.nonzero(bad), strict=True):
             own = self.sides[axis]
             apart = np.abs(self.times[axis] - self.times[axis, index]) + ~self.good[axis]
-            usual = np.median(own.sums.lights[:, np.argsort(apart)[:_NEAR]], axis=1)
+            usual = np.median(own.sums.lights[:, np.argsort(apart)[:5]], axis=1)
             away, misfits = own.sums.lights[:, index] - usual, dict[int, float]()
             for wrong in (1, -1):
                 own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
@@ -445,7 +435,7 @@ class _Check:
             usual = usable & (np.abs(away) <= _DEVIATIONS * robust_scatter(away[usable]) + 1e-12)
         powers, line = powers / np.mean(line), line / np.mean(line)
         # The step from one side to the other is known as well as the uniform frames are.
-        powers, left, _ = _shrunk(powers - 1, _STEP * variances, usable)
+        powers, left, _ = _shrunk(powers - 1, 5.0 * variances, usable)
         powers = 1 + powers * usable
         # A single frame of other power changes both alike.
         single = np.square(powers - line) * (powers != 1)

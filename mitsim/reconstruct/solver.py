@@ -151,8 +151,6 @@ class Solution:
 
 IndexArray = npt.NDArray[np.intp]
 Strips = tuple[slice, ...]
-StripHalves = tuple[Strips, Strips]
-_STRIPS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +160,6 @@ class Group:
     pixels: IndexArray
     patterns: FloatArray
     shared: tuple[FloatArray, FloatArray] | None
-
-    def lights(self, index: int) -> bool:
-        return bool(self.patterns[:, index].any() if self.shared is None else self.shared[1][index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,9 +217,9 @@ class Side:
         return float((self.singular.max() / self.singular.min()) ** 2)
 
     @cached_property
-    def halves(self) -> StripHalves:
+    def halves(self) -> tuple[Strips, Strips]:
         """Sensor rows of the two halves as strips, because an index array would copy each frame."""
-        width = -(-self.sensor_size // _STRIPS)
+        width = -(-self.sensor_size // 8)
         strips = tuple(slice(first, first + width) for first in range(0, self.sensor_size, width))
         return strips[::2], strips[1::2]
 
@@ -302,7 +297,7 @@ def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], 
     singular[singular <= singular.max() * longest * np.finfo(np.float64).eps] = 0.0
     slabs = []
     for index in range(patterns.shape[1]):
-        lit = [b for b, group in enumerate(groups) if group.lights(index)]
+        lit = [b for b, group in enumerate(groups) if group.patterns[:, index].any()]
         columns = np.concatenate([np.arange(starts[b], starts[b + 1]) for b in lit] or [np.arange(0)])
         pieces = [parts[b][0][index] for b in lit] or [np.zeros((sensor, 0))]
         # Equally spaced columns are a slice, because basic indexing is a view and twice as fast.
@@ -363,7 +358,6 @@ MISFIT_RATIO = 1.2
 """Limit of noise outside the range over noise inside: prints have 0.92 to 1.02, depth and gloss 1.4 and more."""
 _TAKEN, _TAKEN_RISE = 30.0, 4
 _EXPONENTS = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
-_FELT = 100.0
 _FAINT, _FEWEST = 2.0, 20
 
 
@@ -485,7 +479,7 @@ def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:
     lowest, highest = problem.scale * 10.0 ** np.array([_EXPONENTS[0], 0.0])
     if lam >= highest:
         return ("Automatic lambda is the largest that is tried: the frames show hardly more than noise.",)
-    if lam <= lowest and np.square(problem.sigma[problem.sigma > 0]).min() < _FELT * lowest:
+    if lam <= lowest and np.square(problem.sigma[problem.sigma > 0]).min() < 100.0 * lowest:
         return (
             "Automatic lambda is the smallest that is tried, so that weakly measured directions of the image may be "
             "noise; compare with a larger lambda.",
@@ -521,10 +515,7 @@ def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
 
 # -------- W by quarters of the sensor in
 
-_LEAST_SPREAD = 0.01
-_MEDIAN = 0.4549
 MEDIAN_SPREAD = 2.33
-_SIGNIFICANT = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -543,22 +534,24 @@ class Halves:
     @cached_property
     def _squares(self) -> tuple[FloatArray, FloatArray]:
         spreads = (half_spread(side.first_half) for side in (self.left, self.right))
-        rows, columns = (np.where(spread >= _LEAST_SPREAD, spread, np.nan) for spread in spreads)
-        by_row, by_column = self.differences
-        return np.square(by_row) / rows[:, None], np.square(by_column) / columns
+        rows, columns = (np.where(spread >= 0.01, spread, np.nan) for spread in spreads)
+        measured, (by_row, by_column) = np.outer(self.left.singular, self.right.singular) > 0, self.differences
+        found = np.square(by_row) / rows[:, None], np.square(by_column) / columns
+        return np.where(measured, found[0], np.nan), np.where(measured, found[1], np.nan)
 
     @cached_property
     def typical(self) -> float:
-        return float(_medians(np.concatenate([square[self._measured] for square in self._squares])[None])[0])
+        return float(_medians(np.concatenate(self._squares, axis=None)[None])[0])
 
     @cached_property
     def excess(self) -> FloatArray:
-        row, column = (np.where(self._measured, square, np.nan) for square in self._squares)
-        return _excess(row.T) + _excess(column)[:, None]
-
-    @property
-    def _measured(self) -> npt.NDArray[np.bool_]:
-        return np.asarray(np.outer(self.left.singular, self.right.singular) > 0)
+        found = []
+        for squares in (self._squares[0].T, self._squares[1]):
+            level, count = _medians(squares), np.maximum((~np.isnan(squares)).sum(axis=1), 1)
+            middle = np.nan if np.isnan(level).all() else np.nanmedian(level)
+            significant = level > middle * (1 + 2.0 * MEDIAN_SPREAD / np.sqrt(count))
+            found.append(np.where(significant, level - middle, 0.0))
+        return np.asarray(found[0] + found[1][:, None])
 
 
 def half_spread(half: FloatArray) -> FloatArray:
@@ -572,22 +565,13 @@ def robust_scatter(values: FloatArray) -> float:
 def _medians(squares: FloatArray) -> FloatArray:
     ordered, count = np.sort(squares, axis=1), np.count_nonzero(~np.isnan(squares), axis=1)  # NaN come last
     rows = np.arange(len(squares))
-    return np.asarray((ordered[rows, np.maximum(count - 1, 0) // 2] + ordered[rows, count // 2]) / (2 * _MEDIAN))
-
-
-def _excess(squares: FloatArray) -> FloatArray:
-    level = _medians(squares)
-    count = np.maximum((~np.isnan(squares)).sum(axis=1), 1)
-    middle = np.nanmedian(level) if not np.isnan(level).all() else np.nan
-    significant = level > middle * (1 + _SIGNIFICANT * MEDIAN_SPREAD / np.sqrt(count))
-    return np.where(significant, level - middle, 0.0)
+    return np.asarray((ordered[rows, np.maximum(count - 1, 0) // 2] + ordered[rows, count // 2]) / (2 * 0.4549))
 
 
 ROUNDING_LIMIT = 0.01
 _ROUNDING_UNITS = 110 * float(np.finfo(np.float64).eps)
 """Rounding before magnification: 2 x 49 eps neglected by LAPACK's dbdsqr and 12 of products; 44 in 5500 models."""
 _SMALLEST, _LARGEST = 1e-30, 1e30
-_UNSEEN = 1e-60
 
 
 @dataclass(frozen=True, eq=False)
@@ -614,10 +598,6 @@ class Prepared:
     @property
     def condition(self) -> float:
         return max(self.left.condition, self.right.condition)
-
-    @property
-    def condition_whole(self) -> float:
-        return self.left.condition * self.right.condition
 
     @property
     def rank(self) -> int:
@@ -666,8 +646,8 @@ class Prepared:
         left, right = self.left, self.right
         return (
             f"Rank {self.rank} of {self.unknowns} (rows {left.rank} of {left.scene_size}, columns {right.rank} of "
-            f"{right.scene_size}), condition {self.condition_whole:.1e} (rows {left.condition:.1e}, columns "
-            f"{right.condition:.1e})"
+            f"{right.scene_size}), condition {left.condition * right.condition:.1e} (rows {left.condition:.1e}, "
+            f"columns {right.condition:.1e})"
         )
 
     def with_correlation(self) -> Prepared:
@@ -810,7 +790,7 @@ def prepare(
         left_side = factorise(factors[0], patterns[0], group_pixels(patterns[0]), centre)
         right_side = left_side if same else factorise(factors[1], patterns[1], group_pixels(patterns[1]), centre)
     for name, factorised in (("left", left_side), ("right", right_side)):
-        if factorised.singular.max() < _UNSEEN:
+        if factorised.singular.max() < 1e-60:
             raise MitsimError(f"patterns light no scene pixel that the {name} factor sees; light those that it sees")
     return Prepared(left_side, right_side, centre)
 

@@ -53,17 +53,13 @@ from mitsim.reconstruct.solver import DiagonalProblem, Side, Solution, coefficie
 # ---- The scene's power spectrum --------------------------------------------------------------------------------------
 
 
-_FALL = -2.0
 _CONTRAST = 0.4
 """Prior standard deviation of a scene over its mean: 0.2 to 0.6 in eight photographs."""
 _DEPARTURE, _MEMORY = 2.0, 4.0
 """Prior standard deviation of log S, and its correlation length in octaves (docs/physics.md, uncertainty)."""
-_ALIKE = 0.8
 _NARROW = 16
 _SINGLE, _BANDS = 8, 4
-_CERTAIN = 100.0
 _NOISE_CERTAIN = 2000.0
-_GREY, _BRIGHT = 0.35, 1.0
 _STEPS, _STILL = 60, 1e-4
 _FARTHEST = 3.0
 
@@ -112,20 +108,20 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
     least = float(np.square(problem.projected).max()) * np.finfo(np.float64).eps
     level = np.maximum(np.broadcast_to(noise, sigma.shape), least)
     place = step * (np.arange(len(nodes)) % (len(nodes) // 2))
-    fall = np.exp2(_FALL * place)
+    fall = np.exp2(-2.0 * place)
     frequencies = np.outer(bands[0][2], bands[1][2])
     detail_energy = float(fall @ np.tensordot(nodes, frequencies)) or 1.0  # a single pixel has none
     usual = np.square(_CONTRAST) * frequencies.sum() / detail_energy * fall
 
     def mean(power: FloatArray) -> tuple[float, float]:
         weights = sigma * even / (np.square(sigma) * np.tensordot(power, shares, axes=1) + level)
-        variance = 1 / (_BRIGHT**-2 + float(np.sum(weights * sigma * even)))
+        variance = 1 / (1.0**-2 + float(np.sum(weights * sigma * even)))
         return variance * float(np.sum(weights * problem.projected)), variance
 
-    brightness, variance = mean(usual * _GREY**2)
+    brightness, variance = mean(usual * 0.35**2)
     detail = np.square(problem.projected - sigma * brightness * even)
     groups = _group((np.square(sigma) / level)[measured], shares[:, measured], (detail / level)[measured])
-    same_octave = np.where(np.equal.outer(*2 * [np.arange(len(nodes)) < len(nodes) // 2]), 1.0, _ALIKE)
+    same_octave = np.where(np.equal.outer(*2 * [np.arange(len(nodes)) < len(nodes) // 2]), 1.0, 0.8)
     before = _DEPARTURE**2 * np.exp(-np.abs(place[:, None] - place) / _MEMORY) * same_octave
     level_of_detail = np.log(usual * max(brightness**2, variance))
     power, covariance, departure = _likeliest(*groups, level_of_detail, np.asarray(np.linalg.inv(before)))
@@ -170,7 +166,7 @@ def _likeliest(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return log S (J,), its covariance and the departure from it, by Fisher scoring."""
     signal = np.maximum(1 - 1 / np.maximum(found, 1.0), 0.0)
-    weight = counts / (1 + counts * (np.square(signal) / _CERTAIN + 1 / _NOISE_CERTAIN))
+    weight = counts / (1 + counts * (np.square(signal) / 100.0 + 1 / _NOISE_CERTAIN))
 
     def cost(power: FloatArray) -> float:
         expected = 1 + told @ np.exp(power)
@@ -203,11 +199,8 @@ def _likeliest(
 # ---- Standard uncertainty by source ----------------------------------------------------------------------------------
 
 
-_LOST = 1e-5
-_EXTRAPOLATED = 1.35
 _AS_STATED = 1.5
 _NEAR = 2.0
-_UNSURE = 0.1
 NO_UNCERTAINTY = {
     "uncertainty": None,
     "uncertainty_budget": None,
@@ -245,7 +238,7 @@ class Uncertainty:
     @property
     def extrapolated(self) -> bool:
         lost = self.budget.get("regularisation_bias", 0.0)
-        return self.bias_factor > _EXTRAPOLATED and 2 * lost**2 > _rms(self.total) ** 2
+        return self.bias_factor > 1.35 and 2 * lost**2 > _rms(self.total) ** 2
 
     def loss(self, image: FloatArray) -> str:
         """Return a sentence if lambda removes most of an ``image``, or the uncertainty exceeds it, else nothing."""
@@ -302,7 +295,7 @@ class Propagation:
         """Factors g (r, k) and h (r', k) of whose products G is the sum; a tenth of an SVD's time."""
         rest, energy = self.gain.copy(), float(np.square(self.gain).sum())
         rows, columns = list[FloatArray](), list[FloatArray]()
-        while not rows or np.square(rest).sum() > _LOST * energy:
+        while not rows or np.square(rest).sum() > 1e-5 * energy:
             row, column = np.unravel_index(np.argmax(np.abs(rest)), rest.shape)
             rows.append(rest[:, column] / rest[row, column])
             columns.append(rest[row].copy())
@@ -367,7 +360,7 @@ class Propagation:
         of_mean = (spectrum.mean**2 + spectrum.mean_variance) * np.square(image(lost * spectrum.even))
         seen = _near(image(lost * told))
         usual = gaussian_filter(self._pixel_variance(np.square(lost) * energy * part), _NEAR, mode="nearest")
-        doubt = max(_UNSURE * float(usual.mean()), 1e-300)
+        doubt = max(0.1 * float(usual.mean()), 1e-300)
         near = (seen + doubt) / (usual + doubt)
         placed = squares * near
         placed *= squares.mean() / max(float(placed.mean()), 1e-300)
@@ -420,7 +413,7 @@ def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0)
     lost, factor = propagation.of_regularisation(problem, float(noise.variance.mean()))
     of_sampling = propagation.of_white(noise.discretisation / problem.data_count)
     calibrated = manifest.digital.exposure_uncertainty if manifest.digital else 0.0
-    exposure = math.hypot(data.digital.exposure_uncertainty, calibrated)
+    exposure = math.hypot(data.shots.manifest.digital.exposure_uncertainty, calibrated)
     variances = {
         "frame_noise": frames,
         "ambient_frame": shown * propagation.of_ambient_frame(*noise.ambient) if noise.ambient else zero,
@@ -428,7 +421,7 @@ def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0)
         "calibration_noise": left + right,
         "print_detail": np.maximum(propagation.of_print(image), told),
         "exposure": np.square(exposure * image),
-        "inseparability": zero if lack is None else _near(data.prepared.image(propagation.gain * lack.struck)),
+        "inseparability": zero if lack is None else _near(data.prepared.image(propagation.gain * lack[0])),
         "regularisation_bias": lost,
     }
     return Uncertainty({name: np.sqrt(np.maximum(each, 0.0)) for name, each in variances.items()}, factor)

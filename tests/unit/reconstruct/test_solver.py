@@ -109,7 +109,7 @@ def test_condition_covers_all_blocks_and_the_worse_side():
     assert prepared.condition == pytest.approx(64.0)
     assert (prepared.unknowns, prepared.rank) == (4 * 2, 4 * 2)
     whole = np.kron(left.T @ left * (dots(4, 2) @ dots(4, 2).T), right.T @ right)
-    assert prepared.condition_whole == pytest.approx(np.linalg.cond(whole), rel=1e-9)
+    assert prepared.left.condition * prepared.right.condition == pytest.approx(np.linalg.cond(whole), rel=1e-9)
     assert prepare(right, left, np.ones((2, 1)), dots(4, 2)).condition == pytest.approx(64.0)
 
 
