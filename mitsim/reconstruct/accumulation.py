@@ -38,6 +38,9 @@ EDGES = 2.9
 """Energy of edges over that of the ramp: a dipole t (1 - t) / 2 has the mean square 1/120; slopes around it add 1/346.
 """
 PRINT = (1 + EDGES) / 2
+CHANCE = 6.0
+"""Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
+TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +181,13 @@ class FrameNoise:
         # The difference of a pair has no ambient frame.
         ambient = float(self.ambient[0].mean()) if self.ambient and shots == 1 else 0.0
         return self._own(light, shots) + ambient
+
+    def chance(self, pixels: float) -> float:
+        """Return the excess by chance of the chi-square of so many ``pixels`` in all measurements.
+
+        The energy of normal noise of variance v in n data varies by sqrt(2 n) v.
+        """
+        return CHANCE * float(np.sqrt(2 * np.square(self.variance).sum() / pixels) / max(self.variance.sum(), TINY))
 
     def add(self, measurement: Measurement) -> None:
         pattern, light, shots = (measurement.row, measurement.column), measurement.light, measurement.shots

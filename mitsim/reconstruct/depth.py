@@ -39,22 +39,10 @@ from mitsim.core.arrays import FloatArray, single_threaded_blas
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture, Measurement
-from mitsim.reconstruct.accumulation import DerivedCapture, FrameNoise, factor_energy
+from mitsim.reconstruct.accumulation import CHANCE, DerivedCapture, FrameNoise, factor_energy
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.misfit import Misfit, weigh
 from mitsim.reconstruct.request import check_parallax
-from mitsim.reconstruct.residuals import CHANCE
-from mitsim.reconstruct.solver import (
-    Side,
-    Solution,
-    Status,
-    Verdict,
-    centre_columns,
-    centre_frame,
-    factorise,
-    group_pixels,
-    prepare,
-)
+from mitsim.reconstruct.solver import Side, centre_columns, centre_frame, factorise, group_pixels, prepare
 
 # ---- Factors moved to another depth ----------------------------------------------------------------------------------
 
@@ -326,25 +314,8 @@ class DepthMap:
         return f"focus: depths of {depths}, told for {message['told_part']:.0%} of pixels"
 
     @property
-    def solution(self) -> Solution:
-        residual = float(np.sqrt(self.left_over / self.energy))
-        status = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
-        return Solution(self.image, self.lam, residual, status)
-
-    @property
     def reliable(self) -> npt.NDArray[np.bool_]:
         return np.asarray(self.confidence >= _RELIABLE)
-
-    def misfit(self, noise: FrameNoise, factor_energy: float | None, print_energy: float) -> Misfit:
-        spare = 1 - 2 * self.image.size / self.data  # a reflectance and a depth for each pixel
-        variance = float(noise.variance.mean()) * self.data * spare
-        expected = variance + self.part * (noise.rendering + self.smoothing * (factor_energy or 0.0))
-        whole = self.left_over, self.energy, expected, self.data / noise.variance.size
-        energies = tuple(np.array([[value]]) for value in whole)
-        return weigh(energies, factor_energy is not None, noise, self.part * print_energy)[0]
-
-    def channels(self) -> dict[str, npt.NDArray[np.float32]]:
-        return {"depth_mm": self.mm.astype(np.float32), "confidence": self.confidence.astype(np.float32)}
 
     def summary(self) -> dict[str, float]:
         reliable = self.mm[self.reliable] if self.reliable.any() else self.mm

@@ -45,19 +45,9 @@ from scipy.sparse import csr_matrix
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.accumulation import Accumulation, DerivedCapture, FrameNoise, print_energy
+from mitsim.reconstruct.accumulation import CHANCE, TINY, Accumulation, DerivedCapture, FrameNoise, print_energy
 from mitsim.reconstruct.factors import decibels
-from mitsim.reconstruct.residuals import (
-    CHANCE,
-    TINY,
-    NoiseTest,
-    Place,
-    Reading,
-    Residuals,
-    find_readings,
-    is_negative,
-    noise_chance,
-)
+from mitsim.reconstruct.residuals import NoiseTest, Place, Reading, Residuals, find_readings, is_negative
 from mitsim.reconstruct.solver import IndexArray, Solution, Status, robust_scatter
 from mitsim.reconstruct.uncertainty import Propagation
 
@@ -660,7 +650,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     faults, places = check.faults(), tuple(sums.places(ratio)) if noise.stated and not off else ()
     turned = noise.shots == 2 and is_negative(prepared, data.shots.patterns, sums.weights)
     # A reading is looked for in dim light, too, where chance hides half of what is off.
-    hint = 1 + noise_chance(noise, float(sums.pixels.sum())) / 2
+    hint = 1 + noise.chance(float(sums.pixels.sum())) / 2
     hinted = found.stated and found.unexplained > UNEXPLAINED and found.chi_square > hint
     suspect = found.flagged or faults or places or off or turned or hinted
     readings = find_readings(data, ratio, beside + of_ramps) if suspect else ()
@@ -692,7 +682,7 @@ def weigh(
     chi_square = float(residual.sum() / max(float(expected.sum()), TINY))
     chi_squares = residual / np.maximum(expected, TINY)
     stated = noise.stated and factors_stated
-    part, most = (UNEXPLAINED, 1 + noise_chance(noise, float(pixels.sum()))) if stated else (GROSS, GROSS_CHI_SQUARE)
+    part, most = (UNEXPLAINED, 1 + noise.chance(float(pixels.sum()))) if stated else (GROSS, GROSS_CHI_SQUARE)
     flagged = unexplained > part and chi_square > most
     cause = Cause.MODEL if flagged else None
     return Misfit(chi_square, unexplained, chi_squares, float(tiles.max()), stated, flagged, cause), excess

@@ -18,9 +18,9 @@ from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising, print_energy
-from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map, move_factors
+from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map, move_factors, parallax_of
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.misfit import GROSS, GROSS_CHI_SQUARE, Cause, LeftOut, Misfit, faulty_frames, find_misfit
+from mitsim.reconstruct.misfit import GROSS, GROSS_CHI_SQUARE, Cause, LeftOut, Misfit, faulty_frames, find_misfit, weigh
 from mitsim.reconstruct.request import (
     IMAGE_FILE,
     PICTURE_FILE,
@@ -28,9 +28,7 @@ from mitsim.reconstruct.request import (
     TIKHONOV,
     ImageCost,
     ImageRequest,
-    check_parallax,
     holds_image,
-    predict_cost,
 )
 from mitsim.reconstruct.solver import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
@@ -255,7 +253,10 @@ class Reconstruction(Solution):
         write_json(folder / RESULT_FILE, {"status": _INCOMPLETE, "inputs": self.inputs})
         channels: dict[str, Any] = {IMAGE_FILE: {"reflectance": self.image.astype(np.float32)}}
         channels[UNCERTAINTY_FILE] = self.uncertainties and self.uncertainties.channels()
-        channels[DEPTH_FILE] = self.depths and self.depths.channels()
+        channels[DEPTH_FILE] = self.depths and {
+            "depth_mm": self.depths.mm.astype(np.float32),
+            "confidence": self.depths.confidence.astype(np.float32),
+        }
         checksums = {}
         for name, values in channels.items():
             (folder / name).unlink(missing_ok=True)
@@ -378,9 +379,9 @@ def reconstruct_request(
     shots: Capture, factors: Factors, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
     asked, lam, doubts = request.inputs(shots, factors), request.lam, list[str]()
-    shots, factors, solver = check_image(shots, factors, request)
+    solver = check_image(shots, factors, request)
     # Depths that are looked for, and total variation, take as long as the data ask for.
-    cost = predict_cost(shots, factors) if request.method == TIKHONOV and not request.looks_for_depth else None
+    cost = ImageCost.of(shots, factors) if request.method == TIKHONOV and not request.looks_for_depth else None
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     clock = (job or Job()).apart("").clock
@@ -404,7 +405,12 @@ def reconstruct_request(
     with clock.stage("accumulate"):
         data = accumulate(shots, factors, solver, **request.iterative)
     with clock.stage("solve"):
-        solution = depths.solution if depths else data.solution(lam)
+        if depths:
+            solved = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
+            residual = float(np.sqrt(depths.left_over / depths.energy))
+            solution = Solution(depths.image, depths.lam, residual, solved)
+        else:
+            solution = data.solution(lam)
     with clock.stage("misfit"):
         data, solution, misfit = _judge(data, solution, depths, lam)
     with clock.stage("uncertainty"):
@@ -438,23 +444,28 @@ def reconstruct_request(
     )
 
 
-def check_image(shots: Capture, factors: Factors, request: ImageRequest) -> tuple[Capture, Factors, Solver]:
+def check_image(shots: Capture, factors: Factors, request: ImageRequest) -> Solver:
     solver = SOLVERS[request.method] if isinstance(request.method, str) else request.method
     factors.check_fit(shots)
     if request.focus is not None:
-        check_parallax(factors.manifest.parallax, factors.name)
+        parallax_of(factors)
     if isinstance(request.focus, (int, float)):
         move_factors(factors, float(request.focus))
     check_factorising(shots, factors, solver)
-    return shots, factors, solver
+    return solver
 
 
 def _judge(
     data: Accumulation, solution: Solution, depths: DepthMap | None, lam: float | Literal["auto"]
 ) -> tuple[Accumulation, Solution, Misfit | None]:
     if depths:
-        image = depths.image
-        misfit = depths.misfit(data.noise, data.factor_energy(image), print_energy(data.model, image))
+        image, noise, factor_energy = depths.image, data.noise, data.factor_energy(depths.image)
+        # Each pixel has a reflectance and a depth.
+        expected = float(noise.variance.mean()) * depths.data * (1 - 2 * image.size / depths.data)
+        expected += depths.part * (noise.rendering + depths.smoothing * (factor_energy or 0.0))
+        sizes = depths.left_over, depths.energy, expected, depths.data / noise.variance.size
+        energies, prints = tuple(np.array([[value]]) for value in sizes), depths.part * print_energy(data.model, image)
+        misfit, _ = weigh(energies, factor_energy is not None, noise, prints)
         # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
         most = move_factors(data.factors, float(np.median(depths.mm)))
         faults = faulty_frames(accumulate(most.of(data.shots), most.factors), image, depths.lam)

@@ -132,7 +132,10 @@ class ImageRequest(Options):
 
     @property
     def plain(self) -> dict[str, Any]:
-        return {**self.iterative, **({} if self.bounds is None else {"bounds": plain_bounds(self.bounds)})}
+        found = self.iterative
+        if self.bounds is not None:
+            found["bounds"] = [end if math.isfinite(end) else None for end in self.bounds]
+        return found
 
     @property
     def name(self) -> str:
@@ -155,19 +158,11 @@ class ImageRequest(Options):
             )
 
     def inputs(self, shots: Capture, factors: Factors) -> dict[str, Any]:
-        asked: dict[str, Any] = {
-            "run": shots.fingerprint,
-            "calibration": factors.fingerprint,
-            "lambda": self.lam,
-            "method": self.name,
-        }
+        asked: dict[str, Any] = {"run": shots.fingerprint, "calibration": factors.fingerprint}
+        asked |= {"lambda": self.lam, "method": self.name}
         asked |= {} if self.focus is None else {"focus": self.focus}
         asked |= {} if self.depth_range is None else {"depth_range": list(self.depth_range)}
         return {**asked, **self.plain}
-
-
-def plain_bounds(bounds: Bounds) -> list[float | None]:
-    return [end if math.isfinite(end) else None for end in bounds]
 
 
 def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
@@ -207,24 +202,24 @@ class ImageCost:
     seconds: dict[str, float]
     memory_bytes: float
 
-
-def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
-    pixels = float(len(factors.left) * len(factors.right))
-    count, (left, right) = len(shots.manifest.patterns.captures), shots.patterns
-    measured = left.shape[1] * right.shape[1]
-    kept = keeps_frames(shots, factors)
-    reading, judging = count * (pixels * _READ_S + _SHOT_S), measured * pixels * _JUDGE_S
-    solving = sum(len(factor) * factor.shape[1] ** 2 * _PRODUCT_S for factor in (factors.left, factors.right))
-    held = 8.0 * pixels * (_FRAMES + _KEPT * measured * kept)
-    return ImageCost(
-        seconds={
-            "accumulate": solving + reading + measured * pixels * _ADD_S,
-            "solve": _PLAIN_S,
-            "misfit": (0.0 if kept else reading) + judging,
-            "uncertainty": _PLAIN_S + solving,
-        },
-        memory_bytes=_BASE_BYTES + held + BYTES_A_NUMBER * slab_numbers(shots, factors),
-    )
+    @classmethod
+    def of(cls, shots: Capture, factors: Factors) -> ImageCost:
+        pixels = float(len(factors.left) * len(factors.right))
+        count, (left, right) = len(shots.manifest.patterns.captures), shots.patterns
+        measured = left.shape[1] * right.shape[1]
+        kept = keeps_frames(shots, factors)
+        reading, judging = count * (pixels * _READ_S + _SHOT_S), measured * pixels * _JUDGE_S
+        solving = sum(len(factor) * factor.shape[1] ** 2 * _PRODUCT_S for factor in (factors.left, factors.right))
+        held = 8.0 * pixels * (_FRAMES + _KEPT * measured * kept)
+        return cls(
+            seconds={
+                "accumulate": solving + reading + measured * pixels * _ADD_S,
+                "solve": _PLAIN_S,
+                "misfit": (0.0 if kept else reading) + judging,
+                "uncertainty": _PLAIN_S + solving,
+            },
+            memory_bytes=_BASE_BYTES + held + BYTES_A_NUMBER * slab_numbers(shots, factors),
+        )
 
 
 def keeps_frames(shots: Capture, factors: Factors) -> bool:

@@ -30,7 +30,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
 from mitsim.devices.patterns import shot_orders
-from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
+from mitsim.reconstruct.accumulation import CHANCE, TINY, Accumulation, FrameNoise
 from mitsim.reconstruct.solver import IndexArray, Prepared, group_pixels, prepare, robust_scatter
 
 # ---- Other readings of the data -------------------------------------------------------------------------------------
@@ -131,9 +131,6 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     return tuple(replace(each, left=float(np.sqrt(max(each.left - allowed, 0.0) / whole))) for each in alike)
 
 
-CHANCE = 6.0
-"""Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
-TINY = 1e-300
 _NOISE_TILE, _NOISE_TILES = 16, 1500
 _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
 _PAIR_ROWS, _SAMPLE = 96, 20_000
@@ -157,7 +154,7 @@ class NoiseTest:
         """
         if not noise.stated:
             return self.gain_error < _SLOPE_KNOWN and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error
-        chance = noise_chance(noise, float(noise.light.size))
+        chance = noise.chance(float(noise.light.size))
         # The energy beside may be stated too large, because a few groups of paths estimate that of rendering.
         little = whole - beside < (1 - _NOISE_OFF - chance) * stated
         if little and self.ratio < 1 - _NOISE_OFF + CHANCE / 2 * self.error:
@@ -324,8 +321,10 @@ class Residuals:
         for name, (squares, own, free) in zip(("tile", "pixel", "row", "column"), (tiles, whole, *lines), strict=True):
             # The cube root of a chi-square is nearly normal (Wilson and Hilferty 1931).
             spread = 2 / (9 * np.maximum(free, 0.5))
-            away = _deviations((np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread))
-            usual = np.median((squares / own).ravel()[:: max(own.size // _SAMPLE, 1)])
+            away = (np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread)
+            step = max(own.size // _SAMPLE, 1)
+            typical, usual = away.ravel()[::step], np.median((squares / own).ravel()[::step])
+            away = (away - np.median(typical)) / max(robust_scatter(typical), 1.0)
             beyond[name] = np.where(away > 7.0, squares - usual * own, 0.0)
         least = 0.02 * float(whole[1].sum())
         found = []
@@ -345,16 +344,3 @@ class Residuals:
         # Not reduceat along the rows: it takes five times as long.
         rows = np.stack([values[strip].sum(axis=0) for strip in self._strips])
         return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
-
-
-def noise_chance(noise: FrameNoise, pixels: float) -> float:
-    """Return the excess by chance of the chi-square of so many ``pixels`` in all measurements of a ``noise``.
-
-    The energy of normal noise of variance v in n data varies by sqrt(2 n) v.
-    """
-    return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels) / max(noise.variance.sum(), TINY))
-
-
-def _deviations(values: FloatArray) -> FloatArray:
-    some = values.ravel()[:: max(values.size // _SAMPLE, 1)]
-    return np.asarray((values - np.median(some)) / max(robust_scatter(some), 1.0))

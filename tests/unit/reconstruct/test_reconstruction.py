@@ -20,7 +20,7 @@ from mitsim.reconstruct import request
 from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import may_replace, reconstruct
-from mitsim.reconstruct.request import predict_cost
+from mitsim.reconstruct.request import ImageCost
 from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Tikhonov
 from mitsim.report.reconstruct_run import reconstruct as reconstruct_folders
@@ -138,7 +138,7 @@ def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors
 def test_what_an_image_takes_is_predicted_where_that_can_be_told(shots: Capture, factors: Factors) -> None:
     """By the stages that it states; every shot is read, and held against the model. (Planted: half of the shots.)"""
     image = reconstruct(shots, factors)
-    assert image.predicted == predict_cost(shots, factors) and image.predicted is not None
+    assert image.predicted == ImageCost.of(shots, factors) and image.predicted is not None
     assert image.predicted.seconds.keys() == image.seconds.keys()
     summary = image.summary()
     assert summary["predicted_seconds"] == sum(summary["predicted"].values()) > 0

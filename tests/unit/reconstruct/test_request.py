@@ -17,8 +17,6 @@ from mitsim.reconstruct.request import (
     ImageRequest,
     check_joint,
     keeps_frames,
-    plain_bounds,
-    predict_cost,
     slab_numbers,
 )
 from mitsim.reconstruct.solvers import SOLVERS
@@ -74,7 +72,6 @@ def test_bounds_are_two_numbers_of_a_method_that_heeds_them() -> None:
     for wrong in ((1.0, 0.0), (1.0, 1.0), (math.nan, 1), (0, math.nan), (0,), (0, True), (math.inf, math.inf), "01"):
         with pytest.raises(ArgumentError, match="the smaller one first"):
             ImageRequest(method="tv", bounds=wrong)  # type: ignore[arg-type]
-    assert plain_bounds((0.0, math.inf)) == [0.0, None]
     asked = ImageRequest(method="tv", bounds=(0.0, math.inf), iterations=7)
     assert asked.iterative == {"bounds": (0.0, math.inf), "iterations": 7} and asked.plain["bounds"] == [0.0, None]
     for iterations in (0, -1, 2.5, True, "7"):
@@ -96,7 +93,7 @@ def made(rows: tuple[int, int], lines: tuple[int, int], patterns: tuple[int, int
 
 
 def of(*sizes: tuple[int, int]) -> ImageCost:
-    return predict_cost(*made(*sizes))
+    return ImageCost.of(*made(*sizes))
 
 
 def test_seconds_are_those_of_frames_numbers_and_factors() -> None:
