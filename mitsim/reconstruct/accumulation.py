@@ -31,7 +31,7 @@ from mitsim.core.manifests import FactorNoise, RunManifest
 from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import BYTES_A_NUMBER, TIKHONOV, keeps_frames, slab_numbers
-from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, Side, Solution, half_spread
+from mitsim.reconstruct.solver import Accumulator, Halves, Pair, Prepared, Side, Solution, half_spread
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 
 EDGES = 2.9
@@ -46,19 +46,19 @@ TINY = 1e-300
 @dataclass(frozen=True, eq=False)
 class Model:
     prepared: Prepared
-    factors: tuple[FloatArray, FloatArray]
-    patterns: tuple[FloatArray, FloatArray]
+    factors: Pair
+    patterns: Pair
 
     @property
     def sides(self) -> tuple[Side, Side]:
         return self.prepared.left, self.prepared.right
 
     @cached_property
-    def slopes(self) -> tuple[FloatArray, FloatArray]:
+    def slopes(self) -> Pair:
         return factor_slope(self.factors[0]), factor_slope(self.factors[1])
 
     @cached_property
-    def moved(self) -> tuple[FloatArray, FloatArray]:
+    def moved(self) -> Pair:
         left, right = zip(self.sides, self.slopes, self.patterns, strict=True)
         return offset_responses(*left), offset_responses(*right)
 
@@ -115,7 +115,7 @@ def factor_slope(factor: FloatArray) -> FloatArray:
     return np.asarray(np.gradient(factor, axis=1))
 
 
-def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[FloatArray, FloatArray]) -> FloatArray:
+def disagreement(model: Model, gain: FloatArray, halves: Halves, known: Pair) -> FloatArray:
     """Return the variance (n, n') of an image by the disagreement of the sensor's halves; 0 where it may be chance.
 
     ``known`` are the variances (n, n') by errors that change from sensor row to row, and from column to column.
@@ -150,7 +150,7 @@ class FrameNoise:
     single projector pixels' light in simulated frames.
     """
 
-    def __init__(self, manifest: RunManifest, ambient: tuple[FloatArray, FloatArray] | None = None) -> None:
+    def __init__(self, manifest: RunManifest, ambient: Pair | None = None) -> None:
         self._digital = manifest.digital
         self.ambient = ambient
         self.light_error = manifest.light_error or 0.0
@@ -211,9 +211,7 @@ class FrameNoise:
 # ---- Energies beside the image: noise of factors, and separable terms that they lack ----
 
 
-def factor_energy(
-    prepared: Prepared, patterns: tuple[FloatArray, FloatArray], noise: FactorNoise, image: FloatArray
-) -> float:
+def factor_energy(prepared: Prepared, patterns: Pair, noise: FactorNoise, image: FloatArray) -> float:
     """Return the energy that ``noise`` of the factors adds to all frames, less the part that the fit takes up.
 
     With d_L the error of Phi_L, independent numbers of variance s^2, frames move by d_L (P_ij o X) Phi_R^T: in the mean
@@ -260,7 +258,7 @@ class DerivedCapture(Capture):
         self.whole, self._part, self._sensor = whole, part, sensor
 
     @cached_property
-    def patterns(self) -> tuple[FloatArray, FloatArray]:
+    def patterns(self) -> Pair:
         return self.whole.patterns
 
     @cached_property

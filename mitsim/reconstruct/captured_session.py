@@ -105,10 +105,10 @@ def calibrate_planes(
 ) -> dict[str, Factors]:
     job, colours = job or Job(), lines_of_planes(CALIBRATION, session.listed.prepare.wavelengths_nm)
     with output_folder(output) as place:
-        found = {
-            name: calibrate_frames(session.of_plane(name), place / name, job.apart(f"{name} "), camera)
-            for name in colours.names
-        }
+        found = {}
+        for name in colours.names:
+            plane = session.of_plane(name)
+            found[name] = calibrate_frames(plane, place / name, job.apart(f"{name} "), camera)
         write_colours(place, colours)
     return found
 
@@ -118,10 +118,8 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
     for side, index in chosen:
         rate, variance, _ = readings.response(side, index)
         if readings.saturated:
-            raise MitsimError(
-                f"frames {session.folder}: {min(readings.saturated)} has pixels at the full well or the ADC's end; "
-                "expose for less"
-            )
+            words = f"{min(readings.saturated)} has pixels at the full well or the ADC's end"
+            raise MitsimError(f"frames {session.folder}: {words}; expose for less")
         yield rate, float(np.sqrt(variance))
 
 
@@ -204,10 +202,8 @@ def _checked(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
     for name in others:
         own = image_size(session.folder / name, session.wanted)
         if own != size:
-            raise MitsimError(
-                f"frames {session.folder}: {name} is {own[0]} x {own[1]} pixels, but {first} is {size[0]} x {size[1]}; "
-                "take all with one camera setting"
-            )
+            words = f"{name} is {own[0]} x {own[1]} pixels, but {first} is {size[0]} x {size[1]}"
+            raise MitsimError(f"frames {session.folder}: {words}; take all with one camera setting")
     prepare, end = session.listed.prepare, session.listed.digital.saturation_dn
     if prepare.divide_by is None:
         common = CommonFactor()
@@ -277,10 +273,8 @@ class _Readings:
         listed = self.session.listed
         if len(listed.exposure_ladder) == 1:
             return None
-        digitals = [
-            listed.digital.model_copy(update={"exposure_s": listed.digital.exposure_s * factor})
-            for factor in listed.exposure_ladder
-        ]
+        digital, factors = listed.digital, listed.exposure_ladder
+        digitals = [digital.model_copy(update={"exposure_s": digital.exposure_s * factor}) for factor in factors]
         found = {}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
             frames = self.session.repeats_of((other, 0, 1 if self.session.pairs else UNIFORM))
@@ -307,10 +301,9 @@ class _Readings:
         if self._ladders is None:
             return dict.fromkeys(SIDES, found)
         each = [found[digital.exposure_s] for digital in self._ladders[SIDES[0]].digitals]
-        return {
-            side: {each[0].exposure_s: _Reading(ladder.merge(own.rate for own in each), ladder, each[0].shots)}
-            for side, ladder in self._ladders.items()
-        }
+        exposure, shots = each[0].exposure_s, each[0].shots
+        merged = ((side, ladder, ladder.merge(own.rate for own in each)) for side, ladder in self._ladders.items())
+        return {side: {exposure: _Reading(rate, ladder, shots)} for side, ladder, rate in merged}
 
     def _merge(self, half: Half) -> _Reading:
         if self._ladders is None:

@@ -68,9 +68,7 @@ class JointMosaic:
                     f"{lines} factors of an even number of sensor pixels, a column for each scene pixel"
                 )
         if self.weights.shape != (len(PLANES), lines):
-            raise MitsimError(
-                f"mosaic: weights are {self.weights.shape}; give one for each of 4 planes and {lines} lines"
-            )
+            raise MitsimError(f"mosaic: weights are {self.weights.shape}; give one for each of 4 planes, {lines} lines")
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -164,10 +162,8 @@ class Chart:
         first, last = self.wavelengths_nm[0], self.wavelengths_nm[-1]
         outside = next((wave for wave in wavelengths_nm if not first <= wave <= last), None)
         if outside is not None:
-            raise MitsimError(
-                f"colour: a line has {outside:g} nm, and the chart's spectra are of {first:g} to {last:g} nm; "
-                "colour needs lines that the eye sees"
-            )
+            words = f"a line has {outside:g} nm, and the chart's spectra are of {first:g} to {last:g} nm"
+            raise MitsimError(f"colour: {words}; colour needs lines that the eye sees")
         return np.array([np.interp(wavelengths_nm, self.wavelengths_nm, spectrum) for spectrum in self.spectra])
 
 

@@ -67,9 +67,8 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
     """Return the factors of a surface at ``depth_mm``; ArgumentError where too little of them is known."""
     parallax, sensor = parallax_of(factors), (len(factors.left), len(factors.right))
     if not (np.isfinite(depth_mm) and depth_mm > parallax.mask_distance_mm):
-        raise ArgumentError(
-            "focus", f"{depth_mm:g}: give a depth above {parallax.mask_distance_mm:g} mm, where the mask is"
-        )
+        least = f"{parallax.mask_distance_mm:g} mm, where the mask is"
+        raise ArgumentError("focus", f"{depth_mm:g}: give a depth above {least}")
     shift = 1 / depth_mm - 1 / parallax.depth_mm
     if shift == 0:
         # The calibration's own, to the last bit.
@@ -204,9 +203,8 @@ class FactorOfDepths:
             own, same = self.factor[row, to], between(column[to])[row[:, 0] + offset]
             weight = np.sqrt(np.maximum((own + same).sum(axis=0) / 2, 0.0))
             unlike.append(np.divide((own - same).sum(axis=0), weight, out=np.zeros(to.size), where=weight > 0))
-            powers = [
-                np.polynomial.polynomial.polyvander(place / self._middle - 1, _DEGREE) for place in (to, column[to])
-            ]
+            places = (place / self._middle - 1 for place in (to, column[to]))
+            powers = [np.polynomial.polynomial.polyvander(place, _DEGREE) for place in places]
             changes.append(weight[:, None] * (powers[0] - powers[1]))
         return np.asarray(np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0])
 
@@ -407,9 +405,8 @@ def _shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) 
         return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
     near, far = depth_range
     if near <= parallax.mask_distance_mm:
-        raise ArgumentError(
-            "depth_range", f"{near:g} to {far:g} mm: begin above {parallax.mask_distance_mm:g} mm, where the mask is"
-        )
+        least = f"{parallax.mask_distance_mm:g} mm, where the mask is"
+        raise ArgumentError("depth_range", f"{near:g} to {far:g} mm: begin above {least}")
     return 1 / far - 1 / parallax.depth_mm, 1 / near - 1 / parallax.depth_mm
 
 
@@ -517,9 +514,8 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
     elif not (error < pixel and rise > max(indifferent(rise), 2e-5 * basis.energy)):
         doubt = "These patterns hardly tell depth: use shifting dots."
     elif alternatives:
-        named = " and ".join(
-            f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in alternatives
-        )
+        others_mm = (f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in alternatives)
+        named = " and ".join(others_mm)
         doubt = (
             f"Depth may be another by whole periods of the dots: {mm:.1f} mm explains the measurements no better "
             f"than {named}, within chance and what no depth explains; use dots of a longer period, or give the "
@@ -660,9 +656,8 @@ class PixelDepths:
         self._lit = [[np.flatnonzero(column) for column in patterns.T] for patterns in basis.patterns]
         most = max(len(row) for row in self._lit[0]) * max(len(column) for column in self._lit[1])
         if most > _MOST_LIT:
-            raise MitsimError(
-                f"focus map: {most} pixels are lit at a time, and {_MOST_LIT} can be told; use dots further apart"
-            )
+            words = f"{most} pixels are lit at a time, and {_MOST_LIT} can be told"
+            raise MitsimError(f"focus map: {words}; use dots further apart")
         middle = len(self._shifts) // 2
         left, right = (float(np.square(table[:, middle]).sum(axis=1).mean()) for table in self._tables)
         self.scale = left * right
@@ -726,10 +721,8 @@ class Arrivals:
         moves, span = _moves(factors), ends[1] - ends[0]
         self._open = [bool(move * span > 0.5) for move in moves]
         if not any(self._open):
-            raise MitsimError(
-                f"focus map: camera and projector of calibration {factors.name} have no baseline, so depth moves no "
-                "light; give a depth, or auto"
-            )
+            words = f"camera and projector of calibration {factors.name} have no baseline, so depth moves no light"
+            raise MitsimError(f"focus map: {words}; give a depth, or auto")
         self.pixel = 1 / float(moves.max())
         self.width = min(span, _period(np.where(self._open, moves, 0.0), shots.patterns))
         self.limited = self.width < span

@@ -25,7 +25,7 @@ from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.reconstruct.solver import Status, Verdict, centre_columns, centre_frame
+from mitsim.reconstruct.solver import Pair, Status, Verdict, centre_columns, centre_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -235,10 +235,8 @@ def factors_of_sums(
             error = float(np.hypot(error, np.sqrt(more / count) / np.linalg.norm(factor)))
         predicted.append(error)
         rank.append(rank_above_noise(factor, error, values))
-    figures = (
-        f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
-        f"rank {rank[0]} of {n} and {rank[1]} of {n}, condition {condition:.1e}."
-    )
+    shown = f"rank {rank[0]} of {n} and {rank[1]} of {n}, condition {condition:.1e}"
+    figures = f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, {shown}."
     if unexplained > allowed:
         status = Status(
             Verdict.NOT_SEPARABLE,
@@ -339,7 +337,7 @@ def _rounding(phi: FloatArray, values: FloatArray) -> float:
 # ---- The uniform response as a product of two vectors ----
 
 
-def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _rank_one_split(mean: FloatArray) -> Pair:
     """Return a (m,) and v (n,) whose product is nearest to a uniform response ``mean`` (m, n).
 
     Power iteration is tried first, because an SVD takes half a minute at 2048 x 2048.
@@ -450,7 +448,7 @@ class Factors:
         return None
 
     @property
-    def sides(self) -> tuple[FloatArray, FloatArray]:
+    def sides(self) -> Pair:
         """Both factors, centred if frames are."""
         if not self.manifest.centre:
             return self.left, self.right
@@ -505,9 +503,8 @@ class Factors:
             if name in _LIGHT:
                 which = "in this light: its diffraction at the mask differs"
             said = [cut("that of a camera file" if each == "plate" else str(each)) for each in (other, own)]
-            raise MitsimError(
-                f"calibration {self.name}: {cut(name)} is {said[0]}, but {shots.name} has {said[1]}; calibrate {which}"
-            )
+            both = f"{cut(name)} is {said[0]}, but {shots.name} has {said[1]}"
+            raise MitsimError(f"calibration {self.name}: {both}; calibrate {which}")
         for side, pattern, factor in zip(("P_L", "P_R"), shots.patterns, (self.left, self.right), strict=True):
             if len(pattern) != factor.shape[1]:
                 raise MitsimError(
@@ -539,16 +536,12 @@ class Factors:
             patterns = parse_patterns(patterns, rows, seed)
         lit = len(patterns.left), len(patterns.right)
         if lit != (rows, columns):
-            raise MitsimError(
-                f"patterns {patterns.name!r} are for {lit[0]} x {lit[1]} scene pixels, but the factors have "
-                f"{rows} x {columns}; use patterns of that size"
-            )
+            words = f"are for {lit[0]} x {lit[1]} scene pixels, but the factors have {rows} x {columns}"
+            raise MitsimError(f"patterns {patterns.name!r} {words}; use patterns of that size")
         factors = self.sides
         # (K, m, n) stacks Phi diag(p_i): frame (i, j) is lefts[i] X rights[j]^T.
-        lefts, rights = (
-            factor[None] * side.T[:, None, :].astype(np.float64)
-            for factor, side in zip(factors, (patterns.left, patterns.right), strict=True)
-        )
+        sides = zip(factors, (patterns.left, patterns.right), strict=True)
+        lefts, rights = (factor[None] * side.T[:, None, :].astype(np.float64) for factor, side in sides)
         shape = len(lefts), len(rights), len(self.left), len(self.right)
 
         def forward(image: FloatArray) -> FloatArray:
@@ -559,9 +552,8 @@ class Factors:
             gathered = (frames.reshape(shape) @ rights).sum(axis=1)
             return np.asarray((lefts.transpose(0, 2, 1) @ gathered).sum(axis=0)).ravel()
 
-        return LinearOperator(
-            (int(np.prod(shape)), rows * columns), matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64)
-        )
+        size = int(np.prod(shape)), rows * columns
+        return LinearOperator(size, matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64))
 
     @check_arguments
     def plot(self, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
@@ -577,12 +569,10 @@ class Factors:
         return f"Factors({shapes}: {self.status.verdict.value}, {self.name})"
 
     def _repr_html_(self) -> str:
-        pictures = {
-            f"{name}: {side.shape[0]} sensor x {side.shape[1]} projector pixels\n{span(side, 'sqrt(e-/s)')}": normalise(
-                side
-            )
-            for name, side in self._sides()
-        }
+        pictures = {}
+        for name, side in self._sides():
+            caption = f"{name}: {side.shape[0]} sensor x {side.shape[1]} projector pixels"
+            pictures[f"{caption}\n{span(side, 'sqrt(e-/s)')}"] = normalise(side)
         return card(f"Factors: {self.status.verdict.value}", pictures, (str(self.status), *self.warnings))
 
     def _sides(self) -> tuple[tuple[str, FloatArray], ...]:
@@ -620,9 +610,8 @@ def factors_of(
     files = [(Path(name) / f"{side}.exr", read(f"{side}.exr")[0]) for side in SIDES]
     left, right = (finite_channel(channels, "factor", path) for path, channels in files)
     terms = max(sum(channel.startswith(_LACKING) for channel in channels) for _, channels in files)
-    rows, columns = (
-        [finite_channel(channels, f"{_LACKING}{k}", path) for k in range(terms)] for path, channels in files
-    )
+    names = [f"{_LACKING}{k}" for k in range(terms)]
+    rows, columns = ([finite_channel(channels, each, path) for each in names] for path, channels in files)
     sentence = manifest.estimate or "Factors from elsewhere, without a word on how good they are"
     known = {verdict.value: verdict for verdict in Verdict}
     status = Status(known.get(manifest.verdict or "", Verdict.UNKNOWN), sentence.rstrip("."))

@@ -52,7 +52,7 @@ from mitsim.reconstruct.factors import (
     rank_above_noise,
     squared_condition,
 )
-from mitsim.reconstruct.solver import Status, Verdict, centre_columns, centre_frame
+from mitsim.reconstruct.solver import Pair, Status, Verdict, centre_columns, centre_frame
 
 # ---- What is seen ----------------------------------------------------------------------------------------------------
 
@@ -129,7 +129,7 @@ class Side:
             phi += (sliding_window_view(code, self.width) @ hats.T) * weight
         return centre_columns(phi) if self.centre else phi
 
-    def normal(self, offset: float, gram: FloatArray, product: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def normal(self, offset: float, gram: FloatArray, product: FloatArray) -> Pair:
         spread, w, k = self.spread(offset), self.width, self.terms
         flat = spread.reshape(self.scene, k * w)
         block = (flat.T @ gram @ flat).reshape(k, w, k, w)
@@ -158,7 +158,7 @@ class Codes:
     """Fitted codes (terms, length) of both sides, with the gain of each plane."""
 
     sides: tuple[Side, Side]
-    codes: tuple[FloatArray, FloatArray]
+    codes: Pair
     gains: dict[str, float]
     variances: FloatArray
     explained: float
@@ -166,12 +166,10 @@ class Codes:
     seen_errors: tuple[float, float]
     told: tuple[float, float]
 
-    def factors(self, offset: tuple[float, float] = (0.0, 0.0), plane: str = "") -> tuple[FloatArray, FloatArray]:
+    def factors(self, offset: tuple[float, float] = (0.0, 0.0), plane: str = "") -> Pair:
         gain = self.gains[plane]
-        left, right = (
-            side.factor(codes, place) * np.sqrt(abs(gain))
-            for side, codes, place in zip(self.sides, self.codes, offset, strict=True)
-        )
+        sides, root = zip(self.sides, self.codes, offset, strict=True), np.sqrt(abs(gain))
+        left, right = (side.factor(codes, place) * root for side, codes, place in sides)
         return np.sign(gain) * left, right
 
     @property
@@ -253,10 +251,8 @@ def fit_codes(exposures: Sequence[Exposure], shape: Shape, start: FloatArray | N
         if not all(energy > 0 for energy in below.values()):
             raise MitsimError(_NO_LIGHT)
         gains = {name: above[name] / below[name] for name in gains}
-        left_over = [
-            np.mean(np.square(each.frame - gains[each.plane] * model))
-            for each, model in zip(exposures, models, strict=True)
-        ]
+        pairs = zip(exposures, models, strict=True)
+        left_over = [np.mean(np.square(each.frame - gains[each.plane] * model)) for each, model in pairs]
         variances, before = np.asarray(left_over), explained
         explained = 1 - float(np.mean(variances / energies))
         if explained - before < 1e-05:
@@ -300,10 +296,8 @@ class _Spectra:
     def compare(self, scenes: Sequence[FloatArray], scales: tuple[float, float]) -> tuple[float, FloatArray]:
         """Return how nearly the spectra are a product of two vectors, 0 to 1, and the resulting code of columns."""
         above, below = np.zeros_like(self._frames[0]), np.zeros(self._frames[0].shape)
-        left, right = (
-            np.conj(_waves(count, period / scale))
-            for count, period, scale in zip(scenes[0].shape, self._periods, scales, strict=True)
-        )
+        sides = zip(scenes[0].shape, self._periods, scales, strict=True)
+        left, right = (np.conj(_waves(count, period / scale)) for count, period, scale in sides)
         for frame, scene in zip(self._frames, scenes, strict=True):
             lit = left @ scene @ right.T
             above += frame * np.conj(lit)
@@ -370,15 +364,12 @@ def find_pose(
 def _refine(
     misfit: Callable[[tuple[float, float]], float], start: tuple[float, float], reach: float
 ) -> tuple[float, float]:
-    options, bounds = {"xatol": np.log(reach) * 0.05}, (-np.log(reach), np.log(reach))
-    row = minimize_scalar(
-        lambda x: misfit((start[0] * np.exp(x), start[1])), bounds=bounds, method="bounded", options=options
-    )
-    rows = start[0] * float(np.exp(row.x))
-    column = minimize_scalar(
-        lambda x: misfit((rows, start[1] * np.exp(x))), bounds=bounds, method="bounded", options=options
-    )
-    return rows, start[1] * float(np.exp(column.x))
+    def least(score: Callable[[float], float]) -> float:
+        ends, options = (-np.log(reach), np.log(reach)), {"xatol": np.log(reach) * 0.05}
+        return float(np.exp(minimize_scalar(score, bounds=ends, method="bounded", options=options).x))
+
+    rows = start[0] * least(lambda x: misfit((start[0] * np.exp(x), start[1])))
+    return rows, start[1] * least(lambda x: misfit((rows, start[1] * np.exp(x))))
 
 
 # ---- How many codes: by frames that are held out ---------------------------------------------------------------------
@@ -490,10 +481,8 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
         right = right[:, ::-1] if pose.orientation in ("mirrored", "turned") else right
         sides = [np.ascontiguousarray(side, dtype=np.float32).astype(np.float64) for side in (left, right)]
         root, norms = np.sqrt(abs(codes.gains[line])), [np.linalg.norm(side) / np.sqrt(side.size) for side in sides]
-        whole, seen = (
-            [float(root * error / norm) for error, norm in zip(errors, norms, strict=True)]
-            for errors in (codes.errors, codes.seen_errors)
-        )
+        errors = codes.errors, codes.seen_errors
+        whole, seen = ([float(root * e / norm) for e, norm in zip(each, norms, strict=True)] for each in errors)
         rank = [rank_above_noise(side, error) for side, error in zip(sides, whole, strict=True)]
         error = float(np.hypot(seen[0], seen[1]))
         figures = (
@@ -590,14 +579,11 @@ class _KnownFrames:
             self.sums[capture.picture] = checksum(path)
             for line in manifests:
                 if captures.lines is not None and line not in PLANES:
-                    raise MitsimError(
-                        f"list {captures.path}: {capture.run} has the line {line}, whose code is its own; calibrate "
-                        "each line alone"
-                    )
+                    words = f"{capture.run} has the line {line}, whose code is its own"
+                    raise MitsimError(f"list {captures.path}: {words}; calibrate each line alone")
                 if picture.ndim == 3 and not line:
-                    raise MitsimError(
-                        f"picture {path}: is in colour, and {capture.run} shows one plane; give a grey picture of that"
-                    )
+                    words = f"is in colour, and {capture.run} shows one plane"
+                    raise MitsimError(f"picture {path}: {words}; give a grey picture of that")
                 light = picture if picture.ndim == 2 else picture[:, :, "rgb".index(line[0])]
                 folder, name = captures.run(capture, line), str(Path(capture.run) / line)
                 shots, saturated = load_run(folder), 0

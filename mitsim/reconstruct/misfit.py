@@ -48,7 +48,7 @@ from mitsim.core.runs import Measurement
 from mitsim.reconstruct.accumulation import CHANCE, TINY, Accumulation, DerivedCapture, FrameNoise, print_energy
 from mitsim.reconstruct.factors import decibels
 from mitsim.reconstruct.residuals import NoiseTest, Place, Reading, Residuals, find_readings, is_negative
-from mitsim.reconstruct.solver import IndexArray, Solution, Status, robust_scatter
+from mitsim.reconstruct.solver import IndexArray, Pair, Solution, Status, robust_scatter
 from mitsim.reconstruct.uncertainty import Propagation
 
 # ---- The picture of shifting dots -----------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ class PictureCheck:
         self.disturbed = self._disturbance(moved, periods, common)
 
     @cached_property
-    def place(self) -> tuple[FloatArray, FloatArray]:
+    def place(self) -> Pair:
         # Looked for in the picture without the powers, because in even parts these look like a slope.
         place, error = self._fit(self._even, [*np.gradient(self._even)], 0.5)
         return place.reshape(2, -1), error.reshape(2, -1)
@@ -125,9 +125,7 @@ class PictureCheck:
         The scatter over the frames beyond its own error is stated, and at least its standard error, because a flicker
         as small as the errors is not seen.
         """
-        found, errors = (
-            np.stack([own, *others]) for own, others in zip((self.power, self.power_error), self.place, strict=True)
-        )
+        found, errors = np.stack([self.power, *self.place[0]]), np.stack([self.power_error, *self.place[1]])
         scatter, known = np.var(found, axis=1), np.mean(np.square(2.0 * errors), axis=1)
         power, *moves = np.sqrt(np.maximum(scatter - known, scatter * np.sqrt(2 / self._count)))
         variance = np.square(image * power)
@@ -137,17 +135,15 @@ class PictureCheck:
         return np.asarray(np.sqrt(variance))
 
     def _disturbance(self, moved: FloatArray, periods: Sequence[int], common: float) -> FloatArray:
-        cells = [
-            place // each for place, each in zip(np.unravel_index(self._pixels, self._shape), periods, strict=True)
-        ]
+        places = np.unravel_index(self._pixels, self._shape)
+        cells = [place // each for place, each in zip(places, periods, strict=True)]
         shape = self._count, *(-(-size // period) for size, period in zip(self._shape, periods, strict=True))
         index = np.ravel_multi_index((self._frames[self._pixels], *cells), shape)
         parts = [np.bincount(index, weights, int(np.prod(shape))).reshape(shape) for weights in (moved, moved**2, None)]
         found, spread = np.zeros(self._count), float(np.mean(np.square(moved)))
         for dots in _WINDOWS:
-            light, power, lit = (
-                uniform_filter(part * 1.0, (0, dots, dots), mode="constant") * dots**2 for part in parts
-            )
+            size = 0, dots, dots
+            light, power, lit = (uniform_filter(part * 1.0, size, mode="constant") * dots**2 for part in parts)
             # Windows over a texture of the print scatter more than others, in all frames.
             usual = np.maximum(np.median(power / np.maximum(lit, 1), axis=0), spread) * (1 + (dots - 1) * common)
             for length in range(1, min(_LONGEST, self._count // 3) + 1):
@@ -163,7 +159,7 @@ class PictureCheck:
 
     def _fit(
         self, image: FloatArray, changes: Sequence[FloatArray], prior: float, learned: Sequence[float] = ()
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> Pair:
         """Return how far each frame is off by each of the ``changes`` (n, n') of an ``image``, with errors.
 
         The errors are those of the sandwich estimator (Huber 1967), because differences are not normal. Least squares
@@ -413,9 +409,8 @@ class FrameCheck:
             least = 0.9 * self._excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
             if number or bad.sum() > self._most or beyond[bad].sum() >= least:
                 off = np.maximum(off, np.where(bad, part, 0.0))
-        for row, column in (
-            np.argwhere(off)[np.argsort(-off[off > 0])].tolist() if (off > 0).sum() <= self._most else ()
-        ):
+        worst = np.argwhere(off)[np.argsort(-off[off > 0])].tolist()
+        for row, column in worst if len(worst) <= self._most else ():
             side = sums.side[row, column]  # it decides which half is at fault
             signs = [1, -1] if abs(side) < 0.3 else [int(np.sign(side))]
             numbers = [self._number[row, column, sign] for sign in (signs if self._signed else [0])]
@@ -632,16 +627,13 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     sums = Residuals(data)
     test, energy, whole = sums.noise_test, max(float(sums.energy.sum()), TINY), float(sums.squares.sum())
     # Numbers without an ADC may be means of many shots.
-    off = (
-        test is not None
-        and test.off(noise, whole, stated, beside)
-        and bool(test.ratio >= 1 or data.shots.manifest.digital.step_dn)
-    )
+    digital = data.shots.manifest.digital
+    off = test is not None and test.off(noise, whole, stated, beside) and bool(test.ratio >= 1 or digital.step_dn)
     ratio = 1.0 if test is None or (noise.stated and not off) else test.ratio if off else max(test.ratio, 1.0)
     energies = sums.residual, sums.energy, sums.expected_energy(ratio, factor_energy or 0.0), sums.pixels
     found, excess = weigh(energies, known, noise, of_ramps)
     chi_square = whole / max(stated + beside, TINY) if off else found.chi_square  # by the stated noise
-    found = replace(found, noise=test, gain=data.shots.manifest.digital.gain_dn_per_e, chi_square=chi_square)
+    found = replace(found, noise=test, gain=digital.gain_dn_per_e, chi_square=chi_square)
     if lack := data.lack(image):
         found = replace(found, predicted=float(np.sqrt(lack[1] / energy)))
     if with_defects and noise.stated and not sums.clipped and (defects := find_defects(data, sums.squares, ratio)):

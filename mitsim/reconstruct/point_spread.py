@@ -114,10 +114,9 @@ class ShiftedLight:
         self.origin = (self.whole[0] - m) // 2, (self.whole[1] - n) // 2
         self._crop = slice(self.origin[0], self.origin[0] + m), slice(self.origin[1], self.origin[1] + n)
         sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
-        down, across = (
-            fft.next_fast_len(max(scene, whole - origin, origin + size), real=True)
-            for scene, whole, origin, size in sides
-        )
+        sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
+        least = (max(scene, whole - origin, origin + size) for scene, whole, origin, size in sides)
+        down, across = (fft.next_fast_len(each, real=True) for each in least)
         self.grid = down, across
         for size, most in zip(self.sensor, self.whole, strict=True):
             if size > most:
@@ -135,17 +134,14 @@ class ShiftedLight:
 
     def under(self, family: PatternFamily) -> ShiftedLight:
         if (family.n, family.n) != self.scene:
-            raise MitsimError(
-                f"patterns of {family.n} pixels a side for a scene of {self.scene[0]}; both need the same"
-            )
+            sizes = f"patterns of {family.n} pixels a side for a scene of {self.scene[0]}"
+            raise MitsimError(f"{sizes}; both need the same")
         return replace(self, patterns=(family.left.astype(np.float64), family.right.astype(np.float64)))
 
     def check_frames(self, frames: Array) -> None:
         if frames.shape != (self.count, *self.sensor) or not np.isfinite(frames).all():
-            raise MitsimError(
-                f"frames of shape {frames.shape}: give {self.count} of {self.sensor[0]} x {self.sensor[1]} finite "
-                "numbers"
-            )
+            size = f"{self.count} of {self.sensor[0]} x {self.sensor[1]}"
+            raise MitsimError(f"frames of shape {frames.shape}: give {size} finite numbers")
 
     def image_of(self, scene: Array) -> Array:
         frames = np.empty((self.count, *self.sensor), self.precision)
@@ -326,9 +322,8 @@ def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
     if smaller:
         # Half as many pixels a side: TV of the same scene is a half, squares are a quarter.
         half = replace(prior, weight=prior.weight / 2)
-        found = _descend(
-            _start(smaller, np.stack([reduce_frame(each, 2) for each in frames]), half), _COARSE_STEPS, 0.0
-        )[0]
+        less = np.stack([reduce_frame(each, 2) for each in frames])
+        found = _descend(_start(smaller, less, half), _COARSE_STEPS, 0.0)[0]
         image = light.double(found.image)
     else:
         image = np.zeros(light.scene, light.precision)
@@ -573,9 +568,8 @@ def reconstruct_psf(
     MitsimError
         For a picture without light, frames that do not fit, too little memory, and another lambda, method or bounds.
     """
-    return reconstruct_psf_request(
-        shots, psf, reduce, ImageRequest(lam=lam, method=method, bounds=bounds, iterations=iterations)
-    )
+    asked = ImageRequest(lam=lam, method=method, bounds=bounds, iterations=iterations)
+    return reconstruct_psf_request(shots, psf, reduce, asked)
 
 
 @single_threaded_blas()
@@ -618,13 +612,8 @@ def reconstruct_psf_request(
 
 def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
-    asked = {
-        "run": shots.fingerprint,
-        POINT_SPREAD: digest,
-        "reduce": reduce,
-        "lambda": request.lam,
-        "method": request.method,
-    }
+    asked = {"run": shots.fingerprint, POINT_SPREAD: digest, "reduce": reduce, "lambda": request.lam}
+    asked["method"] = request.method
     return {**asked, **request.plain}
 
 

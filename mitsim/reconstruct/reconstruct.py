@@ -32,7 +32,7 @@ from mitsim.reconstruct.request import (
 )
 from mitsim.reconstruct.solver import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
-from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
+from mitsim.reconstruct.uncertainty import Uncertainty, rms, uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -212,7 +212,10 @@ class Reconstruction(Solution):
             "focus_alternatives": [asdict(other) for other in self.focus.alternatives] if self.focus else None,
             "depths": self.depths.summary() if self.depths else None,
             "misfit": known.summary() if (known := self.misfit or self.fit) else None,
-            **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
+            "uncertainty": (known_to := self.uncertainties) and rms(known_to.total),
+            "uncertainty_budget": known_to and known_to.budget,
+            "uncertainty_extrapolated": known_to and known_to.extrapolated,
+            "regularisation_bias_factor": known_to and known_to.bias_factor,
             "status": str(self.status),
             "warnings": () if self.ok else (str(self.status),),
             "seconds": {**self.seconds, "total": sum(self.seconds.values())},

@@ -150,6 +150,7 @@ class Solution:
 # ---- One side of the model -------------------------------------------------------------------------------------------
 
 IndexArray = npt.NDArray[np.intp]
+Pair = tuple[FloatArray, FloatArray]
 Strips = tuple[slice, ...]
 
 
@@ -159,7 +160,7 @@ class Group:
 
     pixels: IndexArray
     patterns: FloatArray
-    shared: tuple[FloatArray, FloatArray] | None
+    shared: Pair | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -434,10 +435,8 @@ def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
     sigma, found = problem.sigma[measured], noise[measured]
     octave = np.log2(sigma.max() / sigma).astype(np.intp)
     sizes = np.bincount(octave)
-    data, level, square = (
-        np.bincount(octave, values) / np.maximum(sizes, 1)
-        for values in (np.square(problem.projected[measured]), found, np.square(sigma))
-    )
+    values = np.square(problem.projected[measured]), found, np.square(sigma)
+    data, level, square = (np.bincount(octave, each) / np.maximum(sizes, 1) for each in values)
     power = np.divide(np.maximum(data - level, 0.0), square, out=np.zeros_like(square), where=square > 0)
     before = np.cumsum(sizes * power) / np.cumsum(sizes)
     seen = sizes >= _FEWEST
@@ -525,14 +524,14 @@ class Halves:
     right: Side
 
     @cached_property
-    def differences(self) -> tuple[FloatArray, FloatArray]:
+    def differences(self) -> Pair:
         total = self.quarters.sum(axis=(0, 1))
         by_row = self.quarters[0].sum(axis=0) - self.left.first_half @ total
         by_column = self.quarters[:, 0].sum(axis=0) - total @ self.right.first_half
         return by_row, by_column
 
     @cached_property
-    def _squares(self) -> tuple[FloatArray, FloatArray]:
+    def _squares(self) -> Pair:
         spreads = (half_spread(side.first_half) for side in (self.left, self.right))
         rows, columns = (np.where(spread >= 0.01, spread, np.nan) for spread in spreads)
         measured, (by_row, by_column) = np.outer(self.left.singular, self.right.singular) > 0, self.differences
@@ -591,9 +590,8 @@ class Prepared:
         sigma_R, for n scene pixels of mean square x^2 (times ``light``).
         """
         sides = zip((self.left, self.right), (self.right, self.left), self.noise, self.light, strict=True)
-        return max(
-            own.scene_size * light * float(noise * other.singular.max()) ** 2 for own, other, noise, light in sides
-        )
+        both = (own.scene_size * light * float(noise * other.singular.max()) ** 2 for own, other, noise, light in sides)
+        return max(both)
 
     @property
     def condition(self) -> float:
@@ -702,9 +700,8 @@ class Prepared:
             flags = end_of_range(problem, lam)
         lam = check_lambda(lam)
         sigma = problem.sigma
-        filtered = np.divide(
-            sigma * problem.projected, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0
-        )
+        filtered, squares = np.zeros_like(sigma), np.square(sigma) + lam
+        np.divide(sigma * problem.projected, squares, out=filtered, where=sigma > 0)
         outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
         residual = outside + problem.taken_energy(lam)
         measured = sigma[sigma > 0]
@@ -778,9 +775,8 @@ def prepare(
         centred = [centre_columns(factor) for factor in factors]
         # Exact zeros for a column of equal numbers.
         dust = [len(factor) * np.finfo(np.float64).eps * np.abs(factor).max(axis=0) for factor in factors]
-        factors = [
-            np.where(np.abs(own).max(axis=0) > least, own, 0.0) for own, least in zip(centred, dust, strict=True)
-        ]
+        kept = (np.abs(own).max(axis=0) > least for own, least in zip(centred, dust, strict=True))
+        factors = [np.where(own, factor, 0.0) for own, factor in zip(kept, centred, strict=True)]
     for name, factor, pattern in zip(("left", "right"), factors, patterns, strict=True):
         if not (factor.any() and pattern.any()):
             what = " once centred" if centre else ""
@@ -803,9 +799,8 @@ def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
         raise MitsimError(f"{name} hold {np.count_nonzero(~np.isfinite(values))} values that are not finite")
     largest = np.abs(values).max()
     if largest and not _SMALLEST <= largest <= _LARGEST:
-        raise MitsimError(
-            f"{name} hold numbers up to {largest:.1e}; allowed are {_SMALLEST:g} to {_LARGEST:g}, choose another unit"
-        )
+        allowed = f"allowed are {_SMALLEST:g} to {_LARGEST:g}, choose another unit"
+        raise MitsimError(f"{name} hold numbers up to {largest:.1e}; {allowed}")
     return values
 
 
@@ -844,21 +839,17 @@ class Accumulator:
             raise MitsimError(f"{name} was added before; average repeated captures first")
         expected = (self.prepared.left.sensor_size, self.prepared.right.sensor_size)
         if given.shape != expected or given.dtype.kind not in "buif":
-            raise MitsimError(
-                f"{name} is {given.dtype} of shape {given.shape}; the factors take real numbers of shape {expected}"
-            )
+            wrong = f"{name} is {given.dtype} of shape {given.shape}"
+            raise MitsimError(f"{wrong}; the factors take real numbers of shape {expected}")
         values = self.prepared.as_solved(given.astype(np.float64, copy=False))
         flat = values.ravel()
         energy = float(np.dot(flat, flat))
         if not 1 / _LARGEST_SUM**2 <= energy <= _LARGEST_SUM**2 and (energy or values.any()):
             bad = int(np.count_nonzero(~np.isfinite(values)))
-            wrong = f"has {bad} values that are not finite; capture it again"
-            if not bad:
-                wrong = (
-                    f"has numbers up to {np.abs(values).max():.1e}; allowed are 0 and {1 / _LARGEST_SUM:g} to "
-                    f"{_LARGEST_SUM:g}, choose another unit"
-                )
-            raise MitsimError(f"{name} {wrong}")
+            if bad:
+                raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
+            allowed = f"allowed are 0 and {1 / _LARGEST_SUM:g} to {_LARGEST_SUM:g}, choose another unit"
+            raise MitsimError(f"{name} has numbers up to {np.abs(values).max():.1e}; {allowed}")
         left, right = self.prepared.slabs((row, column))
         where = self.prepared.places((row, column))
         rows_of, columns_of = self.prepared.left.halves, self.prepared.right.halves

@@ -294,6 +294,7 @@ def lengths(slopes: FloatArray) -> FloatArray:
 
 
 Patterns = tuple[FloatArray, FloatArray]
+Lambda = float | Literal["auto"]
 
 
 class Solver(Protocol):
@@ -310,9 +311,7 @@ class Solver(Protocol):
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared: ...
 
-    def compute(
-        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
-    ) -> Solution: ...
+    def compute(self, prepared: Prepared, frames: Accumulator, lam: Lambda, **iterative: Any) -> Solution: ...
 
 
 class Tikhonov(Solver):
@@ -328,9 +327,7 @@ class Tikhonov(Solver):
         noise = (stated.left, stated.right) if stated else Prepared.noise
         return replace(prepared, stated=camera.stated_rank, noise=noise, light=(left, right))
 
-    def compute(
-        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
-    ) -> Solution:
+    def compute(self, prepared: Prepared, frames: Accumulator, lam: Lambda, **iterative: Any) -> Solution:
         return prepared.solve(frames, lam)
 
 
@@ -351,9 +348,7 @@ class ByIterations(Tikhonov):
     def __init__(self, name: str, solve: Callable[..., Solution]) -> None:
         self.name, self._solve = name, solve
 
-    def compute(
-        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
-    ) -> Solution:
+    def compute(self, prepared: Prepared, frames: Accumulator, lam: Lambda, **iterative: Any) -> Solution:
         return self._solve(prepared, frames, lam, **iterative)
 
 

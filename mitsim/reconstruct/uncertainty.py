@@ -37,7 +37,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -48,7 +47,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import Channel
 from mitsim.core.manifests import FactorNoise
 from mitsim.reconstruct.accumulation import PRINT, Accumulation, Model, disagreement
-from mitsim.reconstruct.solver import DiagonalProblem, Side, Solution, coefficient_noise
+from mitsim.reconstruct.solver import DiagonalProblem, Pair, Side, Solution, coefficient_noise
 
 # ---- The scene's power spectrum --------------------------------------------------------------------------------------
 
@@ -201,14 +200,6 @@ def _likeliest(
 
 _AS_STATED = 1.5
 _NEAR = 2.0
-NO_UNCERTAINTY = {
-    "uncertainty": None,
-    "uncertainty_budget": None,
-    "uncertainty_extrapolated": None,
-    "regularisation_bias_factor": None,
-}
-
-
 RANDOM = ("frame_noise", "ambient_frame", "rendering")
 
 
@@ -233,16 +224,16 @@ class Uncertainty:
 
     @property
     def budget(self) -> dict[str, float]:
-        return {name: _rms(values) for name, values in self.sources.items()}
+        return {name: rms(values) for name, values in self.sources.items()}
 
     @property
     def extrapolated(self) -> bool:
         lost = self.budget.get("regularisation_bias", 0.0)
-        return self.bias_factor > 1.35 and 2 * lost**2 > _rms(self.total) ** 2
+        return self.bias_factor > 1.35 and 2 * lost**2 > rms(self.total) ** 2
 
     def loss(self, image: FloatArray) -> str:
         """Return a sentence if lambda removes most of an ``image``, or the uncertainty exceeds it, else nothing."""
-        lost, left, total = self.budget.get("regularisation_bias", 0.0), _rms(image), _rms(self.total)
+        lost, left, total = self.budget.get("regularisation_bias", 0.0), rms(image), rms(self.total)
         if lost > left:
             return (
                 f"Lambda takes away more of the image ({lost:.1e} rms of reflectance, as the uncertainty has it) than "
@@ -258,7 +249,7 @@ class Uncertainty:
 
     @property
     def gist(self) -> str:
-        return f"standard uncertainty {_rms(self.total):.1e} rms"
+        return f"standard uncertainty {rms(self.total):.1e} rms"
 
     def __str__(self) -> str:
         parts = sorted(((value, name) for name, value in self.budget.items() if value), reverse=True)
@@ -270,14 +261,6 @@ class Uncertainty:
         parts = {"uncertainty": self.total, "random": self.random, "systematic": self.systematic}
         return {name: values.astype(np.float32) for name, values in parts.items()}
 
-    def summary(self) -> dict[str, Any]:
-        return {
-            "uncertainty": _rms(self.total),
-            "uncertainty_budget": self.budget,
-            "uncertainty_extrapolated": self.extrapolated,
-            "regularisation_bias_factor": self.bias_factor,
-        }
-
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
@@ -286,12 +269,11 @@ class Propagation:
 
     @cached_property
     def gain(self) -> FloatArray:
-        return np.divide(
-            self._sigma, np.square(self._sigma) + self.lam, out=np.zeros_like(self._sigma), where=self._sigma > 0
-        )
+        sigma = self._sigma
+        return np.divide(sigma, np.square(sigma) + self.lam, out=np.zeros_like(sigma), where=sigma > 0)
 
     @cached_property
-    def terms(self) -> tuple[FloatArray, FloatArray]:
+    def terms(self) -> Pair:
         """Factors g (r, k) and h (r', k) of whose products G is the sum; a tenth of an SVD's time."""
         rest, energy = self.gain.copy(), float(np.square(self.gain).sum())
         rows, columns = list[FloatArray](), list[FloatArray]()
@@ -366,7 +348,7 @@ class Propagation:
         placed *= squares.mean() / max(float(placed.mean()), 1e-300)
         return of_mean + placed, float(np.exp(np.sqrt(spread * spectrum.departure) / 2))
 
-    def of_factors(self, noise: FactorNoise, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def of_factors(self, noise: FactorNoise, image: FloatArray) -> Pair:
         left, right = self.model.sides
         rows = _of_factor(left, right, self.model.patterns[0], self.terms, image)
         columns = _of_factor(right, left, self.model.patterns[1], self.terms[::-1], image.T).T
@@ -377,9 +359,8 @@ class Propagation:
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
         moved = [each.sum(axis=0) for each in self.model.moved]
         seen = moved[0].T @ rows @ right.response, left.response.T @ columns @ moved[1]
-        return PRINT * sum(
-            (np.square(self.model.prepared.image(self.gain * each)) for each in seen), np.zeros_like(image)
-        )
+        squares = (np.square(self.model.prepared.image(self.gain * each)) for each in seen)
+        return PRINT * sum(squares, np.zeros_like(image))
 
     def _spread(self, variances: FloatArray) -> FloatArray:
         return self._pixel_variance(np.square(self.gain) * variances)
@@ -427,9 +408,7 @@ def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0)
     return Uncertainty({name: np.sqrt(np.maximum(each, 0.0)) for name, each in variances.items()}, factor)
 
 
-def _of_factor(
-    own: Side, other: Side, patterns: FloatArray, terms: tuple[FloatArray, FloatArray], image: FloatArray
-) -> FloatArray:
+def _of_factor(own: Side, other: Side, patterns: FloatArray, terms: Pair, image: FloatArray) -> FloatArray:
     seen = image @ other.response
     # Pixels that the same patterns light are seen alike: coefficients answer to each kind of them once.
     kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
@@ -457,5 +436,5 @@ def _together(parts: list[FloatArray]) -> FloatArray:
     return np.sqrt(sum(np.square(part) for part in parts))
 
 
-def _rms(values: FloatArray) -> float:
+def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.square(values).mean()))

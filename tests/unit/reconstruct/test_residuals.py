@@ -6,6 +6,7 @@ Frames that fit only when they are read otherwise: turned, in another order, of 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -181,6 +182,7 @@ def test_chance_is_that_of_all_data(above: float, flagged: bool) -> None:
     residual = expected * (1 + above * 6 * np.sqrt(2 / 6400))
     # A tenth and more of 10^5 in all is unexplained, less than 2 % of a tile.
     noise = SimpleNamespace(stated=True, variance=np.ones((1, 1)))
+    noise.chance = partial(FrameNoise.chance, noise)  # type: ignore[arg-type]
     energies = residual, expected * 1e3, expected, np.full((8, 8), 100.0)
     found, _ = weigh(energies, True, noise, 0.0)  # type: ignore[arg-type]
     assert found.unexplained > 3.5e-3 and found.worst_tile < 2e-2 and found.flagged == flagged
