@@ -238,30 +238,25 @@ def factors_of_sums(
     shown = f"rank {rank[0]} of {n} and {rank[1]} of {n}, condition {condition:.1e}"
     figures = f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, {shown}."
     if unexplained > allowed:
-        status = Status(
-            Verdict.NOT_SEPARABLE,
-            f"Responses are not separable: {unexplained:.1%} of them is left over ({decibels(unexplained):.1f} dB)",
-            "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure",
-            figures,
+        verdict, words = Verdict.NOT_SEPARABLE, f"Responses are not separable: {unexplained:.1%} of them is left over"
+        words += f" ({decibels(unexplained):.1f} dB)"
+        remedy = (
+            "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure"
         )
     elif max(predicted) > LARGEST_ERROR:
-        status = Status(
-            Verdict.MOSTLY_NOISE,
-            f"Factors are mostly noise: an error of {max(predicted):.0%} is expected of them, allowed are "
-            f"{LARGEST_ERROR:.0%}",
-            "raise the exposure or average captures",
-            figures,
-        )
+        verdict, remedy = Verdict.MOSTLY_NOISE, "raise the exposure or average captures"
+        words = f"Factors are mostly noise: an error of {max(predicted):.0%} is expected of them, allowed are "
+        words += f"{LARGEST_ERROR:.0%}"
     elif rank != [n, n]:
-        status = Status(
-            Verdict.RANK_DEFICIENT,
+        verdict = Verdict.RANK_DEFICIENT
+        words = (
             f"Factors are rank deficient: {n - rank[0]} directions of scene rows and {n - rank[1]} of columns are not "
-            "above noise and rounding",
-            "use fewer scene pixels, a larger distance from sensor to mask or more exposure",
-            figures,
         )
+        words += "above noise and rounding"
+        remedy = "use fewer scene pixels, a larger distance from sensor to mask or more exposure"
     else:
-        status = Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
+        verdict, words, remedy = Verdict.CALIBRATED, "Calibrated: responses are separable", ""
+    status = Status(verdict, words, remedy, figures)
     errors, ranks = (predicted[0], predicted[1]), (rank[0], rank[1])
     return Estimate(phi[0], phi[1], residual, unexplained, condition, noise, errors, ranks, status)
 

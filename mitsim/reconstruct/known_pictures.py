@@ -267,16 +267,9 @@ def fit_codes(exposures: Sequence[Exposure], shape: Shape, start: FloatArray | N
         total = float(np.einsum("iaw,awbv,ibv->", spread, block, spread, optimize=True))
         errors[axis] = float(np.sqrt(max(total, 0.0) / (side.sensor * side.scene)))
     balance = float(np.sqrt(np.linalg.norm(codes[1]) / np.linalg.norm(codes[0])))
-    return Codes(
-        sides,
-        (codes[0] * balance, codes[1] / balance),
-        gains,
-        variances,
-        explained,
-        (errors[0] * balance, errors[1] / balance),
-        (seen[0] * balance, seen[1] / balance),
-        (told[0], told[1]),
-    )
+    balanced, of_codes = (codes[0] * balance, codes[1] / balance), (errors[0] * balance, errors[1] / balance)
+    shown = seen[0] * balance, seen[1] / balance
+    return Codes(sides, balanced, gains, variances, explained, of_codes, shown, (told[0], told[1]))
 
 
 # ---- Orientation and scale, by spectra -------------------------------------------------------------------------------

@@ -114,7 +114,6 @@ class ShiftedLight:
         self.origin = (self.whole[0] - m) // 2, (self.whole[1] - n) // 2
         self._crop = slice(self.origin[0], self.origin[0] + m), slice(self.origin[1], self.origin[1] + n)
         sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
-        sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
         least = (max(scene, whole - origin, origin + size) for scene, whole, origin, size in sides)
         down, across = (fft.next_fast_len(each, real=True) for each in least)
         self.grid = down, across
@@ -516,14 +515,9 @@ def solve_point_spread(
     else:
         remedy = "take a larger lambda, or allow more iterations"
         status = Status(Verdict.NOT_CONVERGED, f"Not converged: {lowered} or more", remedy, figures)
-    return Solution(
-        image=np.asarray(found.image[light.window], np.float64),
-        lam=prior.weight or prior.ridge,
-        residual=math.sqrt(float(np.vdot(residual, residual)) / energy) if energy else 0.0,
-        status=status,
-        iterations=found.iterations,
-        objective=found.objective,
-    )
+    image = np.asarray(found.image[light.window], np.float64)
+    share = math.sqrt(float(np.vdot(residual, residual)) / energy) if energy else 0.0
+    return Solution(image, prior.weight or prior.ridge, share, status, None, found.iterations, found.objective)
 
 
 # ---- From a run ------------------------------------------------------------------------------------------------------

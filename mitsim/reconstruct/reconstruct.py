@@ -28,7 +28,6 @@ from mitsim.reconstruct.request import (
     TIKHONOV,
     ImageCost,
     ImageRequest,
-    holds_image,
 )
 from mitsim.reconstruct.solver import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
@@ -256,10 +255,9 @@ class Reconstruction(Solution):
         write_json(folder / RESULT_FILE, {"status": _INCOMPLETE, "inputs": self.inputs})
         channels: dict[str, Any] = {IMAGE_FILE: {"reflectance": self.image.astype(np.float32)}}
         channels[UNCERTAINTY_FILE] = self.uncertainties and self.uncertainties.channels()
-        channels[DEPTH_FILE] = self.depths and {
-            "depth_mm": self.depths.mm.astype(np.float32),
-            "confidence": self.depths.confidence.astype(np.float32),
-        }
+        if self.depths:
+            maps = {"depth_mm": self.depths.mm, "confidence": self.depths.confidence}
+            channels[DEPTH_FILE] = {name: values.astype(np.float32) for name, values in maps.items()}
         checksums = {}
         for name, values in channels.items():
             (folder / name).unlink(missing_ok=True)
@@ -299,11 +297,8 @@ class Reconstruction(Solution):
             pictures[caption] = normalise(self.uncertainty)
         if self.depths:
             pictures[f"depth of each pixel\n{span(self.depths.mm, 'mm')}"] = normalise(self.depths.mm)
-        return card(
-            f"Reconstruction: {self.status.verdict.value}",
-            pictures,
-            (str(self.status), *self.trust, *self.limits, facts),
-        )
+        lines = str(self.status), *self.trust, *self.limits, facts
+        return card(f"Reconstruction: {self.status.verdict.value}", pictures, lines)
 
 
 def _check_stored(more: object) -> None:
@@ -315,10 +310,11 @@ def _check_stored(more: object) -> None:
 
 def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:
     """Return True if ``folder`` contains an image that may be replaced, False if it contains none."""
-    if not holds_image(folder):
+    result = folder / RESULT_FILE
+    if not (result.is_file() or (folder / IMAGE_FILE).is_file()):
         return False
     if not overwrite:
-        check_same_inputs(folder, read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}, asked)
+        check_same_inputs(folder, read_json(result) if result.is_file() else {}, asked)
     return True
 
 

@@ -98,16 +98,13 @@ class ImageRequest(Options):
             raise ArgumentError("method", f"{short_text(self.method)}: give a method's name or a solver")
         method = self.name
         if isinstance(self.method, str) and method not in METHODS:
-            raise ArgumentError(
-                "method",
-                f"{method!r}: use {', '.join(METHODS)} or the file of a trained network, which ends in {MODEL}",
-            )
+            allowed = f"{', '.join(METHODS)} or the file of a trained network, which ends in {MODEL}"
+            raise ArgumentError("method", f"{method!r}: use {allowed}")
         if lam != "auto" and not isinstance(self.method, str):
             raise ArgumentError("lam", f"{lam}: {method} has none; leave it out")
         if lam != "auto" and not 0 <= lam <= _MOST:
-            raise ArgumentError(
-                "lam", f"{short_text(lam)}: give a finite number of at least 0, or auto; at most {_MOST:g}"
-            )
+            words = f"give a finite number of at least 0, or auto; at most {_MOST:g}"
+            raise ArgumentError("lam", f"{short_text(lam)}: {words}")
         if not (focus is None or self.looks_for_depth or 0 < focus <= _MOST):
             raise ArgumentError("focus", f"{short_text(focus)}: give a depth above 0 mm, auto or map")
         if ends := self.depth_range:
@@ -151,11 +148,8 @@ class ImageRequest(Options):
         if self.focus is not None:
             raise ArgumentError("focus", f"{self.focus}: comes with a calibration, not with a point spread function")
         if self.name not in (TIKHONOV, NONNEGATIVE, TV):
-            raise ArgumentError(
-                "method",
-                f"{self.name}: comes with a calibration; by a point spread function use {TIKHONOV}, {NONNEGATIVE} or "
-                f"{TV}",
-            )
+            allowed = f"by a point spread function use {TIKHONOV}, {NONNEGATIVE} or {TV}"
+            raise ArgumentError("method", f"{self.name}: comes with a calibration; {allowed}")
 
     def inputs(self, shots: Capture, factors: Factors) -> dict[str, Any]:
         asked: dict[str, Any] = {"run": shots.fingerprint, "calibration": factors.fingerprint}
@@ -167,10 +161,8 @@ class ImageRequest(Options):
 
 def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
     if parallax is None:
-        raise MitsimError(
-            f"calibration {calibration}: does not state its parallax, which focus needs; calibrate again, or "
-            "add it to the manifest"
-        )
+        words = "does not state its parallax, which focus needs; calibrate again, or add it to the manifest"
+        raise MitsimError(f"calibration {calibration}: {words}")
     return parallax
 
 
@@ -229,9 +221,5 @@ def keeps_frames(shots: Capture, factors: Factors) -> bool:
 
 def slab_numbers(shots: Capture, factors: Factors, whole: bool = False) -> float:
     sides = zip((factors.left, factors.right), shots.patterns, strict=True)
-    return float(
-        sum(
-            len(factor) * (patterns.size if whole else int((patterns != 0).sum())) + factor.size
-            for factor, patterns in sides
-        )
-    )
+    slabs = (len(factor) * (lit.size if whole else int((lit != 0).sum())) + factor.size for factor, lit in sides)
+    return float(sum(slabs))

@@ -31,7 +31,7 @@ from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
 from mitsim.devices.patterns import shot_orders
 from mitsim.reconstruct.accumulation import CHANCE, TINY, Accumulation, FrameNoise
-from mitsim.reconstruct.solver import IndexArray, Prepared, group_pixels, prepare, robust_scatter
+from mitsim.reconstruct.solver import IndexArray, Pair, Prepared, group_pixels, prepare, robust_scatter
 
 # ---- Other readings of the data -------------------------------------------------------------------------------------
 
@@ -63,7 +63,7 @@ class Reading:
         return {"words": self.words, "order": self.order, "unexplained": self.left}
 
 
-def is_negative(prepared: Prepared, patterns: tuple[FloatArray, FloatArray], weights: FloatArray) -> bool:
+def is_negative(prepared: Prepared, patterns: Pair, weights: FloatArray) -> bool:
     """Return True if scene pixels that are lit together are negative in the mean, as with exchanged halves of pairs."""
     sigma, groups = prepared.sigma, [[group.pixels for group in group_pixels(side)] for side in patterns]
     image = prepared.image(weights * sigma / (np.square(sigma) + 0.001 * float(sigma.max()) ** 2 + TINY))
@@ -117,10 +117,8 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     limit = allowed + max(min(0.05 * unexplained, 0.02**2 * whole), min(chance, unexplained / 2))
     good: list[Reading] = []
     # One change is tried before two.
-    for stage in (
-        [(turn, _TAKEN) for turn in turns[1:]] + [(_KEPT, name) for name in names],
-        product(turns[1:], names),
-    ):
+    once = [*((turn, _TAKEN) for turn in turns[1:]), *((_KEPT, name) for name in names)]
+    for stage in (once, product(turns[1:], names)):
         for turn, name in stage if not good else ():
             words = [] if turn == _KEPT else [f"the frames are {turn}"]
             words += [] if name == _TAKEN else [_STEPS.get(name, f"the shots were taken in the order {name}")]
@@ -204,7 +202,7 @@ class Residuals:
         self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         self.leave_out, self.shots, self.free, self.rest, self.side, self.contrast = np.zeros((6, *counts))
-        self.powers: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
+        self.powers: dict[tuple[int, int], Pair] = {}
         self.same: dict[int, list[tuple[int, int, int]]] = {}
         self.clipped: dict[tuple[int, int, int], int] = {}
         # Two arrays of one frame are kept, because to make them anew takes longer than to fill them.
@@ -247,9 +245,8 @@ class Residuals:
         others = self.noise.variance.size - 1
         if measurement.shots == 2 and others:
             some = slice(None, None, max(min(residual.shape) // _PAIR_ROWS, 1))
-            total, difference, left_over, every = (
-                each[some, some].ravel() for each in (measurement.light, measurement.frame, residual, self.noise.light)
-            )
+            arrays = measurement.light, measurement.frame, residual, self.noise.light
+            total, difference, left_over, every = (each[some, some].ravel() for each in arrays)
             beyond = (total * (1 + others) - every) / others
             halves, variance = np.stack([total + difference, total - difference]) / 2, 2 * self.noise.variance[pattern]
             normal = halves @ halves.T

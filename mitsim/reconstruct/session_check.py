@@ -511,9 +511,8 @@ class _Check:
         light = np.square(own.vectors).sum(axis=1)
         lower, upper = np.sort([np.roll(light, 1), np.roll(light, -1)], axis=0)
         strange = (light < _DARK[own.sums.centre] * lower) & (lower > _LIT * np.median(light)) | (_LIT * light > upper)
-        words = (
-            f"sensor {('row', 'column')[own.axis]} {np.argmax(strange)} shows no light, or too much; check the sensor"
-        )
+        where = f"sensor {('row', 'column')[own.axis]} {np.argmax(strange)}"
+        words = f"{where} shows no light, or too much; check the sensor"
         own.add(words, float(np.maximum(light, lower)[strange].sum()))
         if foreign or strange.any() or not shadow.predicts:
             return
@@ -538,13 +537,11 @@ class _Check:
 
     def judge(self) -> None:
         found, sides = self.found, self.sides
-        energies = {
-            why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for own in sides for why in own.extras
-        }
+        reasons = {**sides[0].extras, **sides[1].extras}
+        energies = {why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for why in reasons}
         order, total = sorted(energies, key=lambda why: -energies[why]), float(np.sqrt(sum(energies.values())))
-        doubts = [
-            why for why in order if why not in (_LAMP, _REPLACED) and energies[why] > (_MATTERS * self.noise) ** 2
-        ]
+        least = (_MATTERS * self.noise) ** 2
+        doubts = [why for why in order if why not in (_LAMP, _REPLACED) and energies[why] > least]
         if total > LARGEST_ERROR or (self.refused and doubts):
             raise MitsimError(f"all frames: {order[0]}: it leaves a factor error of {total:.0%}; take them again")
         if self.refused:

@@ -39,7 +39,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -707,50 +707,30 @@ class Prepared:
         measured = sigma[sigma > 0]
         magnified = float(float(measured.max()) * (measured / (np.square(measured) + lam)).max())
         rounding = _ROUNDING_UNITS * max(magnified, 1.0) * self.left.spread * self.right.spread
-        return Solution(
-            image=self.image(filtered),
-            lam=lam,
-            residual=float(np.sqrt(residual / problem.energy)) if problem.energy > 0 else 0.0,
-            status=replace(self._status(lam, rounding, problem.scale), flags=flags),
-            rounding=rounding,
-        )
+        share = float(np.sqrt(residual / problem.energy)) if problem.energy > 0 else 0.0
+        status = replace(self._status(lam, rounding, problem.scale), flags=flags)
+        return Solution(self.image(filtered), lam, share, status, rounding)
 
     def _status(self, lam: float, rounding: float, scale: float) -> Status:
-        figures = f"{self.extent}, rounding below {rounding:.0e}."
-        lost, limit = self.lost
+        status, (lost, limit) = partial(Status, figures=f"{self.extent}, rounding below {rounding:.0e}."), self.lost
         for name, side in (("row", self.left), ("column", self.right)):
             if side.data_rows < side.scene_size:
-                return Status(
-                    Verdict.UNDER_DETERMINED,
-                    f"Under-determined: {side.data_rows} sensor {name}s in all for {side.scene_size} scene {name}s",
-                    "use more patterns, more sensor pixels or fewer scene pixels",
-                    figures,
-                )
+                words = f"Under-determined: {side.data_rows} sensor {name}s in all for {side.scene_size} scene {name}s"
+                remedy = "use more patterns, more sensor pixels or fewer scene pixels"
+                return status(Verdict.UNDER_DETERMINED, words, remedy)
         if self.rank < self.unknowns and lam == 0:
-            return Status(
-                Verdict.RANK_DEFICIENT,
-                f"Rank deficient: {self.unknowns - self.rank} of {self.unknowns} directions are not measured and left "
-                "at zero by the pseudo-inverse",
-                "use more patterns, or lambda above 0",
-                figures,
-            )
+            words = f"Rank deficient: {self.unknowns - self.rank} of {self.unknowns} directions are not measured"
+            remedy = "use more patterns, or lambda above 0"
+            return status(Verdict.RANK_DEFICIENT, f"{words} and left at zero by the pseudo-inverse", remedy)
         if rounding > ROUNDING_LIMIT:
             least = scale * (_ROUNDING_UNITS / ROUNDING_LIMIT / 2) ** 2
-            return Status(
-                Verdict.ILL_CONDITIONED,
-                f"Ill-conditioned: rounding may change more than {ROUNDING_LIMIT:.0%} of the image",
-                f"raise lambda above {least:.1e}, or use more patterns",
-                figures,
-            )
+            words = f"Ill-conditioned: rounding may change more than {ROUNDING_LIMIT:.0%} of the image"
+            return status(Verdict.ILL_CONDITIONED, words, f"raise lambda above {least:.1e}, or use more patterns")
         if lost:
-            return Status(
-                Verdict.PARTLY_MEASURED,
-                f"Solved, but {lost} of {self.unknowns} directions are not measured above {limit} and follow from "
-                "lambda alone",
-                "use more patterns" if limit == "rounding" else "calibrate with more frames, or use more patterns",
-                figures,
-            )
-        return Status(Verdict.SOLVED, "Solved: every direction of the image is measured", "", figures)
+            words = f"Solved, but {lost} of {self.unknowns} directions are not measured above {limit}"
+            remedy = "use more patterns" if limit == "rounding" else "calibrate with more frames, or use more patterns"
+            return status(Verdict.PARTLY_MEASURED, f"{words} and follow from lambda alone", remedy)
+        return status(Verdict.SOLVED, "Solved: every direction of the image is measured")
 
 
 def prepare(

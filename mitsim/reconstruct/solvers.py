@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -124,36 +125,26 @@ def _find_minimum(
     outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
     misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
     lost, limit = prepared.lost
-    figures, name = f"{prepared.extent}.", "total variation" if prior.weight else "least squares"
+    status, name = (
+        partial(Status, figures=f"{prepared.extent}."),
+        "total variation" if prior.weight else "least squares",
+    )
     if not converged:
         far = f"may still be {gap:.1e} above its minimum" if gap <= 1 else "is not proven to be near its minimum"
-        status = Status(
-            Verdict.NOT_CONVERGED,
-            f"Not converged: after {iterations} iterations {name} {far}",
-            f"take a {'weight' if prior.weight else 'lambda'} nearer the automatic one, or allow more "
-            "iterations or a larger tolerance",
-            figures,
-        )
+        remedy = f"take a {'weight' if prior.weight else 'lambda'} nearer the automatic one, or allow more iterations"
+        words = f"Not converged: after {iterations} iterations {name} {far}"
+        found = status(Verdict.NOT_CONVERGED, words, f"{remedy} or a larger tolerance")
     elif lost:
-        status = Status(
-            Verdict.PARTLY_MEASURED,
-            f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not "
-            f"measured above {limit} and follow from {name} alone",
-            "use more patterns",
-            figures,
+        words = f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured"
+        found = status(
+            Verdict.PARTLY_MEASURED, f"{words} above {limit} and follow from {name} alone", "use more patterns"
         )
     else:
-        sentence = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"
-        status = Status(Verdict.SOLVED, sentence, "", figures)
-    return Solution(
-        image=image,
-        lam=prior.weight or prior.ridge,
-        iterations=iterations,
-        objective=outside / 2 + _objective(prepared, problem, prior, image),
-        relative_gap=gap,
-        residual=float(np.sqrt(misfit / problem.energy)) if problem.energy > 0 else 0.0,
-        status=status,
-    )
+        words = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"
+        found = status(Verdict.SOLVED, words)
+    residual = float(np.sqrt(misfit / problem.energy)) if problem.energy > 0 else 0.0
+    objective = outside / 2 + _objective(prepared, problem, prior, image)
+    return Solution(image, prior.weight or prior.ridge, residual, found, None, iterations, objective, gap)
 
 
 def _iterate(
