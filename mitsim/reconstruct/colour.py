@@ -68,7 +68,8 @@ class JointMosaic:
                     f"{lines} factors of an even number of sensor pixels, a column for each scene pixel"
                 )
         if self.weights.shape != (len(PLANES), lines):
-            raise MitsimError(f"mosaic: weights are {self.weights.shape}; give one for each of 4 planes, {lines} lines")
+            words = f"weights are {self.weights.shape}; give one for each of 4 planes and {lines} lines"
+            raise MitsimError(f"mosaic: {words}")
 
     @property
     def shape(self) -> tuple[int, int, int]:

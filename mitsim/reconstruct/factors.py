@@ -240,19 +240,16 @@ def factors_of_sums(
     if unexplained > allowed:
         verdict, words = Verdict.NOT_SEPARABLE, f"Responses are not separable: {unexplained:.1%} of them is left over"
         words += f" ({decibels(unexplained):.1f} dB)"
-        remedy = (
-            "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure"
-        )
+        remedy = "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part"
+        remedy += ", or raise the exposure"
     elif max(predicted) > LARGEST_ERROR:
         verdict, remedy = Verdict.MOSTLY_NOISE, "raise the exposure or average captures"
         words = f"Factors are mostly noise: an error of {max(predicted):.0%} is expected of them, allowed are "
         words += f"{LARGEST_ERROR:.0%}"
     elif rank != [n, n]:
         verdict = Verdict.RANK_DEFICIENT
-        words = (
-            f"Factors are rank deficient: {n - rank[0]} directions of scene rows and {n - rank[1]} of columns are not "
-        )
-        words += "above noise and rounding"
+        words = f"Factors are rank deficient: {n - rank[0]} directions of scene rows and {n - rank[1]} of columns are"
+        words += " not above noise and rounding"
         remedy = "use fewer scene pixels, a larger distance from sensor to mask or more exposure"
     else:
         verdict, words, remedy = Verdict.CALIBRATED, "Calibrated: responses are separable", ""

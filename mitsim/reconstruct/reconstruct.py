@@ -17,7 +17,7 @@ from mitsim.core.files import output_folder, plain, read_json, remove_page, writ
 from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising, print_energy
+from mitsim.reconstruct.accumulation import Accumulation, FrameNoise, accumulate, check_factorising, print_energy
 from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map, move_factors, parallax_of
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import GROSS, GROSS_CHI_SQUARE, Cause, LeftOut, Misfit, faulty_frames, find_misfit, weigh
@@ -255,9 +255,8 @@ class Reconstruction(Solution):
         write_json(folder / RESULT_FILE, {"status": _INCOMPLETE, "inputs": self.inputs})
         channels: dict[str, Any] = {IMAGE_FILE: {"reflectance": self.image.astype(np.float32)}}
         channels[UNCERTAINTY_FILE] = self.uncertainties and self.uncertainties.channels()
-        if self.depths:
-            maps = {"depth_mm": self.depths.mm, "confidence": self.depths.confidence}
-            channels[DEPTH_FILE] = {name: values.astype(np.float32) for name, values in maps.items()}
+        maps = {"depth_mm": self.depths.mm, "confidence": self.depths.confidence} if self.depths else {}
+        channels[DEPTH_FILE] = {name: values.astype(np.float32) for name, values in maps.items()}
         checksums = {}
         for name, values in channels.items():
             (folder / name).unlink(missing_ok=True)
@@ -454,17 +453,21 @@ def check_image(shots: Capture, factors: Factors, request: ImageRequest) -> Solv
     return solver
 
 
+def depth_misfit(depths: DepthMap, noise: FrameNoise, factor_energy: float | None, print_energy: float) -> Misfit:
+    spare = 1 - 2 * depths.image.size / depths.data  # a reflectance and a depth for each pixel
+    variance = float(noise.variance.mean()) * depths.data * spare
+    expected = variance + depths.part * (noise.rendering + depths.smoothing * (factor_energy or 0.0))
+    whole = depths.left_over, depths.energy, expected, depths.data / noise.variance.size
+    energies = tuple(np.array([[value]]) for value in whole)
+    return weigh(energies, factor_energy is not None, noise, depths.part * print_energy)[0]
+
+
 def _judge(
     data: Accumulation, solution: Solution, depths: DepthMap | None, lam: float | Literal["auto"]
 ) -> tuple[Accumulation, Solution, Misfit | None]:
     if depths:
-        image, noise, factor_energy = depths.image, data.noise, data.factor_energy(depths.image)
-        # Each pixel has a reflectance and a depth.
-        expected = float(noise.variance.mean()) * depths.data * (1 - 2 * image.size / depths.data)
-        expected += depths.part * (noise.rendering + depths.smoothing * (factor_energy or 0.0))
-        sizes = depths.left_over, depths.energy, expected, depths.data / noise.variance.size
-        energies, prints = tuple(np.array([[value]]) for value in sizes), depths.part * print_energy(data.model, image)
-        misfit, _ = weigh(energies, factor_energy is not None, noise, prints)
+        image = depths.image
+        misfit = depth_misfit(depths, data.noise, data.factor_energy(image), print_energy(data.model, image))
         # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
         most = move_factors(data.factors, float(np.median(depths.mm)))
         faults = faulty_frames(accumulate(most.of(data.shots), most.factors), image, depths.lam)

@@ -125,10 +125,8 @@ def _find_minimum(
     outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
     misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
     lost, limit = prepared.lost
-    status, name = (
-        partial(Status, figures=f"{prepared.extent}."),
-        "total variation" if prior.weight else "least squares",
-    )
+    status = partial(Status, figures=f"{prepared.extent}.")
+    name = "total variation" if prior.weight else "least squares"
     if not converged:
         far = f"may still be {gap:.1e} above its minimum" if gap <= 1 else "is not proven to be near its minimum"
         remedy = f"take a {'weight' if prior.weight else 'lambda'} nearer the automatic one, or allow more iterations"
@@ -136,9 +134,8 @@ def _find_minimum(
         found = status(Verdict.NOT_CONVERGED, words, f"{remedy} or a larger tolerance")
     elif lost:
         words = f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured"
-        found = status(
-            Verdict.PARTLY_MEASURED, f"{words} above {limit} and follow from {name} alone", "use more patterns"
-        )
+        words += f" above {limit} and follow from {name} alone"
+        found = status(Verdict.PARTLY_MEASURED, words, "use more patterns")
     else:
         words = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"
         found = status(Verdict.SOLVED, words)

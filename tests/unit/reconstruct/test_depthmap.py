@@ -21,7 +21,7 @@ from mitsim.reconstruct.accumulation import DerivedCapture, accumulate
 from mitsim.reconstruct.depth import Arrivals, Depth, PixelDepths, best_depth, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import Cause
-from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
+from mitsim.reconstruct.reconstruct import Reconstruction, depth_misfit, reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
 from tests.ideal_sessions import shadow as plain_shadow
 from tests.unit.reconstruct.test_faults import dark, with_frames
@@ -229,13 +229,15 @@ def test_misfit_leaves_noise_and_print_to_the_scene() -> None:
     (Planted: the sensor's part over the print's energy.)"""
     run, factors = shots(cards(), "dots:8", BASELINE), calibrated(BASELINE)
     found, noise = depth_map(run, factors), accumulate(run, factors).noise
-    plain = found.misfit(noise, 0.0, 0.0)
+    plain = depth_misfit(found, noise, 0.0, 0.0)
     excess = plain.unexplained**2 * found.energy / found.part
     assert plain.unexplained > 3.5e-3 and plain.flagged and plain.stated
-    assert found.misfit(noise, 0.0, excess / 2).unexplained == pytest.approx(plain.unexplained / 2**0.5, rel=1e-6)
-    assert found.misfit(noise, 0.0, 1.01 * excess).unexplained == 0
-    assert found.misfit(noise, excess / found.smoothing, 0.0).unexplained == pytest.approx(0, abs=1e-6)
-    assert not found.misfit(noise, None, 0.0).stated
+    assert depth_misfit(found, noise, 0.0, excess / 2).unexplained == pytest.approx(
+        plain.unexplained / 2**0.5, rel=1e-6
+    )
+    assert depth_misfit(found, noise, 0.0, 1.01 * excess).unexplained == 0
+    assert depth_misfit(found, noise, excess / found.smoothing, 0.0).unexplained == pytest.approx(0, abs=1e-6)
+    assert not depth_misfit(found, noise, None, 0.0).stated
 
 
 def test_files_and_the_summary_have_the_depths(tmp_path: object) -> None:
