@@ -559,7 +559,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (7, 1773),
     "planner": (6, 1657),
-    "reconstruct": (16, 5845),
+    "reconstruct": (16, 5535),
     "report": (6, 1827),
     "scene": (5, 1363),
     "sensor": (4, 1156),
