@@ -27,7 +27,7 @@ class Case:
 
     name: str
     content: str | bytes
-    says: tuple[str, ...]
+    says: str | tuple[str, ...]
     prepare: Prepare = nothing
     line: bool = True
     defines: tuple[tuple[str, str], ...] = ()
@@ -115,8 +115,3 @@ def file(name: str, content: str | bytes) -> Prepare:
         path.write_bytes(content.encode() if isinstance(content, str) else content)
 
     return write
-
-
-def included(content: str, name: str = "part.xml") -> tuple[str, Prepare]:
-    """The good scene with an include, and the included scene's content."""
-    return put(f'<include filename="{name}"/>'), file(name, f'<scene version="3.0.0">{content}</scene>')

@@ -9,21 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from tests.hard.hostile import (
-    GOOD,
-    MESH,
-    OBJ,
-    Case,
-    Prepare,
-    file,
-    included,
-    jpeg,
-    mesh,
-    picture,
-    png,
-    put,
-    skin,
-)
+from tests.hard.hostile import GOOD, MESH, OBJ, Case, Prepare, file, jpeg, mesh, picture, png, put, skin
 
 
 def _sizes() -> list[Case]:
@@ -33,13 +19,10 @@ def _sizes() -> list[Case]:
     double = '<bsdf type="diffuse" id="b0"/>' + "".join(
         f'<bsdf type="blendbsdf" id="b{i + 1}"><ref id="b{i}"/><ref id="b{i}"/></bsdf>' for i in range(12)
     )
-    tower = "".join(f'<scene version="3.0.0"><include filename="p{i + 1}.xml"/></scene>\0' for i in range(20)).split(
-        "\0"
-    )
 
     def towers(folder: Path) -> None:
-        for i, text in enumerate(tower[:-1]):
-            (folder / f"p{i}.xml").write_text(text)
+        for i in range(20):
+            (folder / f"p{i}.xml").write_text(f'<scene version="3.0.0"><include filename="p{i + 1}.xml"/></scene>')
 
     def fans(folder: Path) -> None:
         for i in range(6):
@@ -49,32 +32,28 @@ def _sizes() -> list[Case]:
 
     many = '<shape type="sphere"/>' * 6000
     return [
-        Case("depth of 20", put('<bsdf type="mask">' * 20 + "</bsdf>" * 20), ("nested over 16",)),
-        Case("depth of 100000", put("<a>" * 100000), ("nested over 16",)),
-        Case("50000 elements", put("<shape/>" * 50000), ("10000 elements",)),
-        Case("8 MiB", put("<!--" + "x" * (8 << 20) + "-->"), ("over 4 MiB",), line=False),
+        Case("depth of 20", put('<bsdf type="mask">' * 20 + "</bsdf>" * 20), "nested over 16"),
+        Case("depth of 100000", put("<a>" * 100000), "nested over 16"),
+        Case("50000 elements", put("<shape/>" * 50000), "10000 elements"),
+        Case("8 MiB", put("<!--" + "x" * (8 << 20) + "-->"), "over 4 MiB", line=False),
         Case("chain of 4000 references", put(chain), ("nesting", "16 levels")),
         Case("doubling references", put(double), ("nesting", "256 objects")),
         Case(
             "include of itself by a detour",
             put('<include filename="./x/../scene.xml"/>'),
-            ("comes back",),
+            "comes back",
             lambda f: (f / "x").mkdir(),
         ),
-        Case("tower of includes", put('<include filename="p0.xml"/>'), ("64 includes, 8 deep",), towers),
-        Case("million includes", put('<include filename="p0.xml"/>'), ("64 includes",), fans),
+        Case("tower of includes", put('<include filename="p0.xml"/>'), "64 includes, 8 deep", towers),
+        Case("million includes", put('<include filename="p0.xml"/>'), "64 includes", fans),
         Case(
             "elements over several files",
             put(many + '<include filename="p.xml"/>'),
-            ("10000 elements",),
+            "10000 elements",
             file("p.xml", f'<scene version="3.0.0">{many}</scene>'),
             line=False,
         ),
     ]
-
-
-def _second(made: tuple[str, Prepare], says: tuple[str, ...]) -> tuple[str, tuple[str, ...], Prepare]:
-    return made[0], says, made[1]
 
 
 def _places() -> list[Case]:
@@ -91,71 +70,41 @@ def _places() -> list[Case]:
     spectrum = skin("diffuse", '<spectrum name="reflectance" filename="{}"/>')
     return [
         Case("picture above", picture("../out.png"), (lies, "--allow-outside-files"), outside("out.png", png(2, 2))),
-        Case("linked picture", picture("l.png"), (lies,), link("l.png", "/etc/passwd")),
-        Case("link to itself", picture("l.png"), ("no such file",), link("l.png", "l.png")),
-        Case(
-            "file by parameter",
-            put('<default name="f" value="/etc/passwd"/>').replace(
-                "</scene>", '<shape type="ply"><string name="filename" value="$f"/></shape></scene>'
-            ),
-            (lies,),
-        ),
-        Case("pipe", picture("pipe.png"), ("plain file",), lambda folder: os.mkfifo(folder / "pipe.png")),
-        Case("folder", picture("sub"), ("plain file",), lambda folder: (folder / "sub").mkdir()),
-        Case("empty file", picture("e.png"), ("plain file",), file("e.png", b"")),
+        Case("linked picture", picture("l.png"), lies, link("l.png", "/etc/passwd")),
+        Case("link to itself", picture("l.png"), "no such file", link("l.png", "l.png")),
+        Case("pipe", picture("pipe.png"), "plain file", lambda folder: os.mkfifo(folder / "pipe.png")),
+        Case("folder", picture("sub"), "plain file", lambda folder: (folder / "sub").mkdir()),
+        Case("empty file", picture("e.png"), "plain file", file("e.png", b"")),
         Case(
             "huge sparse file",
             picture("h.png"),
-            ("512 MiB",),
-            lambda folder: os.truncate(_touched(folder / "h.png"), 1 << 40),
+            "512 MiB",
+            lambda folder: ((folder / "h.png").touch(), os.truncate(folder / "h.png", 1 << 40)),
         ),
         Case(
-            "include above",
-            put('<include filename="../p.xml"/>'),
-            (lies,),
-            outside("p.xml", '<scene version="3.0.0"/>'),
+            "include above", put('<include filename="../p.xml"/>'), lies, outside("p.xml", '<scene version="3.0.0"/>')
         ),
-        Case("spectrum above", spectrum.format("../s.spd"), (lies,), outside("s.spd", "400 1\n700 1\n")),
-        Case(
-            "spectrum of text",
-            spectrum.format("s.spd"),
-            ("s.spd", "wavelength in line 1"),
-            file("s.spd", "root:x:0:0\n"),
-        ),
-        Case("spectrum above 1", spectrum.format("s.spd"), ("reflectance: got 3",), file("s.spd", "400 1\n700 3\n")),
+        Case("spectrum above", spectrum.format("../s.spd"), lies, outside("s.spd", "400 1\n700 1\n")),
         Case("native plugin", GOOD, ("plugins/evil.so", "native code"), native("plugins/evil.so"), line=False),
-        Case("native plugin of a stock name", GOOD, ("native code",), native("plugins/diffuse.so"), line=False),
+        Case("native plugin of a stock name", GOOD, "native code", native("plugins/diffuse.so"), line=False),
         Case(
             "linked plugins",
             GOOD,
-            ("native code",),
+            "native code",
             lambda folder: (file("hidden/evil.so", b"x")(folder), (folder / "plugins").symlink_to("hidden")),
             line=False,
         ),
         Case(
             "native plugin of an include",
             put('<include filename="sub/p.xml"/>'),
-            ("native code",),
+            "native code",
             lambda folder: (
                 file("sub/p.xml", '<scene version="3.0.0"/>')(folder),
                 native("sub/plugins/evil.so")(folder),
             ),
             line=False,
         ),
-        Case(
-            "fault in an include",
-            *_second(
-                included('\n<shape type="sphere"><float name="radius" value="-1"/></shape>'),
-                ("part.xml:2: radius: got -1",),
-            ),
-        ),
-        Case("path in an include", *_second(included('<path value="/tmp"/>'), ("part.xml:1: path", "native code"))),
     ]
-
-
-def _touched(path: Path) -> Path:
-    path.touch()
-    return path
 
 
 def _contents() -> list[Case]:
@@ -211,7 +160,7 @@ def _contents() -> list[Case]:
                 "</bsdf></shape>\n</scene>",
                 '</bsdf></shape><emitter type="envmap"><string name="filename" value="p.png"/></emitter></scene>',
             ),
-            ("texels: got 3.6",),
+            "texels: got 3.6",
             file("p.png", png(4, 4, (4500, 4000))),
         ),
         meshed("text", "hello", "no PLY"),

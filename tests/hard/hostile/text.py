@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mitsim.core.configuration import read_toml
-from tests.hard.hostile import GOOD, Case, ball, mesh, picture, png, put, skin, swap
+from tests.hard.hostile import GOOD, Case, ball, file, mesh, nothing, picture, png, put, skin, swap
 
 EDITS = {edit.__name__: edit for edit in (put, swap, ball, skin, picture, mesh)}
 
@@ -54,7 +54,8 @@ def _listed() -> list[Case]:
     for name, told in read_toml(Path(__file__).parent / "scenes.toml").items():
         content = next((edit(*told[kind]) for kind, edit in EDITS.items() if kind in told), GOOD)
         defines = tuple(told.get("defines", {}).items())
-        cases.append(Case(name, content, tuple(told["says"]), line=told.get("line", True), defines=defines))
+        prepare = file(*told["file"]) if "file" in told else nothing
+        cases.append(Case(name, content, tuple(told["says"]), prepare, told.get("line", True), defines))
     return cases
 
 
