@@ -30,6 +30,9 @@ DIGITAL = Digital(
     exposure_s=0.0213, gain_dn_per_e=0.37, black_level_dn=160.0, dark_current_e_per_s=600.0, read_noise_e=3.0
 )
 CAMERA = {"name": "bench 3", "well": 12000.5}
+CASES: dict[str, dict[str, Any]] = {"dots": {}, **{name: {name: True} for name in ("signed", "real_output", "ambient")}}
+CASES["closing"] = {"closing": "uniform"}
+"""Kinds of runs, as arguments of :func:`made`."""
 
 
 @dataclass(frozen=True)

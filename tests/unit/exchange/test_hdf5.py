@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from mitsim.core.exr import read_frame, write_frame
 from mitsim.exchange import packed
 from mitsim.exchange.formats import export, import_file
 from mitsim.exchange.packed import load_hdf5
-from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
+from tests.exchanged import CASES, COLUMNS, ROWS, SCENE, Made, bytes_of, made
 
 
 @pytest.fixture
@@ -30,17 +31,20 @@ def exported(bench: Made, tmp_path: Path) -> Path:
     return tmp_path / "all.h5"
 
 
-@pytest.mark.parametrize("case", ["dots", "signed", "real output", "ambient", "closing"])
+def damaged(path: Path, channel: str, shot: int) -> Path:
+    with h5py.File(path, "r") as file:
+        place, size = file[f"run/shots/{channel}"].id.get_chunk_info(shot)[2:4]
+    content = bytearray(path.read_bytes())
+    content[place + size // 2] ^= 0xFF
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_folders_come_back_to_the_byte(case: str, tmp_path: Path) -> None:
     """Frames, truth, ambient frame, metadata and manifests. (Planted: metadata of frames left out; the manifest written
     from its model, which puts `null` where a field is not stated.)"""
-    bench = made(
-        tmp_path,
-        signed=case == "signed",
-        ambient=case == "ambient",
-        real_output=case == "real output",
-        closing="uniform" if case == "closing" else "",
-    )
+    bench = made(tmp_path, **CASES[case])
     # As other programs write it: what comes back is the file, not what its model says.
     manifest = json.loads((bench.calibration / "manifest.json").read_text())
     (bench.calibration / "manifest.json").write_text(json.dumps({key: manifest[key] for key in sorted(manifest)}))
@@ -66,12 +70,7 @@ def test_the_layout_is_that_of_the_documentation(bench: Made, tmp_path: Path) ->
 
 def test_a_shot_is_read_without_the_others(bench: Made, tmp_path: Path) -> None:
     """(Planted: the stack fetched as a whole.)"""
-    path = exported(bench, tmp_path)
-    with h5py.File(path, "r") as file:
-        place, size = file["run/shots/DN"].id.get_chunk_info(3)[2:4]
-    damaged = bytearray(path.read_bytes())
-    damaged[place + size // 2] ^= 0xFF
-    path.write_bytes(damaged)
+    path = damaged(exported(bench, tmp_path), "DN", 3)
     with load_hdf5(path) as (folders, *_):
         run = folders.parts[""]
         names = [shot.file for shot in run.manifest.patterns.captures]
@@ -83,49 +82,41 @@ def test_a_shot_is_read_without_the_others(bench: Made, tmp_path: Path) -> None:
 
 def test_a_damaged_file_leaves_no_folder(bench: Made, tmp_path: Path) -> None:
     """Not the calibration's either, which was whole. (Planted: each folder finished before the next.)"""
-    path = exported(bench, tmp_path)
-    with h5py.File(path, "r") as file:
-        place, size = file["run/shots/electrons"].id.get_chunk_info(5)[2:4]
-    damaged = bytearray(path.read_bytes())
-    damaged[place + size // 2] ^= 0xFF
-    path.write_bytes(damaged)
+    path = damaged(exported(bench, tmp_path), "electrons", 5)
     with pytest.raises(MitsimError, match="damaged"):
         import_file(path, tmp_path / "run 2", tmp_path / "cal 2")
     assert not (tmp_path / "run 2").exists() and not (tmp_path / "cal 2").exists()
 
 
-def edit(path: Path, what: str) -> None:
-    with h5py.File(path, "a") as file:
-        if what == "another program's":
-            del file.attrs["mitsim_exchange"]
-        elif what == "newer":
-            file.attrs["mitsim_exchange"] = 2
-        elif what == "an outside link":
-            del file["run/truth"]
-            file["run/truth"] = h5py.ExternalLink("/etc/passwd", "/")
-        elif what == "fewer shots":
-            few = file["run/shots/DN"][:5]
-            del file["run/shots/DN"]
-            file["run/shots/DN"] = few
-        else:
-            text = file["run/manifest"][()].tobytes().replace(b'"frame_00002.exr"', b'"manifest.json"  ')
-            del file["run/manifest"]
-            file["run/manifest"] = np.frombuffer(text, np.uint8)
+def put(name: str, change: Callable[[Any], Any]) -> Callable[[h5py.File], None]:
+    """Put in the place of an array what ``change`` makes of it."""
+
+    def edit(file: h5py.File) -> None:
+        held = file[name][()] if isinstance(file[name], h5py.Dataset) else None
+        del file[name]
+        file[name] = change(held)
+
+    return edit
+
+
+def renamed(text: np.ndarray) -> np.ndarray:
+    return np.frombuffer(text.tobytes().replace(b'"frame_00002.exr"', b'"manifest.json"  '), np.uint8)
 
 
 @pytest.mark.parametrize(
-    ("what", "words"),
+    ("edit", "words"),
     [
-        ("another program's", "no HDF5 file of `mitsim export`"),
-        ("newer", "mitsim_exchange is 2"),
-        ("an outside link", "/run/truth is a link"),
-        ("fewer shots", "6 x rows x columns"),
-        ("a frame for a manifest", "a frame is called 'manifest.json'"),
+        (lambda file: file.attrs.pop("mitsim_exchange"), "no HDF5 file of `mitsim export`"),
+        (lambda file: file.attrs.update(mitsim_exchange=2), "mitsim_exchange is 2"),
+        (put("run/truth", lambda _: h5py.ExternalLink("/etc/passwd", "/")), "/run/truth is a link"),
+        (put("run/shots/DN", lambda frames: frames[:5]), "6 x rows x columns"),
+        (put("run/manifest", renamed), "a frame is called 'manifest.json'"),
     ],
 )
-def test_a_file_that_is_no_run_is_refused(bench: Made, tmp_path: Path, what: str, words: str) -> None:
+def test_a_file_that_is_no_run_is_refused(bench: Made, tmp_path: Path, edit: Any, words: str) -> None:
     path = exported(bench, tmp_path)
-    edit(path, what)
+    with h5py.File(path, "a") as file:
+        edit(file)
     with pytest.raises(MitsimError, match=words):
         import_file(path, tmp_path / "run 2")
     assert not (tmp_path / "run 2").exists()

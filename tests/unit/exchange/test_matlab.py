@@ -17,25 +17,13 @@ import mitsim as ms
 from mitsim.core import arrays
 from mitsim.core.errors import MitsimError
 from mitsim.exchange.formats import export, import_file
-from tests.exchanged import COLUMNS, ROWS, Made, made
-
-CASES = ["dots", "signed", "real output", "ambient", "closing"]
-
-
-def bench_of(case: str, tmp_path: Path) -> Made:
-    return made(
-        tmp_path,
-        signed=case == "signed",
-        ambient=case == "ambient",
-        real_output=case == "real output",
-        closing="uniform" if case == "closing" else "",
-    )
+from tests.exchanged import CASES, COLUMNS, ROWS, made
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_papers_variables_are_its_model(case: str, tmp_path: Path) -> None:
     """phi_left (P o X) phi_right' = data_coded - measBg for every pattern, but for the noise, a few digital numbers."""
-    bench = bench_of(case, tmp_path)
+    bench = made(tmp_path, **CASES[case])
     export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
     held = loadmat(tmp_path / "all.mat")
     left, right = held["PL"], held["PR"]
@@ -62,7 +50,7 @@ printf('%.17g %.17g %d %d %s\\n', sum(found(:)), sum(expected(:)), size(found, 1
 @pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed")
 @pytest.mark.parametrize("case", ["signed", "ambient"])
 def test_octave_reads_what_is_written(case: str, tmp_path: Path) -> None:
-    bench = bench_of(case, tmp_path)
+    bench = made(tmp_path, **CASES[case])
     export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
     call = ["octave-cli", "--quiet", "--norc", "--eval", OCTAVE]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
