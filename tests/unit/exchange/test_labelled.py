@@ -1,4 +1,4 @@
-"""Captures, factors and images as xarray Datasets: their numbers, with units, indices of patterns and places in mm."""
+"""Captures, factors and images as xarray Datasets, with units, indices of patterns and places in mm, and as tensors."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import pandas
 import pytest
 
 import mitsim as ms
+from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
+from mitsim.exchange.formats import export
 from tests.exchanged import made
 
 xarray = pytest.importorskip("xarray")
@@ -96,3 +98,29 @@ def test_a_studys_rows_are_a_table(tmp_path: Path) -> None:
     (tmp_path / "toy.png").write_bytes(b"\x89PNG")
     assert found.pictures == {"toy.png": tmp_path / "toy.png"} and "2 points in" in found._repr_html_()
     assert found.to_pandas().equals(pandas.DataFrame([*rows]))
+
+
+# ---- Tensors of PyTorch ----
+
+
+def test_a_missing_package_is_told_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = made(tmp_path)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MitsimError, match=r"torch is not installed .* pip install 'mitsim\[torch\]'"):
+        export(bench.run, "torch", tmp_path / "run.pt", bench.calibration)
+    assert not (tmp_path / "run.pt").exists()
+
+
+def test_the_file_holds_what_the_solver_sees(tmp_path: Path) -> None:
+    """Measurements, truth, patterns and factors."""
+    torch = pytest.importorskip("torch")
+    bench = made(tmp_path, signed=True)
+    shots, factors = ms.load_run(bench.run), ms.load_calibration(bench.calibration)
+    export(bench.run, "torch", tmp_path / "run.pt", bench.calibration)
+    held = {name: each.numpy() for name, each in torch.load(tmp_path / "run.pt", weights_only=True).items()}
+    columns = shots.patterns[1].shape[1]
+    for frame, i, j in shots.measurements():
+        assert np.array_equal(held["y"][i * columns + j], frame)
+    assert np.array_equal(held["x"][0], shots.truth)
+    for name, expected in zip(("P_L", "P_R", "left", "right"), (*shots.patterns, *factors.sides), strict=True):
+        assert np.array_equal(held[name], expected)

@@ -1,10 +1,15 @@
-"""Figures of studies: curves by numbers in order, grids with their own titles."""
+"""Figures of studies, and numbers, means and warnings as pages and figures print them."""
+
+import math
 
 import numpy as np
 import pytest
 
-from mitsim.report.pages import Mean
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.solver import Status, Verdict
+from mitsim.report.pages import Mean, round_to_error, scientific, typeset
 from mitsim.report.plots import curves, grouped_bars, image_grid
+from mitsim.report.reconstruct_run import one_paragraph
 
 
 def test_curves_are_in_the_order_of_their_numbers() -> None:
@@ -94,3 +99,87 @@ def test_a_panel_of_nothing_is_left_out() -> None:
     figure = curves({**nothing, "told": {"a": curve((1, 20.0), (2, 30.0))}}, "x [mm]")
     assert [axes.get_title() for axes in figure.axes] == ["told"]
     assert not curves(nothing, "x [mm]").axes
+
+
+# ---- Numbers and texts ----
+
+
+TIMES, MICRO = "\N{MULTIPLICATION SIGN}", "\N{GREEK SMALL LETTER MU}"
+
+
+@pytest.mark.parametrize(
+    ("text", "printed"),
+    [
+        ("one anchor leaves 7.8e-04", f"one anchor leaves 7.8{TIMES}10⁻⁴"),
+        ("condition 6.2e+06.", f"condition 6.2{TIMES}10⁶."),
+        ("0.0e+00 of them, below 1e-3", "0 of them, below 10⁻³"),
+        ("up to 9.4e-02 and 3.87e-02, 7.0e+02 of 1.0e+00", "up to 0.094 and 0.0387, 700 of 1.0"),
+        ("512 x 512 pixels of 11.72 um", f"512 {TIMES} 512 pixels of 11.72 {MICRO}m"),
+        ("3x3 anchors, -3.5 +- 0.1 dB", f"3{TIMES}3 anchors, -3.5 \N{PLUS-MINUS SIGN} 0.1 dB"),
+        ("dots:7x16, abc1e-3, v1.2e3x, the um of 23 mm", "dots:7x16, abc1e-3, v1.2e3x, the um of 23 mm"),
+    ],
+)
+def test_numbers_in_a_text_are_printed_and_names_are_left_alone(text: str, printed: str) -> None:
+    """No pattern's name is a size, and no number 10 to the power of nothing."""
+    assert typeset(text) == printed
+
+
+@pytest.mark.parametrize(
+    ("value", "printed"),
+    [
+        (None, "\N{EN DASH}"),
+        (0.0, "0"),
+        (0.011, "0.0110"),
+        (1234.4, "1234"),
+        (999.6, "1000"),
+        (99.97, "100"),
+        (2.6e-3, f"2.6{TIMES}10⁻³"),
+        (-6.2e6, f"-6.2{TIMES}10⁶"),
+    ],
+)
+def test_a_number_keeps_its_digits(value: float | None, printed: str) -> None:
+    """Not 0.011 beside 0.0108, nor 1.23e+03 for 1234."""
+    assert scientific(value) == printed
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "printed"),
+    [(0.66877, 0.00088, "0.66877"), (-3.8364e-4, 0.0012, "-0.0004"), (128_314.0, 880.0, "128310"), (1.5, 0.0, "1.5")],
+)
+def test_a_measured_number_ends_where_its_error_does(value: float, error: float, printed: str) -> None:
+    """No digits of a number whose first one is not known."""
+    assert round_to_error(value, error) == printed
+
+
+# ---- Means with standard errors, against numpy ----
+
+
+def test_a_mean_has_the_standard_error_of_its_numbers() -> None:
+    """(Planted: deviation with n in the denominator.)"""
+    mean = Mean.of_numbers([20.0, 23.0, 26.0], "psnr_db")
+    assert mean.value == 23 and mean.of == 3
+    assert mean.error == pytest.approx(np.std([20, 23, 26], ddof=1) / 3**0.5)
+    single = Mean.of_numbers([40.0], "psnr_db")
+    assert single.value == 40 and math.isnan(single.error) and str(single) == "40.0" and "23.0 ± 1.7" in str(mean)
+    with pytest.raises(MitsimError, match="nothing was measured of psnr_db"):
+        Mean.of_numbers([], "psnr_db")
+
+
+def test_an_error_of_a_mean_is_never_nought() -> None:
+    """(Planted: one place whatever the error, so 0.04 dB was 0.0.)"""
+    assert str(Mean(23.41, 0.04, 2)) == "23.41 \N{PLUS-MINUS SIGN} 0.04"
+    assert str(Mean(23.41, 0.94, 2)) == "23.4 \N{PLUS-MINUS SIGN} 0.9" and str(Mean(23.41, math.nan, 1)) == "23.4"
+
+
+# ---- One warning for all lines of a run ----
+
+
+def test_lines_share_one_warning_and_no_flag_is_repeated() -> None:
+    flag = "The calibration was flagged: a quarter of the frames is left over."
+    lost = {name: Status(Verdict.PARTLY_MEASURED, f"Solved, but {n} directions are not measured", "use more patterns",
+                         flags=(flag,)) for name, n in (("r", 7), ("g", 9))}  # fmt: skip
+    noise = Status(Verdict.SOLVED, "Solved", flags=(flag, "The image is hardly more than noise."))
+    (text,) = one_paragraph({**lost, "b": noise, "good": Status(Verdict.SOLVED, "Solved")})
+    assert text.startswith("r, g: Solved, but 7 directions are not measured (so r;") and "b: Solved." in text
+    assert text.count(flag) == 1 and text.count("hardly more than noise") == 1 and "good" not in text
+    assert one_paragraph({"good": Status(Verdict.SOLVED, "Solved")}) == ()
