@@ -760,7 +760,8 @@ def _write_matrix(group: h5py.Group, matrix: sparse.csr_array) -> None:
 
 def _write_shadow(group: h5py.Group, grid: Grid) -> None:
     bundle, geometry, spectrum, _ = grid.key
-    layers = [shadow_terms(geometry, bundle.rows, bundle.columns, depth, spectrum) for depth in bundle.depths]
+    rows, columns = bundle.directions
+    layers = [shadow_terms(geometry, rows, columns, depth, spectrum) for depth in bundle.depths]
     for side, name in enumerate(("left", "right")):
         factors = np.stack([[term[side] for term in terms] for terms in layers])
         group.create_dataset(name, data=factors.astype(np.float32), **PACKED)
@@ -768,8 +769,8 @@ def _write_shadow(group: h5py.Group, grid: Grid) -> None:
     arrays = {
         "anchors": anchor_weights(positions, geometry.centres(0)),
         **({"column_anchors": anchor_weights(positions, geometry.centres(1))} if not geometry.axes_alike else {}),
-        "rows": bundle.rows.centres,
-        "columns": bundle.columns.centres,
+        "rows": rows.centres,
+        "columns": columns.centres,
         "depths_mm": np.array(bundle.depths),
     }
     for name, values in arrays.items():

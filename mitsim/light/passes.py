@@ -64,8 +64,7 @@ class Grid:
 
     @cached_property
     def optics(self) -> FrameOptics:
-        bundle = self.bundle
-        parts = bundle.rows, bundle.columns, bundle.depths, bundle.anchors
+        parts = *self.bundle.directions, self.bundle.depths, self.bundle.anchors
         return FrameOptics(self.geometry, *parts, self.spectrum, self.places)
 
 

@@ -360,7 +360,7 @@ class DirectRuns:
             waves = spectrum is not None
             if not (geometry.is_drawn(waves) or geometry.may_be_drawn(waves)):
                 return Drawn()
-            error, known = raster_error(geometry, bundle.rows, bundle.columns, self.base.depth, spectrum, seen)
+            error, known = raster_error(geometry, *bundle.directions, self.base.depth, spectrum, seen)
             found = Estimate(error, _SURE_OF_RASTER * error) if known else Estimate(*(error * by for by in _OF_FINER))
             return Drawn(found, geometry.is_drawn(waves), cells_to_choose(geometry, spectrum))
 

@@ -158,6 +158,8 @@ class CanvasMap:
 class ProjectorRays:
     def __init__(self, projector: ProjectorOptics) -> None:
         self.projector, self._map = projector, projector.canvas_map
+        self._origin = mi.Point3f(*map(_opaque, self._map.origin))
+        self._turn = mi.Matrix3f(*map(_opaque, self._map.turn.ravel()))
 
     def sample(self, pixel: mi.UInt32, jitter: mi.Point2f, rng: mi.PCG32, wavelengths: mi.Color0f) -> mi.Ray3f:
         projector = self.projector
@@ -184,14 +186,6 @@ class ProjectorRays:
         _, weight = self.projector.emitter.sample_direction(at, mi.Point2f(0.5), True)
         area = _opaque(self._map.pixel_area(self.projector.canvas) * self.projector.share)
         return weight * (_FAR**2 * dr.rsqrt(dr.squared_norm(centre)) * area)
-
-    @cached_property
-    def _origin(self) -> mi.Point3f:
-        return mi.Point3f(*map(_opaque, self._map.origin))
-
-    @cached_property
-    def _turn(self) -> mi.Matrix3f:
-        return mi.Matrix3f(*map(_opaque, self._map.turn.ravel()))
 
     def _image(self, row: mi.Float, column: mi.Float) -> mi.Vector3f:
         canvas_point = self.projector.canvas_point(row, column, _opaque)

@@ -178,16 +178,9 @@ class Bundle:
     lamps: int = 1
 
     @property
-    def rows(self) -> Directions:
-        return self._directions(self.grid.rows)
-
-    @property
-    def columns(self) -> Directions:
-        return self._directions(self.grid.columns)
-
-    def _directions(self, axis: CellAxis) -> Directions:
-        cells = Directions.cells(axis.edges)
-        return Directions(cells.centres, 0.0) if self.between else cells
+    def directions(self) -> tuple[Directions, Directions]:
+        rows, columns = (Directions.cells(axis.edges) for axis in (self.grid.rows, self.grid.columns))
+        return (Directions(rows.centres, 0.0), Directions(columns.centres, 0.0)) if self.between else (rows, columns)
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -380,7 +373,7 @@ class DeviceAccumulator:
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float, lines: int = 1) -> None:
         self._bundle, self._rows, self.lines = bundle, int(labels.max()) + 1, lines
-        self._width = self._places(bundle)
+        self._width = bundle.size + bundle.anchors**2
         self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
         self._labels = mi.UInt32(labels.astype(np.uint32))
         # The last entry counts refused light: negative, not finite or too bright.
@@ -389,12 +382,8 @@ class DeviceAccumulator:
         self.traced = 0
 
     @staticmethod
-    def _places(bundle: Bundle) -> int:
-        return bundle.size + bundle.anchors**2
-
-    @staticmethod
     def holds(bundle: Bundle, labels: Labels, lines: int = 1, paths: float = math.inf) -> bool:
-        entries = (int(labels.max()) + 1) * DeviceAccumulator._places(bundle)
+        entries = (int(labels.max()) + 1) * (bundle.size + bundle.anchors**2)
         parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)
         return lines * entries < MOST_PLACES and entries < _PAYS * parts * paths
 

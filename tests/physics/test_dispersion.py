@@ -6,10 +6,7 @@ that a projector of one line has: places and light agree to float32's rounding, 
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,6 +26,7 @@ from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from mitsim.transport.specular import trace_specular_chains
 from tests.conftest import write_small_scene
+from tests.unit.transport.closed_forms import in_child
 
 N, SAMPLES = 8, 16
 LINES, SHARES = (450.0, 530.0, 640.0), (0.5, 0.3, 0.2)
@@ -139,7 +137,7 @@ def both(name: str, opened: Callable[[str, str], Bench]) -> dict[str, Any]:
     return found
 
 
-def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
+def traced(folder: str, *names: str) -> dict[str, Any]:
     """Light of some scenes; its process has a spectral variant for good."""
     place = Path(folder)
     (place / "lines.toml").write_text(
@@ -172,19 +170,10 @@ def refusal(trace: Callable[[], object]) -> str:
 @pytest.fixture(scope="module")
 def light(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
     """Light of scenes, from a child process: this one has another variant."""
-    program = (
-        "import json, sys; from tests.physics.test_dispersion import traced; "
-        "print(json.dumps(traced(sys.argv[1], sys.argv[2:]), default=float))"
-    )
 
     @cache
     def trace(*names: str) -> dict[str, Any]:
-        command = [sys.executable, "-c", program, str(tmp_path_factory.mktemp("dispersion")), *names]
-        root = Path(__file__).parents[2]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
-        assert done.returncode == 0, done.stderr
-        found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-        return found
+        return in_child("tests.physics.test_dispersion", tmp_path_factory.mktemp("dispersion"), *names)
 
     return trace
 

@@ -58,7 +58,7 @@ Nothing else is sampled by importance: the reference is the judge, and simple en
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -66,7 +66,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import BoolArray, Flaws, Mask, Plate
+from mitsim.devices.mask import BoolArray, Flaws, Plate
 from mitsim.transport.plugins import base
 
 PLUGIN = "mitsim_lensless"
@@ -109,7 +109,8 @@ def plugin_class() -> type:
         def wear(self, geometry: CameraGeometry) -> None:
             self.geometry = geometry
             mask = geometry.build_mask()
-            self._openings, self._feature = Openings(mask), mask.feature_mm
+            self._openings = [(OpenAxis(rows), OpenAxis(columns)) for rows, columns in mask.openings]
+            self._feature = mask.feature_mm
             self._features = self._cover = round(mask.extent_mm / mask.feature_mm)
             self._terms, self._values = [], None
             self._whole = isinstance(mask, Plate) and mask.grids is None
@@ -133,7 +134,14 @@ def plugin_class() -> type:
             geometry = self.geometry
             wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
             if self._points:
-                sample2, sample3 = self._stratify(sample2, *self._points)
+                rows, columns = geometry.frame_shape
+                count, (seed, paths) = mi.Point2f(columns, rows), self._points
+                place = dr.minimum(dr.floor(sample2 * count), count - 1)
+                pixel = mi.UInt32(place.y) * columns + mi.UInt32(place.x)
+                rng = base.generator(dr.opaque(mi.UInt32, seed), pixel)
+                index = dr.arange(mi.UInt32, dr.width(sample2)) % dr.opaque(mi.UInt32, paths)
+                sample2 = (place + base.sobol_point(index, rng)) / count
+                sample3 = base.sobol_point(base.shuffle(index, rng), rng)
             # ---- u: in the region of interest, and in the active part of its pixel
             if geometry.roi is not None:
                 roi, whole = geometry.roi, geometry.shape
@@ -152,7 +160,7 @@ def plugin_class() -> type:
                 for start, centre in zip(base.rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
             ]
             view = 2 * stop * geometry.mask_distance / side
-            row, column, weight = self._openings.draw(mi.Point2f(*corner), view, sample3)
+            row, column, weight = draw_opening(self._openings, mi.Point2f(*corner), view, sample3)
             t = mi.Vector2f(*base.x_y(*(place * (2 * stop / view) - stop for place in (row, column))))
             squared = 1 + dr.squared_norm(t)
             if self._whole:
@@ -176,16 +184,6 @@ def plugin_class() -> type:
         ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             return mi.RayDifferential3f(ray), weight
-
-        def _stratify(self, film: mi.Point2f, seed: int, paths: int) -> tuple[mi.Point2f, mi.Point2f]:
-            rows, columns = self.geometry.frame_shape
-            count = mi.Point2f(columns, rows)
-            place = dr.minimum(dr.floor(film * count), count - 1)
-            pixel = mi.UInt32(place.y) * columns + mi.UInt32(place.x)
-            rng = base.generator(dr.opaque(mi.UInt32, seed), pixel)
-            index = dr.arange(mi.UInt32, dr.width(film)) % dr.opaque(mi.UInt32, paths)
-            film = (place + base.sobol_point(index, rng)) / count
-            return film, base.sobol_point(base.shuffle(index, rng), rng)
 
         def _crossing(self, u: mi.Point2f, t: mi.Vector2f, sample: mi.Point2f) -> mi.Point2f:
             distance, flaws = self.geometry.mask_distance, self._flaws
@@ -252,62 +250,48 @@ class OpenAxis:
         self._before = mi.UInt32(before.astype(np.uint32))
         self._places = mi.UInt32(np.append(np.flatnonzero(bits), len(bits)).astype(np.uint32))
 
-    def open_within(self, low: mi.Float, width: float) -> _Seen:
+    def open_within(self, low: mi.Float, width: float) -> tuple[mi.Float, Callable[[mi.Float], mi.Float]]:
+        """Return the open length of a part of the axis, and the function that makes a random number an open place."""
+
+        def opened(index: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
+            before = dr.gather(mi.UInt32, self._before, index)
+            return before, mi.Float(dr.gather(mi.UInt32, self._before, index + 1) - before)
+
         # From the feature that holds its start: the width of a narrow view keeps its digits.
         start = mi.UInt32(dr.clip(low, 0, self._size))
         within = low - mi.Float(start)
         last = dr.clip(within + width, 0, self._size - mi.Float(start))
         end = mi.UInt32(last)
-        before, first = self._open(start)
-        after, tail = self._open(start + end)
+        (before, first), (after, tail) = opened(start), opened(start + end)
         skipped = first * dr.maximum(within, 0)
-        length = mi.Float(after - before) + tail * (last - mi.Float(end)) - skipped
-        return _Seen(self._places, start, within, before, skipped, dr.maximum(length, 0))
+        length = dr.maximum(mi.Float(after - before) + tail * (last - mi.Float(end)) - skipped, 0)
 
-    def _open(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
-        before = dr.gather(mi.UInt32, self._before, index)
-        return before, mi.Float(dr.gather(mi.UInt32, self._before, index + 1) - before)
+        def draw(number: mi.Float) -> mi.Float:
+            place = skipped + number * length
+            whole = mi.UInt32(place)
+            feature = dr.gather(mi.UInt32, self._places, dr.minimum(before + whole, dr.width(self._places) - 1))
+            return (mi.Float(feature) - mi.Float(start)) + (place - mi.Float(whole)) - within
 
-
-@dataclass
-class _Seen:
-    places: mi.UInt32
-    start: mi.UInt32
-    within: mi.Float
-    before: mi.UInt32
-    skipped: mi.Float
-    length: mi.Float
-
-    def draw(self, number: mi.Float) -> mi.Float:
-        place = self.skipped + number * self.length
-        whole = mi.UInt32(place)
-        feature = dr.gather(mi.UInt32, self.places, dr.minimum(self.before + whole, dr.width(self.places) - 1))
-        return (mi.Float(feature) - mi.Float(self.start)) + (place - mi.Float(whole)) - self.within
+        return length, draw
 
 
-class Openings:
-    """Open places of a mask; for a plate without grids of them, a rectangle that contains them."""
+def draw_opening(
+    grids: Sequence[tuple[OpenAxis, OpenAxis]], corner: mi.Point2f, width: float, number: mi.Point2f
+) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Draw an open place of a square window uniformly; return its row and column, and the open part of the window.
 
-    def __init__(self, mask: Mask | Plate) -> None:
-        self._grids = [(OpenAxis(rows), OpenAxis(columns)) for rows, columns in mask.openings]
-
-    def draw(self, corner: mi.Point2f, width: float, number: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Draw an open place of a square window uniformly; return its row and column, and the open part of the window.
-
-        The place is undefined where the part is 0.
-        """
-        grids = [
-            (rows.open_within(corner.x, width), columns.open_within(corner.y, width)) for rows, columns in self._grids
-        ]
-        areas = [rows.length * columns.length for rows, columns in grids]
-        total = sum(areas[1:], areas[0])
-        left, chosen = number.y * total, list[mi.Float]()
-        for index, ((rows, columns), area) in enumerate(zip(grids, areas, strict=True)):
-            if index:
-                further, left = left >= areas[index - 1], left - areas[index - 1]
-            place = [rows.draw(number.x), columns.draw(dr.select(area > 0, left / area, 0))]
-            if index:
-                place = [dr.select(further, new, old) for new, old in zip(place, chosen, strict=True)]
-            chosen = place
-        row, column = (dr.clip(place, 0, width) for place in chosen)
-        return row, column, total / width**2
+    The place is undefined where the part is 0. For a plate without grids the place lies in a rectangle of all openings.
+    """
+    seen = [(rows.open_within(corner.x, width), columns.open_within(corner.y, width)) for rows, columns in grids]
+    areas = [length * other for (length, _), (other, _) in seen]
+    total = sum(areas[1:], areas[0])
+    left, chosen = number.y * total, list[mi.Float]()
+    for index, (((_, row), (_, column)), area) in enumerate(zip(seen, areas, strict=True)):
+        if index:
+            further, left = left >= areas[index - 1], left - areas[index - 1]
+        place = [row(number.x), column(dr.select(area > 0, left / area, 0))]
+        if index:
+            place = [dr.select(further, new, old) for new, old in zip(place, chosen, strict=True)]
+        chosen = place
+    row, column = (dr.clip(place, 0, width) for place in chosen)
+    return row, column, total / width**2

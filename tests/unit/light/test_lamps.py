@@ -7,9 +7,6 @@ The geometry is that of ``test_lamps``: a point lamp, a sheet at 400 mm, an open
 times what it sees of a lamp of intensity 1 over a sheet of reflectance 1; I / 470 nm is the lamp's spectral intensity.
 """
 
-import json
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +17,7 @@ import pytest
 
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
-from mitsim.core.colour_files import MOSAIC, RUN
+from mitsim.core.colour_files import RUN
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import SPECTRA_NM, CountedLamps, Response, Spectrum
 from mitsim.light.passes import Grid, Simulation, expected_of
@@ -31,6 +28,7 @@ from mitsim.transport.records import PathSamples
 from tests.conftest import write_small_scene
 from tests.system.conftest import CAMERA
 from tests.unit.bench.test_lamps import ALBEDO, POSITION, seen
+from tests.unit.transport.closed_forms import in_child
 
 LAMPS = {
     "flat": '<spectrum name="intensity" value="3e4"/>',
@@ -41,18 +39,10 @@ LAMPS = {
 SHEETS = {"grey": "0.5", "coloured": "350:0.2, 550:0.8, 850:0.4"}
 CURVE = {420.0: 0.2, 530.0: 0.8, 700.0: 0.3}
 """A camera's electrons per photon."""
-FILTERS = {
-    "G": {400.0: 0.02, 480.0: 0.1, 530.0: 0.6, 600.0: 0.1, 700.0: 0.05},
-    "B": {390.0: 0.1, 450.0: 0.5, 520.0: 0.1, 600.0: 0.0, 650.0: 0.0},
-    "R": {420.0: 0.0, 560.0: 0.02, 600.0: 0.5, 650.0: 0.4, 750.0: 0.2},
-}
-"""The same behind filters, GBRG."""
 LINES = [638.0, 520.0, 445.0]
 SHARES = [0.5, 0.3, 0.2]
 SEEDS, SAMPLES = 8, 64
 CASES = [("flat", "grey", False), ("coloured", "coloured", True), ("cie_a", "grey", False), ("d65", "coloured", True)]
-FILTERED = ["flat", "coloured", "cie_a", "d65"]
-"""Lamps over a grey sheet that are seen behind filters as well; d65's lights a coloured one."""
 
 
 def spectral(lamp: str, wavelengths: np.ndarray) -> np.ndarray:
@@ -96,12 +86,6 @@ def traced(folder: str) -> list[dict[str, Any]]:
     (place / "lines.toml").write_text(
         f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {LINES}\nradiant_shares = {SHARES}\n'
     )
-    single = CAMERA.replace("5.86", "11.72").replace("binning = 2\n", "").replace("quantum_efficiency = 0.75\n", "")
-    tables = "".join(
-        f"[mosaic_curves.{name}]\nwavelengths_nm = {list(curve)}\nefficiency = {list(curve.values())}\n"
-        for name, curve in FILTERS.items()
-    )
-    (place / "filters.toml").write_text(f'{single}mosaic = "GBRG"\n{tables}')
     for lamp, sheet, curve in CASES:
         emitter = f'<emitter type="point">{POSITION}{LAMPS[lamp]}</emitter>'
         path = write_small_scene(place, lamp, mask="open", extra=emitter)
@@ -113,7 +97,6 @@ def traced(folder: str) -> list[dict[str, Any]]:
         assert isinstance(simulation.from_camera, LampTracer)
         traced_runs = [simulation.from_camera.trace(seed, 0, SAMPLES) for seed in range(SEEDS)]
         lines = [[light.value.sum() / SAMPLES for light in run.by_line(len(LINES))] for run in traced_runs]
-        bands = [np.bincount(run.pixel - whole.n**2, run.value) / SAMPLES for run in traced_runs]
         mirrors = FromCameraTracer(simulation.setup, simulation.aim, Paths(mirrors=True))
         mirrored = CombinedTracer(mirrors, simulation.from_camera)
         both = mirrored.trace(0, 0, SAMPLES).by_line(len(LINES)) if lamp == "flat" else []
@@ -124,55 +107,18 @@ def traced(folder: str) -> list[dict[str, Any]]:
         found.append(
             {
                 "lines": np.array(lines).tolist(),
-                "bands": np.array(bands).tolist(),
                 "together": [float(light.value.sum()) / SAMPLES for light in both],
                 "accumulated": np.asarray(accumulated[0].sum(axis=1)).tolist(),
-                "shares": whole.counted_lamps.shares.tolist() if whole.counted_lamps.shares is not None else [],
-                "edges": list(whole.counted_lamps.bands),
-                "spectra": [list(each.wavelengths_nm) for each in whole.counted_lamps.spectra],
-                "weights": [list(each.weights) for each in whole.counted_lamps.spectra],
                 "unknown": whole.counted_lamps.unknown,
-                "filtered": through_filters(place, path, lamp) if lamp in FILTERED else {},
             }
         )
     return found
 
 
-def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
-    """Light of a ``lamp`` behind filters: by band and line of all lines, and of the second line alone."""
-    sheet = SHEETS["coloured" if lamp == "d65" else "grey"]
-    bench = open_bench(scene, "llvm_ad_spectral", place / "filters.toml", place / "lines.toml", albedo=sheet)
-    colours = SpectralBench.of(bench, MOSAIC).lit_by_lamps({}, 0)
-    counted_lamps, found = colours.whole.counted_lamps, {}
-    assert counted_lamps is not None
-    for name, each in {"lines": colours.whole, "alone": colours.benches[1]}.items():
-        tracer = Simulation(each, Settings(depth=400.0, effects=frozenset({"ambient"}))).from_camera
-        assert isinstance(tracer, CombinedTracer) and len(tracer.tracers) == 3
-        traced_runs = [tracer.trace(seed, 0, SAMPLES) for seed in range(SEEDS if name == "lines" else 1)]
-        lines = [run.by_line(len(LINES) if name == "lines" else 1) for run in traced_runs]
-        found[name] = [[np.bincount(one.pixel - bench.n**2, one.value, 12).tolist() for one in run] for run in lines]
-        found[f"replicates {name}"] = [
-            [float(run.value.sum()) for run in runs]
-            for runs in (tracer.replicates((3, 4), 1)[0], [tracer.trace(seed) for seed in (3, 4)])
-        ]
-    assert counted_lamps.shares is not None
-    return {
-        **found,
-        "shares": counted_lamps.shares.tolist(),
-        "unknown": counted_lamps.unknown,
-        "range": counted_lamps.range_nm,
-    }
-
-
 @pytest.fixture(scope="module")
 def light(tmp_path_factory: pytest.TempPathFactory) -> Mapping[tuple[str, str, bool], dict[str, Any]]:
     """Light of each case, from one child process: this one has another variant."""
-    program = "import json, sys; from tests.unit.light.test_lamps import traced; print(json.dumps(traced(sys.argv[1])))"
-    command = [sys.executable, "-c", program, str(tmp_path_factory.mktemp("lamps"))]
-    root = Path(__file__).parents[3]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
-    assert done.returncode == 0, done.stderr
-    return dict(zip(CASES, json.loads(done.stdout.splitlines()[-1]), strict=True))
+    return dict(zip(CASES, in_child("tests.unit.light.test_lamps", tmp_path_factory.mktemp("lamps")), strict=True))
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,14 +1,39 @@
 """How much of each light the next round of sampling traces: what buys the missing accuracy with the least work."""
 
+from __future__ import annotations
+
+import json
 import math
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+import mitsim
+from mitsim.light import cost_model
+from mitsim.light.cost_model import (
+    Numbers,
+    accumulation_seconds,
+    checking_seconds,
+    forming_seconds,
+    optics_seconds,
+    tracing_seconds,
+    truth_seconds,
+)
 from mitsim.light.light import SampledPass, cheapest_samples, next_samples
-from mitsim.light.passes import EVEN, even
+from mitsim.light.passes import EVEN, GRIDS, PASSES, even, table_of
+from mitsim.light.settings import GROUPS, Forming, Settings
+from mitsim.optics.frames import PROBES
+from tests.exchanged import frame_of
+from tests.unit.planner.invented_pilot_result import PILOT_RESULT, plan
 
 LIGHTS = (
     SampledPass("direct", 24, 0.165, 3.0),
@@ -77,3 +102,167 @@ def test_the_next_round_lowers_the_variance_by_what_is_missing_and_a_twentieth()
     assert grown(1.5) == math.ceil(1000 * 1.05 * 1.5**2)
     assert grown(1.001) == 1100
     assert grown(1e200) == 6000
+
+
+# -------- Predicted times
+#
+# What simulating is predicted to take: multiplications counted by hand, at unit costs of one or none.
+
+FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
+ONE = Numbers(*[1.0] * 6)
+COSTS = "_FRAME_S", "_ENTRY_S", "_ACCUMULATED_S", "_RAY_S", "_PIXEL_S"
+
+
+def count(monkeypatch: pytest.MonkeyPatch, **costs: float) -> None:
+    """All unit costs are 0 but these; a multiplication of ``formed`` is one second."""
+    for name in COSTS:
+        monkeypatch.setattr(cost_model, name, costs.get(name, 0.0))
+
+
+def formed(forming: Forming, numbers: Numbers, frames: float = 1.0) -> float:
+    return float(forming_seconds(forming, numbers, frames, 1.0))
+
+
+def products(rows: float, terms: float = 1.0) -> float:
+    """Of left (50, rows) times light (rows, rows) times right (rows, 50), and of the groups' probes in the same way."""
+    probes = GROUPS * (PROBES + 1) * (min(rows, 50) + 50) * rows
+    return terms * (50 * rows * rows + 50 * 50 * rows + probes)
+
+
+@pytest.mark.parametrize(
+    ("change", "multiplications"),
+    [
+        ({"waves": 0.0}, products(5)),
+        ({}, products(5, 3)),
+        ({"layers": 2.0}, 2 * products(5, 3)),
+        ({"cells": 4.0}, products(20, 3)),
+        ({"anchors": 2.0, "cells": 8.0}, products(40, 3) + products(20, 3)),
+        ({"anchors": 2.0, "layers": 3.0, "coarse_layers": 1.0}, 3 * products(5, 3) + 3 * products(10, 3)),
+        ({"indirect": 1.0}, products(5, 3) + products(10, 3)),
+        ({"followed_anchors": 3.0, "layers": 3.0, "coarse_layers": 1.0}, 3 * products(5, 3) + products(7.5, 3)),
+        ({"occluded_anchors": 4.0}, products(5, 3)),
+        ({"occluded": 1.0, "occluded_anchors": 4.0}, products(5, 3) + products(2, 3)),
+        ({"occluded": 90.0, "occluded_anchors": 4.0}, products(5, 3) + products(20, 3)),
+        ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
+    ],
+)
+def test_forming_a_frame_is_as_many_products_as_its_matrices_have(
+    change: dict[str, float], multiplications: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of the ten rows of cells hold light; coarse light of several anchors and indirect light add frames.
+
+    A quarter of the pixels is lit: of one occluded pixel a quarter of two rows, of many no more than of all.
+    """
+    count(monkeypatch)
+    assert formed(FORMING, replace(ONE, **change), 7.0) == pytest.approx(7 * multiplications)
+
+
+def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
+    """Three lines: two fifths more tracing, or three times as much where glass parts them, and all else three times.
+    (Planted: shadows of one line; accumulating of one; paths shared whatever parts them.)"""
+    three = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, lines=3))
+    settings = plan(pilot_result=PILOT_RESULT).settings
+    numbers = Numbers.of(settings)
+    for seconds in (
+        lambda forming: forming_seconds(forming, numbers, 5.0),
+        lambda forming: optics_seconds(forming, numbers),
+        lambda forming: checking_seconds(forming, numbers),
+        lambda forming: accumulation_seconds(forming, numbers, 1e6),
+    ):
+        assert seconds(three.forming) == pytest.approx(3 * seconds(PILOT_RESULT.forming))  # type: ignore[no-untyped-call]
+    one, several = (tracing_seconds(pilot_result, settings) for pilot_result in (PILOT_RESULT, three))
+    assert several == pytest.approx({name: 1.4 * each for name, each in one.items()})
+    parted = tracing_seconds(replace(three, forming=replace(three.forming, parted=True)), settings)
+    assert parted == pytest.approx({name: 3 * each for name, each in one.items()})
+    assert truth_seconds(three, settings) == pytest.approx(1.4 * truth_seconds(PILOT_RESULT, settings))
+
+
+# -------- The table of passes
+#
+# The table of passes: adding one is its row, its integrator and its test, and nothing else.
+
+TOY = Path(__file__).with_name("toy_pass.patch")
+N = 16
+PROGRAM = """
+import json, pathlib, sys
+import numpy as np
+import mitsim as ms
+from mitsim.light.cost_model import tracing_seconds
+from mitsim.light.light import trace_light
+from mitsim.light.light import write_light
+from mitsim.light.light import next_samples
+from mitsim.planner import pilot
+assert pathlib.Path(ms.__file__).parents[1] == pathlib.Path.cwd(), ms.__file__
+scene, folder = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2])
+found = {}
+for name in ("plain", "veiled"):
+    bench = ms.open_bench(scene, projector=folder / f"{name}.toml")
+    lighting = bench.family("dots:2").lighting
+    plan = bench.plan("dots:2", accuracy=5e-3)
+    result = pilot.PilotRuns(bench, lighting, 5e-3, 0).pilot_result
+    light = trace_light(bench, plan, lighting, 0)
+    write_light(folder / f"{name}.h5", light)
+    grown = next_samples(light.simulation, light.samples, {each: float(each == "veil") for each in light.samples}, 2.0)
+    sample_cost = result.sample_costs["veil"]
+    found[name] = {
+        "plan": plan.payload(),
+        "samples": dict(light.samples),
+        "grown": grown,
+        "noise": sample_cost.error,
+        "paths": sample_cost.paths,
+        "seconds": tracing_seconds(result, plan.settings)["veil"],
+        "reached": light.reached,
+    }
+print(json.dumps(found))
+"""
+
+
+def test_a_new_pass_is_its_row_and_its_integrator(small_scene: Callable[..., Path], tmp_path: Path) -> None:
+    """`veil`: a tenth of the direct light once more where the projector's name says so, added to a copy of the package
+    by a patch. It is traced, accumulated and sampled in rounds, measured by the pilot, and counted in costs, plans and
+    files of light, with no other file touched.
+
+    (Planted, each in the code that reads the table: a pass left out of the pilot; of tracing; of rounds; of plans.)
+    """
+    patch = TOY.read_text()
+    assert re.findall(r"^\+\+\+ b/(.*)$", patch, re.MULTILINE) == ["mitsim/light/passes.py", "mitsim/transport/veil.py"]
+    row = patch[: patch.index("diff --git a/mitsim/transport")]
+    assert len(re.findall(r"^\+(?!\+)", row, re.MULTILINE)) == 2, "an import and a row"
+    package = Path(mitsim.__file__).parent
+    copy = tmp_path / "copy"
+    shutil.copytree(package, copy / "mitsim")  # with its byte code: modules that stay as they are load at once
+    for shelf in ("scenes", "calibration"):
+        (copy / shelf).symlink_to(package.parent / shelf)
+    subprocess.run(["git", "apply", str(TOY)], cwd=copy, check=True)
+    for name in ("plain", "veiled"):
+        (tmp_path / f"{name}.toml").write_text(f'name = "{name}"\neffective_wavelength_nm = 562.0\n')
+    scene = small_scene(n=N, reflectance=np.random.default_rng(1).integers(20, 256, (64, 64)))
+    command = [sys.executable, "-c", PROGRAM, str(scene), str(tmp_path)]
+    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    plain, veiled = found["plain"], found["veiled"]
+    assert veiled["reached"] and set(veiled["samples"]) - set(plain["samples"]) == {"veil"}
+    # The pilot tells its noise, and plans its samples; a round that lacks them takes more of it and of nothing else.
+    assert veiled["noise"] > 0 == plain["noise"] and veiled["paths"] == N * N
+    assert veiled["plan"]["settings"]["veil_samples"] > plain["plan"]["settings"]["veil_samples"] > 0
+    assert veiled["grown"]["veil"] > veiled["samples"]["veil"]
+    assert {**veiled["grown"], "veil": 0} == {**veiled["samples"], "veil": 0}
+    assert veiled["seconds"] > 0 == plain["seconds"]
+    # Files of light have it in the frames of any pattern.
+    pattern = np.random.default_rng(3).random((N, N))
+    dim, bright = (frame_of(tmp_path / f"{name}.h5", pattern)[0] for name in ("plain", "veiled"))
+    assert np.linalg.norm(bright - 1.1 * dim) < 0.01 * np.linalg.norm(dim)
+    assert bright.sum() == pytest.approx(1.1 * dim.sum(), rel=5e-3)
+
+
+def test_rows_are_told_apart() -> None:
+    """By name and by stream: two passes of one stream would have the same noise. Grids that they name are there."""
+    direct = PASSES["direct"]
+    for twice, other in (("name", replace(direct, stream="own")), ("stream", replace(direct, name="own"))):
+        with pytest.raises(ValueError, match=f"two passes have the {twice} 'direct'"):
+            table_of(*PASSES.values(), other)
+    grids = {grid for row in PASSES.values() for grid in row.grids}
+    assert grids == set(GRIDS)
+    counted = {row.anchors for row in PASSES.values() if row.anchors}
+    assert all(getattr(Settings(400.0), name) == 1 for name in counted)

@@ -1,16 +1,19 @@
 """With every effect off a simulation is the plain geometric model; each effect changes its own part and no other."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
-from mitsim.light.passes import Simulation, expected_of
-from mitsim.light.settings import Settings
+from mitsim.light.passes import LightEstimate, Simulation, emission, expected_of
+from mitsim.light.settings import Settings, SharpPixels
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.transport.records import AMBIENT, PathSamples
@@ -131,17 +134,6 @@ def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
     assert light["indirect"].sum() == pytest.approx(kinds[2], rel=0.02) and not light["anchor_residual"].nnz
 
 
-def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
-    """Weighed by the mean anchor weights, what is accumulated for single anchors adds up to nothing."""
-    made = simulation(bench, anchors=2)
-    seen = made.anchored.trace(2, 0, 4)
-    light = made.accumulate("anchor_residual", seen, np.zeros(N * N, dtype=np.int64), 4)["anchor_residual"]
-    rows, columns = made.grids["anchor_residual"].bundle.cells
-    found = light[[0]].toarray().reshape(2, rows, 2, columns)
-    weights = [0.5, 0.5]  # linear interpolation, over the sensor
-    assert np.abs(np.einsum("a,b,aybx->yx", weights, weights, found)).max() < 1e-12 and np.abs(found).max() > 1e-12
-
-
 def test_followed_lights_mean_and_its_anchors_make_one_frame(bench: Bench) -> None:
     """With the same light at all anchors nothing is left beyond the mean; ambient light is seen from random points."""
     made = simulation(bench, "interreflection", "mirrors", "ambient", followed_anchors=2)
@@ -177,3 +169,167 @@ def test_flux_counts_each_pixels_direct_light(bench: Bench) -> None:
         and not made.flux(ambient, 2).any()
         and not made.flux(PathSamples.none(), 1).any()
     )
+
+
+# -------- Direct light that is accumulated on the device
+#
+# Direct light that is accumulated on the device: what the host accumulates of the same paths, place by place.
+
+BALL = """<shape type="sphere"><point name="center" x="10" y="5" z="330"/><float name="radius" value="20"/>
+    <bsdf type="roughconductor"><string name="material" value="none"/>
+    <float name="alpha" value="0.05"/></bsdf></shape>"""
+SAMPLES = 96
+SETTINGS = Settings(
+    depth=380.0,
+    anchors=3,
+    layers=(400.0, 350.0, 310.0),
+    coarse_layers=True,
+    subdivision=2,
+    # A window that holds most of the light of these pixels, and not all.
+    sharp=SharpPixels(tuple(range(50, 200, 7)), 3, (-0.03, 0.05, -0.03, 0.05)),
+    samples={"anchor_residual": SAMPLES, "sharp": 1000.0},
+)
+
+
+@pytest.fixture(scope="module")
+def ball(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    """A ball before the sheet, seen by a sensor of 6.4 mm."""
+    return open_bench(shared_scene("ball", n=N, pitch=0.1, extra=BALL), variant, for_render=True)
+
+
+def both(simulation: Simulation, name: str, labels: np.ndarray) -> tuple[LightEstimate, LightEstimate]:
+    """Light of a pass by the host and by the device."""
+    each = simulation.passes[name]
+    path_samples, accumulator = each.trace(3, 0, SAMPLES), simulation.accumulator(name, labels, 1)
+    assert accumulator is not None
+    rest = each.trace(3, 0, SAMPLES, accumulator)
+    assert not len(rest.value) and len(path_samples.value) > 1000
+    (sums,) = accumulator.fetch()
+    host, device = (simulation.accumulate(name, found, labels, SAMPLES) for found in (path_samples, sums))
+    return host, device
+
+
+@pytest.mark.parametrize("name", ["anchor_residual", "sharp"])
+def test_the_device_adds_up_what_the_host_does(ball: Bench, name: str) -> None:
+    """Light between layers and between cells is split, not drawn. (Planted: rows and columns of anchors exchanged; the
+    nearer layer's part for the farther; the first cell of two alone; what lies outside accumulated as the first
+    anchor's; pixels' rows for classes'.)"""
+    labels = np.random.default_rng(1).integers(0, 5, N * N)
+    host, device = both(Simulation(ball, SETTINGS), name, labels)
+    expected, found = (light[name].toarray() for light in (host, device))
+    assert found.shape == expected.shape and np.count_nonzero(expected) > 500
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-5 * np.abs(expected).max())
+    assert np.abs(found - expected).sum() < 2e-5 * np.abs(expected).sum()
+    if name == "sharp":
+        assert 0 < host.outside < 0.5 * host.received
+        assert (device.received, device.outside) == pytest.approx((host.received, host.outside), rel=1e-5)
+        np.testing.assert_allclose(device.flux, host.flux, rtol=1e-5, atol=1e-7 * host.flux.max())
+
+
+def test_few_paths_for_many_cells_are_left_to_the_host(ball: Bench) -> None:
+    """An accumulator would be mostly empty. (Planted: always an accumulator.)"""
+    labels = np.arange(N * N) % 49
+    names = "anchor_residual", "sharp"
+    few = Simulation(ball, replace(SETTINGS, samples=dict.fromkeys(names, 1.0)))
+    many = Simulation(ball, replace(SETTINGS, samples=dict.fromkeys(names, 1000.0)))
+    assert all(few.accumulator(name, labels, 1) is None for name in names)
+    assert all(many.accumulator(name, labels, 3) is not None for name in names)
+
+
+def test_the_middle_of_the_sharpest_lobe_is_light(ball: Bench, variant: str) -> None:
+    """Accumulators refuse what is no light; what the sharpest lobe of Mitsuba brings is, and what is dim is not rounded
+    away. (Planted: light compared to a board's own; `_LOBE` of 2^20.)"""
+    simulation = Simulation(ball, SETTINGS)
+    tracer = simulation.anchored
+    assert tracer is not None
+    lobe = mi.load_dict({"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": 1e-6})
+    square = dr.zeros(mi.SurfaceInteraction3f)
+    square.wi = mi.Vector3f(0, 0, 1)
+    brightest = math.pi * float(np.max(np.array(lobe.eval(mi.BSDFContext(), square, mi.Vector3f(0, 0, 1)))))
+    assert brightest > 2e7
+    board = tracer.setup.board
+    accumulator = simulation.accumulator("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
+    for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
+        accumulator.add([mi.Float(light)], mi.UInt32(0), mi.UInt32(place))
+    accumulated, *_ = accumulator.fetch()[0].light()
+    np.testing.assert_allclose(accumulated.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)
+
+
+# -------- Glare
+#
+# Glare: a traced chessboard has its projector's ANSI contrast, and scattered rays carry what pixels lack.
+
+FIELD, GROUPS, RAYS = 4, 8, 256
+CONTRAST = 20.0
+PROJECTOR = f"""
+name = "a projector of little contrast"
+effective_wavelength_nm = 562.0
+contrast_ratio = 100.0
+ansi_contrast = {CONTRAST}
+"""
+WHITE = np.add.outer(np.arange(N) // FIELD, np.arange(N) // FIELD) % 2 == 1
+
+
+@pytest.fixture
+def made(small_scene: Callable[..., Path], tmp_path: Path) -> Simulation:
+    """Before a sheet that catches all glare within five standard deviations, and through a stop that shows it all."""
+    scene, sheet = small_scene(fov=110), '<scale x="64" y="64"/>'
+    scene.write_text(scene.read_text().replace(sheet, '<scale x="600" y="600"/>'))
+    projector = tmp_path / "glare.toml"
+    projector.write_text(PROJECTOR)
+    effects = frozenset({"glare", "black-level"})
+    return Simulation(open_bench(scene, projector=projector), Settings(depth=400.0, effects=effects))
+
+
+def traced(made: Simulation, name: str, labels: np.ndarray, seed: int) -> np.ndarray:
+    """(classes, rows, columns) light of a pass in the cells of the window."""
+    bundle = made.grids["fine"].bundle
+    light = made.accumulate(name, made.passes[name].tracer.trace(seed, 0, RAYS), labels, RAYS)["fine"].toarray()
+    rows, columns = bundle.cells
+    first = (rows - N) // 2
+    assert (rows, columns) == (N + 2 * first,) * 2, "the window is in the middle"
+    window = slice(first, first + N)
+    return light[:2].reshape(2, rows, columns)[:, window, window]
+
+
+def test_a_chessboard_has_the_ansi_contrast(made: Simulation) -> None:
+    """Each cell over its light in a white picture without glare, the four in the middle of each field.
+
+    Eight seeds of 256 rays a pixel. The mean of their contrasts must be within 4 of its standard errors (a false alarm
+    in 200, of Student's t with 7 degrees of freedom), which are below 1 %.
+    """
+    labels = WHITE.ravel().astype(np.int64)
+    shown = emission(made.physics, Lighting(labels, np.array([[0.0, 1.0]])))[0]
+    middle = np.isin(np.arange(N) % FIELD, (FIELD // 2 - 1, FIELD // 2))
+    chosen, contrasts = np.outer(middle, middle), []
+    for seed in range(GROUPS):
+        direct, glare = (traced(made, name, labels, seed) for name in ("direct", "glare"))
+        white = direct.sum(axis=0) / made.physics.projector.share
+        light = np.tensordot(shown, direct + glare, 1) / white
+        contrasts.append(light[chosen & WHITE].mean() / light[chosen & ~WHITE].mean())
+    error = np.std(contrasts, ddof=1) / np.sqrt(GROUPS)
+    assert error < 0.01 * CONTRAST and abs(np.mean(contrasts) - CONTRAST) < 4 * error
+
+
+def test_scattered_rays_carry_the_rest_about_their_pixels(made: Simulation) -> None:
+    """On a matt sheet that faces the sensor, a ray that is seen at the tan-angle t brings its flux / (1 + t^2)^2.
+
+    Thus every ray of a pass carries the same, none is lost, and both passes carry g and 1 - g. About its pixel a ray
+    lies as the Gaussian and the pixel are wide: 65 536 rays tell the mean to 0.4 % of that, the standard deviation to
+    0.3 %; four times as much is allowed (a false alarm in 4000).
+    """
+    g = made.bench.projector.glare
+    assert made.physics.projector.share == 1 - g and 0.05 < g < 0.2
+    carried = []
+    for name, deviation in (("direct", 0.0), ("glare", 0.25 * N)):
+        light = made.passes[name].tracer.trace(5, 0, RAYS)
+        flux = light.value * np.square(1 + np.square(light.row) + np.square(light.column))
+        assert len(flux) == N * N * RAYS and np.ptp(flux) < 1e-4 * flux.mean()
+        carried.append(flux.mean())
+        for place, own, (low, high) in zip(
+            (light.row, light.column), np.divmod(light.pixel, N), made.bench.windows, strict=True
+        ):
+            away = (place - low) / (high - low) * N - own - 0.5
+            wide = np.hypot(deviation, np.sqrt(1 / 12))
+            assert abs(away.mean()) < 0.016 * wide and away.std() == pytest.approx(wide, rel=0.012)
+    assert carried[1] / carried[0] == pytest.approx(g / (1 - g), rel=1e-5)

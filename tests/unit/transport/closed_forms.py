@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -9,7 +13,7 @@ import numpy as np
 
 
 def stock_projector(
-    n: int, scale: float, place: tuple[float, ...], turn: float = 0.0, canvas: np.ndarray | None = None
+    n: int, scale: float, place: tuple[float, ...], turn: float = 0.0, canvas: np.ndarray | None = None, **more: Any
 ) -> Any:
     """A projector with an n x 2n canvas, the window in its right half; fov_axis x has tan 0.3 on either side."""
     if canvas is None:
@@ -19,7 +23,7 @@ def stock_projector(
     picture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
     to_world = mi.ScalarAffineTransform4f().translate(list(place)).rotate([0, 1, 0], turn)
     light = {"type": "projector", "to_world": to_world, "fov_axis": "x", "fov": 33.398488, "scale": scale}
-    return mi.load_dict({**light, "irradiance": picture})
+    return mi.load_dict({**light, "irradiance": picture, **more})
 
 
 def seen(stop: float) -> float:
@@ -32,3 +36,12 @@ def seen(stop: float) -> float:
 def mean(values: np.ndarray) -> tuple[float, float]:
     """Mean of independent values and its standard error."""
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def in_child(module: str, folder: Path, *words: str) -> Any:
+    """What ``traced`` of a module returns in a child process, because a process keeps its variant."""
+    program = f"import json, sys; from {module} import traced; print(json.dumps(traced(*sys.argv[1:]), default=float))"
+    command, root = [sys.executable, "-c", program, str(folder), *words], Path(__file__).parents[3]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])

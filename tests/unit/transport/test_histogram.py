@@ -2,12 +2,23 @@
 
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.transport.records import AMBIENT, DIRECT, Bundle, CellAxis, CellGrid, PathSamples, Sightings, aligned_grid
+from mitsim.transport.records import (
+    AMBIENT,
+    DIRECT,
+    Bundle,
+    CellAxis,
+    CellGrid,
+    DeviceAccumulator,
+    PathSamples,
+    Sightings,
+    aligned_grid,
+)
 
 
 @settings(max_examples=60, deadline=None)
@@ -151,10 +162,6 @@ def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...]) -> None
 @pytest.mark.usefixtures("variant")
 def test_small_light_beside_great_light_is_counted() -> None:
     """4096 paths of 1 beside one of 2^24, where float32 has steps of 2: what is fetched and accumulated is exact."""
-    import mitsuba as mi
-
-    from mitsim.transport.records import DeviceAccumulator
-
     light = np.ones(4097, np.float32)
     light[0] = 2.0**24
     assert np.add.accumulate(light)[-1] == 2.0**24, "float32 loses all of it"

@@ -8,19 +8,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.transport.connect import SensorPoints
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.integrator import IndirectTracer, Paths
-from mitsim.transport.records import DIRECT, INDIRECT, Bundle, DeviceAccumulator, PathSamples, aligned_grid
+from mitsim.transport.records import (
+    AMBIENT,
+    DIRECT,
+    INDIRECT,
+    Bundle,
+    CellGrid,
+    DeviceAccumulator,
+    PathSamples,
+    aligned_grid,
+)
 from tests.unit.transport.closed_forms import mean, seen
-
-if TYPE_CHECKING:
-    import mitsuba as mi
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -33,8 +41,6 @@ class Alone(SensorPoints):
     index: int = 0
 
     def at(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
-        import drjit as dr
-
         assert self.of_several is not None
         # Opaque numbers, so that all anchors share one compiled kernel.
         down, right = (dr.opaque(type(row), place) for place in divmod(self.index, self.of_several.anchors))
@@ -84,8 +90,8 @@ def test_accumulators_hold_what_anchors_are_brought(
     rows for columns of anchors; launches that begin with the first path again.)"""
     points = SensorPoints(beside.geometry.half_width, 3)
     tracer, labels = anchored(beside, points), np.arange(N**2) % 5
-    reach = beside.geometry.reach(beside.geometry.scene_distance)
-    bundle = Bundle(aligned_grid(*beside.windows, 2 * N, 1, reach), 3, (400.0, 300.0))
+    windows = [(low / 2, high / 2) for low, high in beside.windows]  # some light lies outside
+    bundle = Bundle(aligned_grid(*windows, 2 * N, 1, 0.0), 3, (400.0, 300.0))
     whole, parts = (DeviceAccumulator(bundle, labels, tracer.board) for _ in range(2))
     caustics, host = tracer.trace(4, 0, 8, whole), tracer.trace(4, 0, 8)
     units = np.array(whole.sums)
@@ -96,7 +102,10 @@ def test_accumulators_hold_what_anchors_are_brought(
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name
     assert np.array_equal(caustics.value, host.value[host.kind == DIRECT]) and caustics.value.size
     expected = bundle.accumulate(host.where(host.kind == INDIRECT), labels)
-    found = whole.fetch()[0].light()[0]
+    found, received, outside = whole.fetch()[0].light()
+    indirect = host.where(host.kind == INDIRECT)
+    assert 0 < outside == pytest.approx(bundle.outside(indirect), rel=1e-5)
+    assert received == pytest.approx(indirect.value.sum(), rel=1e-6)
     # Which layer light is accumulated in is drawn: all layers together are the same.
     by_place = [np.asarray(light.toarray()).reshape(light.shape[0], 2, -1).sum(axis=1) for light in (expected, found)]
     near = np.isclose(*by_place, rtol=1e-5, atol=1e-7 * by_place[0].max())
@@ -186,3 +195,55 @@ def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Call
     r2 = np.square(places[:, :2] - at).sum(axis=1) + np.square(places[:, 2])
     expected = np.pi * 111000 * (0.3 / N) ** 2 * 0.5 / np.pi * 400**2 / r2**2
     assert found.value == pytest.approx(expected, rel=1e-4)
+
+
+# -------- Light followed from the camera
+#
+# Light followed from the camera: ambient light, against scenes in which it has a closed form.
+#
+# What it adds to the projector's light is in test_indirect.py and tests/physics/test_mirror.py.
+#
+# Gates on Monte Carlo means are seven standard errors of eight independent seeds: five sigma of the t distribution.
+
+SKY = '<emitter type="constant"><spectrum name="radiance" value="2"/></emitter>'
+
+
+@pytest.fixture(scope="module")
+def outdoors(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    """The sheet, |x|, |y| < 64 mm at 400 mm, under an even sky."""
+    return open_bench(shared_scene("outdoors", extra=SKY), variant)
+
+
+def grid(bench: Bench) -> CellGrid:
+    return aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
+
+
+def camera_tracer(bench: Bench, **followed: object) -> FromCameraTracer:
+    return FromCameraTracer(bench.setup, grid(bench), Paths(**followed))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interreflection", [False, True])
+def test_an_even_sky(outdoors: Bench, interreflection: bool) -> None:
+    """The sheet of albedo 0.5 shows half of the sky's radiance, and where the sheet ends is the sky itself.
+
+    With bounces a path finds the sky in two ways (by connecting and by running into it), which share the light.
+    """
+    stop, sheet = outdoors.geometry.tan_half_fov, 64 / 400
+    expected = 2 * seen(stop) - seen(sheet)
+    trace = camera_tracer(outdoors, interreflection=interreflection, emitters=outdoors.loaded.lamps)
+    found = [trace.trace(seed, 0, 128) for seed in range(SEEDS)]
+    assert all((one.kind == AMBIENT).all() and (one.pixel == N * N).all() for one in found)
+    total, error = mean(np.array([one.value.sum() / 128 for one in found]))
+    assert SIGMAS * error < 0.03 * expected
+    assert abs(total - expected) < SIGMAS * error
+    one = PathSamples.join(found)
+    on_sheet = (np.abs(one.row) < sheet) & (np.abs(one.column) < sheet)
+    assert one.value[on_sheet].sum() / (128 * SEEDS) == pytest.approx(seen(sheet), rel=0.02)
+    assert 1 / one.inverse_depth[on_sheet] == pytest.approx(np.full(on_sheet.sum(), 400.0), rel=1e-5)
+
+
+def test_light_that_the_projectors_side_finds_is_not_followed(hollow: Bench) -> None:
+    """Matt surfaces turn no light sharply: every path ends at the first."""
+    assert not camera_tracer(hollow, interreflection=True).trace(0, 0, 2).value.size
+    assert not camera_tracer(hollow).trace(0, 0, 2).value.size

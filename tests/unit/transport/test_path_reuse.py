@@ -16,7 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer
-from mitsim.transport.integrator import IndirectTracer, Paths
+from mitsim.transport.integrator import IndirectTracer, Paths, adaptive_counts, by_pixel, effect_of
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import INDIRECT, Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from tests.unit.transport.test_indirect import MATT, MIRROR, SHINY, SPHERE
@@ -168,29 +168,6 @@ def test_the_accumulator_holds_what_the_host_accumulates(
     np.testing.assert_allclose(*by_layer, rtol=0.03)
 
 
-@pytest.mark.parametrize("mirrors", [False, True])
-def test_the_accumulator_holds_paths_of_their_own_at_every_anchor(
-    shared_scene: Callable[..., Path], mirrors: bool
-) -> None:
-    """Place by place, all but caustics: those stay on the host."""
-    bench = opened(shared_scene(f"anchors {mirrors}", extra=SCENES["mirror wall"]))
-    points = SensorPoints(bench.geometry.half_width, anchors=3)
-    tracer = IndirectTracer(bench.setup, Paths(mirrors, True), points=points)
-    grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov / 3)
-    bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
-    accumulator = DeviceAccumulator(bundle, labels, tracer.board)
-    rest = tracer.trace(3, 0, 64, accumulator)
-    matrix, received, outside = accumulator.fetch()[0].light()
-    every = tracer.trace(3, 0, 64)
-    indirect = every.where(every.kind == INDIRECT)
-    assert (len(rest.value) > 0) == mirrors and len(rest.value) + len(indirect.value) == len(every.value)
-    assert 0 < outside == pytest.approx(bundle.outside(indirect), rel=1e-6)
-    assert received == pytest.approx(indirect.value.sum(), rel=1e-6)
-    expected = bundle.accumulate(indirect, labels).toarray()
-    assert (np.count_nonzero(expected.reshape(6, 3, -1, 3, grid.shape[1]), axis=(0, 2, 4)) > 0).all()
-    np.testing.assert_allclose(matrix.toarray(), expected, rtol=1e-4, atol=1e-7 * expected.max())
-
-
 def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path]) -> None:
     bench = open_bench(small_scene(extra=SPHERE.format(bsdf=MATT), sheet_z=3000))
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
@@ -204,3 +181,49 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
     tracer.trace(0, 0, 256, accumulator)
     with pytest.raises(MitsimError, match="NaN"):
         accumulator.fetch()[0].light()
+
+
+# -------- Blocks that are followed more often
+#
+# Blocks that are followed more often: the light stays, its noise moves; numbers from moments.
+
+ODD = 18
+BLOCKS = 5
+"""Blocks a side of 18 pixels: the last are of two pixels."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shared", [False, True])
+def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], shared: bool) -> None:
+    """Of each class of pixels, how much and from where, whatever the repeats; and less noise where there are more.
+
+    (Planted: light that is not divided by the repeats, and turns of a block that share a sample's numbers.)
+    """
+    bench = open_bench(shared_scene(f"repeated {shared}", extra=SCENES["matt walls"], n=ODD))
+    repeats = np.random.default_rng(2).choice([1, 2, 5], BLOCKS**2)
+    plain = tracers(bench)[shared]
+    again = plain.with_adaptive_counts(repeats.tolist())
+    paths_per_sample = repeats.sum() * 16 if shared else by_pixel(repeats.tolist(), ODD).sum()
+    assert again.paths_per_sample == paths_per_sample
+    runs = [[side.trace(seed, 0, 256) for seed in range(SEEDS)] for side in (plain, again)]
+    found = np.array([[summed(run, 256, ODD) for run in side] for side in runs])
+    means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
+    bound = SIGMAS * np.hypot(*errors)
+    assert (np.abs(means[0] - means[1]) <= bound).all() and bound[0].sum() < 0.2 * means[0, 0].sum()
+    each = [[np.bincount(run.pixel, run.value, ODD * ODD) for run in side] for side in runs]
+    variance = np.var(each, axis=1).reshape(2, -1)
+    for count in (1, 2, 5):
+        such = by_pixel(repeats.tolist(), ODD) == count
+        assert variance[1][such].sum() == pytest.approx(variance[0][such].sum() / count, rel=0.45), count
+
+
+def test_repeats_leave_less_variance_for_the_cost() -> None:
+    """Half of the blocks a hundred times as noisy: (1 + 10)^2 / (2 (1 + 100)) = 0.6 of variance times cost at best."""
+    moments = np.ones((16, 16))
+    moments[:, :8] = 100.0
+    repeats = adaptive_counts(moments)
+    variance, paths = effect_of(repeats, moments)
+    assert variance * paths < 0.72
+    assert repeats[:, :6].min() > 2 * repeats[:, 10:].max()
+    assert set(adaptive_counts(np.ones((8, 8))).ravel()) == set(adaptive_counts(np.zeros((8, 8))).ravel()) == {1}
+    assert effect_of(repeats, np.zeros((16, 16)))[0] == 1.0

@@ -6,10 +6,7 @@ eight independent seeds: five sigma of the t distribution.
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +19,7 @@ from mitsim.api.bench import open_bench
 from mitsim.core.colour_files import RUN
 from mitsim.transport.records import Bundle, DeviceAccumulator, PathSamples, aligned_grid
 from tests.conftest import write_small_scene
+from tests.unit.transport.closed_forms import in_child
 from tests.unit.transport.test_path_reuse import BENT, OBJECT, WALL, tracers
 
 N, SEEDS, SIGMAS, SAMPLES = 16, 8, 7.0, 256
@@ -70,7 +68,7 @@ def by_line(light: PathSamples) -> list[list[float]]:
     return (np.array(found) / SAMPLES).tolist()
 
 
-def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
+def traced(folder: str, *names: str) -> dict[str, Any]:
     """Light of some scenes by paths of their own and by shared ones; its process has a spectral variant for good."""
     place, found = Path(folder), dict[str, Any]()
     (place / "bent.obj").write_text(BENT)
@@ -108,19 +106,10 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def light(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
     """Light of a scene, traced with that of all others that are as quick."""
-    program = (
-        "import json, sys; from tests.unit.transport.test_path_reuse_by_line import traced; "
-        "print(json.dumps(traced(sys.argv[1], sys.argv[2:]), default=float))"
-    )
 
     @cache
     def trace(*names: str) -> dict[str, Any]:
-        command = [sys.executable, "-c", program, str(tmp_path_factory.mktemp("by_line")), *names]
-        root = Path(__file__).parents[3]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
-        assert done.returncode == 0, done.stderr
-        found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-        return found
+        return in_child("tests.unit.transport.test_path_reuse_by_line", tmp_path_factory.mktemp("by_line"), *names)
 
     def of(name: str) -> dict[str, Any]:
         found: dict[str, Any] = trace(*(each for each in SCENES if (each in QUICK) == (name in QUICK)))[name]

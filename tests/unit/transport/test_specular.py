@@ -9,6 +9,7 @@ from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.frames import specular_frames
 from mitsim.transport.connect import PinholeRays, ProjectorOptics, shines_in
 from mitsim.transport.specular import SpecularRays, trace_specular_chains
+from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE = 8, 111000.0
@@ -16,24 +17,10 @@ CONDUCTOR = {"type": "conductor"}
 
 
 def emitter(n: int = N, to_world: "mi.ScalarAffineTransform4f | None" = None) -> "mi.Emitter":
-    canvas = np.zeros((n + 3, 2 * n + 1, 1), np.float32)
-    canvas[1 : 1 + n, 2 : 2 + n] = np.linspace(0.5, 1, n)[:, None, None]
-    return mi.load_dict(
-        {
-            "type": "projector",
-            "to_world": mi.ScalarAffineTransform4f().translate([20, 0, 0]) if to_world is None else to_world,
-            "fov": 30,
-            "fov_axis": "x",
-            "scale": SCALE,
-            "irradiance": {
-                "type": "bitmap",
-                "bitmap": mi.Bitmap(canvas),
-                "raw": True,
-                "filter_type": "nearest",
-                "wrap_mode": "clamp",
-            },
-        }
-    )
+    canvas = np.zeros((n + 3, 2 * n + 1))
+    canvas[1 : 1 + n, 2 : 2 + n] = np.linspace(0.5, 1, n)[:, None]
+    place = {} if to_world is None else {"to_world": to_world}
+    return stock_projector(n, SCALE, (20, 0, 0), canvas=canvas, fov=30, **place)
 
 
 def projector(scene: "mi.Scene", n: int = N) -> ProjectorOptics:
@@ -100,50 +87,34 @@ COSINE = float(np.cos(np.arctan(10 / 400)))
 GLASS = fresnel(COSINE, 1.5)
 
 
+DIELECTRIC = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+HALF = {"type": "mitsim_mask", "opacity": 0.5, "bsdf": CONDUCTOR}
+BLEND = {"type": "mitsim_blendbsdf", "weight": 0.25}
+MIRROR = {"type": "twosided", "bsdf": CONDUCTOR}
+PARTS = {
+    "grey": ({"type": "conductor", "specular_reflectance": {"type": "uniform", "value": 0.3}}, 0.3),
+    "front": ({"type": "mitsim_twosided", "front": CONDUCTOR, "back": {"type": "diffuse"}}, 1.0),
+    "back": ({"type": "mitsim_twosided", "front": {"type": "diffuse"}, "back": CONDUCTOR}, 0.0),
+    "blend": ({**BLEND, "a": {"type": "diffuse"}, "b": CONDUCTOR}, 0.25),
+    "two mirrors": (
+        {**BLEND, "a": {"type": "twosided", "in": {**CONDUCTOR, "specular_reflectance": 0.4}}, "b": HALF},
+        0.75 * 0.4 + 0.25 * 0.5,
+    ),
+    "mask": ({"type": "mitsim_mask", "opacity": 0.25, "bsdf": MIRROR}, 0.25),
+    "whole mask": ({"type": "mitsim_mask", "opacity": 1.0, "bsdf": MIRROR}, 1.0),
+    "half glass": ({**HALF, "bsdf": DIELECTRIC}, GLASS / 2),
+    "plastic": ({**DIELECTRIC, "type": "plastic"}, GLASS),
+    "glass": (DIELECTRIC, GLASS),
+    "pane": ({**DIELECTRIC, "type": "thindielectric"}, 2 * GLASS / (1 + GLASS)),
+}
+
+
 @pytest.mark.parametrize(
-    ("bsdf", "part"),
-    [
-        ({"type": "conductor", "specular_reflectance": {"type": "uniform", "value": 0.3}}, 0.3),
-        ({"type": "mitsim_twosided", "front": CONDUCTOR, "back": {"type": "diffuse"}}, 1.0),
-        ({"type": "mitsim_twosided", "front": {"type": "diffuse"}, "back": CONDUCTOR}, 0.0),
-        ({"type": "mitsim_blendbsdf", "weight": 0.25, "a": {"type": "diffuse"}, "b": CONDUCTOR}, 0.25),
-        (
-            {
-                "type": "mitsim_blendbsdf",
-                "weight": 0.25,
-                "a": {"type": "twosided", "in": {**CONDUCTOR, "specular_reflectance": 0.4}},
-                "b": {"type": "mitsim_mask", "opacity": 0.5, "bsdf": CONDUCTOR},
-            },
-            0.75 * 0.4 + 0.25 * 0.5,
-        ),
-        ({"type": "mitsim_mask", "opacity": 0.25, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 0.25),
-        ({"type": "mitsim_mask", "opacity": 1.0, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 1.0),
-        pytest.param(
-            {"type": "mitsim_mask", "opacity": 0.5, "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}},
-            GLASS / 2,
-            marks=pytest.mark.slow,
-        ),
-        ({"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
-        ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
-        ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, 2 * GLASS / (1 + GLASS)),
-    ],
-    ids=[
-        "grey",
-        "front",
-        "back",
-        "blend",
-        "two mirrors",
-        "mask",
-        "whole mask",
-        "half glass",
-        "plastic",
-        "glass",
-        "pane",
-    ],
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "half glass" else ()) for name in PARTS]
 )
-def test_each_material_sends_on_its_part(bsdf: dict, part: float) -> None:
+def test_each_material_sends_on_its_part(name: str) -> None:
     """Choices between materials are those that :mod:`mitsim.scene.load` puts in place of Mitsuba's."""
-    full = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
+    full, (bsdf, part) = flux(scene_with(sheet=plane(0, 400, CONDUCTOR))), PARTS[name]
     assert full > 0
     # The reflectance of glass changes by less than 1e-4 over the window's small part that meets the sensor.
     assert flux(scene_with(sheet=plane(0, 400, bsdf))) == pytest.approx(part * full, rel=1e-3)
@@ -225,16 +196,3 @@ def test_a_painted_mirror_is_divided_where_its_paint_ends(variant: str) -> None:
     ).irradiance
     rows = np.sort(frame[0].mean(axis=1))
     assert rows[30] == pytest.approx(rows[0], rel=1e-2) and rows[33] == pytest.approx(9 * rows[0], rel=1e-2)
-
-
-ONE_VARIANT = """
-import runpy, sys
-import numpy as np
-from mitsim.core.environment import load_variant
-mi = load_variant(sys.argv[1])
-from mitsim.transport import plugins
-plugins.register()
-tests = runpy.run_path(sys.argv[2])
-half = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
-print(tests["flux"](tests["scene_with"](sheet=tests["plane"](0, 400, half))))
-"""

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -70,9 +72,6 @@ def test_every_material_gives_forward_what_it_gives_backward(small_scene: Callab
 
     A material that is not reciprocal and not in DIRECTED shows. (Planted: hair left out of DIRECTED, 1.0 off.)
     """
-    import drjit as dr
-    import mitsuba as mi
-
     assert {*EXAMPLES, *PLAIN} == set(PLUGINS["bsdf"]), "a BSDF without an example"
     given = [(name, text) for name, texts in EXAMPLES.items() for text in texts]
     given += [(name, f'<bsdf type="{name}"/>') for name in PLAIN]
@@ -119,9 +118,6 @@ def test_a_choice_samples_each_part_by_its_share(variant: str, bsdf: dict, glass
 
     (Mitsuba's blend of half a mirror: 0.8 of it.)
     """
-    import drjit as dr
-    import mitsuba as mi
-
     count, cosine = 2**18, 0.8
     material, rng = mi.load_dict(bsdf), mi.PCG32(count)
     si = dr.zeros(mi.SurfaceInteraction3f, count)
