@@ -565,7 +565,7 @@ SIZES = {
     "sensor": (4, 1156),
     "sessions": (3, 804),
     "studies": (22, 5091),
-    "transport": (15, 4081),
+    "transport": (15, 4056),
     "verbs": (1, 348),
     "version": (1, 1),
 }
