@@ -67,7 +67,8 @@ def _table(results: Results) -> Sequence[Part]:
     columns = {MEASURES[name][0]: f"{name.replace('_', '-')} {MEASURES[name][1].rpartition(' ')[2]}"
                for name in results.scope.measures}  # fmt: skip
     names = {(knob, each): str(each) for knob in _knobs(results) for each in distinct(results.frame, knob)}
-    return Pivot(_knobs(results), columns=columns, title="Measures by setting", names=names).parts_of(results)
+    table = Pivot(_knobs(results), columns=columns, title="Measures by setting", names=names)
+    return [*table.draw(results).values()]
 
 
 STUDY = Study(

@@ -246,9 +246,7 @@ class _Place:
         return replace(path_samples, row=row, column=column)
 
     def whole(self, path_samples: PathSamples, side: int, straight: bool) -> PathSamples:
-        """Return the light of each projector pixel from ``side`` x ``side`` even points; ``straight`` omits the
-        keystone.
-        """
+        """Return light at ``side`` x ``side`` even points of each projector pixel; ``straight`` omits keystone."""
         n = self._n
         part = (np.arange(n * side) + 0.5) / side
         lines = [first + (last - first) * part / n for first, last in self._windows]

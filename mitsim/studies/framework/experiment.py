@@ -311,7 +311,8 @@ class Study:
         return {file: figure for figures in drawn for file, figure in figures.items()}
 
     def parts(self, results: Results) -> list[Any]:
-        return [part for each in self.tables for part in (each(results) if callable(each) else each.parts_of(results))]
+        parts = (each(results) if callable(each) else each.draw(results).values() for each in self.tables)
+        return [part for own in parts for part in own]
 
 
 def group_by_setup(points: Sequence[Point]) -> list[Point]:

@@ -74,10 +74,11 @@ class Panel:
     names: Names = field(default_factory=dict)
     errors: Mapping[str, str] = field(default_factory=dict)
 
-    def draw(self, results: Results) -> dict[str, Figure]:
+    def draw(self, results: Results) -> dict[str, Any]:
+        """Return the figures, or the tables of a page, by file name."""
         rows = choose_rows(results.frame, self.where)
         measure = str(getattr(self, "y", getattr(self, "x", ""))).removesuffix("_db") or "images"
-        drawn: dict[str, Figure | None] = {}
+        drawn: dict[str, Any] = {}
         for value in distinct(rows, self.each) if self.each else [""]:
             shown = f"exposure {value}" if self.each == "exposure" else self.name(self.each, value)
             one = replace(self, title=", ".join(filter(None, (self.title, shown))))
@@ -86,7 +87,7 @@ class Panel:
             drawn[f"{name}.png"] = one.figure(results, own)
         return {name: figure for name, figure in drawn.items() if figure is not None}
 
-    def figure(self, results: Results, rows: DataFrame) -> Figure | None:
+    def figure(self, results: Results, rows: DataFrame) -> Any:
         raise NotImplementedError
 
     def name(self, column: str, value: Any) -> str:
@@ -221,23 +222,18 @@ class Pivot(Panel):
     columns: Columns
     value: str = "psnr_db"
 
-    def parts_of(self, results: Results) -> list[Part]:
-        chosen, found = choose_rows(results.frame, self.where), list[Part]()
+    def figure(self, results: Results, rows: DataFrame) -> Part | None:
         shown = {name: column for column, name in self.columns.items()} if isinstance(self.columns, Mapping) else {}
 
         def text(mean: Mean, head: str) -> str:
             return with_unit(mean, "dB" if shown.get(head, self.value).endswith("_db") else "").removesuffix(" dB")
 
-        for value in distinct(chosen, self.each) if self.each else [None]:
-            own = choose_rows(chosen, {} if value is None else {self.each: value})
-            heads = list(self.parts(own, self.columns))
-            lines = tuple(
-                (name, *(text(cells[head], head) if head in cells else DASH for head in heads))
-                for name, cells in self.cells(own, self.rows, self.columns, self.value).items()
-            )
-            title = ", ".join(filter(None, (self.title, "" if value is None else self.name(self.each, value))))
-            found += [Part(title, "", ("", *heads), lines)] if lines else []
-        return found
+        heads = list(self.parts(rows, self.columns))
+        lines = tuple(
+            (name, *(text(cells[head], head) if head in cells else DASH for head in heads))
+            for name, cells in self.cells(rows, self.rows, self.columns, self.value).items()
+        )
+        return Part(self.title, "", ("", *heads), lines) if lines else None
 
 
 _MOST_SHOWN = 6
