@@ -564,7 +564,7 @@ SIZES = {
     "scene": (5, 1363),
     "sensor": (4, 1156),
     "sessions": (3, 804),
-    "studies": (22, 5091),
+    "studies": (22, 5088),
     "transport": (15, 4056),
     "verbs": (1, 348),
     "version": (1, 1),
