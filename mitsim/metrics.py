@@ -141,9 +141,7 @@ def _rescaling(shots: Capture, board_reflectance: float | None) -> float:
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     a, b = (_real(values, name) for values, name in ((image, "image"), (truth, "truth")))
     if a.ndim != 2 or a.shape != b.shape:
-        raise MitsimError(
-            f"image quality: image is {_size(a)}, truth {_size(b)}; both must have the same rows x columns"
-        )
+        raise MitsimError(f"image quality: image is {_size(a)}, truth {_size(b)}; both must have the same shape")
     for name, values in (("image", a), ("truth", b)):
         bad = int(np.count_nonzero(~np.isfinite(values)))
         if bad:

@@ -535,9 +535,7 @@ def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> Floa
         problem = f"{size[0]} x {size[1]} pixels, reduce {reduce}; it needs more than {2 * _BORDER} pixels a side"
         raise _PICTURE.refusal(path, f"{problem}, and reduce from 1 to its shorter side")
     if most is not None and max(rows, columns) > most:
-        raise _PICTURE.refusal(
-            path, f"{rows} x {columns} pixels; at most {most} a side make a mask, so set a larger psf_reduce"
-        )
+        raise _PICTURE.refusal(path, f"{rows} x {columns} pixels; a mask has at most {most} a side, set psf_reduce")
     Cost(memory_bytes=size[0] * size[1] * _PIXEL_BYTES).check(f"point spread function {path}", Limits())
     values = np.asarray(read_image(path, _PICTURE), dtype=np.float64)
     values = values if values.ndim == 2 else values[..., :3].mean(axis=2)

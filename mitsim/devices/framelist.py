@@ -473,9 +473,7 @@ def load_known(path: Path | str) -> KnownCaptures:
         folder = found.run(capture)
         lines = open_lines(folder, RUN, MOSAIC)
         if lines.filters:
-            raise MitsimError(
-                f"{folder}: is behind colour filters, all in one frame; import its planes, or calibrate --colour mosaic"
-            )
+            raise MitsimError(f"{folder}: is behind colour filters; import its planes, or calibrate --colour mosaic")
         manifests = {name: read_manifest(part, RunManifest) for name, part in lines.parts.items()}
         check_plain(found.picture(capture), "picture")
         if number == 0:

@@ -61,27 +61,16 @@ class Lines:
         alone = [(nm, tuple(share * (at == place) for at in range(size))) for place, (nm, share) in enumerate(pairs)]
         return tuple(Lines((nm,) * size, shares) for nm, shares in alone)
 
-    @property
-    def mean_nm(self) -> float:
-        """Return the wavelength that carries as many photons per watt [nm], to a picometre."""
-        if not self.several:
-            return self.wavelengths_nm[0]
-        return round(float(np.average(self.wavelengths_nm, weights=self.shares)), 3)
-
-    @property
-    def shining(self) -> Lines:
-        power: dict[float, float] = {}
+    def bands(self, count: int) -> tuple[Lines, ...]:
+        """Return the ``count`` bands that leave the least power off their mean; MitsimError for too many."""
+        lit: dict[float, float] = {}
         for wavelength, share in sorted(zip(self.wavelengths_nm, self.shares, strict=True)):
             if share > 0:
-                power[wavelength] = power.get(wavelength, 0.0) + share
-        return Lines(tuple(power), tuple(power.values()))
-
-    def bands(self, count: int) -> tuple[Lines, ...]:
-        lines = self.shining
-        size = len(lines.shares)
+                lit[wavelength] = lit.get(wavelength, 0.0) + share
+        size = len(lit)
         if not 1 <= count <= size:
             raise MitsimError(f"{count} bands of {size} lines of light: give 1 to {size}")
-        shares, waves = np.array(lines.shares), np.array(lines.wavelengths_nm)
+        shares, waves = np.array([*lit.values()]), np.array([*lit])
         power, first, second = (np.append(0, np.cumsum(shares * waves**k)) for k in range(3))
         start, end = np.meshgrid(np.arange(size + 1), np.arange(size + 1), indexing="ij")
         own, mean, square = (part[end] - part[start] for part in (power, first, second))
@@ -95,7 +84,7 @@ class Lines:
         for cut in reversed(cuts):
             edges.insert(0, int(cut[edges[0]]))
         edges.insert(0, 0)
-        return tuple(Lines(lines.wavelengths_nm[a:b], lines.shares[a:b]) for a, b in pairwise(edges))
+        return tuple(Lines((*lit,)[a:b], (*lit.values(),)[a:b]) for a, b in pairwise(edges))
 
 
 # -------- A projector
@@ -270,8 +259,12 @@ class ProjectorModel(Configuration):
         return lines
 
     def in_bands(self, count: int) -> ProjectorModel:
-        bands = self.lines.bands(count)
-        waves, shares = tuple(band.mean_nm for band in bands), tuple(sum(band.shares) for band in bands)
+        found = []
+        for band in self.lines.bands(count):
+            # The mean carries as many photons per watt as the band, to a picometre.
+            mean = round(float(np.average(band.wavelengths_nm, weights=band.shares)), 3)
+            found.append((mean if band.several else band.wavelengths_nm[0], sum(band.shares)))
+        waves, shares = zip(*found, strict=True)
         return self.model_copy(update={"wavelengths_nm": waves, "radiant_shares": shares})
 
     @property

@@ -171,9 +171,8 @@ class SensorModel(Configuration, defer_build=True):
             if bool(getattr(self, one)) != bool(getattr(self, other)):
                 raise ValueError(f"{one} and {other} go together; give both, or none")
         if self.rows is not None and self.columns is not None and min(self.rows, self.columns) < self.binning:
-            raise ValueError(
-                f"rows {self.rows} and columns {self.columns} hold no superpixel of binning {self.binning}; bin less"
-            )
+            raise ValueError(f"rows {self.rows} or columns {self.columns} are below binning {self.binning}; bin less")
+
         if self.temperature_c is not None and None in (self.dark_current_temperature_c, self.dark_doubling_c):
             needed = "dark_current_temperature_c and dark_doubling_c; give both, or leave it out"
             raise ValueError(f"temperature_c {self.temperature_c:g} moves the dark current only with {needed}")
@@ -182,9 +181,7 @@ class SensorModel(Configuration, defer_build=True):
         if self.line_time_us is not None and self.shutter == "global":
             raise ValueError(f"line_time_us {self.line_time_us:g} is of a rolling shutter; set shutter 'rolling'")
         if self.binned_full_well_e is not None and not self.binning_on_chip:
-            raise ValueError(
-                f"binned_full_well_e {self.binned_full_well_e:g} is of charge summed on chip; set binning_on_chip"
-            )
+            raise ValueError("binned_full_well_e is of charge summed on chip; set binning_on_chip, or leave it out")
         if self.linearity and not math.isfinite(self.full_well_e):
             raise ValueError("linearity is relative to the full well; give a finite full_well_e")
         for part in (level / _LEVELS for level in range(_LEVELS + 1)):

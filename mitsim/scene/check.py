@@ -237,9 +237,7 @@ def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
     for bumps in (child for *_, child in links if plugin(child) in BUMPS):
         for inner in (each for each in nodes_below(nodes, bumps) if plugin(each) in materials):
             if plugin(inner) in STRAIGHT:
-                why = (
-                    f"inside of a {plugin(bumps)} Mitsuba takes it for opaque wherever it connects a surface to a light"
-                )
+                why = f"inside of a {plugin(bumps)} Mitsuba takes it for opaque where it connects a surface to a light"
                 remedy = "turn them round: the mask, or other material that light passes, outermost"
                 rule = f"{why}, so that is missing; {remedy}"
             elif plugin(bumps) == "bumpmap" and (
@@ -260,9 +258,8 @@ def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
             lost.append(None)
             continue
         place = outline.tag(mirror[0])
-        brought = (
-            f"that {place.path.name}:{place.line} ({plugin(mirror[2])}) brings to other surfaces, so that is missing"
-        )
+        mirrors = f"{place.path.name}:{place.line} ({plugin(mirror[2])})"
+        brought = f"that {mirrors} brings to other surfaces, so that is missing"
         remedy = "use a light that has a surface (area; mitsim_projector for the reference)"
         rule = f"{estimator} finds no light of it {brought}; {remedy}"
         lost.append(str(outline.tag(light).refusal("light", repr(plugin(light)), rule)))

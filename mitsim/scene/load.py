@@ -429,9 +429,7 @@ def check_thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) ->
         radius = float(np.linalg.svd(local[:3, :3], compute_uv=False)[0]) * float(props.get("radius", 1.0))
         distance = max(float(np.linalg.norm(a - b)) for a in ends for b in eyes + (places if lamp else []))
         if distance > most * radius:
-            rule = (
-                f"single precision holds {distance / most:.2g} mm there; take a larger radius, or a mesh of its shape"
-            )
+            rule = f"single precision holds {distance / most:.2g} mm there; take a larger radius, or a mesh"
             tag = outline.tag(mi.parser.SceneNode(nodes[index]), "radius")
             raise tag.refusal("radius", f"{radius:g} mm at a distance of {distance:.4g} mm", rule)
 

@@ -281,9 +281,8 @@ class _Problem:
             steps, here = np.maximum(np.abs(x) * _STEPS[free], _LEAST_STEPS[free]), rest(x)
             return np.stack([(rest(x + step) - here) / step.sum() for step in np.diag(steps)], axis=1)
 
-        solved = scipy.optimize.least_squares(
-            rest, values[free], slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=35
-        )
+        limits = {"x_scale": "jac", "xtol": 1e-10, "ftol": 1e-10, "max_nfev": 35}
+        solved = scipy.optimize.least_squares(rest, values[free], slopes, **limits)
         values[free] = solved.x
         # Dark readings are known to half a code, and pixels are alike to half a code, even if few codes hide it.
         span, code = float(np.ptp(self.time[~lit])), max(0.5, abs(values[1]))
@@ -491,9 +490,7 @@ class Pixels:
         mean, error = transfer["dark"], transfer.error("dark")
         names = "dark_current_e_per_s", "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s"
         if self.excess is None:
-            self.notes.append(
-                "dark current is not told by dark frames of one exposure, and taken as 0; take two or more"
-            )
+            self.notes.append("dark current is not told by dark frames of one exposure, and taken as 0; take two")
             return dict.fromkeys(names, (0.0, 0.0))
         gain, both = transfer["gain"], (self.taken[self.long], self.taken[self.least])
         unit, count, (m, n) = gain * (both[0].exposure_s - both[1].exposure_s), self.size, self.shape

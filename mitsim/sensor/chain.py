@@ -27,6 +27,8 @@ from mitsim.core.job import compiled_kernels
 from mitsim.devices.sensor import SensorModel
 
 Digital = FloatArray | npt.NDArray[np.uint32]
+Moments = tuple[FloatArray, FloatArray]
+"""Mean and variance."""
 _NUMBERS = (
     "superpixel_full_well_e", "linearity", "superpixel_read_noise_e", "gain_dn_per_e", "superpixel_black_level_dn",
     "largest_dn",
@@ -146,9 +148,8 @@ def specimen(model: SensorModel, shape: tuple[int, int]) -> Specimen:
     if spread or hot is not None:
         current = np.full(shape, mean * model.binning**2)
         if spread:  # a gamma law, which is never negative and whose sums over binned pixels are gamma, too
-            drawn = stream(model.pattern_seed, "dark current").standard_gamma(
-                (mean * model.binning / spread) ** 2, shape
-            )
+            shape_of_law = (mean * model.binning / spread) ** 2
+            drawn = stream(model.pattern_seed, "dark current").standard_gamma(shape_of_law, shape)
             current = (spread**2 / mean) * drawn
         if hot is not None:
             current += model.hot_dark_current_e_per_s * hot
@@ -407,7 +408,7 @@ _STEP, _FINEST = 1 / 8, 1 / 64
 """Distance of interpolated offsets, in deviations of the noise of reading, and the least distance [DN]."""
 
 
-def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatArray, FloatArray]:
+def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> Moments:
     """Return mean and variance of min(N, F) for Poisson N with mean ``expected`` (any shape) and full well F.
 
     With k P(N=k) = mu P(N=k-1), K = ceil(F), Q = P(N >= K), d = mu - F and e = mu P(N = K-1), the loss L = (N - F)^+
@@ -434,7 +435,7 @@ def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatA
     return clipped, variance
 
 
-def _tails(count: int, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _tails(count: int, mean: FloatArray) -> Moments:
     """Return P(N >= count) and P(N < count) for Poisson N, as two tails, so that 1e-20 keeps its digits.
 
     Large counts use Temme's uniform expansion (DLMF 8.12.8, one term), because scipy's sums stop early.
@@ -465,9 +466,7 @@ def _poisson(count: int, mean: FloatArray) -> FloatArray:
         return np.asarray(np.exp(-remainder - count * (apart - np.log1p(apart))) / math.sqrt(2 * math.pi * count))
 
 
-def frame_moments(
-    expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
-) -> tuple[FloatArray, FloatArray]:
+def frame_moments(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> Moments:
     """Return mean (DN) and variance (DN^2) of the output of `expose` for one specimen (EMVA 1288 4.0, photon transfer).
 
     Fixed patterns move means. The variance includes row noise, which is the covariance of two pixels of a row. Near an
@@ -486,7 +485,7 @@ def frame_moments(
     return mean, variance
 
 
-def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel) -> Moments:
     level, spread = bent_moments(expected, model)
     mean = np.asarray(amplify(level if offset is None else level + offset, model))
     noise = np.asarray(_linear_variance(spread, model))
@@ -501,9 +500,7 @@ def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel
     return mean, noise
 
 
-def _cut_by_offset(
-    expected: FloatArray, offset: FloatArray | float, model: SensorModel
-) -> tuple[FloatArray, FloatArray]:
+def _cut_by_offset(expected: FloatArray, offset: FloatArray | float, model: SensorModel) -> Moments:
     """Interpolate moments between black levels, because an offset acts as another black level."""
     if not np.ptp(offset):
         return _cut(expected, _with_offset(model, float(np.mean(offset))))
@@ -527,7 +524,7 @@ def _with_offset(model: SensorModel, offset: float) -> SensorModel:
     return model.model_copy(update={"black_level_dn": black})
 
 
-def bent_moments(expected: npt.ArrayLike, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def bent_moments(expected: npt.ArrayLike, model: SensorModel) -> Moments:
     """Return mean and variance [electrons] of `chain.bend` of unclipped Poisson counts with mean ``expected``.
 
     With g the polynomial of the model, a_j = g^(j)(mu) / j! and m_j the central moments of the Poisson law,
@@ -559,9 +556,8 @@ def mean_variance(expected_electrons: npt.ArrayLike, exposure_s: float, model: S
     if model.has_fixed_pattern or model.linearity or model.crosstalk:
         return float(frame_moments(expected_electrons, exposure_s, model)[1].mean())
     light = checked_light(expected_electrons, "expected_electrons")
-    low, high, mean = (
-        float(add_dark_current(value, exposure_s, model)) for value in (light.min(), light.max(), light.mean())
-    )
+    extremes = light.min(), light.max(), light.mean()
+    low, high, mean = (float(add_dark_current(value, exposure_s, model)) for value in extremes)
     first, last = _linear(model)
     if first <= low and high <= last:
         return float(_linear_variance(np.float64(mean), model))
@@ -596,7 +592,7 @@ def _linear(model: SensorModel) -> tuple[float, float]:
     return max(first, 0.0), last
 
 
-def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _cut(expected: FloatArray, model: SensorModel) -> Moments:
     clipped, variance = clipped_moments(expected, model.superpixel_full_well_e)
     read, gain = model.superpixel_reading_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
     mean, noise = np.asarray(amplify(clipped, model)), np.asarray(variance * gain**2 + read**2)
@@ -615,9 +611,7 @@ def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArr
     return _sum_counts(expected, hard & ~gone, (mean, total), model)
 
 
-def _sum_counts(
-    expected: FloatArray, hard: npt.NDArray[np.bool_], moments: tuple[FloatArray, FloatArray], model: SensorModel
-) -> tuple[FloatArray, FloatArray]:
+def _sum_counts(expected: FloatArray, hard: npt.NDArray[np.bool_], moments: Moments, model: SensorModel) -> Moments:
     """Replace the moments of hard pixels by sums over counts, or by quadrature if there are many."""
     mean, total = moments
     for part, found in ((hard & (expected < _SOME), _sum_about_mean), (hard & (expected >= _SOME), _average_counts)):
@@ -626,7 +620,7 @@ def _sum_counts(
     return mean, total
 
 
-def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _sum_about_mean(expected: FloatArray, model: SensorModel) -> Moments:
     nodes = _grid(expected)
     reach = 12 * np.sqrt(nodes) + 20
     first, last = np.floor(nodes - reach).clip(0).astype(np.intp), np.ceil(nodes + reach).astype(np.intp)
@@ -644,7 +638,7 @@ def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
     return _between(expected, nodes, mean, variance)
 
 
-def _average_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _average_counts(expected: FloatArray, model: SensorModel) -> Moments:
     nodes = _grid(expected)
     deviates = np.linspace(-8, 8, 129)
     weights = np.exp(-np.square(deviates) / 2)
@@ -670,16 +664,14 @@ def _grid(expected: FloatArray) -> FloatArray:
     return expected if count >= expected.size else np.square(np.linspace(roots.min(), roots.max() + 1e-6, count))
 
 
-def _between(
-    expected: FloatArray, nodes: FloatArray, mean: FloatArray, variance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _between(expected: FloatArray, nodes: FloatArray, mean: FloatArray, variance: FloatArray) -> Moments:
     if nodes is expected:
         return mean, variance
     curves = scipy.interpolate.CubicSpline(np.sqrt(nodes), np.stack([mean, variance], axis=1))(np.sqrt(expected))
     return curves[:, 0], np.maximum(curves[:, 1], 0.0)
 
 
-def _read_moments(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _read_moments(electrons: FloatArray, model: SensorModel) -> Moments:
     signal = amplify(bend(clip_at_full_well(electrons, model), model), model)
     read = np.full(signal.shape, model.superpixel_reading_noise_e * model.gain_dn_per_e)
     if model.largest_dn is None:
@@ -687,7 +679,7 @@ def _read_moments(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray
     return _round_moments(signal, read, model.largest_dn)
 
 
-def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
+def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> Moments:
     first, second = np.empty_like(mean), np.empty_like(mean)
     wide = deviation >= _SMOOTH
     for part, moments in ((wide, _cut_moments), (~wide, _code_moments)):
@@ -696,7 +688,7 @@ def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tup
     return first, second
 
 
-def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
+def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> Moments:
     """Return moments of a rounded normal signal for deviations of at least 2 DN.
 
     The sum over codes is the midpoint rule for a closed-form integral, with Euler and Maclaurin's first term.
@@ -715,7 +707,7 @@ def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple
     return mean + first, np.maximum(second - first**2, 0.0)
 
 
-def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
+def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> Moments:
     """Return moments of a rounded normal signal for deviations below 2 DN, code by code."""
     nearest = np.clip(np.rint(mean), 0, largest)
     if not deviation.any():

@@ -272,9 +272,8 @@ def _linearity(photons: FloatArray, signal: FloatArray, used: npt.NDArray[np.boo
     """
     weight = used / np.square(np.where(used, signal, 1.0))
     first = weight * photons
-    total, second, value, cross = (
-        part.sum(axis=-1) for part in (weight, weight * photons**2, weight * signal, first * signal)
-    )
+    parts = weight, weight * photons**2, weight * signal, first * signal
+    total, second, value, cross = (part.sum(axis=-1) for part in parts)
     first = first.sum(axis=-1)
     slope = (total * cross - first * value) / (total * second - first**2)
     line = ((value - slope * first) / total)[..., None] + slope[..., None] * photons

@@ -153,9 +153,7 @@ BY_FACES = MOVED + '<boolean name="face_normals" value="true"/>'
 
 @pytest.mark.parametrize(("name", "degrees"), [("lamp.obj", 30), ("lamp.ply", 60)])
 @pytest.mark.parametrize("merged", [False, True])
-def test_emitting_faces(
-    small_scene: Callable[..., Path], variant: str, name: str, degrees: float, merged: bool
-) -> None:
+def test_lit_faces(small_scene: Callable[..., Path], variant: str, name: str, degrees: float, merged: bool) -> None:
     """L A cos / r^2 at a point 30 mm off the axis: by vertex normals, which are refused, Mitsuba's samples gave 0.85
     and 0.47 of it at 30 and 60 degrees."""
     import drjit as dr

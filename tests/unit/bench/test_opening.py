@@ -99,9 +99,7 @@ def test_devices_are_camera_and_projector(tmp_path: Path) -> None:
         ((0.011731, 0.011709), None),
     ],
 )
-def test_pitches_are_the_scenes(
-    loader: Loader, scene: Path, pitches: tuple[float, float], reported: str | None
-) -> None:
+def test_pitches_are_a_scenes(loader: Loader, scene: Path, pitches: tuple[float, float], reported: str | None) -> None:
     """Along columns and down the rows. (Planted: one for the other; a shorter pitch let pass.)"""
     loader.pitches = pitches
     if reported is None:
@@ -131,9 +129,8 @@ def test_a_camera_blind_to_the_projector_is_refused(loader: Loader, scene: Path,
     assert not loader.asked
     open_bench(scene, camera=plain, for_render=True)
     filters = camera(quantum_efficiency="", mosaic='"RGGB"', binning="1")
-    curves = "".join(
-        f"\n[mosaic_curves.{name}]\nwavelengths_nm = [400.0, 700.0]\nefficiency = [0.5, 0.5]\n" for name in "RGB"
-    )
+    table = "\n[mosaic_curves.{}]\nwavelengths_nm = [400.0, 700.0]\nefficiency = [0.5, 0.5]\n"
+    curves = "".join(map(table.format, "RGB"))
     filters.write_text(filters.read_text() + curves)
     loader.pitches = 0.00586, 0.00586
     open_bench(scene, "llvm_ad_spectral", filters)

@@ -5,7 +5,7 @@ from typing import get_args
 import pytest
 from pydantic import ValidationError
 
-from mitsim.devices.session import Order, SessionRecipe, halves, halves_in_order
+from mitsim.devices.session import SIDES, Order, SessionRecipe, halves, halves_in_order
 
 REQUIRED = {"board_reflectance": 0.9, "exposure_fraction": 0.5, "signed_capture": "uniform", "source": "chosen"}
 
@@ -22,24 +22,14 @@ def test_every_frame_is_taken_once_and_pairs_one_after_the_other(order: Order, p
 
 def test_orders_are_what_their_names_say() -> None:
     """(Planted: one side before the other, signs reversed too, the seed not heeded.)"""
-    assert halves_in_order(2, True) == [
-        *(("horizontal", 0, 1), ("horizontal", 0, -1), ("horizontal", 1, 1), ("horizontal", 1, -1)),
-        *(("vertical", 0, 1), ("vertical", 0, -1), ("vertical", 1, 1), ("vertical", 1, -1)),
-    ]
-    assert [half[:2] for half in halves_in_order(2, True, "reversed")[::2]] == [
-        *(("vertical", 1), ("vertical", 0), ("horizontal", 1), ("horizontal", 0))
-    ]
-    assert [half[:2] for half in halves_in_order(2, True, "interleaved")[::2]] == [
-        *(("horizontal", 0), ("vertical", 0), ("horizontal", 1), ("vertical", 1))
-    ]
-    assert halves_in_order(2, False, "interleaved")[:4] == [
-        *(("horizontal", 0, 0), ("vertical", 0, 0), ("horizontal", 0, 1), ("vertical", 0, 1))
-    ]
-    assert (
-        halves_in_order(64, True, "random", 1)
-        == halves_in_order(64, True, "random", 1)
-        != halves_in_order(64, True, "random", 2)
-    )
+    h, v = SIDES
+    listed = [(side, index, sign) for side in SIDES for index in (0, 1) for sign in (1, -1)]
+    assert listed == halves_in_order(2, True) and listed[:3] == [(h, 0, 1), (h, 0, -1), (h, 1, 1)]
+    assert [half[:2] for half in halves_in_order(2, True, "reversed")[::2]] == [(v, 1), (v, 0), (h, 1), (h, 0)]
+    assert [half[:2] for half in halves_in_order(2, True, "interleaved")[::2]] == [(h, 0), (v, 0), (h, 1), (v, 1)]
+    assert halves_in_order(2, False, "interleaved")[:4] == [(h, 0, 0), (v, 0, 0), (h, 0, 1), (v, 0, 1)]
+    drawn = [halves_in_order(64, True, "random", seed) for seed in (1, 1, 2)]
+    assert drawn[0] == drawn[1] != drawn[2]
 
 
 @pytest.mark.parametrize(

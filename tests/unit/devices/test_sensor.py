@@ -11,9 +11,8 @@ from tests.invented import sensor
 
 
 def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
-    model = sensor(
-        pixel_pitch_um=5.0, read_noise_e=3.0, binning=3, dark_current_e_per_s=2.0, black_level_dn=10.0, bits=12
-    )
+    pixel = {"pixel_pitch_um": 5.0, "read_noise_e": 3.0, "dark_current_e_per_s": 2.0, "black_level_dn": 10.0}
+    model = sensor(**pixel, binning=3, bits=12)
     assert model.superpixel_pitch_um == 15.0
     assert model.superpixel_area_m2 * 1e12 == pytest.approx(225.0, rel=1e-12)
     assert model.superpixel_full_well_e == 9000.0

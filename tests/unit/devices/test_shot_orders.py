@@ -14,9 +14,7 @@ def _patterns(name: str, n: int = 16) -> Patterns:
     return Patterns.of(family, [f"{index}.exr" for index in range(len(family.shots))])
 
 
-@pytest.mark.parametrize(
-    "name", ["uniform", "dots:4", "dots:4x7", "dots:1x5", "hadamard:1", "hadamard:8", "hadamard:12"]
-)
+@pytest.mark.parametrize("name", ["uniform", "dots:4x7", "dots:1x5", "hadamard:1", "hadamard:8", "hadamard:12"])
 def test_every_order_is_a_permutation_and_that_of_the_run_is_the_identity(name: str) -> None:
     patterns = _patterns(name)
     orders, count = shot_orders(patterns), len(patterns.captures)

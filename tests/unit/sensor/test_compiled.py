@@ -48,9 +48,8 @@ def test_pixels_and_streams_share_no_deviates() -> None:
 def test_numpy_makes_the_same_frame_of_the_same_deviates() -> None:
     """Every stage, of pixels that expect many electrons; codes at a tie may be the next. (Planted: no black level; the
     full well after the linearity; read noise not in the superpixel.)"""
-    model = sensor(
-        bits=14, read_noise_e=5.0, full_well_e=11_000.0, black_level_dn=63.5, binning=2, linearity=(0.01, -0.02)
-    )
+    pixel = {"read_noise_e": 5.0, "full_well_e": 11_000.0, "black_level_dn": 63.5, "linearity": (0.01, -0.02)}
+    model = sensor(**pixel, bits=14, binning=2)
     light, count = np.linspace(300, 50_000, 10_001), 10_001
     shot, read = deviates("shot", "read", count=count)
     electrons = chain.clip_at_full_well(chain.poisson_count(light, shot), model)

@@ -16,6 +16,7 @@ from mitsim.sensor.chain import expose, frame_moments, ripple_level, ripple_resp
 SENSOR = load_sensor(shipped_path("calibration", "imx249.toml"))
 ROWS, HERTZ, AMPLITUDE = 40, 120.0, 0.7
 LINE_US = 90.0
+ROLLING, GLOBAL = ("imx477", "ov5647", "mt9m034"), ("imx249", "imx250", "imx255", "mt9m031")
 
 
 def camera(**changes: Any) -> SensorModel:
@@ -80,14 +81,12 @@ def test_noise_of_a_frame_in_ripple_is_that_of_its_rows_means() -> None:
 
 def test_shutters_of_the_shipped_cameras(tmp_path: Path) -> None:
     """Nothing is said of a global one in manifests, so that they stay as they are."""
-    rolling = {
-        name: load_sensor(shipped_path("calibration", f"{name}.toml")) for name in ("imx477", "ov5647", "mt9m034")
-    }
+    shipped = {name: load_sensor(shipped_path("calibration", f"{name}.toml")) for name in (*ROLLING, *GLOBAL)}
+    rolling = {name: shipped[name] for name in ROLLING}
     assert {name: sensor.shutter for name, sensor in rolling.items()} == dict.fromkeys(rolling, "rolling")
     assert rolling["imx477"].known_line_time_s() * 3040 == pytest.approx(0.0869, abs=1e-4)
     assert rolling["ov5647"].known_line_time_s() * 0x7B0 == pytest.approx(1 / 15.63, rel=1e-3)
-    for name in ("imx249", "imx250", "imx255", "mt9m031"):
-        sensor = load_sensor(shipped_path("calibration", f"{name}.toml"))
+    for sensor in map(shipped.get, GLOBAL):
         assert sensor.shutter == "global" and sensor.known_line_time_s() == 0
         assert not {"shutter", "line_time_us"} & set(sensor.identity)
     assert rolling["ov5647"].identity["shutter"] == "rolling"

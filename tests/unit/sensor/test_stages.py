@@ -135,9 +135,8 @@ def test_offsets_have_the_set_deviations_by_pixel_row_and_column(binning: int, o
 
     b^2 readings of a superpixel: a pixel's own add to b, those that a row shares to b^1.5; on chip there is one.
     """
-    model = camera(
-        binning=binning, binning_on_chip=on_chip, dsnu_pixel_e=6.0, dsnu_row_e=3.0, dsnu_column_e=4.0, bits=None
-    )
+    offsets = {"dsnu_pixel_e": 6.0, "dsnu_row_e": 3.0, "dsnu_column_e": 4.0}
+    model = camera(binning=binning, binning_on_chip=on_chip, **offsets, bits=None)
     side = 300
     offset = specimen(model, (side, side)).offset_e
     assert offset is not None
@@ -164,15 +163,15 @@ def test_responses_and_dark_currents_have_the_set_mean_and_variance() -> None:
     own = specimen(model, (side, side))
     assert own.response is not None and own.dark_e_per_s is not None
     assert own.response.mean() == pytest.approx(0.98, abs=5 * math.sqrt(response_variance(model)) / side)
-    for values, variance in (
+    pairs = (own.response, response_variance(model)), (own.dark_e_per_s, dark_current_variance(model))
+    for values, variance in pairs:
         (own.response, response_variance(model)),
         (own.dark_e_per_s, dark_current_variance(model)),
     ):
         off = (values - values.mean()) ** 2
         assert off.mean() == pytest.approx(variance, abs=float(5 * off.std() / side))
-    assert own.dark_e_per_s.mean() == pytest.approx(
-        mean_dark_current(model), abs=5 * math.sqrt(dark_current_variance(model)) / side
-    )
+    error = math.sqrt(dark_current_variance(model)) / side
+    assert own.dark_e_per_s.mean() == pytest.approx(mean_dark_current(model), abs=5 * error)
     assert own.dark_e_per_s.min() >= 0
     # Of 360 000 pixels 7200 are dead, nearly each in a superpixel of its own: 1 - 0.98^4 of them.
     assert own.dead == pytest.approx(side**2 * (1 - 0.98**4), rel=0.01)
