@@ -1,27 +1,20 @@
-"""The registry of effects: each has a neutral value that passes light through, and adding one touches little."""
+"""The registry of effects: each has a neutral value that passes light through."""
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-import mitsim
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench import effects
 from mitsim.bench.effects import _TABLE, EFFECTS, Physics
 from mitsim.devices.patterns import Lighting
 from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import Settings
-from tests.extended import Section, Step
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, Z = 16, 400.0
@@ -37,17 +30,6 @@ LAMP_AND_MIRROR = """<emitter type="constant"><spectrum name="radiance" value="0
     <translate x="-90" z="300"/></transform><bsdf type="conductor"/></shape>"""
 ALWAYS = ("interreflection", "diffraction")
 """Light turns at several surfaces and bends at masks wherever there are any."""
-_EFFECTS, _PASSES = "mitsim/bench/effects.py", "mitsim/light/passes.py"
-TOY = (
-    Step(_EFFECTS, "below", "interreflection: bool", "    lamp: float\n"),
-    Step(_EFFECTS, "below", "interreflection=True,",
-         '            lamp=0.9 if "dimmed" in bench.projector.name else 1.0,\n'),
-    Step(_EFFECTS, "below", "_TABLE = (", '    Effect("dimming", {"lamp": 1.0}, absent="the projector\'s lamp gives '
-         'all that it can", in_truth=True),\n'),
-    Step(_PASSES, "below", "black = physics.black_level if leaking else 0.0",
-         "    lighting = Lighting(lighting.labels, physics.lamp * lighting.weights)\n"),
-)  # fmt: skip
-"""An effect as docs/extending.md has one: power of the projector's lamp, as a part of its full power."""
 
 
 def device(tmp_path_factory: pytest.TempPathFactory, text: str) -> Path:
@@ -112,66 +94,6 @@ def test_each_effect_has_a_name_of_its_own_and_the_table_stays() -> None:
     assert list(EFFECTS) == [effect.name for effect in _TABLE]
     with pytest.raises(TypeError):
         EFFECTS["fog"] = EFFECTS["blur"]  # type: ignore[index]
-
-
-# ---- a new effect ----------------------------------------------------------------------------------------------------
-
-PROGRAM = """
-import json, pathlib, sys
-import mitsim
-from mitsim import cli
-assert pathlib.Path(mitsim.__file__).parents[1] == pathlib.Path.cwd(), mitsim.__file__
-for arguments in json.loads(sys.argv[1]):
-    sys.argv = ["mitsim", *arguments]
-    try:
-        cli.run()
-    except SystemExit as stop:
-        assert stop.code in (0, 1), stop.code
-"""
-
-
-@pytest.mark.slow
-def test_a_new_effect_is_an_entry_and_its_physics(small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    """`dimming`: a lamp at 90 % where the projector's name says so, added to a copy of the package.
-
-    Plan, pilot, command line and capture follow without a change. Leaving it out makes frames 1/0.9 as bright.
-    """
-    package = Path(mitsim.__file__).parent
-    copy = tmp_path / "copy"
-    shutil.copytree(package, copy / "mitsim")  # with its byte code: modules that stay as they are load at once
-    for shelf in ("scenes", "calibration"):
-        (copy / shelf).symlink_to(package.parent / shelf)
-    Section("dimming", [*TOY]).edit(copy)
-    dimmed, full = tmp_path / "dimmed.toml", tmp_path / "full.toml"
-    dimmed.write_text('name = "dimmed"\neffective_wavelength_nm = 562.0\n')
-    full.write_text('name = "full"\neffective_wavelength_nm = 562.0\n')
-    devices = [str(small_scene()), "--patterns", "uniform", "--accuracy", "0.02", "--json"]
-    shot = ["--exposure", "0.01", "-o"]
-    off, changed = "--effects=-dimming", ["--projector", str(dimmed)]
-    calls = [
-        ["plan", *devices, "--projector", str(full)],
-        ["capture", *devices, *changed, *shot, str(tmp_path / "on")],
-        ["capture", *devices, *changed, off, *shot, str(tmp_path / "off")],
-    ]
-    command = [sys.executable, "-c", PROGRAM, json.dumps(calls)]
-    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    plans = [
-        json.loads(done.stdout.splitlines()[0]),
-        *(json.loads((tmp_path / name / "manifest.json").read_text())["plan"] for name in ("on", "off")),
-    ]
-    absent, on, left_out = (next(row for row in plan["effects"] if row["name"] == "dimming") for plan in plans)
-    assert on["state"] == "exact" and on["error_if_off"] == pytest.approx(1 / 0.9 - 1, rel=1e-6)
-    assert left_out["state"] == "off" and "switched by the user" in left_out["reason"]
-    assert any("dimming (off)" in warning for warning in plans[2]["warnings"])
-    assert (absent["state"], absent["error_if_off"]) == ("off", 0.0) and "gives all" in absent["reason"]
-    bright, dim = (electrons(tmp_path / name) for name in ("off", "on"))
-    # The same paths: what is left is single precision.
-    assert np.abs(dim - 0.9 * bright).max() < 1e-6 * bright.max()
-
-
-def electrons(run: Path) -> Any:
-    return mitsim.load_run(run).electrons
 
 
 def test_computed_speckle_is_that_of_the_shots(small_scene: Callable[..., Path], tmp_path: Path, variant: str) -> None:

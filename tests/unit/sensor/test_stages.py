@@ -165,9 +165,6 @@ def test_responses_and_dark_currents_have_the_set_mean_and_variance() -> None:
     assert own.response.mean() == pytest.approx(0.98, abs=5 * math.sqrt(response_variance(model)) / side)
     pairs = (own.response, response_variance(model)), (own.dark_e_per_s, dark_current_variance(model))
     for values, variance in pairs:
-        (own.response, response_variance(model)),
-        (own.dark_e_per_s, dark_current_variance(model)),
-    ):
         off = (values - values.mean()) ** 2
         assert off.mean() == pytest.approx(variance, abs=float(5 * off.std() / side))
     error = math.sqrt(dark_current_variance(model)) / side
