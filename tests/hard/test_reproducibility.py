@@ -1,6 +1,6 @@
 """The same seed gives the same bits: whatever the number of threads, the process, the clock, or how work is cut.
 
-Interrupted and resumed runs are bit-equal too: tests/system/test_resume.py, tests/unit/acquire/test_run.py.
+Interrupted and resumed runs are bit-equal too: tests/system/test_faults.py, tests/unit/acquire/test_run.py.
 """
 
 import hashlib

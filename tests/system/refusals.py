@@ -1,10 +1,11 @@
-"""What tests of refusals share: the call that must be refused, a new output's name, and words that a line must have."""
+"""What system tests share: types of the calls, a new output's name, and words that a line must have."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
-Refused = Callable[..., str]
+Call, Refused = Callable[..., Any], Callable[..., str]
 NEW = ("-o", "new")
 
 

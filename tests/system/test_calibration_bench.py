@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mitsim.devices.session import load_recipe
-from tests.system.refusals import Refused, mentions
+from tests.system.refusals import Call, Refused, mentions
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
 
 @pytest.mark.slow
-def test_a_plan_prints_what_it_takes_and_writes_its_recipe(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_a_plan_prints_what_it_takes_and_writes_its_recipe(call: Call, lab: Any, tmp_path: Path) -> None:
     options = "--plan", "--psnr", 20, "--patterns", "dots:4", "--json", "--quiet", "-o", tmp_path / "recipe.toml"
     done = call("calibrate", *lab.arguments, *options)
     assert done.code == 0, done.err
@@ -28,14 +27,14 @@ def test_a_plan_prints_what_it_takes_and_writes_its_recipe(call: Callable[..., A
     assert reported["photons_a_pixel"] > reported["electrons_a_pixel"] > 0 and reported["simulation_s"] > 0
 
 
-def test_a_ceiling_ends_with_status_one_and_a_line(call: Callable[..., Any], lab: Any) -> None:
+def test_a_ceiling_ends_with_status_one_and_a_line(call: Call, lab: Any) -> None:
     done = call("calibrate", *lab.arguments, "--plan", "--psnr", 90, "--patterns", "uniform", "--quiet")
     assert done.code == 1
     (line,) = [line for line in done.err.splitlines() if "cannot be reached" in line]
     mentions(line, "90 dB cannot be reached under uniform", "without noise", "improve the capture")
 
 
-def test_modelled_factors_are_a_calibration_that_says_so(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_modelled_factors_are_a_calibration_that_says_so(call: Call, lab: Any, tmp_path: Path) -> None:
     """The small sensor sees no difference of distance and size, so one is held."""
     fit = "mask_distance,mask_shift_row,mask_shift_column"
     options = "--model", "wave", "--frames-used", 8, "--fit", fit, "-o", tmp_path / "cal", "--json", "--quiet"

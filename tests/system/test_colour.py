@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ import pytest
 from mitsim.core.configuration import shipped_path
 from mitsim.core.exr import read_frame
 from tests.system.conftest import tree
+from tests.system.refusals import Call
 from tests.unit.transport.test_path_reuse import WALL
 
 LINES = {638: 0.5, 520: 0.3, 445: 0.2}
@@ -85,12 +85,7 @@ def electrons(run: Path) -> np.ndarray:
     ],
 )
 def test_each_line_is_what_a_mono_capture_of_it_gives(
-    call: Callable[..., Any],
-    shell: Callable[..., Any],
-    coloured: Callable[[str], Path],
-    tmp_path: Path,
-    name: str,
-    mask: str,
+    call: Call, shell: Call, coloured: Callable[[str], Path], tmp_path: Path, name: str, mask: str
 ) -> None:
     """Reflectances, power, diffraction and photons of each line alone: frames differ by their Monte Carlo errors, also
     behind masks that are drawn on a raster for each line.
@@ -125,7 +120,7 @@ def test_each_line_is_what_a_mono_capture_of_it_gives(
 
 @pytest.mark.slow
 def test_a_grey_lamp_is_in_every_line_what_a_mono_capture_has(
-    call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
+    call: Call, shell: Call, coloured: Callable[[str], Path], tmp_path: Path
 ) -> None:
     """A flat spectrum has as many photons as its power has at 595 nm, the middle of 360 to 830 nm.
 
@@ -152,7 +147,7 @@ def test_a_grey_lamp_is_in_every_line_what_a_mono_capture_has(
 
 @pytest.mark.slow
 def test_a_capture_in_colour_goes_on_where_it_stopped(
-    shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
+    shell: Call, coloured: Callable[[str], Path], tmp_path: Path
 ) -> None:
     """Frames that are lost come back bit for bit, colour.json last; another configuration is refused before work."""
     whole = projector(tmp_path / "all.toml", LINES)
@@ -173,7 +168,7 @@ def test_a_capture_in_colour_goes_on_where_it_stopped(
 @pytest.mark.slow
 @pytest.mark.parametrize("mask", ["", TURNED])
 def test_each_line_is_calibrated_for_itself(
-    call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, mask: str
+    call: Call, shell: Call, coloured: Callable[[str], Path], tmp_path: Path, mask: str
 ) -> None:
     """Factors of a line are those of a mono session whose projector shows it alone, noise apart.
 

@@ -11,7 +11,6 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ import pytest
 
 from mitsim.bench.layout import Preview
 from mitsim.report import lit_scene
+from tests.system.refusals import Call
 
 VERBS = ["demo", "run", "view", "plan", "capture", "calibrate", "reconstruct", "render", "study", "report", "doctor"]
 VERBS += ["characterise", "sense", "export", "import", "patterns", "transport", "list", "new", "pairs", "train"]
@@ -42,7 +42,7 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 # ---- keys and types --------------------------------------------------------------------------------------------------
 
 
-def test_view(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view(call: Call, lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without its previews, which unit/bench/test_layout.py renders."""
     blank = Preview(np.ones((4, 4, 1)), np.eye(4), 0.2)
     monkeypatch.setattr(lit_scene, "previews", lambda *_: (blank, blank))
@@ -64,7 +64,7 @@ def test_view(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: p
     assert text.endswith("Drawn: view.png\n") and "parallax: " in text and (tmp_path / "view.png").is_file()
 
 
-def test_plan(call: Callable[..., Any], lab: Any) -> None:
+def test_plan(call: Call, lab: Any) -> None:
     options = "--patterns", "dots:4", "--json", "--quiet", "--variant", "llvm_ad_mono"
     plan = call("plan", *lab.arguments, *options).payload
     assert {"effects", "accuracy", "predicted_seconds", "predicted_range", "kernels"} <= plan.keys()
@@ -108,7 +108,7 @@ def test_calibrate(lab: Any) -> None:
     assert_seconds(found["seconds"])
 
 
-def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_reconstruct(call: Call, lab: Any, tmp_path: Path) -> None:
     options = "--json", "--quiet", "--variant", "llvm_ad_mono", "-o", tmp_path / "image"
     found = call("reconstruct", lab.run, "--calibration", lab.calibration, *options, pictures=True).payload
     keys = {"psnr", "ssim", "lambda", "rank", "condition", "residual", "status", "warnings", "seconds", "output"}
@@ -151,7 +151,7 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     assert written == found
 
 
-def test_reconstruct_at_another_depth(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_reconstruct_at_another_depth(call: Call, lab: Any, tmp_path: Path) -> None:
     options = "--calibration", lab.calibration, "--json", "--quiet", "-o"
     found = call("reconstruct", lab.run, *options, tmp_path / "image", "--focus", "400").payload
     assert found["focus_mm"] == 400 and found["focus_error_mm"] is None
@@ -163,14 +163,14 @@ def test_reconstruct_at_another_depth(call: Callable[..., Any], lab: Any, tmp_pa
     assert not (tmp_path / "other").exists()
 
 
-def test_reconstruct_writes_into_the_run_by_default(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_reconstruct_writes_into_the_run_by_default(call: Call, lab: Any, tmp_path: Path) -> None:
     run = lab.copy("run", tmp_path / "run")
     found = call("reconstruct", "run", "--calibration", lab.calibration, "--json", cwd=tmp_path).payload
     assert found["output"] == "run/reconstruction" and (run / "reconstruction" / "image.exr").is_file()
 
 
 @pytest.mark.parametrize("estimator", ["reference", "factored"])
-def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: str) -> None:
+def test_render(call: Call, lab: Any, tmp_path: Path, estimator: str) -> None:
     options = "--estimator", estimator, "--spp", 16, "--accuracy", "0.02", "--seed", 3, "--json", "--quiet"
     found = call("render", lab.scene, "-o", tmp_path / "frame.exr", *options).payload
     assert (found["estimator"], found["seed"], found["output"]) == (estimator, 3, str(tmp_path / "frame.exr"))
@@ -184,7 +184,7 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
 
 
 @pytest.mark.slow
-def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_study_accuracy(call: Call, lab: Any, tmp_path: Path) -> None:
     """Rows of runs and of the reference; unit/studies/test_accuracy.py has the parts of the light."""
     options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet", "--quick"
     study = call("study", "accuracy", lab.scene, *options).payload
@@ -195,13 +195,13 @@ def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path) -> N
     assert {"accuracy.csv", "accuracy.png"} <= {path.name for path in (tmp_path / "study").iterdir()}
 
 
-def test_doctor(call: Callable[..., Any]) -> None:
+def test_doctor(call: Call) -> None:
     found = call("doctor", "--json", "--quiet", "--variant", "llvm_ad_mono").payload
     assert found["ok"] is True and len(found["checks"]) == 5, found
     assert all({"name", "ok", "detail", "remedy"} <= check.keys() for check in found["checks"])
 
 
-def test_characterise_and_sense(call: Callable[..., Any], tmp_path: Path) -> None:
+def test_characterise_and_sense(call: Call, tmp_path: Path) -> None:
     small = "--pixels", 32, "--steps", 20, "--frames", 2, "--json", "--quiet", "--variant", "llvm_ad_mono"
     found = call("characterise", "imx477", "-o", tmp_path / "figures", *small).payload
     assert {"camera", "pixels", "steps", "frames", "seed", "exposure_s", "warnings", "output"} <= found.keys()
@@ -219,7 +219,7 @@ def test_characterise_and_sense(call: Callable[..., Any], tmp_path: Path) -> Non
     assert "quantum_efficiency" in refused.refusal and not (tmp_path / "other.png").exists()
 
 
-def test_pairs(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_pairs(call: Call, lab: Any, tmp_path: Path) -> None:
     options = "--count", 3, "--patterns", "dots:4", "--json", "--quiet", "--variant", "llvm_ad_mono"
     found = call("pairs", *lab.arguments, "-o", tmp_path / "pairs", *options).payload
     assert found.keys() == {
@@ -236,7 +236,7 @@ def test_pairs(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     assert flagged.code == 1 and "3 pairs are expected to fill the full well" in flagged.payload["warnings"][0]
 
 
-def test_train(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_train(call: Call, lab: Any, tmp_path: Path) -> None:
     """And the network asked for an image of frames that it was not trained for: it comes with the doubt."""
     pytest.importorskip("torch", reason="torch is an extra: pip install 'mitsim[learn]'")
     common = "--json", "--quiet", "--variant", "llvm_ad_mono"
@@ -261,7 +261,7 @@ def test_train(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
 # ---- exit statuses ---------------------------------------------------------------------------------------------------
 
 
-def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_a_flagged_result_exits_with_1_and_says_why(call: Call, lab: Any, tmp_path: Path) -> None:
     for verb in (("plan",), ("capture", "-o", tmp_path / "run")):
         outcome = call(*verb, *lab.arguments, "--patterns", "dots:4", "--effects=-diffraction", "--json")
         assert outcome.code == 1
@@ -271,13 +271,13 @@ def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], la
         assert all(line.startswith("mitsim: warning: ") for line in lines)
 
 
-def test_a_saturated_capture_is_flagged(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_a_saturated_capture_is_flagged(call: Call, lab: Any, tmp_path: Path) -> None:
     outcome = call("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", "dots:4", "--exposure", "1000")
     assert outcome.code == 1 and "full well" in outcome.err
 
 
 @pytest.mark.slow
-def test_an_under_determined_image_is_flagged(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_an_under_determined_image_is_flagged(call: Call, lab: Any, tmp_path: Path) -> None:
     # 12 sensor rows cannot tell 16 scene rows apart under one pattern.
     scene = lab.write_scene("few", pixels=12)
     captured = call("capture", scene, *lab.electronics, "-o", tmp_path / "run", "--patterns", "uniform")
@@ -289,7 +289,7 @@ def test_an_under_determined_image_is_flagged(call: Callable[..., Any], lab: Any
 
 
 def test_a_fault_of_the_program_is_one_line_and_its_traceback_is_kept(
-    call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, lab: Any, tmp_path: Path
+    call: Call, monkeypatch: pytest.MonkeyPatch, lab: Any, tmp_path: Path
 ) -> None:
     """Status 2: 1 would say that there is a result. (Planted: the exception raised on; the log left out.)"""
 
@@ -307,7 +307,7 @@ def test_a_fault_of_the_program_is_one_line_and_its_traceback_is_kept(
 # ---- the installed program -------------------------------------------------------------------------------------------
 
 
-def test_the_program(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_the_program(shell: Call, lab: Any, tmp_path: Path) -> None:
     good = shell("capture", *lab.arguments, "-o", "run", "--patterns", "uniform", "--json", cwd=tmp_path)
     assert good.code == 0 and good.err == ""
     assert good.payload["output"] == "run"
@@ -315,7 +315,7 @@ def test_the_program(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> Non
     assert "run" in bad.refusal
 
 
-def test_version_and_help(shell: Callable[..., Any]) -> None:
+def test_version_and_help(shell: Call) -> None:
     import mitsim
 
     version = shell("--version")
@@ -326,7 +326,7 @@ def test_version_and_help(shell: Callable[..., Any]) -> None:
         assert re.search(rf"\b{verb}\b +\S+", text.out), f"{verb} has no description"
 
 
-def test_help_of_every_verb_names_every_option(call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_of_every_verb_names_every_option(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     """And says of each what it is. (Planted: an option without a word; a hidden one.)"""
     from typer.main import get_command
 
@@ -349,7 +349,7 @@ def test_help_of_every_verb_names_every_option(call: Callable[..., Any], monkeyp
         assert fragment in text, fragment
 
 
-def test_no_arguments_show_the_help(call: Callable[..., Any]) -> None:
+def test_no_arguments_show_the_help(call: Call) -> None:
     outcome = call()
     assert outcome.code == 2 and "Usage" in outcome.out + outcome.err
     assert [line for line in outcome.err.splitlines() if line.startswith("mitsim:")] == [
@@ -440,7 +440,7 @@ def test_a_refusal_on_a_terminal_leaves_one_line(
     assert visible.strip().startswith("mitsim: --accuracy 0") and visible.strip().count("\n") == 0
 
 
-def test_no_bar_where_stderr_is_no_terminal(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_no_bar_where_stderr_is_no_terminal(call: Call, lab: Any, tmp_path: Path) -> None:
     outcome = call("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", "dots:4")
     assert outcome.code == 0 and outcome.err == ""
     assert len(outcome.out.splitlines()) <= 3 and "\x1b" not in outcome.out  # a long folder has a line of its own

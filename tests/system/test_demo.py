@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.system.refusals import Call
 
 LABELS = ("Uniform", "16 dots", "25 dots", "49 dots", "64 Hadamard")
 FAMILIES = ("uniform", "dots:4", "dots:5", "dots:7", "hadamard:8")
@@ -44,7 +45,7 @@ def assert_self_contained(page: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def done(call: Callable[..., Any], lab: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def done(call: Call, lab: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """A finished demo and its report."""
     folder: Path = tmp_path_factory.mktemp("demo") / "demo"
     options = lab.scene, "-o", folder, "--accuracy", "0.02", "--json"
@@ -73,7 +74,7 @@ def test_the_page_stands_alone_and_shows_every_family(done: tuple[Path, dict[str
 
 
 def test_the_folders_are_those_of_capture_and_calibrate(
-    call: Callable[..., Any], done: tuple[Path, dict[str, Any]], tmp_path: Path
+    call: Call, done: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     folder, report = done
     options = "--calibration", folder / "calibration", "-o", tmp_path / "image", "--json"
@@ -83,7 +84,7 @@ def test_the_folders_are_those_of_capture_and_calibrate(
 
 @pytest.mark.slow
 def test_a_second_demo_of_ones_own_devices_and_patterns_replaces_the_first(
-    call: Callable[..., Any], lab: Any, done: tuple[Path, dict[str, Any]], tmp_path: Path
+    call: Call, lab: Any, done: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(done[0], tmp_path / "demo"))
     old = (folder / "report.html").stat().st_mtime_ns
@@ -106,7 +107,7 @@ def test_a_second_demo_of_ones_own_devices_and_patterns_replaces_the_first(
 
 
 @pytest.mark.slow
-def test_the_shipped_demo(shell: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_shipped_demo(shell: Call, tmp_path: Path) -> None:
     """The photograph at the default accuracy: 49 dots beat uniform light by at least 8 dB (issue 2)."""
     outcome = shell("demo", "-o", "demo", "--json", cwd=tmp_path)
     assert outcome.code == 0 and outcome.err == ""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mitsim.bench.effects import SWITCHES
+from tests.system.refusals import Call, Refused
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ from mitsim.bench.effects import SWITCHES
     ids=lambda verb: verb[0],
 )
 @pytest.mark.parametrize("effects", ["fog", "+fog", "ambient", "+ambient,-ambient"])
-def test_effects_that_make_no_sense(refused: Callable[..., str], lab: Any, verb: tuple[str, ...], effects: str) -> None:
+def test_effects_that_make_no_sense(refused: Refused, lab: Any, verb: tuple[str, ...], effects: str) -> None:
     line = refused(*verb, lab.scene, "--effects", effects)
     assert "--effects" in line and effects in line
     assert ("both on and off" in line) == ("-ambient" in effects)
@@ -30,7 +30,7 @@ def test_effects_that_make_no_sense(refused: Callable[..., str], lab: Any, verb:
         assert all(name in line for name in SWITCHES)
 
 
-def test_a_plan_as_json(call: Callable[..., Any], lab: Any) -> None:
+def test_a_plan_as_json(call: Call, lab: Any) -> None:
     options = "--patterns", "dots:4", "--json", "--effects", "+anchors,-diffraction,+ambient"
     effects = call("plan", *lab.arguments, *options).payload["effects"]
     rows = {row["name"]: row for row in effects}
@@ -39,7 +39,7 @@ def test_a_plan_as_json(call: Callable[..., Any], lab: Any) -> None:
     assert rows["anchors"]["state"] == "approximate" and rows["ambient"]["state"] == "exact"
 
 
-def test_a_capture_without_two_effects(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_a_capture_without_two_effects(call: Call, lab: Any, tmp_path: Path) -> None:
     options = "--effects", "-diffraction,-interreflection", "--patterns", "uniform"
     call("capture", *lab.arguments, "-o", tmp_path / "run", *options)
     plan = json.loads((tmp_path / "run" / "manifest.json").read_text())["plan"]

@@ -3,7 +3,6 @@ came back, and its frames formed of a file of its light."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,18 @@ import pytest
 import mitsim as ms
 from mitsim.core.exr import read_frame
 from tests.exchanged import frame_of
-from tests.system.refusals import mentions
+from tests.system.refusals import Call, Refused, mentions
 
 EXPORTED = {"format", "frames", "calibration", "notes", "output"}
 IMPORTED = {"frames", "output", "calibration_output", "holds", "left_out", "report", "notes", "warnings"}
 
 
-def image(call: Callable[..., Any], run: Path, calibration: Path, to: Path) -> np.ndarray:
+def image(call: Call, run: Path, calibration: Path, to: Path) -> np.ndarray:
     assert call("reconstruct", run, "--calibration", calibration, "-o", to).code in (0, 1)
     return read_frame(to / "image.exr")[0]["reflectance"]
 
 
-def test_out_and_back(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_out_and_back(call: Call, lab: Any, tmp_path: Path) -> None:
     name = "all.h5"
     out = call("export", lab.run, "--format", "hdf5", "--calibration", lab.calibration, "-o", tmp_path / name, "--json")
     assert out.code == 0 and out.payload.keys() == EXPORTED and out.payload["frames"] == 16
@@ -35,7 +34,7 @@ def test_out_and_back(call: Callable[..., Any], lab: Any, tmp_path: Path) -> Non
     assert np.array_equal(again, image(call, lab.run, lab.calibration, tmp_path / "a"))
 
 
-def test_pictures_and_frames_again(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_pictures_and_frames_again(call: Call, lab: Any, tmp_path: Path) -> None:
     """By the line that export prints, with the names put in."""
     out = call("export", lab.run, "--format", "png", "-o", tmp_path / "out", "--projector", "mp_cl1", "--json")
     assert out.code == 0, out.err
@@ -48,7 +47,7 @@ def test_pictures_and_frames_again(call: Callable[..., Any], lab: Any, tmp_path:
     assert np.array_equal(again, image(call, lab.run, lab.calibration, tmp_path / "a"))
 
 
-def test_refusals(refused: Callable[..., str], lab: Any) -> None:
+def test_refusals(refused: Refused, lab: Any) -> None:
     mentions(refused("export", lab.run, "--format", "xml", "-o", "new"), "--format 'xml'", "hdf5, mat, torch, png")
     mentions(refused("export", lab.run, "--format", "flatcam", "-o", "new"), "--format 'flatcam'")
     mentions(refused("export", lab.calibration, "--format", "hdf5", "-o", "new"), "holds a calibration")
@@ -65,7 +64,7 @@ def test_refusals(refused: Callable[..., str], lab: Any) -> None:
     mentions(refused("import", "none.h5", "-o", "new", "--exposure", 1), "--exposure", "leave it out")
 
 
-def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_light_in_a_file_makes_the_frames_of_a_capture(call: Call, lab: Any, tmp_path: Path) -> None:
     """By the lines of docs/exchange.md: of the same seed to single precision, as capture traces the same paths; of
     another seed within the error that both files state: the square of their difference, over what both state of it,
     varies by 0.2 among pairs of seeds. (Planted: the error of one group, other electrons a joule.)"""
@@ -97,7 +96,7 @@ def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any],
     assert square / error == pytest.approx(1, abs=0.6), "three standard deviations"
 
 
-def test_patterns_are_drawn(call: Callable[..., Any], tmp_path: Path) -> None:
+def test_patterns_are_drawn(call: Call, tmp_path: Path) -> None:
     stripes = "stripes", "-o", tmp_path / "s", "--camera", "imx249", "--exposure", 0.02, "--projector-pixels", 4
     for arguments, count in ((("dots:2", "-o", tmp_path / "d"), 4), (stripes, 16)):
         done = call("patterns", *arguments, "--json")
@@ -107,7 +106,7 @@ def test_patterns_are_drawn(call: Callable[..., Any], tmp_path: Path) -> None:
     assert done.payload["session"] == str(tmp_path / "s" / "session.json")
 
 
-def test_patterns_that_cannot_be_drawn(refused: Callable[..., str]) -> None:
+def test_patterns_that_cannot_be_drawn(refused: Refused) -> None:
     mentions(refused("patterns", "stripes", "-o", "new"), "--camera is not given")
     mentions(refused("patterns", "dots:2", "-o", "new", "--exposure", 1), "--exposure 1.0", "goes with stripes")
     mentions(refused("patterns", "dots:2", "-o", "new", "--projector-pixels", 0), "--projector-pixels")

@@ -19,6 +19,7 @@ import mitsim as ms
 from mitsim.acquire import capture
 from mitsim.core.exr import read_frame
 from mitsim.light import light
+from tests.system.refusals import Call, Refused
 
 pytestmark = pytest.mark.usefixtures("variant")
 ACCURACY, SEED = 0.02, 4
@@ -111,7 +112,7 @@ def test_the_lines_that_the_package_opens_with(shared_scene: Callable[..., Path]
 
 @pytest.mark.usefixtures("other_kernels")
 def test_a_saved_capture_is_that_of_the_command_line(
-    call: Callable[..., Any], shots: ms.Capture, bench: ms.Bench, tmp_path: Path
+    call: Call, shots: ms.Capture, bench: ms.Bench, tmp_path: Path
 ) -> None:
     """The same files with the same pixels, and manifests that differ in seconds and compiled kernels alone."""
     shots.save(tmp_path / "saved")
@@ -254,7 +255,7 @@ def test_objects_show_themselves(bench: ms.Bench, shots: ms.Capture, factors: ms
 # ---- numbers and names -----------------------------------------------------------------------------------------------
 
 
-def test_a_shipped_name_wins_over_a_folder_of_that_name(refused: Callable[..., str], tmp_path: Path) -> None:
+def test_a_shipped_name_wins_over_a_folder_of_that_name(refused: Refused, tmp_path: Path) -> None:
     (tmp_path / "photograph").mkdir()
     (tmp_path / "photograph" / "scene.xml").write_text("<scene")
     assert "dots:129" in refused("plan", "photograph", "--patterns", "dots:129")
@@ -263,7 +264,7 @@ def test_a_shipped_name_wins_over_a_folder_of_that_name(refused: Callable[..., s
 
 
 @pytest.mark.parametrize("name", ["scene", "variant", "camera", "projector", "allow_outside_files", "for_render"])
-def test_parameters_that_python_takes_for_others(refused: Callable[..., str], bench: ms.Bench, name: str) -> None:
+def test_parameters_that_python_takes_for_others(refused: Refused, bench: ms.Bench, name: str) -> None:
     line = refused("plan", bench.loaded.path, "-D", f"{name}=x")
     assert f"-D '{name}=x'" in line and "another" in line
 

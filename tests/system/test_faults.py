@@ -11,7 +11,7 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,9 @@ import pytest
 from mitsim.core.exr import read_frame
 from mitsim.core.files import LOCK
 from tests.system.interrupted import PATTERNS, RESUME, assert_equal_runs, cut_short, ended, running
+from tests.system.refusals import Call, Refused
 
 pytestmark = pytest.mark.robustness("Faults")
-
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-LAST = 505  # of 512 frames, which are written 16 at a time
 
 
 def finished(run: Path, whole: Path) -> dict[Path, int]:
@@ -40,7 +38,7 @@ def finished(run: Path, whole: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in frames}
 
 
-def assert_resumed(call: Callable[..., Any], lab: Any, run: Path, whole: Path) -> None:
+def assert_resumed(call: Call, lab: Any, run: Path, whole: Path) -> None:
     """``--resume`` ends in the frames of ``whole``, and writes none of the finished ones again."""
     kept = finished(run, whole) if run.exists() else {}
     outcome = call("capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, "--resume")
@@ -48,29 +46,6 @@ def assert_resumed(call: Callable[..., Any], lab: Any, run: Path, whole: Path) -
     assert_equal_runs(run, whole)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     assert not (run / LOCK).exists() and not list(run.glob(".*.part"))
-
-
-# ---- signals ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("least", [0, 64, LAST])
-@pytest.mark.parametrize("how", STOPS, ids=lambda how: how.name)
-def test_no_moment_is_a_bad_one(
-    call: Callable[..., Any], lab: Any, tmp_path: Path, whole: Path, how: signal.Signals, least: int
-) -> None:
-    """Before the first frame (while light is traced), between frames, and close to the last; then resumed."""
-    run = tmp_path / "run"
-    done = cut_short(how, least, "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, "--json")
-    # The last frames take milliseconds: the signal may find the result printed, but then all of it, or the run over.
-    if least < LAST or done.returncode != 0:
-        words = {signal.SIGINT: "mitsim: interrupted", signal.SIGTERM: "mitsim: ended by SIGTERM"}.get(how, "")
-        # Between the folder and its manifest nothing is kept yet.
-        allowed = [words and words + RESUME, *([words and f"{words}\n"] if least == 0 else [])]
-        assert done.returncode == (-how if how == signal.SIGKILL else 128 + how) and done.stderr in allowed
-    assert done.stdout == "" or (least == LAST and json.loads(done.stdout)["frames"] == 512)
-    assert len(list(run.glob("frame_*.exr"))) >= least
-    assert_resumed(call, lab, run, whole)
 
 
 @pytest.mark.slow
@@ -112,7 +87,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-def test_a_disk_that_fills_up_during_a_run(call: Callable[..., Any], lab: Any, whole: Path, small_disk: Path) -> None:
+def test_a_disk_that_fills_up_during_a_run(call: Call, lab: Any, whole: Path, small_disk: Path) -> None:
     run = small_disk / "run"
     process = running(20, "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, "--json")
     with pytest.raises(OSError, match="No space left"), open(small_disk / "filler", "wb", buffering=0) as filler:
@@ -131,21 +106,8 @@ def test_a_disk_that_fills_up_during_a_run(call: Callable[..., Any], lab: Any, w
 # ---- the folder ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def interrupted(whole: Path, tmp_path: Path) -> Path:
-    """The run as a kill after 40 frames leaves it: frames, and a manifest that says incomplete."""
-    run = tmp_path / "run"
-    run.mkdir()
-    for path in sorted(whole.glob("frame_*.exr"))[:40]:
-        shutil.copy2(path, run)
-    manifest = json.loads((whole / "manifest.json").read_text())
-    kept = {key: manifest[key] for key in ("kind", "configuration", "configuration_sha256")}
-    (run / "manifest.json").write_text(json.dumps({**kept, "status": "incomplete"}))
-    return run
-
-
 def test_damaged_frames_of_an_interrupted_run_are_made_again(
-    call: Callable[..., Any], lab: Any, interrupted: Path, whole: Path
+    call: Call, lab: Any, interrupted: Path, whole: Path
 ) -> None:
     """No manifest holds checksums yet, so each frame carries that of its own pixels.
 
@@ -174,7 +136,7 @@ def test_damaged_frames_of_an_interrupted_run_are_made_again(
 
 
 def test_resume_with_another_version_is_refused(
-    refused: Callable[..., str], lab: Any, interrupted: Path, monkeypatch: pytest.MonkeyPatch
+    refused: Refused, lab: Any, interrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from mitsim.core.environment import versions
 
@@ -185,14 +147,12 @@ def test_resume_with_another_version_is_refused(
 
 
 @pytest.mark.slow
-def test_resume_with_another_variant_is_refused(shell: Callable[..., Any], lab: Any, interrupted: Path) -> None:
+def test_resume_with_another_variant_is_refused(shell: Call, lab: Any, interrupted: Path) -> None:
     options = "--patterns", PATTERNS, "--resume", "--variant", "llvm_ad_rgb"
     assert "(variant differ)" in shell("capture", *lab.arguments, "-o", interrupted, *options).refusal
 
 
-def test_resume_with_another_texture_is_refused(
-    refused: Callable[..., str], call: Callable[..., Any], lab: Any, tmp_path: Path
-) -> None:
+def test_resume_with_another_texture_is_refused(refused: Refused, call: Call, lab: Any, tmp_path: Path) -> None:
     """The scene's XML is the same, the picture that it shows is not."""
     scene = Path(shutil.copytree(lab.scene.parent, tmp_path / "scenes")) / lab.scene.name
     options = *lab.electronics, "-o", tmp_path / "run", "--patterns", "dots:4"
@@ -206,9 +166,7 @@ def test_resume_with_another_texture_is_refused(
 # ---- the machine -----------------------------------------------------------------------------------------------------
 
 
-def test_a_home_that_takes_no_kernels(
-    shell: Callable[..., Any], call: Callable[..., Any], lab: Any, tmp_path: Path
-) -> None:
+def test_a_home_that_takes_no_kernels(shell: Call, call: Call, lab: Any, tmp_path: Path) -> None:
     """Dr.Jit's kernel cache lies in the home folder; without it the program compiles anew, to the same frame."""
     environment = {**os.environ, "HOME": "/proc/nowhere", "XDG_CACHE_HOME": "/proc/nowhere"}
     options = "render", lab.scene, "--spp", 16, "--json", "-o"
@@ -216,3 +174,129 @@ def test_a_home_that_takes_no_kernels(
     assert outcome.payload["mean"] == call(*options, tmp_path / "kept.exr").payload["mean"]
     ours, theirs = (read_frame(tmp_path / f"{name}.exr")[0] for name in ("anew", "kept"))
     assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
+
+
+# ---- A capture or calibration that was cut short ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def killed(lab: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same run, its process killed while it wrote frames; not to be changed."""
+    run: Path = tmp_path_factory.mktemp("killed") / "run"
+    done = cut_short(signal.SIGKILL, 100, "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, "--quiet")
+    assert done.returncode == -signal.SIGKILL and done.stdout == "" and done.stderr == ""
+    return run
+
+
+@pytest.fixture
+def interrupted(killed: Path, tmp_path: Path) -> Path:
+    """A copy of the killed run."""
+    return Path(shutil.copytree(killed, tmp_path / "run"))
+
+
+def test_a_killed_run_is_no_run(refused: Refused, lab: Any, interrupted: Path) -> None:
+    line = refused("reconstruct", "run", "--calibration", lab.calibration)
+    assert "run: the capture is incomplete" in line and "--resume" in line
+    line = refused("capture", *lab.arguments, "-o", "run", "--patterns", PATTERNS)
+    assert "run: the folder holds files already" in line
+    assert "go on with --resume" in line and "empty" not in line, "emptying it would throw the frames away"
+
+
+def test_resume_finishes_it(call: Call, lab: Any, interrupted: Path, whole: Path) -> None:
+    """And sweeps up what was half written."""
+    kept = {path: path.stat().st_mtime_ns for path in interrupted.glob("frame_*.exr")}
+    (interrupted / ".frame_00400.exr.4711-140703.part").write_bytes(b"\x76\x2f\x31\x01")
+    outcome = call("capture", *lab.arguments, "-o", interrupted, "--patterns", PATTERNS, "--resume", "--json")
+    assert outcome.code == 0 and outcome.payload["frames"] == 512
+    assert_equal_runs(interrupted, whole)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept, "frames that were there are not written again"
+    assert [path.name for path in interrupted.glob(".*")] == []
+
+
+def test_resume_of_a_finished_run_changes_nothing(call: Call, lab: Any, tmp_path: Path) -> None:
+    run = lab.copy("run", tmp_path / "run")
+    before = {path.name: path.read_bytes() for path in run.glob("*.exr")}
+    assert call("capture", *lab.arguments, "-o", run, "--patterns", "dots:4", "--resume").code == 0
+    assert {path.name: path.read_bytes() for path in run.glob("*.exr")} == before
+
+
+def test_resume_replaces_a_frame_that_was_changed(call: Call, lab: Any, tmp_path: Path) -> None:
+    """`reconstruct` refuses such a frame and says: capture it again with --resume."""
+    run = lab.copy("run", tmp_path / "run")
+    data = bytearray((run / "frame_00005.exr").read_bytes())
+    data[-2000] ^= 1
+    (run / "frame_00005.exr").write_bytes(data)
+    assert "resume" in call("reconstruct", run, "--calibration", lab.calibration).refusal
+    assert call("capture", *lab.arguments, "-o", run, "--patterns", "dots:4", "--resume").code == 0
+    assert_equal_runs(run, lab.run)
+
+
+@pytest.mark.parametrize(
+    ("options", "fragment"),
+    [
+        (["--seed", "1"], "seed"),
+        (["--patterns", "dots:2"], "patterns"),
+        (["--accuracy", "0.1"], "accuracy"),
+        (["--exposure", "0.01"], "exposure"),
+        (["--camera", "other.toml"], "sensor"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else None,
+)
+def test_resume_refuses_another_configuration(
+    refused: Refused, lab: Any, tmp_path: Path, options: list[str], fragment: str
+) -> None:
+    (tmp_path / "other.toml").write_text(lab.camera.read_text().replace("6.7", "7.6"))
+    lab.copy("run", tmp_path / "run")
+    line = refused("capture", *lab.arguments, "-o", "run", "--resume", "--patterns", "dots:4", *options)
+    assert "--resume: run holds a run of another configuration" in line and f"({fragment} differ)" in line
+
+
+@pytest.mark.parametrize("text", ['{"kind": "capt', "[]", "{}"])
+def test_resume_refuses_a_corrupted_manifest(refused: Refused, lab: Any, tmp_path: Path, text: str) -> None:
+    run = lab.copy("run", tmp_path / "run")
+    (run / "manifest.json").write_text(text)
+    assert "run/manifest.json" in refused("capture", *lab.arguments, "-o", "run", "--resume", "--patterns", "dots:4")
+
+
+# ---- calibrations ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wide(lab: Any) -> tuple[object, ...]:
+    """The laboratory's devices with a projector of 32 x 32 pixels, whose 128 shots take long enough to be hit."""
+    return lab.write_scene("wide", n=32), *lab.electronics[:-1], "0.02"
+
+
+@pytest.fixture(scope="module")
+def factors(call: Call, wide: tuple[object, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The calibration of those devices which nothing disturbed."""
+    calibration: Path = tmp_path_factory.mktemp("factors") / "cal"
+    assert call("calibrate", *wide, "-o", calibration).code in (0, 1)
+    return calibration
+
+
+@pytest.mark.parametrize(
+    ("how", "part"),
+    [
+        pytest.param(signal.SIGKILL, "manifest.json", marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, "light.part.npz", marks=pytest.mark.slow),
+        (signal.SIGINT, "stripes.part.npz"),
+        pytest.param(signal.SIGTERM, "stripes.part.npz", marks=pytest.mark.slow),
+    ],
+)
+def test_a_calibration_that_is_stopped_loses_no_finished_part(
+    call: Call, lab: Any, wide: tuple[object, ...], factors: Path, tmp_path: Path, how: signal.Signals, part: str
+) -> None:
+    """While light is traced, after it, and between stripes; `reconstruct` does not take it for a calibration."""
+    calibration = tmp_path / "cal"
+    done = cut_short(how, part, "calibrate", *wide, "-o", calibration)
+    reported = {signal.SIGINT: "mitsim: interrupted" + RESUME, signal.SIGTERM: "mitsim: ended by SIGTERM" + RESUME}
+    assert (done.returncode, done.stderr) == (-how if how == signal.SIGKILL else 128 + how, reported.get(how, ""))
+    assert (calibration / part).is_file()
+    assert "the calibration is incomplete" in call("reconstruct", lab.run, "--calibration", calibration).refusal
+    assert "(seed differ)" in call("calibrate", *wide, "-o", calibration, "--resume", "--seed", "1").refusal
+    outcome = call("calibrate", *wide, "-o", calibration, "--resume")
+    assert outcome.code in (0, 1), outcome.err
+    assert sorted(path.name for path in calibration.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
+    ours, theirs = (json.loads((folder / "manifest.json").read_text()) for folder in (calibration, factors))
+    assert ours["checksums"] == theirs["checksums"] and ours["configuration"] == theirs["configuration"]

@@ -3,9 +3,7 @@ other, whose image by the authors' own calibration is known."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from PIL import Image
 from mitsim import calibrate_known, load_calibration, load_run, reconstruct
 from mitsim.core.configuration import shipped_path
 from tests.known_camera import write_known
+from tests.system.refusals import Call
 
 CAPTURES = next(
     (path for parent in Path(__file__).resolve().parents if (path := parent / "shared/data/flatcam").is_dir()), None
@@ -23,7 +22,7 @@ pytestmark = pytest.mark.skipif(CAPTURES is None, reason="real captures are not 
 PLANES = ("r", "gb", "gr", "b")
 
 
-def captured(number: int, call: Callable[..., Any], folder: Path, **more: object) -> Path:
+def captured(number: int, call: Call, folder: Path, **more: object) -> Path:
     """The RUN folder of a capture, imported by the shipped list with what ``more`` says of `[prepare]` in place of its
     own words."""
     text = shipped_path("calibration", "flatcam.toml").read_text()
@@ -52,7 +51,7 @@ HALF = "{row = 80, column = 100, rows = 340, columns = 420}"
 
 
 @pytest.mark.slow
-def test_half_of_one_plane_tells_the_code(call: Callable[..., Any], tmp_path: Path) -> None:
+def test_half_of_one_plane_tells_the_code(call: Call, tmp_path: Path) -> None:
     """Correlations with the authors' image of the capture that was not learned from were 0.933 and 0.963."""
     runs = {number: captured(number, call, tmp_path, channel='"gb"', crop=HALF) for number in (6, 7)}
     greens = {}
@@ -69,9 +68,7 @@ def test_half_of_one_plane_tells_the_code(call: Callable[..., Any], tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("learned", "judged"), [(6, 7), (7, 6)])
-def test_the_other_capture_is_as_its_authors_have_it(
-    call: Callable[..., Any], tmp_path: Path, learned: int, judged: int
-) -> None:
+def test_the_other_capture_is_as_its_authors_have_it(call: Call, tmp_path: Path, learned: int, judged: int) -> None:
     """All of it automatic: how pictures lie, scales, codes, their weights, and that of the image. 42 s each."""
     runs = {number: captured(number, call, tmp_path) for number in (6, 7)}
     listed = listing(tmp_path, runs[learned], CAPTURES / f"rec_{learned}.png", centre=True)

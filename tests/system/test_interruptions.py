@@ -21,6 +21,8 @@ from tests.system.interrupted import PATTERNS, assert_equal_runs, ended, running
 
 pytestmark = pytest.mark.slow
 
+LATE = 505
+"""Frames of 512, which are written 16 at a time."""
 TRIES = 6
 """Of each work, killed when so many files are there."""
 
@@ -66,16 +68,18 @@ ENDS: dict[str, Callable[[subprocess.Popen[str]], None]] = {
 
 
 @pytest.mark.parametrize("how", ENDS)
-@pytest.mark.parametrize("frames", [60])
+@pytest.mark.parametrize("frames", [0, 60, LATE])
 def test_a_capture_goes_on_to_the_same_frames(lab: Any, whole: Path, tmp_path: Path, how: str, frames: int) -> None:
     command = ("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", PATTERNS, "--quiet")
     process = running(frames, *command, session=True)
-    workers = psutil.Process(process.pid).children(recursive=True)
-    ENDS[how](process)
+    workers = psutil.Process(process.pid).children(recursive=True) if process.poll() is None else []
+    with contextlib.suppress(ProcessLookupError):  # it may be over
+        ENDS[how](process)
     finished = ended(process)
     assert not psutil.wait_procs(workers, timeout=120)[1], "the worker goes on without its parent"
     assert "Traceback" not in finished.stderr and finished.stderr.count("\n") <= 1, finished.stderr
-    assert finished.returncode not in (0, 1, 2)
+    # The last frames take milliseconds: the signal may find the run over.
+    assert finished.returncode not in (0, 1, 2) or (frames == LATE and finished.returncode == 0)
     code, reported = done(*command, "--resume")
     assert code == 0, reported
     assert_equal_runs(tmp_path / "run", whole)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.exr import read_frame
-from tests.system.refusals import Refused, mentions
+from tests.system.refusals import Call, Refused, mentions
 from tests.system.test_colour import LINES, projector
 from tests.system.test_mosaic import camera_behind_filters
 from tests.system.test_mosaic import sheet as coloured_sheet
@@ -43,7 +43,7 @@ def devices(lab: Any) -> tuple[object, ...]:
 
 
 def test_a_plan_is_written_and_captured(
-    call: Callable[..., Any], refused: Refused, lab: Any, devices: tuple[object, ...], tmp_path: Path
+    call: Call, refused: Refused, lab: Any, devices: tuple[object, ...], tmp_path: Path
 ) -> None:
     """Frames are those of the capture that planned itself; what `plan --json` prints has a file's name more. (Planted:
     defaults of the options taken for asked for beside the plan.)"""
@@ -85,7 +85,7 @@ def test_a_plan_is_written_and_captured(
 
 
 def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
-    call: Callable[..., Any], refused: Refused, lab: Any, devices: tuple[object, ...], tmp_path: Path
+    call: Call, refused: Refused, lab: Any, devices: tuple[object, ...], tmp_path: Path
 ) -> None:
     """Neither the plan by light that is traced by it, nor files of camera, its drawn mask and projector, with
     --overwrite. (Planted: each left out; once, `transport --plan p.json -o p.json --overwrite` took the plan away.)"""
@@ -106,7 +106,7 @@ def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
 
 
 def test_what_python_warns_of_is_a_line_of_the_command_line(
-    call: Callable[..., Any], lab: Any, devices: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    call: Call, lab: Any, devices: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A note on stderr when all is done, without file and line of a program, and not among the JSON. (Planted: Python's
     own words, as until 0.6.0 `mitsim demo --patterns dots:2` had them.)"""
@@ -156,7 +156,7 @@ def same_run(one: Path, other: Path) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", ["bands:2", "lines", "mosaic"])
 def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
-    shell: Callable[..., Any], sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path, colour: str
+    shell: Call, sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path, colour: str
 ) -> None:
     """Frames of each line, and of all lines behind filters, are those of the capture that plans itself. Another word
     of --colour, and light by pixel, of which none is told apart, are refused in a line before anything is written.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from mitsim.core.exr import read_frame
 from tests.system.conftest import CAMERA, tree
+from tests.system.refusals import Call
 from tests.system.test_colour import LINES, SHEET, electrons, projector, spectrum
 from tests.unit.bench.test_lamps import POSITION
 
@@ -67,7 +67,7 @@ def camera_behind_filters(path: Path) -> Path:
 
 
 def test_a_pixel_sees_each_line_through_its_own_filter(
-    shell: Callable[..., Any], scene: Path, devices: tuple[str, ...], tmp_path: Path
+    shell: Call, scene: Path, devices: tuple[str, ...], tmp_path: Path
 ) -> None:
     """Against runs of each line by a monochrome camera, of the same paths: electrons by efficiencies' ratio."""
     run, lines = tmp_path / "run", tmp_path / "lines"
@@ -96,7 +96,7 @@ def counted(plane: str) -> float:
 
 @pytest.mark.slow
 def test_a_run_behind_filters_goes_on_and_comes_apart(
-    shell: Callable[..., Any], scene: Path, lit: Path, devices: tuple[str, ...], tmp_path: Path
+    shell: Call, scene: Path, lit: Path, devices: tuple[str, ...], tmp_path: Path
 ) -> None:
     """Lost frames come back bit for bit; images of the lines are their truths, though all share every frame, and a
     lamp's light: of that each colour's pixels have what its integral says beside the others'.
@@ -147,7 +147,7 @@ NONE = "imx249.toml has no mosaic of colour filters; give one"
     ],
 )
 def test_what_colour_cannot_do_is_refused(
-    call: Callable[..., Any], scene: Path, tmp_path: Path, verb: str, options: str, words: str
+    call: Call, scene: Path, tmp_path: Path, verb: str, options: str, words: str
 ) -> None:
     assert words in call(verb, scene, "-o", tmp_path / "new", "--colour", *options.split()).refusal
     assert not (tmp_path / "new").exists()

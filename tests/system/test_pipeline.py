@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.exr import read_frame
+from tests.system.refusals import Call
 
 FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 62.0), "hadamard:4": (32, 55.0), "random:4": (16, 50.0)}
 """Frames, and the least PSNR [dB] of an image with automatic lambda."""
@@ -23,7 +24,7 @@ FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 62.0), "hadamard:4": (32, 55.0)
 
 @pytest.fixture(scope="module")
 def runs(
-    call: Callable[..., Any], lab: Any, tmp_path_factory: pytest.TempPathFactory
+    call: Call, lab: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[[str], tuple[Path, dict[str, Any]]]:
     """Run folder and report of each family, captured once."""
     folder = tmp_path_factory.mktemp("runs")
@@ -37,7 +38,7 @@ def runs(
 
 
 @pytest.fixture(scope="module")
-def recover(call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]]) -> Callable[..., Any]:
+def recover(call: Call, lab: Any, runs: Callable[[str], tuple[Path, Any]]) -> Callable[..., Any]:
     """Report of `mitsim reconstruct` on a family's run."""
 
     @cache
@@ -64,7 +65,7 @@ def test_every_family_is_captured_and_recovered(
     assert found["psnr"] == pytest.approx(-10 * np.log10(np.mean((image - truth.astype(float)) ** 2)), abs=1e-3)
 
 
-def test_detail_finer_than_a_projector_pixel_costs(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_detail_finer_than_a_projector_pixel_costs(call: Call, lab: Any, tmp_path: Path) -> None:
     """Three squares a pixel: uneven light in a pixel casts another shadow than the board's, and 66 dB become 49."""
     devices = lab.write_scene("detail", reflectance=lab.photograph(48)), *lab.electronics
     assert call("capture", *devices, "-o", tmp_path / "run", "--patterns", "dots:4").code == 0
@@ -91,7 +92,7 @@ def test_the_image_stands_upright(lab: Any, recover: Callable[..., Any]) -> None
 
 
 def test_the_brightest_pixel_is_at_the_fraction_of_full_well(
-    call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
+    call: Call, lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
 ) -> None:
     full_well = 4 * 32360.0
     for run, fraction in ((runs("dots:4")[0], 0.8), (tmp_path / "dim", 0.25)):
@@ -104,7 +105,7 @@ def test_the_brightest_pixel_is_at_the_fraction_of_full_well(
 
 
 def test_a_second_reconstruction_replaces_the_first_when_it_is_asked_to(
-    call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
+    call: Call, lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
 ) -> None:
     """Of the same inputs at once; of others with --overwrite alone, and the refusal says what differs."""
     run, image = runs("dots:4")[0], tmp_path / "image"
@@ -131,7 +132,7 @@ def test_a_second_reconstruction_replaces_the_first_when_it_is_asked_to(
     assert written() == 1e9
 
 
-def test_a_flatcam_from_end_to_end(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_a_flatcam_from_end_to_end(call: Call, lab: Any, tmp_path: Path) -> None:
     devices = lab.write_scene("flatcam", mask="flatcam"), *lab.electronics
     assert call("capture", *devices, "-o", tmp_path / "run", "--patterns", "dots:4").code == 0
     assert call("calibrate", *devices, "-o", tmp_path / "cal").code in (0, 1)
@@ -141,7 +142,7 @@ def test_a_flatcam_from_end_to_end(call: Callable[..., Any], lab: Any, tmp_path:
 
 
 @pytest.mark.slow
-def test_both_estimators_render_the_same_frame(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_both_estimators_render_the_same_frame(call: Call, lab: Any, tmp_path: Path) -> None:
     """Under uniform light both estimators see the same irradiance, but for diffraction, which the reference lacks.
 
     The mean over the frame, and the frame's projection on the factored one: each within 5 standard errors of the

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +13,7 @@ from PIL import Image
 import mitsim as ms
 from mitsim.core.exr import read_frame
 from mitsim.core.images import lightness
+from tests.system.refusals import Call
 from tests.taken import RealBench
 from tests.test_docs import blocks, examples, figures
 
@@ -37,7 +36,7 @@ def files(folder: Path, count: int, ending: str) -> list[Path]:
 
 @pytest.mark.slow
 def test_a_bench_of_ones_own_leads_to_an_image(
-    call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str
 ) -> None:
     """Every command, with the page's devices; frames are taken when their pictures are drawn. The image is as good as
     one of a run that mitsim captured and calibrated itself, with the same noise (49.8 dB)."""
@@ -67,7 +66,7 @@ def test_a_bench_of_ones_own_leads_to_an_image(
     assert ms.psnr(image, real.thing.truth) > 49.5
 
 
-def walk(call: Callable[..., Any], heading: str) -> None:
+def walk(call: Call, heading: str) -> None:
     """Run the commands under a ``heading``. They print what the page has: words, and figures to a tenth.
 
     Lambda is left out, because it is sought at a flat minimum. Kernels of BLAS for other processors move it by a sixth,
@@ -83,7 +82,7 @@ def walk(call: Callable[..., Any], heading: str) -> None:
 
 
 def test_a_flatcams_captures_lead_to_the_image_of_its_authors(
-    call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a capture that was not learned from, in colour, no darker and no brighter. (Planted: planes of another
     mosaic; the image turned by a half; a run that does not say by which command it was made.)"""
@@ -98,9 +97,7 @@ def test_a_flatcams_captures_lead_to_the_image_of_its_authors(
     assert np.abs(ours - theirs).mean() < 0.1
 
 
-def test_a_diffusercams_capture_leads_to_a_hand(
-    call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_diffusercams_capture_leads_to_a_hand(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where one division by the spectrum of the light has it, too, and dark around it. (Planted: the image turned by a
     half.)"""
     monkeypatch.chdir(tmp_path)
@@ -123,9 +120,7 @@ def test_a_diffusercams_capture_leads_to_a_hand(
 
 @pytest.mark.slow
 @pytest.mark.skipif(not WHOLE.is_dir(), reason="published captures are not here")
-def test_whole_captures_lead_to_the_same_images(
-    call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_whole_captures_lead_to_the_same_images(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the walks' commands, but for what is of copies: a FlatCam's planes as the page has them, and a hand that
     is, with 4 x 4 pixels averaged, that of the copy."""
     monkeypatch.chdir(tmp_path)

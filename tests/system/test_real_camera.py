@@ -7,7 +7,6 @@ mitsim's renderer or sensor is in it, so that scale, sign and order of the docum
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from mitsim.acquire.exposure import Exposer
 from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import read_frame, write_frame
 from tests.real_session import RealSession, write_image
-from tests.system.refusals import mentions
+from tests.system.refusals import Call, Refused, mentions
 
 CAMERA = {"name": "bench 3"}
 DIGITAL = {"exposure_s": 0.02, "black_level_dn": 160, "gain_dn_per_e": 0.125, "dark_current_e_per_s": 4000}
@@ -74,7 +73,7 @@ class Bench3:
 
 
 @pytest.mark.parametrize("signed", [False, True], ids=["dots", "signed pairs"])
-def test_a_folder_made_by_hand_reconstructs(call: Callable[..., Any], tmp_path: Path, signed: bool) -> None:
+def test_a_folder_made_by_hand_reconstructs(call: Call, tmp_path: Path, signed: bool) -> None:
     bench = Bench3(tmp_path)
     found = call("reconstruct", bench.run(signed), "--calibration", bench.calibration(), "--json").payload
     assert found["psnr"] is None and found["ssim"] is None, "nobody knows the truth"
@@ -87,7 +86,7 @@ def test_a_folder_made_by_hand_reconstructs(call: Callable[..., Any], tmp_path: 
     assert text.code == 0 and "PSNR" not in text.out
 
 
-def test_files_of_another_program(call: Callable[..., Any], tmp_path: Path) -> None:
+def test_files_of_another_program(call: Call, tmp_path: Path) -> None:
     """Half floats and further channels are read as they are: whole numbers below 2048 are the same in eleven digits."""
     import OpenEXR
 
@@ -105,7 +104,7 @@ def test_files_of_another_program(call: Callable[..., Any], tmp_path: Path) -> N
     assert np.array_equal(*images)
 
 
-def test_the_example_of_the_documentation(call: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_example_of_the_documentation(call: Call, tmp_path: Path) -> None:
     """The manifest in docs/real_camera.md can be read."""
     text = (Path(__file__).parents[2] / "docs" / "real_camera.md").read_text(encoding="utf-8")
     section = text[text.index("## A real camera") :]
@@ -132,7 +131,7 @@ def test_the_example_of_the_documentation(call: Callable[..., Any], tmp_path: Pa
 
 
 def test_frames_of_a_session_calibrate_as_the_session_did(
-    call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    call: Call, lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Written as PNG with no more than a camera tells, they give the same image of the same run, to the bit."""
     frames, shoot = tmp_path / "frames", Exposer.digital
@@ -162,7 +161,7 @@ def test_frames_of_a_session_calibrate_as_the_session_did(
     assert np.array_equal(*(image["reflectance"] for image in images))
 
 
-def test_what_the_command_says_of_measured_frames(call: Callable[..., Any], tmp_path: Path) -> None:
+def test_what_the_command_says_of_measured_frames(call: Call, tmp_path: Path) -> None:
     session = RealSession()
     frames = session.write(tmp_path / "frames")
     done = call("calibrate", "--frames", "frames", "-o", "cal", cwd=tmp_path)
@@ -188,7 +187,7 @@ def test_what_the_command_says_of_measured_frames(call: Callable[..., Any], tmp_
     ids=" ".join,
 )
 def test_measured_frames_leave_no_choice(
-    refused: Callable[..., str], tmp_path: Path, arguments: tuple[str, ...], fragments: list[str]
+    refused: Refused, tmp_path: Path, arguments: tuple[str, ...], fragments: list[str]
 ) -> None:
     RealSession().write(tmp_path / "frames")
     mentions(refused("calibrate", "-o", "new", *arguments), *fragments)

@@ -4,7 +4,6 @@ goes on."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,11 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.exr import read_frame
+from tests.system.refusals import Call, Refused
 
 
 @pytest.fixture(scope="module")
-def imaged(call: Callable[..., Any], lab: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def imaged(call: Call, lab: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An image of the laboratory's frames."""
     place: Path = tmp_path_factory.mktemp("imaged") / "smooth"
     call("reconstruct", lab.run, "--calibration", lab.calibration, "-o", place, "--method", "tv", "--lambda", "2e8")
@@ -32,7 +32,7 @@ def numbers_in(folder: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def test_an_image_tells_the_session_that_repeats_it(call: Callable[..., Any], lab: Any, imaged: Path) -> None:
+def test_an_image_tells_the_session_that_repeats_it(call: Call, lab: Any, imaged: Path) -> None:
     """Frames, calibration, and how it was solved for."""
     told = call("run", "--from", imaged, "--json")
     assert told.code == 0 and told.payload["warnings"] == [] and told.payload["output"] is None
@@ -47,7 +47,7 @@ def test_an_image_tells_the_session_that_repeats_it(call: Callable[..., Any], la
     assert "[calibrate]" in alone and "[capture]" not in alone
 
 
-def test_what_was_changed_since_is_told(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_what_was_changed_since_is_told(call: Call, lab: Any, tmp_path: Path) -> None:
     """A flagged session file, by exit status 1."""
     run = lab.copy("run", tmp_path / "run")
     manifest = json.loads((run / "manifest.json").read_text())
@@ -59,7 +59,7 @@ def test_what_was_changed_since_is_told(call: Callable[..., Any], lab: Any, tmp_
     assert "# " + f"{lab.scene} was changed since" in (tmp_path / "again.toml").read_text()
 
 
-def test_what_no_session_makes_is_refused(refused: Callable[..., str], lab: Any, tmp_path: Path) -> None:
+def test_what_no_session_makes_is_refused(refused: Refused, lab: Any, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     assert "holds nothing that a session file repeats" in refused("run", "--from", "empty")
     assert "runs nothing" in refused("run", "--from", lab.run, "--resume")
@@ -71,9 +71,7 @@ def test_what_no_session_makes_is_refused(refused: Callable[..., str], lab: Any,
 
 
 @pytest.mark.slow
-def test_a_session_file_repeats_a_figure_bit_by_bit(
-    call: Callable[..., Any], lab: Any, imaged: Path, tmp_path: Path
-) -> None:
+def test_a_session_file_repeats_a_figure_bit_by_bit(call: Call, lab: Any, imaged: Path, tmp_path: Path) -> None:
     """Frames, truth, factors and image of three commands, by one file; and what is finished is left alone: by the same
     file nothing is written, and of another request nothing is lost."""
     ms.session_of(imaged).save(tmp_path / "again.toml")

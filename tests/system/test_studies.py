@@ -7,12 +7,14 @@ from typing import Any
 
 import pytest
 
+from tests.system.refusals import Call
+
 TOY = "tests.unit.studies.toy_study"
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def study(call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+def study(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """``mitsim study`` of the toy study, or of another name."""
     monkeypatch.setenv("TOY_FOLDER", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
@@ -20,7 +22,7 @@ def study(call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPa
     return lambda *options, name=TOY: call("study", name, *options, "--quiet")
 
 
-def test_keys_of_a_study(study: Callable[..., Any], tmp_path: Path) -> None:
+def test_keys_of_a_study(study: Call, tmp_path: Path) -> None:
     found = study("-o", tmp_path / "out", "--quick", "--json")
     assert found.code == 0, found.err
     payload = found.payload
@@ -33,7 +35,7 @@ def test_keys_of_a_study(study: Callable[..., Any], tmp_path: Path) -> None:
         assert (tmp_path / "out" / name).is_file()
 
 
-def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Path) -> None:
+def test_parts_merge_on_the_command_line(study: Call, tmp_path: Path) -> None:
     for number in (1, 2):
         part = study("-o", tmp_path / f"p{number}", "--quick", "--shard", f"{number}/2", "--jobs", 1)
         assert part.code == 0 and "4 points measured, 4 of other parts are missing" in part.out
@@ -69,7 +71,7 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
         ("merge", (), "give the folders of the parts"),
     ],
 )
-def test_refusals(study: Callable[..., Any], tmp_path: Path, name: str, options: tuple[Any, ...], words: str) -> None:
+def test_refusals(study: Call, tmp_path: Path, name: str, options: tuple[Any, ...], words: str) -> None:
     """Exit 2, one line, nothing left behind."""
     found = study(*options, "-o", tmp_path / "out", name=name)
     assert found.code == 2 and words in found.err, found.err

@@ -11,6 +11,7 @@ import pytest
 
 from mitsim.core.exr import read_frame
 from tests.system.conftest import ACCURACY
+from tests.system.refusals import Call
 from tests.unit.transport.test_indirect import MATT
 from tests.unit.transport.test_path_reuse import WALL
 
@@ -28,7 +29,7 @@ def channels(path: Path) -> list[np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", VARIANTS)
 def test_the_reference_sees_a_grey_scene_alike_in_every_variant(
-    call: Callable[..., Any], shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str
+    call: Call, shell: Call, lab: Any, tmp_path: Path, colour: str
 ) -> None:
     """White light on grey paper: colour adds nothing, so the mean irradiance of every channel is that of mono.
 
@@ -45,9 +46,7 @@ def test_the_reference_sees_a_grey_scene_alike_in_every_variant(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("colour", "gate"), [(VARIANTS[0], 1e-6), (VARIANTS[1], 2 * float(ACCURACY))])
-def test_capture_in_every_variant(
-    shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str, gate: float
-) -> None:
+def test_capture_in_every_variant(shell: Call, lab: Any, tmp_path: Path, colour: str, gate: float) -> None:
     """The same frames as in mono, and the same truth.
 
     Three channels take mono's paths: the same to float32's rounding. Wavelengths are sampled, so that both estimates
@@ -70,7 +69,7 @@ def test_capture_in_every_variant(
 
 @pytest.mark.slow
 def test_sampled_wavelengths_leave_indirect_light(
-    call: Callable[..., Any], shell: Callable[..., Any], shared_scene: Callable[..., Path], tmp_path: Path
+    call: Call, shell: Call, shared_scene: Callable[..., Path], tmp_path: Path
 ) -> None:
     """A corner of two walls, where light is accumulated on the device: frames of both variants keep the accuracy."""
     scene = shared_scene("spectral corner", extra=WALL.format(turn=90, x=-30, bsdf=MATT))
@@ -83,7 +82,7 @@ def test_sampled_wavelengths_leave_indirect_light(
     assert 0 < np.linalg.norm(ours - theirs) < 2 * 0.05
 
 
-def test_a_variant_that_is_not_on_this_machine(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+def test_a_variant_that_is_not_on_this_machine(shell: Call, lab: Any, tmp_path: Path) -> None:
     """A GPU variant: one line where there is no GPU, the usual frames where there is one."""
     outcome = shell(
         "capture", *lab.arguments, "-o", "run", "--patterns", "uniform", "--variant", "cuda_ad_mono", cwd=tmp_path
