@@ -478,10 +478,8 @@ class Sums:
         count, started = len(store), time.perf_counter()
         truths, weights, variances, noise = [], [], np.empty(count), np.empty(count)
         for index in range(count):
-            frames = prepared.accumulator()
-            for frame, (row, column) in zip(store.frames(index), store.indices, strict=True):
-                frames.add(frame, row, column)
-            problem = prepared.problem(frames)
+            shown = zip(store.frames(index), *store.indices.T, strict=True)
+            problem = prepared.problem(prepared.accumulator(shown))
             variances[index], noise[index] = datum_variance(problem), relative_noise(problem)
             weights.append(problem.projected.astype(np.float32))
             truths.append(store.truth(index))

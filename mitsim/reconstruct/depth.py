@@ -488,9 +488,7 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
     rise, misfit = min(near, far) - least, 0.0
     if basis.noise.stated and stated:
         prepared = prepare(basis.side(0, shift), basis.side(1, shift), *basis.patterns)
-        sums = prepared.accumulator()
-        for each in basis.frames:
-            sums.add(each.frame, each.row, each.column)
+        sums = prepared.accumulator((each.frame, each.row, each.column) for each in basis.frames)
         image = prepared.solve(sums, 1e-3 * prepared.problem(sums).scale).image
         expected = float(basis.noise.variance.mean()) * (basis.data - image.size) + basis.part * basis.noise.rendering
         expected += basis.smoothing(shift) * factor_energy(prepared, basis.patterns, stated, image)

@@ -36,7 +36,7 @@ from sensor row to row adds to all numbers of a column of W; halves of the colum
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property, partial
@@ -654,8 +654,12 @@ class Prepared:
             left = _correlate_side(self.left)
             return replace(self, left=left, right=left if self.right is self.left else _correlate_side(self.right))
 
-    def accumulator(self) -> Accumulator:
-        return Accumulator(self)
+    def accumulator(self, measurements: Iterable[tuple[FloatArray, int, int]] = ()) -> Accumulator:
+        """Return the sum of ``measurements``, frames with the numbers of their patterns, to which more can be added."""
+        sums = Accumulator(self)
+        for measurement in measurements:
+            sums.add(*measurement)
+        return sums
 
     def problem(self, frames: Accumulator) -> DiagonalProblem:
         if frames.prepared.left is not self.left or frames.prepared.right is not self.right:

@@ -172,10 +172,8 @@ class Unexposed:
     def clear(self, lam: float) -> FloatArray:
         model, exposer, expected = self.prepare(), self.exposer(1.0), self.expected
         off = exposer.electrons(expected.projector_off) if takes_ambient_frame("auto", self.family, expected) else 0.0
-        sums = model.accumulator()
-        for measurement in self.family.measurements(exposer.electrons(frame) - off for frame in expected):
-            sums.add(*measurement)
-        return model.solve(sums, lam).image
+        measured = self.family.measurements(exposer.electrons(frame) - off for frame in expected)
+        return model.solve(model.accumulator(measured), lam).image
 
     def exposer(self, seconds: float) -> Exposer:
         speckle = self.lit.light.speckle(self.family) if self.model == RENDERED else 0.0

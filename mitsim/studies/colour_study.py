@@ -199,10 +199,8 @@ def daylit_image(line: LitLine, light: tuple[FloatArray, float], lux: float, pat
         off = off + exposer.rate(exposer.digital(lamp * exposer.exposure_s, "ambient", shot)) / count
     plain = prepare(*line.factors.sides, family.left, family.right, centre=line.factors.manifest.centre)
     model = plain.with_correlation()
-    sums = model.accumulator()
-    for frame, row, column in _measured(exposer, family, rates):
-        sums.add(frame if family.signed else frame - off, row, column)
-    return model.solve(sums, "auto")
+    seen = _measured(exposer, family, rates)
+    return model.solve(model.accumulator((frame - off, row, column) for frame, row, column in seen), "auto")
 
 
 def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:

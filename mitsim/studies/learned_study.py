@@ -207,8 +207,7 @@ def transfer(data: str, held_out: str, seed: int) -> Found:
     like, rows, arrays = next(network.parameters()), [], {AUTHORS: seen[_TAUGHT].scene}
     for plane, measured in seen.items():
         prepared = twin_camera(measured, learned)
-        frames = prepared.accumulator()
-        frames.add(measured.frame, 0, 0)
+        frames = prepared.accumulator([(measured.frame, 0, 0)])
         problem = prepared.problem(frames)
         found = {TIKHONOV: prepared.solve(frames).image, TV: solve_tv(prepared, frames).image}
         with torch.no_grad():

@@ -234,10 +234,8 @@ def split(frames: Unexposed, twin: LitScene, seconds: float) -> tuple[Solution, 
     solution, exposer, lit = model.solve(sums), frames.exposer(seconds), frames.lit
 
     def image(expected: ExpectedFrames) -> FloatArray:
-        sums = model.accumulator()
-        for shot, frame in zip(frames.family.shots, expected, strict=True):
-            sums.add(exposer.electrons(frame) / seconds, shot.row, shot.column)
-        return model.solve(sums, solution.lam).image
+        measured = frames.family.measurements(exposer.electrons(frame) / seconds for frame in expected)
+        return model.solve(model.accumulator(measured), solution.lam).image
 
     lights = as_bright(twin.light, lit.light), direct_of(lit.light)
     even, direct = (image(LitScene(light).expected_frames(RENDERED, frames.family)) for light in lights)
@@ -331,10 +329,7 @@ def _measure_global(studio: Studio, point: Point) -> Found:
         return [exposer.rate(exposer.digital(np.maximum(rate, 0.0) * seconds, *shot.names)) for shot, rate in shown]
 
     def accumulate(taken: list[FloatArray], less: FloatArray | float = 0.0) -> Accumulator:
-        sums = model.accumulator()
-        for shot, frame in zip(family.shots, taken, strict=True):
-            sums.add(frame - less, shot.row, shot.column)
-        return sums
+        return model.accumulator(family.measurements(frame - less for frame in taken))
 
     rows, arrays = [], {"direct, true": lit.truth}
     for depth, own in ((AS_IT_IS, direct), (MENDED, mended)):

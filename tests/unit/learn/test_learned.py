@@ -58,10 +58,8 @@ def summed(solver: Any, patterns: str = "uniform") -> tuple[Any, Any]:
     camera = bench()
     shots = camera.run(patterns, picture(1), 1)
     prepared = solver.init(camera.calibrated(1), shots.patterns)
-    sums = prepared.accumulator()
-    for each in shots.pattern_measurements():
-        sums.add(each.frame, each.row, each.column)
-    return prepared, sums
+    measured = ((each.frame, each.row, each.column) for each in shots.pattern_measurements())
+    return prepared, prepared.accumulator(measured)
 
 
 # -------- The network

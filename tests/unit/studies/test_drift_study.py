@@ -102,11 +102,9 @@ def test_a_tilt_changes_the_image_as_it_is_predicted_to(stand: DriftStand, drift
     tilt of the rows costs this print hangs on that detail: its change has -0.4 of the error from before."""
     bench, images = stand.lit.bench, []
     for each in (Drift(), drift):
-        sums = stand._model.accumulator()
         expected = stand.lit.expected_frames(RENDERED, stand.family, bench=drift_mask(bench, each))
-        for frame, shot in zip(expected, stand.family.shots, strict=True):
-            sums.add(stand._frames.exposer(1.0).electrons(frame), shot.row, shot.column)
-        images.append(stand._model.solve(sums, stand.linear.lam).image)
+        seen = stand.family.measurements(stand._frames.exposer(1.0).electrons(frame) for frame in expected)
+        images.append(stand._model.solve(stand._model.accumulator(seen), stand.linear.lam).image)
     still, tilted = (
         stand.linear.expected_image(stand.lit.truth, stand._frame_changes(each)).image for each in (Drift(), drift)
     )

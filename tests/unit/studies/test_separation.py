@@ -25,13 +25,10 @@ def test_light_that_is_linear_between_dots_is_found_exactly(patterns: str) -> No
     haze = FACTOR @ (0.3 + 0.2 * rows + 0.1 * columns - 0.15 * rows * columns) @ FACTOR.T
     frames = [FACTOR @ (family.light(shot) * scene) @ FACTOR.T + haze for shot in family.shots]
     model = prepare(FACTOR, FACTOR, *sides)
-    whole, rest = model.accumulator(), model.accumulator()
-    for shot, frame in zip(family.shots, frames, strict=True):
-        whole.add(frame, shot.row, shot.column)
-    common = separate(model, (FACTOR, FACTOR), sides, whole.sum, np.sum(frames, axis=0))
+    whole = model.accumulator(family.measurements(frames)).sum
+    common = separate(model, (FACTOR, FACTOR), sides, whole, np.sum(frames, axis=0))
     np.testing.assert_allclose(common, haze, atol=1e-7 * haze.max())
-    for shot, frame in zip(family.shots, frames, strict=True):
-        rest.add(frame - common, shot.row, shot.column)
+    rest = model.accumulator(family.measurements(frame - common for frame in frames))
     np.testing.assert_allclose(model.solve(rest, 0).image, scene, atol=1e-6)
 
 
