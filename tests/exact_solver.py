@@ -105,7 +105,7 @@ def dots(n: int, k: int) -> FloatArray:
 
 def paper_factor() -> FloatArray:
     """Phi (512, 128) of the paper's camera and scene: both sides of its idealised model."""
-    camera = CameraGeometry.build("the paper's camera")
+    camera = CameraGeometry()
     scene = centred_edges(_SCENE_PIXELS, _SCENE_WIDTH / _SCENE_PIXELS)
     mask = camera.build_mask()
     return scene_factor(

@@ -11,13 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from mitsim.core.configuration import (
-    CAMERA,
-    DEFAULT_CAMERA,
-    PROJECTOR,
-    load_model,
-    locate,
-)
+from mitsim.core.configuration import CAMERA, DEFAULT_CAMERA, PROJECTOR, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, load_variant
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import plain

@@ -15,21 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mitsim.bench.effects import parse_switches
+from mitsim.core import configuration
 from mitsim.core.colour_files import BANDS, LINES, bands_of, spectral_of
-from mitsim.core.configuration import (
-    CAMERA,
-    DEVICES,
-    LIMITS,
-    PROJECTOR,
-    QUALITY,
-    FilePath,
-    Options,
-    load_model,
-    locate,
-    option,
-    shipped_names,
-    validated_by,
-)
+from mitsim.core.configuration import CAMERA, PROJECTOR, QUALITY, FilePath, Options, option, shipped_names, validated_by
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
 from mitsim.core.errors import ArgumentError, MitsimError, check_root, short_text
 from mitsim.core.files import check_plain
@@ -290,14 +278,14 @@ class Variant(Options):
         DEFAULT_VARIANT,
         "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
         metavar="VARIANT",
-        panel=LIMITS,
+        panel=configuration.LIMITS,
     )
 
 
 class LitScene(Variant):
     """What opens a scene with the projector's light."""
 
-    PANEL = DEVICES
+    PANEL = configuration.DEVICES
 
     projector: FilePath | None = option(
         None, "projector: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, PROJECTOR)
@@ -349,7 +337,7 @@ class Opening(LitScene):
         if colour != NO:
             from mitsim.devices.projector import ProjectorModel  # here: it imports numpy
 
-            light = load_model(projector, ProjectorModel)
+            light = configuration.load_model(projector, ProjectorModel)
             (light.in_bands(bands_of(colour)) if colour.startswith(BANDS) else light).traced_lines  # noqa: B018
         if timing is not None and colour != MOSAIC:
             timing.check(sensor, camera)
@@ -368,7 +356,7 @@ class Opening(LitScene):
         from mitsim.devices.camera import load_mask  # here: it imports numpy
 
         named = (self.camera, CAMERA), (self.projector, PROJECTOR)
-        files = [locate(each, "calibration", ".toml", field) for each, field in named if each]
+        files = [configuration.locate(each, "calibration", ".toml", field) for each, field in named if each]
         mask = load_mask(files[0]) if self.camera else None
         return files if mask is None or mask.file is None else [*files, files[0].parent / mask.file]
 

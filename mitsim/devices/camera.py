@@ -154,11 +154,6 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
             raise ValueError(f"{got} pixels must be square; {remedy}")
         return self
 
-    @classmethod
-    def build(cls, where: str, **values: object) -> CameraGeometry:
-        """Return the geometry of loose ``values``; a MitsimError of one line begins with ``where``."""
-        return validate(cls, values, where)
-
     @property
     def identity(self) -> dict[str, object]:
         """Return all fields for manifests but those that are unset and unknown to calibrations of 0.4."""
@@ -442,7 +437,7 @@ class MaskProfile(Configuration):
             mask |= {"mask": self.kind, "mask_order": self.order}
         else:
             mask["mask_plate"] = self.plate(folder)
-        return CameraGeometry.build("camera file: [mask]", **{**dict(camera), **mask})
+        return validate(CameraGeometry, {**dict(camera), **mask}, "camera file: [mask]")
 
 
 def mura(features: int) -> FloatArray:

@@ -15,31 +15,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, field_validator, model_validator
 
-from mitsim.core.colour_files import (
-    ALL,
-    MOSAIC,
-    PLANES,
-    RUN,
-    ColourManifest,
-    Preparation,
-    Raw,
-    Wanted,
-    image_files,
-    open_lines,
-)
+from mitsim.core import colour_files, manifests
+from mitsim.core.colour_files import Preparation, Wanted
 from mitsim.core.configuration import Configuration, Positive, locate, read_table, validate
 from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.core.files import check_plain, read_json
-from mitsim.core.manifests import (
-    MOST_PIXELS,
-    MOST_SHOTS,
-    Digital,
-    FileName,
-    Parallax,
-    Plain,
-    RunManifest,
-    read_manifest,
-)
+from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Plain
 from mitsim.devices.patterns import stripe_count
 from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, halves_in_order
@@ -140,9 +121,9 @@ class FrameList(Configuration):
     """Frames lose row and column means (FlatCam masks)."""
     board_reflectance: float | None = Field(default=None, gt=0, le=1)
     """Reflectance of the board that counts as 1 in the image; none: unknown."""
-    parallax: Parallax | None = None
+    parallax: manifests.Parallax | None = None
     """How the factors move with depth; none: not known, and no `--focus`."""
-    raw: Raw | None = None
+    raw: colour_files.Raw | None = None
     """How frames without a header are read; none: there are none."""
     prepare: Preparation = Preparation()
     """Table: what is done to the files' numbers before they are frames."""
@@ -172,7 +153,7 @@ class SessionFrames:
 
     @property
     def planes(self) -> tuple[str, ...]:
-        return PLANES if self.listed.prepare.channel == ALL else ("",)
+        return colour_files.PLANES if self.listed.prepare.channel == colour_files.ALL else ("",)
 
     def of_plane(self, name: str) -> SessionFrames:
         if not name:
@@ -190,7 +171,7 @@ class SessionFrames:
             return self
         from mitsim.core.images import Preparer
 
-        if self.listed.prepare.channel == ALL:
+        if self.listed.prepare.channel == colour_files.ALL:
             raise _refusal(self.folder, "prepare.channel all is of every plane; take one, by `of_plane`")
         preparer = Preparer.of(self.listed.prepare, self.listed.digital, self.wanted, self.folder)
         return replace(self, listed=self.listed.model_copy(update={"digital": preparer.digital}), preparer=preparer)
@@ -243,7 +224,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
     ]
     frames, dark = listed.frames, listed.dark
     if not frames:
-        names = [path.name for path in image_files(folder, Wanted(raw=listed.raw))]
+        names = [path.name for path in colour_files.image_files(folder, Wanted(raw=listed.raw))]
         dark = dark or tuple(DarkFile(file=name) for name in names if name.startswith(DARK))
         names = [name for name in names if name not in {frame.file for frame in dark}]
         if len(names) != len(wanted):
@@ -345,7 +326,7 @@ class FlatList(Configuration):
     """Photons that fall on a pixel in a second under a `light` of 1; none: not known, and no quantum efficiency."""
     source: str = Field(default="measured by mitsim characterise", max_length=1000)
     """Which specimen, gain setting and temperature: goes into the camera's file."""
-    raw: Raw | None = None
+    raw: colour_files.Raw | None = None
     """How frames without a header are read; none: there are none."""
     lit: Annotated[tuple[LitSet, ...], FailFast()] = Field(strict=False, max_length=_MOST_SETS)
     """Sets under even light."""
@@ -448,8 +429,8 @@ class KnownCaptures:
 
     path: Path
     listed: KnownList
-    lines: ColourManifest | None
-    manifests: dict[str, RunManifest]
+    lines: colour_files.ColourManifest | None
+    manifests: dict[str, manifests.RunManifest]
 
     def run(self, capture: KnownCapture, line: str = "") -> Path:
         return self.path.parent / capture.run / line
@@ -471,10 +452,10 @@ def load_known(path: Path | str) -> KnownCaptures:
     found = KnownCaptures(path, listed, None, {})
     for number, capture in enumerate(listed.known):
         folder = found.run(capture)
-        lines = open_lines(folder, RUN, MOSAIC)
+        lines = colour_files.open_lines(folder, colour_files.RUN, colour_files.MOSAIC)
         if lines.filters:
             raise MitsimError(f"{folder}: is behind colour filters; import its planes, or calibrate --colour mosaic")
-        manifests = {name: read_manifest(part, RunManifest) for name, part in lines.parts.items()}
+        manifests = {name: manifests.read_manifest(part, manifests.RunManifest) for name, part in lines.parts.items()}
         check_plain(found.picture(capture), "picture")
         if number == 0:
             found = KnownCaptures(path, listed, lines.colours, manifests)
@@ -497,7 +478,7 @@ def load_known(path: Path | str) -> KnownCaptures:
     return found
 
 
-def preparation_of(manifest: RunManifest, place: Path | str) -> Preparation:
+def preparation_of(manifest: manifests.RunManifest, place: Path | str) -> Preparation:
     """Return the preparation that an import applied before the frames of a ``manifest``; empty for other runs.
 
     Raises MitsimError if the manifest states another one.

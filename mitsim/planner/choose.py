@@ -19,17 +19,7 @@ from mitsim.bench.effects import EFFECTS, names
 from mitsim.core.arrays import FloatArray
 from mitsim.light import cost_model
 from mitsim.light.passes import FOLLOWED, PASSES
-from mitsim.light.settings import (
-    COUNTED,
-    GROUPS,
-    SURE,
-    WIDE,
-    Approximation,
-    Estimate,
-    Number,
-    PilotResult,
-    Settings,
-)
+from mitsim.light.settings import COUNTED, GROUPS, SURE, WIDE, Approximation, Estimate, Number, PilotResult, Settings
 
 _MARGIN = 0.95
 """Part of the accuracy that is planned for, because the pilot's frames differ from the others."""

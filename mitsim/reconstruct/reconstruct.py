@@ -21,14 +21,7 @@ from mitsim.reconstruct.accumulation import Accumulation, FrameNoise, accumulate
 from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map, move_factors, parallax_of
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import GROSS, GROSS_CHI_SQUARE, Cause, LeftOut, Misfit, faulty_frames, find_misfit, weigh
-from mitsim.reconstruct.request import (
-    IMAGE_FILE,
-    PICTURE_FILE,
-    RESULT_FILE,
-    TIKHONOV,
-    ImageCost,
-    ImageRequest,
-)
+from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, RESULT_FILE, TIKHONOV, ImageCost, ImageRequest
 from mitsim.reconstruct.solver import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 from mitsim.reconstruct.uncertainty import Uncertainty, rms, uncertainty

@@ -40,13 +40,7 @@ from mitsim.optics.terms import best_term
 from mitsim.reconstruct.colour import PLANES, JointMosaic
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
-from mitsim.reconstruct.reconstruct import (
-    MADE_OF,
-    Reconstruction,
-    check_same_inputs,
-    may_replace,
-    reconstruct_request,
-)
+from mitsim.reconstruct.reconstruct import MADE_OF, Reconstruction, check_same_inputs, may_replace, reconstruct_request
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
 from mitsim.reconstruct.solver import Solution, Status, automatic_lambda, prepare
 from mitsim.report.folder_page import ColourImage, report_folder, state_image

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Mask, mls_mask
@@ -191,7 +192,7 @@ def test_a_mask_on_the_sensor_is_its_own_shadow(measured: Recorder) -> None:
 @pytest.mark.parametrize(("distance", "thickness"), [(400.0, 0.0), (399.9, 0.1), (500.0, 0.0), (1e6, 0.0)])
 def test_a_mask_at_the_scene_is_refused_and_says_what_is_allowed(distance: float, thickness: float) -> None:
     with pytest.raises(MitsimError, match=r"^here: [^\n]*must be less than scene_distance 400\.0 mm[^\n]*$"):
-        CameraGeometry.build("here", mask_distance=distance, mask_thickness=thickness)
+        validate(CameraGeometry, {"mask_distance": distance, "mask_thickness": thickness}, "here")
 
 
 @pytest.mark.parametrize(
@@ -208,7 +209,7 @@ def test_a_mask_at_the_scene_is_refused_and_says_what_is_allowed(distance: float
 def test_lengths_beyond_all_cameras_are_refused_in_one_line(field: str, value: float) -> None:
     """Features of 1e-300 mm gave a transmission of 1e-296, and a refusal of waves 300 digits long."""
     with pytest.raises(MitsimError, match=rf"^here: {field}: got [^\n]{{1,150}}$"):
-        CameraGeometry.build("here", **{field: value})
+        validate(CameraGeometry, {field: value}, "here")
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

@@ -23,16 +23,7 @@ from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import Settings
 from mitsim.planner.planner import make_plan
 from tests.physics.radiosity import gauss, solid_angle
-from tests.physics.test_estimators_agree import (
-    LIMIT,
-    PASSES,
-    Pair,
-    classes_of,
-    frame_of,
-    pair_of,
-    worst,
-    z_scores,
-)
+from tests.physics.test_estimators_agree import LIMIT, PASSES, Pair, classes_of, frame_of, pair_of, worst, z_scores
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("variant")]
 SmallScene = Callable[..., Path]

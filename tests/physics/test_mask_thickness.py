@@ -9,6 +9,7 @@ The rendering of the last test uses fixed seeds; its gate is given there.
 import numpy as np
 import pytest
 
+from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.devices.mask import Mask
@@ -176,7 +177,7 @@ def test_wall_shift_in_features() -> None:
 
 def test_a_mask_reaching_into_the_scene_is_refused() -> None:
     with pytest.raises(MitsimError, match="mask_thickness 398"):
-        CameraGeometry.build("here", mask_thickness=398.0)
+        validate(CameraGeometry, {"mask_thickness": 398.0}, "here")
     at = Directions([0.0], 0.0)
     with pytest.raises(MitsimError, match=r"beyond the mask at 2\.5 mm"):
         shadow_terms(CameraGeometry(mask_thickness=0.5), at, at, 2.2)

@@ -64,6 +64,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import BoolArray, Flaws, Plate
@@ -104,7 +105,7 @@ def plugin_class() -> type:
                 values |= {"rows": rows, "columns": columns}
             if shown != [columns, rows]:
                 values["roi"] = first[1], first[0], shown[1], shown[0]
-            self.wear(CameraGeometry.build(PLUGIN, pixels=max(rows, columns), **values))
+            self.wear(validate(CameraGeometry, {"pixels": max(rows, columns), **values}, PLUGIN))
 
         def wear(self, geometry: CameraGeometry) -> None:
             self.geometry = geometry

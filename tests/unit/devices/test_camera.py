@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.projector import Spectrum
@@ -64,7 +65,7 @@ def test_tall_pixels_behind_a_mask_on_a_raster_are_refused() -> None:
 )
 def test_bad_numbers_are_refused_in_one_line(field: str, value: object) -> None:
     with pytest.raises(MitsimError, match="here: ") as caught:
-        CameraGeometry.build("here", **{field: value})
+        validate(CameraGeometry, {field: value}, "here")
     assert "\n" not in str(caught.value) and field in str(caught.value)
 
 

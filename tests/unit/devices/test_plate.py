@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices import mask as plate_module
 from mitsim.devices.camera import CameraGeometry, MaskProfile, load_mask, make_square, mura, read_drawing
@@ -226,4 +227,4 @@ def test_a_camera_wears_a_profile_and_cameras_without_stay_what_they_were() -> N
     with pytest.raises(MitsimError, match="mask_thickness"):
         MaskProfile(kind="random", feature_mm=0.05, features=60).put_on(CameraGeometry(mask_thickness=0.1), Path())
     with pytest.raises(MitsimError, match="plate"):
-        CameraGeometry.build("scene", mask="plate")
+        validate(CameraGeometry, {"mask": "plate"}, "scene")

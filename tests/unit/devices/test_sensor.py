@@ -25,9 +25,8 @@ def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        *(("pixel_pitch_um", 0.0), ("full_well_e", -1.0), ("read_noise_e", -0.1), ("quantum_efficiency", 1.01)),
-        *(("quantum_efficiency", 1e-9), ("full_well_e", 1e13), ("read_noise_e", 1e7), ("gain_dn_per_e", 1e7)),
-        *(("binning", 2.0), ("gain_dn_per_e", math.inf), ("colour", "red")),
+        *(("full_well_e", -1.0), ("full_well_e", 1e13), ("quantum_efficiency", 1.01), ("quantum_efficiency", 1e-9)),
+        *(("binning", 2.0), ("colour", "red")),
     ],
 )
 def test_a_value_out_of_range_is_refused(field: str, value: object) -> None:

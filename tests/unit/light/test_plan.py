@@ -20,15 +20,7 @@ from mitsim.core.job import Cost
 from mitsim.light.passes import even
 from mitsim.light.plan import Plan
 from mitsim.light.settings import REPLICATES, Approximation, Drawn, ErrorCovariance, Estimate, SampleCost, SharpPixels
-from tests.unit.planner.invented_pilot_result import (
-    ACCURACIES,
-    ONE_CLASS,
-    PILOT_RESULT,
-    SIZES,
-    changes,
-    plan,
-    rows,
-)
+from tests.unit.planner.invented_pilot_result import ACCURACIES, ONE_CLASS, PILOT_RESULT, SIZES, changes, plan, rows
 from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
 

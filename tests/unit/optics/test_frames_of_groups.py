@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from mitsim.acquire.exposure import Totals
-from mitsim.optics.frames import (
-    AccumulatedLight,
-    ClassFrames,
-    bound_of,
-    probe_vectors,
-)
+from mitsim.optics.frames import AccumulatedLight, ClassFrames, bound_of, probe_vectors
 from tests.unit.optics.small_camera import BESIDE, PIXELS, ambient_groups, expected_frames, random_groups, small_optics
 
 SEEDS = 300

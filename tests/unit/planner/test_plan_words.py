@@ -11,15 +11,7 @@ from mitsim.light.settings import Approximation, PilotResult, Settings
 from mitsim.planner.planner import SceneFacts
 from mitsim.scene.check import Unfit
 from mitsim.scene.outline import Tag
-from tests.unit.planner.invented_pilot_result import (
-    ONE_CLASS,
-    PILOT_RESULT,
-    SIZES,
-    changes,
-    plan,
-    rows,
-    stages,
-)
+from tests.unit.planner.invented_pilot_result import ONE_CLASS, PILOT_RESULT, SIZES, changes, plan, rows, stages
 
 
 def bench(

@@ -7,13 +7,7 @@ from scipy.linalg import hadamard
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.reconstruct.factors import (
-    AmbientLight,
-    _rank_one_split,
-    estimate_factors,
-    predicted_error,
-    stripe_sums,
-)
+from mitsim.reconstruct.factors import AmbientLight, _rank_one_split, estimate_factors, predicted_error, stripe_sums
 from mitsim.reconstruct.solver import prepare
 from tests.shadow_factor import scene_factor
 

@@ -7,12 +7,7 @@ from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
-from mitsim.reconstruct.accumulation import (
-    Model,
-    accumulate,
-    disagreement,
-    factor_slope,
-)
+from mitsim.reconstruct.accumulation import Model, accumulate, disagreement, factor_slope
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation

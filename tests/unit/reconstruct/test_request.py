@@ -12,13 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import ArgumentError
-from mitsim.reconstruct.request import (
-    ImageCost,
-    ImageRequest,
-    check_joint,
-    keeps_frames,
-    slab_numbers,
-)
+from mitsim.reconstruct.request import ImageCost, ImageRequest, check_joint, keeps_frames, slab_numbers
 from mitsim.reconstruct.solvers import SOLVERS
 
 TAKEN = [

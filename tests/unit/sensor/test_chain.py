@@ -2,11 +2,8 @@
 
 import math
 
-import mpmath
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import special, stats
 
 from mitsim.core.arrays import stream
@@ -60,33 +57,6 @@ def test_light_that_cannot_be_is_refused_not_clipped(bad: float) -> None:
         chain.electrons_from_irradiance(light, 1.0, sensor(), 550.0)
     with pytest.raises(ValueError, match="expected_electrons"):
         chain.expose(light, 1.0, sensor(), stream(0, "a"), stream(0, "b"))
-
-
-def exact_moments(mean: float, well: float) -> tuple[float, float]:
-    """Moments of min(N, F) summed term by term with 50 digits: an independent path to the same numbers."""
-    with mpmath.workdps(50):
-        mu, full = mpmath.mpf(mean), mpmath.mpf(well)
-        top = int(mean + 40 * math.sqrt(mean) + 200)
-        weight = mpmath.exp(-mu)
-        first = second = mpmath.mpf(0)
-        for count in range(top):
-            value = min(mpmath.mpf(count), full)
-            first += weight * value
-            second += weight * value**2
-            weight *= mu / (count + 1)
-        return float(first), float(second - first**2)
-
-
-@settings(max_examples=60, deadline=None)
-@given(mean=st.floats(0.01, 300), well=st.floats(0.5, 400))
-def test_clipped_moments_equal_the_sum_over_the_distribution(mean: float, well: float) -> None:
-    first, variance = chain.clipped_moments(mean, well)
-    exact = exact_moments(mean, well)
-    # Rounding: differences of terms of size mean^2 + well^2 in double precision (about 1e-16 each, 1e3
-    # headroom).
-    scale = mean**2 + well**2
-    assert first == pytest.approx(exact[0], rel=1e-11, abs=1e-13 * scale)
-    assert variance == pytest.approx(exact[1], rel=1e-11, abs=1e-13 * scale)
 
 
 def test_noise_streams_are_separate() -> None:

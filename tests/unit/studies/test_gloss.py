@@ -14,13 +14,7 @@ import pytest
 from mitsim.api.bench import open_bench
 from mitsim.report import EQUAL_PEAK
 from mitsim.report.lit_scene import IdealCamera, LitScene, Unexposed
-from mitsim.studies.light_studies import (
-    ERROR_SOURCES,
-    INTERREFLECTION,
-    PIXELS,
-    SENSOR,
-    split,
-)
+from mitsim.studies.light_studies import ERROR_SOURCES, INTERREFLECTION, PIXELS, SENSOR, split
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
