@@ -56,7 +56,7 @@ from mitsim.core.job import Job
 from mitsim.devices.framelist import capacity_of, load_flats
 from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import load_sensor
-from mitsim.devices.session import load_recipe
+from mitsim.devices.session import Drift, load_recipe
 from mitsim.learn.requests import PairOptions, PairsRequest, Schedule, Training, check_torch
 from mitsim.studies import OF_CAPTURES, OF_NO_SCENE, find_files
 
@@ -371,13 +371,19 @@ def scope_of(
 
     MitsimError for options that the study does not have, or that cannot be.
     """
-    from mitsim.studies.framework.experiment import check_drifts, check_sweep, measures_of
+    from mitsim.studies.framework.experiment import MEASURES, check_sweep, number_of
 
     if name == "sweep":
         check_sweep(tuple(varied), len(scope.pictures))
-        scope = replace(scope, measures=measures_of(measure))
+        measures = tuple(measure.split(","))
+        if unknown := [each for each in measures if each not in MEASURES]:
+            raise MitsimError(f"--measure {unknown[0]!r}: use {', '.join(MEASURES)}")
+        scope = replace(scope, measures=measures)
     elif name == "drift" and measure == "psnr":
-        check_drifts(tuple(varied))
+        still = Drift(power_ripple_hz=1.0, lamp_ripple_hz=1.0)  # a recipe states them, which is not read yet
+        for kind, texts in varied:
+            for text in texts:
+                still.alone(kind, number_of(kind, text))
     elif not (name in ("accuracy", "calibration") and measure == "psnr" and not varied):
         if varied or patterns != "dots:7" or measure != "psnr":
             others = "measure is for sweep, over for drift and sweep, patterns for these, accuracy and calibration"

@@ -51,20 +51,14 @@ Gains = Sequence[float | FloatArray]
 """Root mean squares of independent gains: of a whole frame, or (m,) of its rows."""
 
 
-@dataclass(frozen=True, eq=False)
 class Axis:
     """One side of the camera: (K, m, r) blocks of U, (r,) singular values, (n, r) V and (n, K) patterns."""
 
-    slabs: FloatArray
-    singular: FloatArray
-    basis: FloatArray
-    patterns: FloatArray
-
-    @classmethod
-    def of(cls, factor: FloatArray, patterns: FloatArray) -> Axis:
+    def __init__(self, factor: FloatArray, patterns: FloatArray) -> None:
         stacked = np.concatenate([factor * column for column in patterns.T])
-        left, singular, right = np.linalg.svd(stacked, full_matrices=False)
-        return cls(left.reshape(patterns.shape[1], *factor.shape[:1], -1), singular, right.T, patterns)
+        left, self.singular, right = np.linalg.svd(stacked, full_matrices=False)
+        self.slabs, self.basis = left.reshape(patterns.shape[1], *factor.shape[:1], -1), right.T
+        self.patterns = patterns
 
     @cached_property
     def total(self) -> FloatArray:
@@ -254,17 +248,15 @@ class LinearImage:
 
     @cached_property
     def axes(self) -> tuple[Axis, Axis]:
-        left = Axis.of(self._centre(self.left), self.family.left.astype(np.float64))
-        right = Axis.of(self._centre(self.right), self.family.right.astype(np.float64))
+        sides = (side - side.mean(axis=0) if self.centre else side for side in (self.left, self.right))
+        shown = (patterns.astype(np.float64) for patterns in (self.family.left, self.family.right))
+        left, right = map(Axis, sides, shown)
         return left, right
 
     @cached_property
     def filter(self) -> FloatArray:
         sigma = np.outer(self.axes[0].singular, self.axes[1].singular)
         return np.asarray(sigma / (np.square(sigma) + self.lam))
-
-    def _centre(self, matrix: FloatArray) -> FloatArray:
-        return np.asarray(matrix - matrix.mean(axis=0)) if self.centre else matrix
 
 
 def _by_row(rms: float | FloatArray) -> FloatArray:

@@ -50,27 +50,16 @@ _LONGEST_S = 10.0
 _FILLED_BY_DARK = 0.01
 
 
-@dataclass(frozen=True, eq=False)
 class Frames:
     """Frames of a simulated camera in S sets of frames that are taken alike; `dark` and `bright` are stacks.
 
-    ``light`` and ``electrons`` (S,) are photons and photoelectrons of a pixel; 0 in the dark.
+    ``light`` and ``electrons`` (S,) are photons and photoelectrons of a pixel; 0 in the dark. MitsimError if no light
+    saturates the camera.
     """
 
-    sensor: SensorModel
-    shape: tuple[int, int]
-    light: FloatArray
-    electrons: FloatArray
-    exposure_s: FloatArray
-    counts: npt.NDArray[np.intp]
-    dark: int
-    bright: int
-    seed: int
-
-    @classmethod
-    def of(cls, sensor: SensorModel, procedure: Procedure) -> Frames:
-        """Return the frames of a simulated camera; MitsimError if no light saturates it."""
-        capacity, steps, pixels = capacity_of(sensor), procedure.steps, procedure.pixels
+    def __init__(self, sensor: SensorModel, procedure: Procedure) -> None:
+        self.sensor, self.shape, self.seed = sensor, (procedure.pixels, procedure.pixels), procedure.seed
+        capacity, steps = capacity_of(sensor), procedure.steps
         hottest = sensor.dark_current_e_per_s + sensor.hot_dark_current_e_per_s
         hottest = sensor.binning**2 * sensor.dark_factor * hottest
         longest, exposure_s = _LONGEST_S, math.inf
@@ -80,12 +69,11 @@ class Frames:
         longest = min(max(longest, EXPOSURE_S[0] * _DARK_STEPS), EXPOSURE_S[1])
         times = longest * np.arange(_DARK_STEPS) / (_DARK_STEPS - 1)
         ladder, beyond = capacity * _TO * np.arange(1, steps + 1) / steps, 2 * capacity + 20 * math.sqrt(capacity)
-        electrons = np.concatenate([ladder, [beyond, capacity / 2, 0.0], np.zeros(_DARK_STEPS)])
-        exposures = np.concatenate([np.full(steps + 3, min(0.01, exposure_s)), times])
-        counts, bright = np.full(len(electrons), 2), steps + 1
-        counts[[bright, bright + 1]] = procedure.frames
-        light = electrons / procedure.efficiency(sensor)
-        return cls(sensor, (pixels, pixels), light, electrons, exposures, counts, bright + 1, bright, procedure.seed)
+        self.electrons = np.concatenate([ladder, [beyond, capacity / 2, 0.0], np.zeros(_DARK_STEPS)])
+        self.light = self.electrons / procedure.efficiency(sensor)
+        self.exposure_s = np.concatenate([np.full(steps + 3, min(0.01, exposure_s)), times])
+        self.counts, self.bright, self.dark = np.full(len(self.electrons), 2), steps + 1, steps + 2
+        self.counts[[self.bright, self.dark]] = procedure.frames
 
     def images(self, index: int, places: Places | None = None) -> Iterator[FloatArray]:
         """Yield the frames of a set, with the pixel at `places` (M, N) in place of each pixel."""
@@ -519,7 +507,7 @@ def characterise(
 ) -> Characterisation:
     """Run EMVA 1288's procedure on simulated frames of a camera, in a new, empty or earlier folder `output`."""
     procedure, job = procedure or Procedure(), job or Job()
-    frames = Frames.of(sensor, procedure)
+    frames = Frames(sensor, procedure)
     bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
     stated = {"name": f"{sensor.name}, found", "pixel_pitch_um": sensor.superpixel_pitch_um, "bits": bits}
     stated["source"] = f"simulated frames of {sensor.name}"

@@ -405,11 +405,10 @@ def in_processes(
                         worker.left = deque(waiting.popleft())
                         with suppress(OSError):  # it died, which is noticed when its answer is read
                             worker.pipe.send(tuple(worker.left))
-                busy = [worker for worker in crew if worker.left]
+                busy = {worker.pipe: worker for worker in crew if worker.left}
                 if not busy:
                     return
-                ready = wait([worker.pipe for worker in busy])
-                for worker in (worker for worker in busy if worker.pipe in ready):
+                for worker in (busy[pipe] for pipe in wait(busy)):  # type: ignore[index]
                     point = worker.left[0]
                     try:
                         answer = worker.pipe.recv()

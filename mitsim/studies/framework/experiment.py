@@ -19,7 +19,6 @@ from mitsim.bench.request import Request
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import read_name
-from mitsim.devices.session import Drift
 from mitsim.reconstruct.request import METHODS
 from mitsim.report import CONVENTIONS
 from mitsim.studies import ALL, EXPERIMENTS, GONE, SHARED
@@ -394,14 +393,6 @@ def values_of(text: str) -> tuple[str, tuple[str, ...]]:
     return name, tuple(f"{first + (last - first) * index / (count - 1):.6g}" for index in range(count))
 
 
-def measures_of(text: str) -> tuple[str, ...]:
-    """Return the comma-separated measures; MitsimError for an unknown one."""
-    names = tuple(text.split(","))
-    if unknown := [name for name in names if name not in MEASURES]:
-        raise MitsimError(f"--measure {unknown[0]!r}: use {', '.join(MEASURES)}")
-    return names
-
-
 def check_sweep(sweep: Sweep, pictures: int) -> None:
     """Raise MitsimError for a ``sweep`` that varies nothing, or an impossible knob."""
     knobs, allowed = dict(sweep), {"exposure": CONVENTIONS, "method": METHODS}
@@ -422,13 +413,6 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
             read_name(text)
         elif name in ("seed", "accuracy"):
             Request.of(**{name: number_of(name, text, int if name == "seed" else float)})
-
-
-def check_drifts(sweep: Sweep) -> None:
-    still = Drift(power_ripple_hz=1.0, lamp_ripple_hz=1.0)  # a recipe states them, which is not read yet
-    for kind, texts in sweep:
-        for text in texts:
-            still.alone(kind, number_of(kind, text))
 
 
 def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> float:

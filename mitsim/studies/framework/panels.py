@@ -84,8 +84,9 @@ class Panel:
             one = replace(self, title=", ".join(filter(None, (self.title, shown))))
             name = "_".join(filter(None, (self.file or measure, str(value)))).replace(" ", "_").replace(":", "")
             own = choose_rows(rows, {self.each: value} if self.each else {})
-            drawn[f"{name}.png"] = one.figure(results, own)
-        return {name: figure for name, figure in drawn.items() if figure is not None}
+            if not own.empty and (figure := one.figure(results, own)) is not None:
+                drawn[f"{name}.png"] = figure
+        return drawn
 
     def figure(self, results: Results, rows: DataFrame) -> Any:
         raise NotImplementedError
@@ -162,13 +163,11 @@ class Lines(Panel):
     shared: Where | None = None
     log: bool = False
 
-    def figure(self, results: Results, rows: DataFrame) -> Figure | None:
+    def figure(self, results: Results, rows: DataFrame) -> Figure:
         from pandas import to_numeric
 
         from mitsim.report.plots import curves
 
-        if rows.empty:
-            return None
         begin = rows[:0] if self.shared is None else choose_rows(rows, self.shared)
         shown: dict[str, dict[str, dict[float, Mean]]] = {}
         for facet, (own, other) in self.parts(rows, self.facet).items():
@@ -205,8 +204,6 @@ class Bars(Panel):
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         from mitsim.report.plots import grouped_bars
 
-        if rows.empty:
-            return None
         groups = {group: bars for group, bars in self.cells(rows, self.rows, self.colour, self.x).items() if bars}
         if self.ordered:
             groups = dict(sorted(groups.items(), key=lambda item: -next(iter(item[1].values())).value))

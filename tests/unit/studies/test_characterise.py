@@ -148,7 +148,7 @@ def test_noise_that_rounding_hides_is_the_standard_s_limit_and_of_real_numbers_w
     """0.1 DN of noise: rounded, (0.24 - 1/12)^(1/2) DN; not rounded, itself. (Planted: real numbers as if rounded.)"""
     quiet = {**PLAIN, "read_noise_e": 0.5, "dark_current_e_per_s": 0.0, "gain_dn_per_e": 0.2}
     for bits, expected in ((12, 0.39581 / 0.2), (None, 0.5)):
-        frames = Frames.of(sensor(**{**quiet, "bits": bits}), SMALL)
+        frames = Frames(sensor(**{**quiet, "bits": bits}), SMALL)
         session = session_of(frames.take(Job()), frames.dark, frames.bright, True, bits is not None)
         assert float(figures(session)["dark_noise"]) == pytest.approx(expected, rel=0.02)
         assert frames.figures_set()["dark_noise"] == 0.5

@@ -15,9 +15,10 @@ from mitsim.report.pages import Value
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, batches, run_experiment
 from mitsim.studies.framework.claims import UNDECIDED, Judged, Level, stated
-from mitsim.studies.framework.experiment import Claim, Results, Scope, Setup, find_experiment, measures_of, values_of
+from mitsim.studies.framework.experiment import Claim, Results, Scope, Setup, find_experiment, values_of
 from mitsim.studies.framework.panels import flag_warnings, section_of, write_page
 from mitsim.studies.light_studies import ERROR_SOURCES
+from mitsim.verbs import scope_of
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))
@@ -148,9 +149,9 @@ def test_what_a_sweep_varies_and_measures() -> None:
     assert values_of("roughness=0.1:0.5:5") == ("roughness", ("0.1", "0.2", "0.3", "0.4", "0.5"))
     assert values_of("mask=separable,flatcam") == ("mask", ("separable", "flatcam"))
     assert values_of("patterns=dots:4,dots:7") == ("patterns", ("dots:4", "dots:7"))
-    assert measures_of("psnr,misfit") == ("psnr", "misfit")
+    assert scope_of("sweep", WHOLE, "dots:7", (("mask", ("a", "b")),), "psnr,misfit").measures == ("psnr", "misfit")
     with pytest.raises(MitsimError, match="--measure 'speed': use psnr, ssim"):
-        measures_of("psnr,speed")
+        scope_of("sweep", WHOLE, "dots:7", (("mask", ("a", "b")),), "psnr,speed")
 
 
 @pytest.mark.parametrize("text", ["", "roughness", "roughness=", "=1:2:3", "z=1:2:x", "z=1:2:1", "z=1:2:99999"])
