@@ -564,9 +564,9 @@ SIZES = {
     "scene": (5, 1358),
     "sensor": (4, 1143),
     "sessions": (3, 804),
-    "studies": (22, 5080),
+    "studies": (22, 5048),
     "transport": (15, 4057),
-    "verbs": (1, 348),
+    "verbs": (1, 354),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
