@@ -28,6 +28,7 @@ from mitsim.core.manifests import (
     Patterns,
     RunManifest,
     ShotFile,
+    _Head,
 )
 from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.framelist import ChartPlace, DarkFile, FrameList, KnownCapture, KnownList, StripeFile
@@ -44,7 +45,7 @@ MODELS = (
     *(CameraGeometry, MaskProfile, ProjectorModel, Coherence),
     *(SensorModel, EfficiencyCurve),
     *(SessionRecipe, BoardShape, Drift),
-    *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, ClosingFile),
+    *(_Head, RunManifest, Digital, Patterns, ShotFile, AmbientFile, ClosingFile),
     *(CalibrationManifest, FactorNoise, Parallax),
     *(FrameList, StripeFile, DarkFile, Raw, Preparation, Crop),
     *(CaptureList, KnownList, KnownCapture),
@@ -96,10 +97,16 @@ def allowed_text(rules: Mapping[str, Any]) -> str:
 
 
 def table(model: type[BaseModel]) -> str:
-    """Return the Markdown table of a ``model``: fields, allowed values, defaults and meanings."""
+    """Return the Markdown table of a ``model``: fields, allowed values, defaults and meanings.
+
+    Fields of a base class are in the table of that class.
+    """
     schema, known = model.model_json_schema(), meanings(model)
+    inherited = {name for base in model.__mro__[1:] if base in MODELS for name in base.model_fields}
     lines = ["| field | allowed | default | meaning |", "|---|---|---|---|"]
     for name, rules in schema["properties"].items():
+        if name in inherited:
+            continue
         default = "required" if name in schema.get("required", ()) else default_text(model.model_fields[name].default)
         lines.append(f"| `{name}` | {allowed_text(rules)} | {default} | {known[name]} |")
     return "\n".join(lines)
