@@ -323,7 +323,8 @@ def prepare_study(
     if wrong := [one for one in scenes if not isinstance(one, (str, Path))]:
         raise ArgumentError("scene", f"{wrong[0]!r}: give a path")
     if name == MERGE:
-        asked.refuse(asked.without("experiment", "variant"), "on parts, which say themselves what they are of")
+        others = (name for name in asked.given if name not in ("experiment", "variant"))
+        asked.refuse(others, "on parts, which say themselves what they are of")
         from mitsim.studies.framework.campaign import merge
 
         return partial(merge, [Path(part) for part in scenes], output, asked.experiment)

@@ -21,7 +21,6 @@ from dataclasses import fields
 from functools import cache
 from io import FileIO
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Generic, TypeVar
 
 import numpy as np
@@ -201,9 +200,7 @@ class Behind(Generic[Item]):
     def __enter__(self) -> Behind[Item]:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def give(self, items: Iterable[Item]) -> None:

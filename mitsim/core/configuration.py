@@ -326,9 +326,6 @@ class Options(BaseModel):
         """Return the given options that another ``model`` shares."""
         return model(**{name: value for name, value in self.given.items() if name in model.model_fields})
 
-    def without(self, *names: str) -> dict[str, Any]:
-        return {name: value for name, value in self.given.items() if name not in names}
-
     def refuse(self, names: Iterable[str], where: str) -> None:
         """Refuse given options that have no effect under the condition ``where``."""
         for name in names:

@@ -202,9 +202,7 @@ def read_header(path: Path) -> ExrHeader:
     if not (0 < width <= files.MOST_SIDE and 0 < height <= files.MOST_SIDE):
         raise ValueError(f"claims {width}x{height} pixels; 1 to {files.MOST_SIDE} a side are allowed")
     if (left, top) != (0, 0) or window != shown:
-        raise ValueError(
-            f"has the data window {window} and the display window {shown}; save it with equal ones from 0, 0"
-        )
+        raise ValueError(f"has the data window {window} and the display window {shown}; save equal ones from 0, 0")
     if not 0 < len(channels) <= _MOST_CHANNELS:
         raise ValueError(f"has {len(channels)} channels; 1 to {_MOST_CHANNELS} are allowed")
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels):

@@ -77,10 +77,6 @@ def image_pages(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, tuple[in
         return pages, size
 
 
-def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
-    return image_pages(path, wanted)[1]
-
-
 def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
     """Return the numbers of a picture of one page; raises as :func:`read_images`, and for several pages."""
     pages, _ = image_pages(path, wanted)
@@ -323,9 +319,7 @@ class Preparer:
             flat = plain.mean(base / how.flat, wanted)
             for name, other in (("dark", dark), ("flat_dark", under)):
                 if other is not None and other.shape != flat.shape:
-                    raise MitsimError(
-                        f"{base / how.flat}: is {size_of(flat)}, but {name} {size_of(other)}; give one size"
-                    )
+                    raise MitsimError(f"{base / how.flat}: {size_of(flat)}, but {name} {size_of(other)}; give one size")
             light = flat - (plain.level if under is None else under)
             mean = plain.plane(light).mean()
             if not mean > 0:

@@ -177,7 +177,7 @@ def is_stopped() -> bool:
 
 def end_stopped() -> NoReturn:
     number = signal.Signals(_stopped_by or signal.SIGINT)
-    _say(_with_advice(_ending(number)))
+    _say_end(number)
     sys.exit(128 + number)
 
 
@@ -207,13 +207,12 @@ def end_uncaught(error: BaseException) -> NoReturn:
     sys.exit(2)
 
 
-def _ending(number: signal.Signals) -> str:
-    return "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
-
-
-def _with_advice(text: str) -> str:
+def _say_end(text: str | signal.Signals, remedy: str = "") -> None:
+    """Report an end by a signal, or a text about one, with the advice of the command and a ``remedy``."""
+    if isinstance(text, signal.Signals):
+        text = "interrupted" if text == signal.SIGINT else f"ended by {text.name}"
     noted = _advice[:].rstrip(b"\0").decode(errors="ignore") if _advice is not None else ""
-    return f"{text}; {noted}" if noted else text
+    _say("; ".join(filter(None, (text, noted, remedy))))
 
 
 def _say(text: str) -> None:
@@ -286,10 +285,10 @@ def _watch(child: int) -> NoReturn:
     killer = signal.Signals(os.WTERMSIG(status))
     if asked:
         # A first signal ends it without a word once Python has given up its handlers, in the last moment.
-        _say(_with_advice(_ending(killer) if killer == asked[0] else "stopped at once"))
+        _say_end(killer if killer == asked[0] else "stopped at once")
     else:
         crash = killer.name in _CRASHES
         cause = "a crash in native code" if crash else "out of memory, or killed from outside"
         remedy = "run: mitsim doctor" if crash else "free memory or ask for less"
-        _say(f"{_with_advice(f'the worker process was ended by {killer.name} ({cause})')}; {remedy}")
+        _say_end(f"the worker process was ended by {killer.name} ({cause})", remedy)
     os._exit(128 + (asked[0] if asked else killer))

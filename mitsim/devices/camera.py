@@ -21,7 +21,7 @@ from mitsim.core.colour_files import Wanted
 from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
-from mitsim.core.images import image_size, own_end, read_image
+from mitsim.core.images import image_pages, own_end, read_image
 from mitsim.core.job import Cost, Limits
 from mitsim.devices.mask import FEW, LARGEST, NO_FLAWS, CameraMask, Flaws, Mask, MaskKind, Plate, mls_mask, within
 from mitsim.devices.patterns import is_prime
@@ -477,7 +477,7 @@ def read_drawing(path: Path) -> FloatArray:
     Row 0 is at the top and column 0 at the left for a viewer from the sensor. Raises MitsimError for a file that is no
     PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
     """
-    rows, columns = image_size(path, _DRAWING)
+    rows, columns = image_pages(path, _DRAWING)[1]
     if (rows - columns) % 2 and 2 * max(rows, columns) > LARGEST:
         problem = f"{rows} x {columns} pixels: about its centre the shorter side needs half a pixel, so features become"
         allowed = f"half as large, of which {LARGEST} a side are allowed"
@@ -524,7 +524,7 @@ def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> Floa
     pixels per side, for a ``reduce`` that does not fit, and without light above the background.
     """
     path = Path(path)
-    size = image_size(path, _PICTURE)
+    size = image_pages(path, _PICTURE)[1]
     rows, columns = (side // reduce for side in size) if reduce >= 1 else (0, 0)
     if min(rows, columns) < 1 or min(size) <= 2 * _BORDER:
         problem = f"{size[0]} x {size[1]} pixels, reduce {reduce}; it needs more than {2 * _BORDER} pixels a side"

@@ -26,7 +26,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, verify
 from mitsim.core.files import output_folder
-from mitsim.core.images import CommonFactor, image_size, own_end, read_image
+from mitsim.core.images import CommonFactor, image_pages, own_end, read_image
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital
 from mitsim.core.worker import workers
@@ -196,11 +196,11 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...]) -> Fac
 
 def _checked(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
     first, *others = session.files
-    size = image_size(session.folder / first, session.wanted)
+    size = image_pages(session.folder / first, session.wanted)[1]
     for name in session.files:
         verify(session.folder, name, {}, "")  # no link out of it
     for name in others:
-        own = image_size(session.folder / name, session.wanted)
+        own = image_pages(session.folder / name, session.wanted)[1]
         if own != size:
             words = f"{name} is {own[0]} x {own[1]} pixels, but {first} is {size[0]} x {size[1]}"
             raise MitsimError(f"frames {session.folder}: {words}; take all with one camera setting")

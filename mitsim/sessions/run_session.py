@@ -208,10 +208,8 @@ def run(
         if asked.pictures:
             from mitsim.report.pages import render_page
 
-            flagged = sum(bool(step.warnings) for step in results)
-            verdict = f"{len(results)} step{'s' * (len(results) > 1)} done" + (
-                f", {flagged} flagged" if flagged else ""
-            )
+            count, flagged = len(results), sum(bool(step.warnings) for step in results)
+            verdict = f"{count} step{'s' * (count > 1)} done{f', {flagged} flagged' if flagged else ''}"
             page = render_page(
                 "session.html",
                 folder=folder.absolute(),

@@ -24,7 +24,7 @@ from mitsim.core.arrays import FloatArray, in_threads, stream
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import write_json, write_text
-from mitsim.core.images import image_size, read_image
+from mitsim.core.images import image_pages, read_image
 from mitsim.core.job import Cost, Job
 from mitsim.devices.framelist import DarkSet, FlatFrames, LitSet, capacity_of
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
@@ -537,7 +537,7 @@ def characterise_frames(
 
     with ExitStack() as stack:
         folder = None if output is None else stack.enter_context(study_folder(output, "characterise"))
-        shape = image_size(listed.folder / listed.sets[0].files[0], listed.wanted)
+        shape = image_pages(listed.folder / listed.sets[0].files[0], listed.wanted)[1]
         if min(shape) < _LEAST_SIDE:
             raise MitsimError(f"{where}: {shape[0]} x {shape[1]} pixels; give {_LEAST_SIDE} or more a side")
         Cost(memory_bytes=2 * 8 * _FLOATS * math.prod(shape)).check(where, job.limits)

@@ -24,7 +24,7 @@ from mitsim.core.images import (
     _one_line_refusals,
     _read_header,
     card,
-    image_size,
+    image_pages,
     normalise,
     own_end,
     png,
@@ -65,7 +65,7 @@ def test_numbers_are_read_as_they_are_stored(tmp_path: Path, name: str, write: W
     """To the bit, of every type that a file may have. (Planted: 32 bits without a sign read with one; bytes of 16 bits
     changed places.)"""
     write(tmp_path / name)
-    assert image_size(tmp_path / name) == (5, 7)
+    assert image_pages(tmp_path / name)[1] == (5, 7)
     values = read_image(tmp_path / name)
     assert np.array_equal(values, expected) and values.dtype == expected.dtype and values.dtype.isnative
 
@@ -75,7 +75,7 @@ def test_pages_come_in_their_order(tmp_path: Path) -> None:
     stack[0].save(tmp_path / "a.tif", save_all=True, append_images=stack[1:])
     np.save(tmp_path / "a.npy", np.stack([NUMBERS, NUMBERS * 2, NUMBERS * 3]))
     for name in ("a.tif", "a.npy"):
-        assert image_size(tmp_path / name) == (5, 7)
+        assert image_pages(tmp_path / name)[1] == (5, 7)
         assert [page[4, 6] for page in read_images(tmp_path / name)] == [3842, 7684, 11526]
 
 
@@ -148,7 +148,7 @@ def test_a_picture_too_large_for_any_sensor_is_refused_by_its_header(tmp_path: P
     for name, sides in (("a.npy", (2, 20000)), ("b.npy", (8193, 8192))):
         np.lib.format.open_memmap(tmp_path / name, "w+", np.uint8, sides).flush()
         with pytest.raises(MitsimError, match=f"{sides[0]} x {sides[1]} pixels; "):
-            image_size(tmp_path / name)
+            image_pages(tmp_path / name)[1]
     saved(NUMBERS)(tmp_path / "a.png")
     with pytest.raises(MitsimError, match=r"drawing .*5 x 7 pixels; 1 to 6 a side"):
         read_image(tmp_path / "a.png", Wanted("drawing", most=6))
