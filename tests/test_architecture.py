@@ -550,7 +550,7 @@ SIZES = {
     "bench": (5, 1141),
     "calibrate": (5, 1223),
     "cli": (6, 1426),
-    "core": (13, 2983),
+    "core": (13, 2970),
     "devices": (8, 1991),
     "exchange": (5, 1313),
     "learn": (5, 1208),
@@ -563,10 +563,10 @@ SIZES = {
     "report": (6, 1819),
     "scene": (5, 1358),
     "sensor": (4, 1143),
-    "sessions": (3, 804),
+    "sessions": (3, 802),
     "studies": (22, 5048),
     "transport": (15, 4057),
-    "verbs": (1, 354),
+    "verbs": (1, 355),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
