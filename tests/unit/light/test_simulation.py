@@ -309,27 +309,3 @@ def test_a_chessboard_has_the_ansi_contrast(made: Simulation) -> None:
         contrasts.append(light[chosen & WHITE].mean() / light[chosen & ~WHITE].mean())
     error = np.std(contrasts, ddof=1) / np.sqrt(GROUPS)
     assert error < 0.01 * CONTRAST and abs(np.mean(contrasts) - CONTRAST) < 4 * error
-
-
-def test_scattered_rays_carry_the_rest_about_their_pixels(made: Simulation) -> None:
-    """On a matt sheet that faces the sensor, a ray that is seen at the tan-angle t brings its flux / (1 + t^2)^2.
-
-    Thus every ray of a pass carries the same, none is lost, and both passes carry g and 1 - g. About its pixel a ray
-    lies as the Gaussian and the pixel are wide: 65 536 rays tell the mean to 0.4 % of that, the standard deviation to
-    0.3 %; four times as much is allowed (a false alarm in 4000).
-    """
-    g = made.bench.projector.glare
-    assert made.physics.projector.share == 1 - g and 0.05 < g < 0.2
-    carried = []
-    for name, deviation in (("direct", 0.0), ("glare", 0.25 * N)):
-        light = made.passes[name].tracer.trace(5, 0, RAYS)
-        flux = light.value * np.square(1 + np.square(light.row) + np.square(light.column))
-        assert len(flux) == N * N * RAYS and np.ptp(flux) < 1e-4 * flux.mean()
-        carried.append(flux.mean())
-        for place, own, (low, high) in zip(
-            (light.row, light.column), np.divmod(light.pixel, N), made.bench.windows, strict=True
-        ):
-            away = (place - low) / (high - low) * N - own - 0.5
-            wide = np.hypot(deviation, np.sqrt(1 / 12))
-            assert abs(away.mean()) < 0.016 * wide and away.std() == pytest.approx(wide, rel=0.012)
-    assert carried[1] / carried[0] == pytest.approx(g / (1 - g), rel=1e-5)

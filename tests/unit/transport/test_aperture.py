@@ -92,17 +92,6 @@ def test_an_even_picture_casts_the_stock_projectors_irradiance(radius: float, z:
     assert picture({"light": whole}, z, 40.0) == pytest.approx(found, rel=1e-4)
 
 
-def test_a_small_aperture_is_the_pinhole() -> None:
-    """The same picture of random pixels, out of focus, turned: blur of 0.01 mm on pixels of 7 mm."""
-    texels = (np.random.default_rng(2).random((N, 2 * N)) > 0.5).astype(float)
-    light = stock(turn=4.0, canvas=texels)
-    sharp = picture({"light": light}, 500.0, 60.0, 20.0)
-    found = picture(aperture_scene_parts(light, 0.02, 250.0), 500.0, 60.0, 20.0)
-    assert 0.2 < (sharp > 0.5 * sharp.max()).mean() < 0.8
-    # Both use the same sequence of random numbers for the camera; the blur touches 1 path in 500 or so.
-    assert np.linalg.norm(found - sharp) < 1e-2 * np.linalg.norm(sharp)
-
-
 def circle_below(distance: np.ndarray, radius: float) -> np.ndarray:
     """Part of a disk on one side of a line at a distance from its centre (1/2 through the centre)."""
     s = np.clip(distance / radius, -1, 1)

@@ -209,11 +209,6 @@ def test_a_gap_that_mitsuba_skips_is_the_references_refusal(loaded: Scene) -> No
     assert "the reference sees what stands at least 0.039 mm" in str(loaded(slab(398 - 0.02, 4)).unfit.reference)
 
 
-def test_a_foil_of_glass_is_too_thin_for_the_reference(loaded: Scene) -> None:
-    unfit = loaded(slab(350, 0.02)).unfit
-    assert unfit.factored is None and unfit.reference is not None
-
-
 def test_what_touches_along_a_line_or_in_a_point_is_no_contact(loaded: Scene) -> None:
     ball = '<shape type="sphere"><point name="center" x="3" y="2" z="356"/><float name="radius" value="10"/></shape>'
     crossing = plate(340, THIN, 25, turn=20) + plate(340, "", 25, turn=-10)

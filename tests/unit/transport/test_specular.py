@@ -7,7 +7,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.frames import specular_frames
-from mitsim.transport.connect import PinholeRays, ProjectorOptics, shines_in
+from mitsim.transport.connect import ProjectorOptics, shines_in
 from mitsim.transport.specular import SpecularRays, trace_specular_chains
 from tests.unit.transport.closed_forms import stock_projector
 
@@ -44,28 +44,6 @@ def flux(scene: "mi.Scene", **settings: int) -> float:
     beams = trace_specular_chains(scene, camera, projector(scene), **settings)
     geometry = camera.geometry
     return specular_frames(beams, geometry, geometric_samplers(geometry), np.zeros(N * N, np.int64)).flux
-
-
-def test_power_is_the_irradiance_that_mitsuba_renders(variant: str) -> None:
-    """A board at 400 mm seen by a pinhole camera: L = E reflectance / pi."""
-    light = emitter(to_world=mi.ScalarAffineTransform4f())
-    rays = PinholeRays(ProjectorOptics(light, N, 1, 2, (N + 3, 2 * N + 1)), [None])
-    expected = np.pi * SCALE * np.linspace(0.5, 1, N)
-    assert rays.power[:, 0].reshape(N, N) == pytest.approx(np.repeat(expected[:, None], N, axis=1), rel=1e-6)
-    side = 2 * np.tan(np.radians(15)) / (2 * N + 1)
-    assert rays.area == pytest.approx(side**2, rel=1e-6)
-    centre = (np.arange(N * N) // N + 0.5, np.arange(N * N) % N + 0.5)
-    d = rays.directions(np.stack(centre, axis=1))
-    # Straight above each lit point, looking down: the pinhole's own rays would be in the light's way.
-    target = d / d[:, 2:] * 400
-    scene = mi.load_dict({"type": "scene", "light": light, "board": plane(0, 400, {"type": "diffuse"}, 500)})
-    origin = (target - [0, 0, 30]).astype(np.float32)
-    ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(0, 0, 1)))
-    integrator = mi.load_dict({"type": "direct"})
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, N * N)
-    radiance = np.array(integrator.sample(scene, sampler, ray)[0]).ravel()
-    assert radiance * np.pi / 0.5 * 400**2 == pytest.approx(rays.power[:, 0], rel=1e-5)
 
 
 def test_no_mirror_no_beams_and_a_depth_of_at_least_one(variant: str) -> None:
