@@ -31,7 +31,9 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
 from mitsim.optics.image_formation import anchor_positions
 from mitsim.transport.plugins.base import (
+    Light,
     Numbers,
+    Surface,
     channels,
     device_vectors,
     generator,
@@ -346,7 +348,7 @@ class Reception:
         squared = 1 + dr.square(self.way.row - row * inverse) + dr.square(self.way.column - column * inverse)
         return dr.square(inverse) / (squared * dr.sqrt(squared))
 
-    def sightings(self, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, by_line: bool = False) -> Sightings:
+    def sightings(self, light: Light, pixel: mi.UInt32, by_line: bool = False) -> Sightings:
         return Sightings.of(light, by_line, pixel, self.way.row, self.way.column, self.way.inverse_depth)
 
 
@@ -373,12 +375,10 @@ class OpticalSetup:
         flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
         return float(flux.mean(dtype=np.float64)) / (math.pi * self.geometry.scene_distance**2)
 
-    def receive(
-        self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, local: mi.Point3f, active: mi.Bool
-    ) -> Reception:
+    def receive(self, si: Surface, toward: mi.Vector3f, local: mi.Point3f, active: mi.Bool) -> Reception:
         return self.received(si, toward, self.way(si, local, active))
 
-    def way(self, si: mi.SurfaceInteraction3f, local: mi.Point3f, active: mi.Bool) -> Way:
+    def way(self, si: Surface, local: mi.Point3f, active: mi.Bool) -> Way:
         to_world = self.camera.world_transform()
         point = to_world.inverse() @ si.p
         sensor = to_world @ local
@@ -408,7 +408,7 @@ class OpticalSetup:
         return Way(active, direction, passed, geometric, row * inverse_depth, column * inverse_depth, inverse_depth)
 
     @staticmethod
-    def received(si: mi.SurfaceInteraction3f, toward: mi.Vector3f, way: Way) -> Reception:
+    def received(si: Surface, toward: mi.Vector3f, way: Way) -> Reception:
         si.wi = si.to_local(way.direction)
         reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), way.open)
         geometric = way.geometric / dr.abs(dr.dot(si.n, toward))
@@ -445,7 +445,7 @@ class Landing:
     arrives: mi.Bool
 
 
-def landing(setup: OpticalSetup, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Landing:
+def landing(setup: OpticalSetup, si: Surface, direction: mi.Vector3f, active: mi.Bool) -> Landing:
     inverse, passage = setup.camera.world_transform().inverse(), setup.passage
     ray, length = mi.Ray3f(si.p, direction, si.time, si.wavelengths), mi.Float(0)
 
@@ -518,9 +518,7 @@ class ProjectorConnector:
         disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
         return mi.Point3f(disk.x, disk.y, 0) * dr.opaque(mi.Float, self.projector.aperture)
 
-    def connect(
-        self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool, lens: mi.Point3f | None = None
-    ) -> Connection:
+    def connect(self, si: Surface, rng: mi.PCG32, active: mi.Bool, lens: mi.Point3f | None = None) -> Connection:
         if self.projector.ideal:
             ds, weight = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
             return Connection(ds.d, ds.p, weight, mi.Float(0), self.projector.pixel_at(ds.uv), active & (ds.pdf > 0))

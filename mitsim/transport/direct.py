@@ -18,8 +18,8 @@ from mitsim.core.environment import keep_scenes
 from mitsim.devices.projector import Lines
 from mitsim.transport.connect import OpticalSetup, Reception, SensorPoints, landing, sample_wavelengths
 from mitsim.transport.integrator import PATHS_PER_LAUNCH, InFlight, Tracer
-from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, split_by_line, streams
-from mitsim.transport.records import DIRECT, DeviceAccumulator, PathSamples, Sightings, check_finite
+from mitsim.transport.plugins.base import Light, rows_columns, shuffle, sobol_point, split_by_line, streams
+from mitsim.transport.records import DIRECT, Anchor, DeviceAccumulator, PathSamples, Sightings, check_finite
 from mitsim.transport.transmission import Arrival
 
 IntArray = npt.NDArray[np.int64]
@@ -65,7 +65,7 @@ class DirectTracer(Tracer):
         dr.eval(accumulator.sums)
         return []
 
-    def _sightings(self, flight: InFlight) -> tuple[Sightings, tuple[mi.UInt32, mi.UInt32]]:
+    def _sightings(self, flight: InFlight) -> tuple[Sightings, Anchor]:
         number, anchor, share = self._pair(flight)
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         anchors = dr.opaque(mi.UInt32, self.points.anchors)
@@ -81,14 +81,14 @@ class DirectTracer(Tracer):
 
         def add_light(at: Arrival, state: tuple[Sightings, mi.PCG32]) -> tuple[Sightings, mi.PCG32]:
             seen, rng = state
-            reception, received = self._by_connection(at, sensor)
+            reception, received = self._by_connection(at, sensor, pixel)
             return seen.joined_by(reception.sightings(received, pixel, by_line), rng.next_float32()), rng
 
         by_line = self.projector.by_line
         seen, _ = self.setup.passage.along(ray, flux, (Sightings.none(by_line), rng), add_light)
         return seen, (row, column)
 
-    def _by_connection(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
+    def _by_connection(self, at: Arrival, sensor: mi.Point3f, pixel: mi.UInt32) -> tuple[Reception, Light]:
         reception = self.setup.receive(at.si, -at.direction, sensor, at.active)
         return reception, reception.irradiance * at.light
 
@@ -143,9 +143,7 @@ class FluxTracer:
         check_finite(total)
         return total.reshape(len(total), groups, -1)
 
-    def _light(
-        self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32, lines: Lines | None
-    ) -> mi.UnpolarizedSpectrum:
+    def _light(self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32, lines: Lines | None) -> Light:
         setup, glossy = self._setup, self._glossy
         pixels = dr.opaque(mi.UInt32, setup.projector.n**2)
         shared, rng = streams(seed, pixel + group * pixels, sample)
@@ -157,7 +155,7 @@ class FluxTracer:
         sensor, flux = self._sensor.inside(point), setup.rays.flux(pixel, wavelengths) * spectral
         half = dr.opaque(mi.Float, self._sensor.half_width) if glossy else None
 
-        def connected(at: Arrival, point: mi.Point3f) -> mi.UnpolarizedSpectrum:
+        def connected(at: Arrival, point: mi.Point3f) -> Light:
             reception = setup.receive(at.si, -at.direction, point, at.active)
             value = reception.irradiance * at.light
             if half is None:
@@ -169,9 +167,7 @@ class FluxTracer:
             # A choice between a spectrum and a number is a plain array, which loops of spectral variants refuse.
             return mi.UnpolarizedSpectrum(dr.select(value > 0, value / share, 0))
 
-        def add_light(
-            at: Arrival, state: tuple[mi.UnpolarizedSpectrum, mi.PCG32]
-        ) -> tuple[mi.UnpolarizedSpectrum, mi.PCG32]:
+        def add_light(at: Arrival, state: tuple[Light, mi.PCG32]) -> tuple[Light, mi.PCG32]:
             total, rng = state
             if turned is not None and half is not None:
                 turn = at.turn(rng.next_float32(), turned)

@@ -25,7 +25,7 @@ from mitsim.core.colour_files import MOST_LINES
 from mitsim.devices.projector import SPECTRA_NM, Band, Response
 from mitsim.transport import integrator
 from mitsim.transport.connect import OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
-from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, streams, x_y
+from mitsim.transport.plugins.base import Light, Surface, rows_columns, shuffle, sobol_point, streams, x_y
 from mitsim.transport.records import CellGrid, DeviceAccumulator, PathSamples, Sightings
 from mitsim.transport.transmission import refracted_way
 
@@ -126,7 +126,7 @@ class CameraPaths(integrator.PathIntegrator[State]):
 
     # ---- lights that paths run into ---------------------------------------------------------------------------------
 
-    def _run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _run_into(self, paths: State, si: Surface, first: bool) -> None:
         if first or self.rules.mirrors or self.passage.open:
             # Where the camera sees this vertex, unless an earlier one that is no mirror has settled it.
             depth = dr.rcp((paths.travelled + si.t) * self.slope)
@@ -147,7 +147,7 @@ class CameraPaths(integrator.PathIntegrator[State]):
             light = self._irradiance(paths, emitter.eval(si, lamp)) * share
             self._keep(paths, "ambient", lamp, light, self._lamps)
 
-    def _hit_lens(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
+    def _hit_lens(self, paths: State, si: Surface) -> None:
         """Keep light of the projector's lens.
 
         Light over mirrors alone belongs to the beams (:mod:`mitsim.transport.specular`); light over one other surface,
@@ -161,7 +161,7 @@ class CameraPaths(integrator.PathIntegrator[State]):
 
     # ---- connections ------------------------------------------------------------------------------------------------
 
-    def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: State, si: Surface, first: bool) -> None:
         bsdf, passage = si.bsdf(), self.passage
 
         # ---- To the projector; a vertex that is seen straight is the projector's side's
@@ -209,7 +209,7 @@ class CameraPaths(integrator.PathIntegrator[State]):
 
     # ---- turns ------------------------------------------------------------------------------------------------------
 
-    def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: integrator.Turn, first: bool) -> mi.Bool:
+    def _note_turn(self, paths: State, si: Surface, turn: integrator.Turn, first: bool) -> mi.Bool:
         passing, pdf, going = turn.passing, turn.sample.pdf, mi.Bool(True)
         before_sensor = paths.straight & ~passing
         if first or self.passage.open:
@@ -237,16 +237,14 @@ class CameraPaths(integrator.PathIntegrator[State]):
 
     # ---- light that is kept -----------------------------------------------------------------------------------------
 
-    def _irradiance(self, paths: State, radiance: mi.Spectrum) -> mi.UnpolarizedSpectrum:
+    def _irradiance(self, paths: State, radiance: mi.Spectrum) -> Light:
         return mi.unpolarized_spectrum(radiance) * paths.throughput * self.weight
 
     @property
     def _lamps(self) -> mi.UInt32:
         return dr.opaque(mi.UInt32, self.tracer.projector.n**2)
 
-    def _keep_projector(
-        self, paths: State, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, order: mi.UInt32
-    ) -> None:
+    def _keep_projector(self, paths: State, active: mi.Bool, light: Light, pixel: mi.UInt32, order: mi.UInt32) -> None:
         self._keep(paths, "direct", active & (order == 1), light, pixel)
         if self.rules.interreflection:
             self._keep(paths, "indirect", active & (order > 1), light, pixel)
@@ -254,7 +252,7 @@ class CameraPaths(integrator.PathIntegrator[State]):
     def _part(self, paths: State, kept: mi.Float) -> mi.Float:
         return 1 - (1 - paths.part) * kept if self.rules.steep else paths.part
 
-    def _keep(self, paths: State, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
+    def _keep(self, paths: State, kind: str, active: mi.Bool, light: Light, pixel: mi.UInt32) -> None:
         # Accumulated as the sensor's centre sees it.
         row, column = (t + s * paths.inverse_depth for t, s in zip((self.row, self.column), self.origin, strict=True))
         seen = Sightings.of(dr.select(active, light, 0), self.by_line, pixel, row, column, paths.inverse_depth)
@@ -268,7 +266,7 @@ def _share(own: mi.Float, rival: mi.Float) -> mi.Float:
     return dr.select(own > 0, own / (own + rival), 1)
 
 
-def _seen_at(si: mi.SurfaceInteraction3f, point: mi.Point3f) -> mi.SurfaceInteraction3f:
+def _seen_at(si: Surface, point: mi.Point3f) -> Surface:
     apparent = mi.SurfaceInteraction3f(si)
     apparent.p = point
     return apparent
@@ -308,9 +306,7 @@ class LampTracer(FromCameraTracer):
                 tracers[-1]._alone = dr.opaque(mi.UInt32, band)
         return tracers
 
-    def wavelengths(
-        self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32
-    ) -> tuple[mi.Color0f, mi.UnpolarizedSpectrum]:
+    def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, Light]:
         place = sobol_point(shuffle(sample, shared), shared).x
         counts = mi.Float(self._response.counts.astype(np.float32))
         steps = len(self._response.counts) - 1

@@ -22,8 +22,8 @@ from mitsim.core.environment import keep_scenes
 from mitsim.core.job import compiled_kernels
 from mitsim.scene.load import holds_hair
 from mitsim.transport.connect import OpticalSetup, SensorPoints, Way, sample_wavelengths
-from mitsim.transport.plugins.base import sobol_point, streams
-from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, DeviceAccumulator, PathSamples, Sightings
+from mitsim.transport.plugins.base import Surface, sobol_point, streams
+from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, Anchor, DeviceAccumulator, PathSamples, Sightings
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 PATHS_PER_LAUNCH = 2**22
@@ -232,7 +232,7 @@ class PathIntegrator(ABC, Generic[State]):
         if self.followed:
             self.scatter(paths, si, first)
 
-    def scatter(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def scatter(self, paths: State, si: Surface, first: bool) -> None:
         # ---- BSDF sample; the connection may have looked at the surface from elsewhere
         toward, rules = -paths.ray.d, self.rules
         si.wi = si.to_local(toward)
@@ -277,14 +277,14 @@ class PathIntegrator(ABC, Generic[State]):
             paths.straight &= passing
         paths.ray = self.passage.leaving(si, onward)
 
-    def _run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _run_into(self, paths: State, si: Surface, first: bool) -> None:
         """Keep light that paths meet on their way; none from the projector's side."""
 
     @abstractmethod
-    def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: State, si: Surface, first: bool) -> None:
         """Keep light that the vertices send to the sensor, or along their paths."""
 
-    def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+    def _note_turn(self, paths: State, si: Surface, turn: Turn, first: bool) -> mi.Bool:
         return mi.Bool(True)
 
 
@@ -293,19 +293,17 @@ def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
     return (sample.sampled_type & mirror) != 0
 
 
-def shading_correction(
-    si: mi.SurfaceInteraction3f, local: mi.Vector3f, onward: mi.Vector3f, toward: mi.Vector3f
-) -> mi.Float:
+def shading_correction(si: Surface, local: mi.Vector3f, onward: mi.Vector3f, toward: mi.Vector3f) -> mi.Float:
     """Return the factor of light followed forward, which sees shading normals the other way (Veach 1997, 5.3)."""
     correction = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
     return correction / (mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward))
 
 
-def tilt(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
+def tilt(si: Surface, direction: mi.Vector3f) -> mi.Float:
     return dr.dot(si.sh_frame.n, direction) / dr.dot(si.n, direction)
 
 
-def part_over_turn(paths: PathState, si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
+def part_over_turn(paths: PathState, si: Surface, correction: mi.Float) -> mi.Float:
     """Return the part of the light over the next turn that is followed from the projector.
 
     For a first turn it is :func:`matt_part`, after a mirror one, because the camera's side finds nothing there.
@@ -314,7 +312,7 @@ def part_over_turn(paths: PathState, si: mi.SurfaceInteraction3f, correction: mi
     return dr.select(paths.depth == paths.scattered, later, 1)
 
 
-def projector_part(si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
+def projector_part(si: Surface, correction: mi.Float) -> mi.Float:
     """Return the part of the light over a later turn that is followed from the projector.
 
     A shading normal's correction may grow without bound for grazing light, so that the variance would be infinite.
@@ -322,7 +320,7 @@ def projector_part(si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Floa
     return matt_part(si) * dr.select(dr.abs(correction) > _STEEP, _STEEP / dr.abs(correction), 1)
 
 
-def matt_part(si: mi.SurfaceInteraction3f) -> mi.Float:
+def matt_part(si: Surface) -> mi.Float:
     """Return 0 for hair, whose light is followed from the camera, and 1 elsewhere.
 
     Mitsuba samples hair for a view. Forward, its values over the density have no bound, and single paths dominate.
@@ -348,7 +346,6 @@ def camera_part(pdf: mi.Float) -> mi.Float:
 # (camera_part). Light that only mirrors have turned before the last surface (a caustic) belongs to direct light.
 
 _ROOMS = (4**2, 12**2)
-Anchor: TypeAlias = "tuple[mi.UInt32, mi.UInt32]"
 Held: TypeAlias = "dict[str, Any]"
 
 
@@ -404,7 +401,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
         sightings = self.connections.none(("direct", "indirect") if self.rules.mirrors else ("indirect",), self.by_line)
         self.paths = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
 
-    def _connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: PathState, si: Surface, first: bool) -> None:
         if first:
             return
         drawn = {kind: paths.rng.next_float32() for kind in ("direct", "indirect")}
@@ -416,14 +413,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
 
         paths.sightings = self.connections.at_each(paths.sightings, paths.active, connect)
 
-    def _keep_light(
-        self,
-        paths: PathState,
-        si: mi.SurfaceInteraction3f,
-        way: Way,
-        drawn: dict[str, mi.Float],
-        at: tuple[Held, mi.UInt32],
-    ) -> None:
+    def _keep_light(self, paths: PathState, si: Surface, way: Way, drawn: Held, at: tuple[Held, mi.UInt32]) -> None:
         reception = self.setup.received(si, -paths.ray.d, way)
         light = reception.irradiance * self.flux * paths.throughput
         caustic, part = paths.scattered == 0, 1 - camera_part(reception.pdf)

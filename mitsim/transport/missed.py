@@ -29,6 +29,7 @@ from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer
 from mitsim.transport.integrator import InFlight, Paths, Turn, camera_part, launches
 from mitsim.transport.plugins import base
+from mitsim.transport.plugins.base import Light, Surface
 from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, DeviceAccumulator, PathSamples, Sightings, check_finite
 from mitsim.transport.specular import turned_by_mirrors
 from mitsim.transport.transmission import Arrival
@@ -114,9 +115,7 @@ class _Landed:
         rays = _Turned(mi.Vector3f(si.p), way, mi.UInt32(found.mirror), *map(mi.Float, found.spectrum.T))
         return cls(mi.UInt32(first), side, dr.gather(_Turned, rays, mi.UInt32(order)))
 
-    def light(
-        self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool
-    ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum, mi.UInt32]:
+    def light(self, si: Surface, rng: mi.PCG32, active: mi.Bool) -> tuple[Light, Light, mi.UInt32]:
         """Return the radiance that surfaces send on of the light in their cubes, one ray of each drawn for all."""
         code = _cube(si.p, self.side)
         first, end = (dr.gather(mi.UInt32, self.first, code + step, active) for step in (0, 1))
@@ -158,7 +157,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
         super().__init__(tracer, flight)
         self._rays = tracer.setup.rays  # made before the loop, in which nothing can be evaluated
 
-    def _connect(self, paths: _MissedState, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: _MissedState, si: Surface, first: bool) -> None:
         if first or self.tracer.landed is None:
             return
         foreign = paths.active & (paths.in_mirror | (paths.scattered > 0))
@@ -168,7 +167,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
         none = mi.Float(0)
         self._join(paths, "indirect", Sightings.of(missed, self.by_line, mirror, base.panchromatic(hit), none, none))
 
-    def _hit_lens(self, paths: _MissedState, si: mi.SurfaceInteraction3f) -> None:
+    def _hit_lens(self, paths: _MissedState, si: Surface) -> None:
         once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
         met = once & (camera_part(paths.density) > 0)
         hit = self.connector.hit(paths.ray, si.t, paths.rng, met, paths.since)
@@ -185,7 +184,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
         seen = Sightings.of(dr.select(met, light, 0), self.by_line, paths.lobe, connected, none, none)
         self._join(paths, "direct", seen)
 
-    def _note_turn(self, paths: _MissedState, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+    def _note_turn(self, paths: _MissedState, si: Surface, turn: Turn, first: bool) -> mi.Bool:
         going = super()._note_turn(paths, si, turn, first)
         shape = dr.reinterpret_array(mi.UInt32, dr.select(si.instance != None, si.instance, si.shape))  # noqa: E711
         turned = ~turn.passing & ~paths.by_delta
@@ -428,15 +427,9 @@ class _Connections(DirectTracer):
         super().__init__(setup, 1, spread=True)
         self._least, self._over_sharp = least, over_sharp
 
-    def _place(
-        self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
-    ) -> tuple[mi.Point2f, mi.Float]:
-        self._own_least = dr.gather(mi.Float, self._least, number)
-        return super()._place(number, row, column, jitter)
-
-    def _by_connection(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
-        reception, received = super()._by_connection(at, sensor)
-        sharp = reception.pdf > self._own_least
+    def _by_connection(self, at: Arrival, sensor: mi.Point3f, pixel: mi.UInt32) -> tuple[Reception, Light]:
+        reception, received = super()._by_connection(at, sensor, pixel)
+        sharp = reception.pdf > dr.gather(mi.Float, self._least, pixel)
         return reception, dr.select(sharp == self._over_sharp, received, 0)
 
 

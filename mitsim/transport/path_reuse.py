@@ -44,7 +44,7 @@ from mitsim.transport.integrator import (
     shading_correction,
     tilt,
 )
-from mitsim.transport.plugins.base import generator, sobol_point, split_by_line
+from mitsim.transport.plugins.base import Light, Surface, generator, sobol_point, split_by_line
 from mitsim.transport.records import INDIRECT, DeviceAccumulator, PathSamples, Sightings, check_finite
 
 ByLine: TypeAlias = "list[mi.Float]"
@@ -194,19 +194,17 @@ class ReusedPaths(ProjectorPaths):
         self.own_turn = self._turn_on(si, -self.second_ray.d, paths.ray.d, paths.active & self.follows)
         self.onward = mi.Vector3f(paths.ray.d)
 
-    def _factors(self, spectrum: mi.UnpolarizedSpectrum) -> ByLine:
+    def _factors(self, spectrum: Light) -> ByLine:
         return [spectrum[line] for line in range(self.tracer.lines)]
 
-    def _turn(self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> ByLine:
+    def _turn(self, si: Surface, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> ByLine:
         si.wi = si.to_local(toward)
         context = mi.BSDFContext(mi.TransportMode.Importance)
         value = mi.unpolarized_spectrum(si.bsdf().eval(context, si, si.to_local(onward), active))
         value *= dr.abs(mi.Frame3f.cos_theta(si.wi) / dr.dot(si.n, toward))
         return self._factors(dr.select(active & dr.isfinite(value), value, 0))
 
-    def _turn_on(
-        self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool
-    ) -> ByLine:
+    def _turn_on(self, si: Surface, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> ByLine:
         kept = projector_part(si, tilt(si, toward) / tilt(si, onward)) if self.rules.steep else 1
         return [light * kept for light in self._turn(si, toward, onward, active)]
 
@@ -276,7 +274,7 @@ class ReusedPaths(ProjectorPaths):
     def sends(self) -> int:
         return self.tracer.lines
 
-    def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
+    def _sender(self, si: Surface) -> Sender:
         context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.first_ray.d
 
         def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
@@ -288,7 +286,7 @@ class ReusedPaths(ProjectorPaths):
 
         return send
 
-    def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
+    def _turner(self, si: Surface) -> Turner:
         def turn(at: mi.UInt32, active: mi.Bool) -> tuple[ByLine, ByLine]:
             met, ray = (dr.gather(type(each), each, at, active) for each in (self.second_hit, self.second_ray))
             second = met.compute_surface_interaction(ray, active=active)
@@ -310,7 +308,7 @@ class ReusedPaths(ProjectorPaths):
 
         return turn
 
-    def _first_points(self) -> mi.SurfaceInteraction3f:
+    def _first_points(self) -> Surface:
         return self.first_hit.compute_surface_interaction(self.first_ray, active=self.lit)
 
     def _pair_samples(self, values: ByLine, seen: Way | Sightings) -> PathSamples:
@@ -364,7 +362,7 @@ class DiffuseReusedPaths(ReusedPaths):
         reception = self.setup.received(second, facing, way)
         self.to_sensor = self._factors(reception.irradiance * dr.abs(dr.dot(self.normal, facing)))
 
-    def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
+    def _sender(self, si: Surface) -> Sender:
         def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
             cosine = dr.dot(si.sh_frame.n, direction) * self.facing
             value = dr.abs(dr.dot(si.n, direction))
@@ -372,7 +370,7 @@ class DiffuseReusedPaths(ReusedPaths):
 
         return send
 
-    def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
+    def _turner(self, si: Surface) -> Turner:
         own = self._cosines(self.shading, self.normal, -self.second_ray.d)
         further = [dr.select(own > 0, light / own, 0) for light in self.beyond]
         dr.eval(further)

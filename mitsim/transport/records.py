@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise, product
 from operator import or_
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -24,9 +24,10 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import compiled_kernels
 from mitsim.optics.shadow import Directions
-from mitsim.transport.plugins.base import panchromatic
+from mitsim.transport.plugins.base import Light, panchromatic
 
 IntArray = npt.NDArray[np.int64]
+Anchor: TypeAlias = "tuple[mi.UInt32, mi.UInt32]"
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2
 """Kinds of light: of lamps, of the projector over one surface that is no mirror, and over several."""
 _COUNTED = 4
@@ -45,7 +46,7 @@ class Sightings:
     lines: mi.UnpolarizedSpectrum | None = None
 
     @classmethod
-    def of(cls, light: mi.UnpolarizedSpectrum, by_line: bool, pixel: mi.UInt32, *place: mi.Float) -> Sightings:
+    def of(cls, light: Light, by_line: bool, pixel: mi.UInt32, *place: mi.Float) -> Sightings:
         row, column, inverse_depth = place
         lines = light / len(light) if by_line else None
         return cls(panchromatic(light), pixel, row, column, inverse_depth, lines)
@@ -116,7 +117,7 @@ class PathSamples:
         return [replace(self, value=self.lines[line].astype(np.float64), lines=None) for line in range(lines)]
 
     @classmethod
-    def fetch(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> PathSamples:
+    def fetch(cls, seen: Sightings, kind: int, anchors: Anchor | None = None) -> PathSamples:
         # Together: one by one, each would trace all paths again.
         dr.eval(seen, anchors)
         light = np.array(seen.value)
@@ -387,14 +388,14 @@ class DeviceAccumulator:
         parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)
         return lines * entries < MOST_PLACES and entries < _PAYS * parts * paths
 
-    def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
+    def place(self, seen: Sightings, chosen: mi.Float, anchor: Anchor | None = None) -> mi.UInt32:
         layer = mi.UInt32(0)
         for part in self._parts_beyond(seen):
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
         axes = (self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)
         return self._place(seen, layer, [self._cell(axis, tau) for axis, tau in axes], anchor)
 
-    def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
+    def shares(self, seen: Sightings, anchor: Anchor) -> Iterator[tuple[mi.UInt32, mi.Float]]:
         """Yield the places that light is split between, and its share in each."""
         passed = [dr.clip(part, 0, 1) for part in self._parts_beyond(seen)]
         layers = [(mi.UInt32(k), a - b) for k, (a, b) in enumerate(pairwise([mi.Float(1), *passed, mi.Float(0)]))]
@@ -421,9 +422,7 @@ class DeviceAccumulator:
     def _cell(self, axis: CellAxis, tau: mi.Float) -> mi.UInt32:
         return mi.UInt32(dr.maximum(dr.floor(self._position(axis, tau)), 0))
 
-    def _place(
-        self, seen: Sightings, layer: mi.UInt32, cells: Sequence[mi.UInt32], anchor: tuple[mi.UInt32, mi.UInt32] | None
-    ) -> mi.UInt32:
+    def _place(self, seen: Sightings, layer: mi.UInt32, cells: Sequence[mi.UInt32], anchor: Anchor | None) -> mi.UInt32:
         inside, grid = mi.Bool(True), self._bundle.grid
         for axis, tau in ((grid.rows, seen.row), (grid.columns, seen.column)):
             position = self._position(axis, tau)

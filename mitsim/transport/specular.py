@@ -26,7 +26,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import Beams
 from mitsim.optics.image_formation import IntArray
 from mitsim.transport.connect import PinholeRays, ProjectorOptics, wavelength_sets
-from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
+from mitsim.transport.plugins.base import Surface, channels, device_vectors, host_values, turn_and_origin, vectors
 from mitsim.transport.transmission import CLEAR, flat_panes, transmits
 
 # -------- Rays that follow perfect mirrors, from points of the window to where they cross the sensor plane
@@ -158,7 +158,7 @@ class SpecularRays:
             rays = join(onward)
         return join(crossings)
 
-    def _bounce(self, rays: Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[Rays]:
+    def _bounce(self, rays: Rays, si: Surface, active: Mask) -> list[Rays]:
         count = len(active)
         # Each ray meets the tangent plane of the surface, or its round or smooth shape.
         hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.transport.plugins.base import generator
+from mitsim.transport.plugins.base import Surface, generator
 from mitsim.transport.plugins.materials import is_glass
 
 CLEAR = 32 * 2.0**-24
@@ -74,7 +74,7 @@ class Passage:
         for bsdf in (shape.bsdf() for shape in scene.shapes()):
             self.open |= bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
 
-    def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
+    def between(self, si: Surface, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
         if not self.open:
             return ~self.scene.ray_test(self.leaving_to(si, target), active), mi.Spectrum(1)
         ray = self.leaving_to(si, target)
@@ -111,7 +111,7 @@ class Passage:
         begun = mi.Bool(True), ray, light, *state
         return dr.while_loop(begun, lambda active, *_: active, advance)[3:]  # type: ignore[no-any-return]
 
-    def next_surface(self, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.SurfaceInteraction3f:
+    def next_surface(self, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> Surface:
         """Return the next surface on a ray, never behind its start, so that the ray advances.
 
         On the thin triangles of a wire, single precision may put the point 0.01 mm behind the ray's start.
@@ -121,10 +121,10 @@ class Passage:
         return si
 
     @staticmethod
-    def straight(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+    def straight(si: Surface, active: mi.Bool) -> mi.Spectrum:
         return mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, active))
 
-    def through(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Passed:
+    def through(self, si: Surface, direction: mi.Vector3f, active: mi.Bool) -> Passed:
         passed = Passed(mi.Vector3f(direction), self.straight(si, active), mi.Float(1))
         if self.panes:
             context = mi.BSDFContext(mi.TransportMode.Importance)
@@ -137,36 +137,36 @@ class Passage:
             passed.eta = dr.select(bent, sample.eta, passed.eta)
         return passed
 
-    def is_pane(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+    def is_pane(self, si: Surface) -> mi.Bool:
         found = mi.Bool(False)
         for pane in self.panes:
             found |= si.shape == pane
         return found
 
-    def passes(self, si: mi.SurfaceInteraction3f, sample: mi.BSDFSample3f) -> mi.Bool:
+    def passes(self, si: Surface, sample: mi.BSDFSample3f) -> mi.Bool:
         if not self.open:
             return mi.Bool(False)
         bent = self.is_pane(si) & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaTransmission)
         return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null) | bent
 
-    def clear(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
+    def clear(self, si: Surface, direction: mi.Vector3f) -> mi.Float:
         slope = dr.maximum(dr.abs(dr.dot(si.n, direction)), _GRAZING)
         clear = mi.Float(CLEAR)
         if self._instanced:
             clear = dr.select(si.instance != dr.zeros(mi.ShapePtr), _LOOSE, CLEAR)
         return clear * (1 + dr.max(dr.abs(si.p))) / slope
 
-    def onward(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
+    def onward(self, si: Surface, direction: mi.Vector3f) -> mi.Ray3f:
         """Return a ray that starts beyond the surface on the line through the point; beside it for a cylinder."""
         start = si.p + direction * self.clear(si, direction)
         if self._round:
             start = dr.select(_is_round(si), si.spawn_ray(direction).o, start)
         return mi.Ray3f(start, direction, si.time, si.wavelengths)
 
-    def leaving(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
+    def leaving(self, si: Surface, direction: mi.Vector3f) -> mi.Ray3f:
         return self.onward(si, direction) if self.transmits else si.spawn_ray(direction)
 
-    def leaving_to(self, si: mi.SurfaceInteraction3f, target: mi.Point3f) -> mi.Ray3f:
+    def leaving_to(self, si: Surface, target: mi.Point3f) -> mi.Ray3f:
         ray = si.spawn_ray_to(target)
         if self.transmits:
             direction = dr.normalize(target - si.p)
@@ -176,7 +176,7 @@ class Passage:
         return ray
 
 
-def _is_round(si: mi.SurfaceInteraction3f) -> mi.Bool:
+def _is_round(si: Surface) -> mi.Bool:
     return si.shape.shape_type() == mi.UInt32(int(mi.ShapeType.Cylinder))
 
 
@@ -270,7 +270,7 @@ class _Aim:
     eta: mi.Float
 
 
-def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> RefractedWay:
+def refracted_way(passage: Passage, si: Surface, target: mi.Point3f, active: mi.Bool) -> RefractedWay:
     """Find the way through flat glass from a surface to a target."""
     facing, zero, none = dr.normalize(target - si.p), mi.Vector3f(0), mi.Float(0)
 

@@ -14,6 +14,10 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 
+Surface: TypeAlias = "mi.SurfaceInteraction3f"
+Light: TypeAlias = "mi.UnpolarizedSpectrum"
+Numbers: TypeAlias = "mi.Float | FloatArray"
+
 # -------- Between Dr.Jit and NumPy
 
 
@@ -27,7 +31,7 @@ def vectors(values: mi.Vector3f, count: int) -> FloatArray:
     return np.stack([host_values(part, count) for part in (values.x, values.y, values.z)], axis=1)
 
 
-def channels(spectrum: mi.UnpolarizedSpectrum, count: int) -> FloatArray:
+def channels(spectrum: Light, count: int) -> FloatArray:
     return np.stack([host_values(spectrum[i], count) for i in range(len(spectrum))], axis=1)
 
 
@@ -44,8 +48,6 @@ def device_vectors(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
 
 
 # -------- Coordinates
-
-Numbers: TypeAlias = "mi.Float | FloatArray"
 
 
 def rows_columns(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
@@ -123,10 +125,10 @@ def _unit(bits: mi.UInt32) -> mi.Float:
     return mi.Float(bits >> 8) * (1 / 2**24)
 
 
-def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
+def panchromatic(radiance: Light) -> mi.Float:
     # dr.mean would write the number of lanes into the kernel: another kernel for each number of paths.
     return dr.sum(radiance) / len(radiance)
 
 
-def split_by_line(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
+def split_by_line(light: Light, lines: int) -> list[mi.Float]:
     return [panchromatic(light)] if lines == 1 else [light[line] / len(light) for line in range(lines)]

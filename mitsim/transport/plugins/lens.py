@@ -51,7 +51,7 @@ import scipy
 
 from mitsim.core.arrays import FloatArray, integer, stream
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.base import host_values, vectors
+from mitsim.transport.plugins.base import Surface, host_values, vectors
 
 PLUGIN = "mitsim_projector"
 
@@ -89,7 +89,7 @@ def plugin_class() -> type:
             power = dr.select(active, dr.pi * self.scale * self.irradiance.eval(si, active), 0)
             return dr.select(d.z > 0, power / (self.get_shape().surface_area() * dr.square(dr.square(d.z))), 0)
 
-        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        def eval(self, si: Surface, active: mi.Bool = True) -> mi.Spectrum:
             active &= si.wi.z > 0
             return mi.depolarizer(self._radiance(si.p, si.to_world(si.wi), si.wavelengths, active))
 

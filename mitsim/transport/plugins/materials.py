@@ -100,7 +100,7 @@ from collections.abc import Iterator, Sequence
 from functools import reduce
 from operator import or_
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -110,7 +110,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from mitsim.core.configuration import read_toml, shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import BUMPS, CHOICES, DIRECTED
+from mitsim.transport.plugins.base import Light, Surface
 
+Draw: TypeAlias = "tuple[mi.BSDFSample3f, mi.Spectrum]"
+Value: TypeAlias = "tuple[mi.Spectrum, mi.Float]"
 GLASS, GRATING = "mitsim_glass", "mitsim_grating"
 _LIGHT = "calibration", "mp_cl1.toml"
 
@@ -134,7 +137,7 @@ def _bsdf_class() -> type:
         name: str
         model: object
 
-        def eval_pdf(self, *turn: Any) -> tuple[mi.Spectrum, mi.Float]:
+        def eval_pdf(self, *turn: Any) -> Value:
             return mi.Spectrum(0), mi.Float(0)
 
         def eval(self, *turn: Any) -> mi.Spectrum:
@@ -258,8 +261,8 @@ def _glass() -> type:
             dr.make_opaque(self.wavelength)
 
         def sample(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+            self, ctx: mi.BSDFContext, si: Surface, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
+        ) -> Draw:
             wavelength = si.wavelengths[0] if mi.is_spectral else self.wavelength
             part, cosine, eta_it, eta_ti = mi.fresnel(si.wi.z, dr.sqrt(self.model.index_squared(wavelength)))
             kinds = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
@@ -380,14 +383,14 @@ def _grating() -> type:
 
         # ---- formula of the module's docstring
 
-        def _grating_vector(self, si: mi.SurfaceInteraction3f) -> mi.Vector2f:
+        def _grating_vector(self, si: Surface) -> mi.Vector2f:
             circular = self.model.grooves == "circular"
             across = si.to_local(si.dp_du if circular else mi.Vector3f(self.model.direction))
             flat = mi.Vector2f(across.x, across.y)
             length = dr.norm(flat)
             return dr.select(length > 0, flat / length, mi.Vector2f(1, 0))
 
-        def _lobes(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.Float, mi.UnpolarizedSpectrum]]:
+        def _lobes(self, si: Surface) -> Iterator[tuple[mi.Float, Light]]:
             each = map(mi.UnpolarizedSpectrum, self.model.wavelengths)
             lines = list(zip(self._shares, each, strict=True))
             if mi.is_spectral:
@@ -404,9 +407,7 @@ def _grating() -> type:
 
         # ---- Mitsuba's interface
 
-        def eval_pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[mi.Spectrum, mi.Float]:
+        def eval_pdf(self, ctx: mi.BSDFContext, si: Surface, wo: mi.Vector3f, active: mi.Bool = True) -> Value:
             if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
                 return mi.Spectrum(0), mi.Float(0)
             cosine_i, cosine_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
@@ -424,8 +425,8 @@ def _grating() -> type:
             return mi.depolarizer(dr.select(active, self.reflectance * density, 0)), pdf
 
         def sample(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+            self, ctx: mi.BSDFContext, si: Surface, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
+        ) -> Draw:
             chosen = s1 * self._total()
             reached = mi.Float(self.diffuse)
             lambertian = chosen < reached
@@ -486,18 +487,18 @@ def _wrappers() -> dict[str, type]:
             self.m_components = [part.flags(i) for part in parts for i in range(part.component_count())]
             self.m_flags = reduce(or_, (part.flags() for part in parts))
 
-        def _shares(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Sequence[mi.Float]:
+        def _shares(self, si: Surface, active: mi.Bool) -> Sequence[mi.Float]:
             return (mi.Float(1),)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             for number, part in enumerate(self.parts):
                 callback.put(f"part_{number}", part, mi.ParamFlags.Differentiable)
 
-        def eval_null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        def eval_null_transmission(self, si: Surface, active: mi.Bool = True) -> mi.Spectrum:
             shares = zip(self._shares(si, active), self.parts, strict=True)
             return sum((part.eval_null_transmission(si, active) * share for share, part in shares), mi.Spectrum(0))
 
-        def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        def eval_diffuse_reflectance(self, si: Surface, active: mi.Bool = True) -> mi.Spectrum:
             shares = zip(self._shares(si, active), self.parts, strict=True)
             return sum((part.eval_diffuse_reflectance(si, active) * share for share, part in shares), mi.Spectrum(0))
 
@@ -521,14 +522,14 @@ def _wrappers() -> dict[str, type]:
             if self.weight is not None:
                 callback.put("weight", self.weight, mi.ParamFlags.Differentiable)
 
-        def _shares(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Sequence[mi.Float]:
+        def _shares(self, si: Surface, active: mi.Bool) -> Sequence[mi.Float]:
             side = dr.select(si.wi.z < 0, mi.Float(1), 0)
             second = side if self.weight is None else dr.clip(self.weight.eval_1(si, active), 0, 1)
             return 1 - second, second
 
         def sample(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+            self, ctx: mi.BSDFContext, si: Surface, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
+        ) -> Draw:
             shares, count = self._shares(si, active), self.parts[0].component_count()
             if ctx.component != _ANY:
                 which = int(ctx.component >= count)
@@ -546,9 +547,7 @@ def _wrappers() -> dict[str, type]:
             bs.pdf = dr.select(single, bs.pdf * dr.select(chosen, shares[1], shares[0]), density)
             return bs, dr.select(single, value, dr.select(density > 0, mixed / density, 0))
 
-        def eval_pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[mi.Spectrum, mi.Float]:
+        def eval_pdf(self, ctx: mi.BSDFContext, si: Surface, wo: mi.Vector3f, active: mi.Bool = True) -> Value:
             shares = self._shares(si, active)
             (first, pdf), (second, its_pdf) = (part.eval_pdf(ctx, si, wo, active) for part in self.parts)
             return first * shares[0] + second * shares[1], pdf * shares[0] + its_pdf * shares[1]
@@ -569,8 +568,8 @@ def _wrappers() -> dict[str, type]:
                 self.white = make(own)
 
         def sample(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+            self, ctx: mi.BSDFContext, si: Surface, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
+        ) -> Draw:
             bs, value = self.parts[0].sample(ctx, si, s1, s2, active)
             if ctx.mode == mi.TransportMode.Radiance:
                 return bs, value
@@ -584,9 +583,7 @@ def _wrappers() -> dict[str, type]:
             turned = _adjoint(self.parts[0], ctx, si, bs.wo, active & ~single)
             return bs, dr.select(single, value, dr.select(bs.pdf > 0, turned / bs.pdf, 0))
 
-        def eval_pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[mi.Spectrum, mi.Float]:
+        def eval_pdf(self, ctx: mi.BSDFContext, si: Surface, wo: mi.Vector3f, active: mi.Bool = True) -> Value:
             value, density = self.parts[0].eval_pdf(ctx, si, wo, active)
             if ctx.mode == mi.TransportMode.Importance:
                 value = _adjoint(self.parts[0], ctx, si, wo, active)
@@ -596,9 +593,7 @@ def _wrappers() -> dict[str, type]:
     return {PREFIX + name: each for name, each in made.items()}
 
 
-def _adjoint(
-    bsdf: mi.BSDF, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
-) -> mi.Spectrum:
+def _adjoint(bsdf: mi.BSDF, ctx: mi.BSDFContext, si: Surface, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
     """Return the value for light from ``si.wi`` seen from ``wo``, with the cosine of ``wo``."""
     seen = mi.SurfaceInteraction3f(si)
     seen.wi = wo
