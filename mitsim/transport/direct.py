@@ -28,13 +28,11 @@ _LOBE = 2.0**8
 
 
 class DirectTracer(Tracer):
+    brightest = _LOBE
+
     def __init__(self, setup: OpticalSetup, anchors: int, spread: bool = False, pixels: IntArray | None = None) -> None:
         super().__init__(setup, points=SensorPoints(setup.geometry.half_width, anchors, spread))
         self._pixels = np.arange(setup.projector.n**2) if pixels is None else pixels
-
-    @property
-    def board(self) -> float:
-        return _LOBE * self.setup.board
 
     @property
     def paths_per_sample(self) -> int:

@@ -80,6 +80,7 @@ class Tracer(ABC):
     """
 
     paths_per_launch: ClassVar[int] = PATHS_PER_LAUNCH
+    brightest: ClassVar[float] = 1.0
 
     def __init__(self, setup: OpticalSetup, paths: Paths | None = None, points: SensorPoints | None = None) -> None:
         self.setup, self.projector, self.paths = setup, setup.projector, paths or Paths()
@@ -97,6 +98,10 @@ class Tracer(ABC):
     @property
     def by_line(self) -> bool:
         return self.projector.by_line
+
+    @property
+    def board(self) -> float:
+        return self.brightest * self.setup.board
 
     @property
     def per_wavelength(self) -> Sequence[Any]:
@@ -366,10 +371,6 @@ class IndirectTracer(Tracer):
     @property
     def connections_per_path(self) -> int:
         return self.points.count
-
-    @property
-    def board(self) -> float:
-        return self.setup.board
 
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return ProjectorPaths(self, flight).path_samples(accumulator)

@@ -342,24 +342,22 @@ _MOST_BITS = 52
 
 @dataclass(frozen=True, eq=False)
 class Lit:
+    accumulator: DeviceAccumulator
     numbers: npt.NDArray[np.uint32]
-    rows: int
-    size: int
-    lamps: int
 
-    @property
+    @cached_property
     def inside(self) -> int:
-        return int(np.searchsorted(self.numbers, np.uint32(self.size * self.rows)))
+        return int(np.searchsorted(self.numbers, np.uint32(self.accumulator.bundle.size * self.accumulator.rows)))
 
     @cached_property
     def layout(self) -> sparse.csr_array:
         # All places fit 32 bits, in which matrices take half the time.
-        numbers = self.numbers[: self.inside]
-        places = (numbers // np.uint32(self.rows)).astype(np.int32)
-        row = numbers.astype(np.int32) - places * np.int32(self.rows)
-        starts = np.append(0, np.cumsum(np.bincount(places, minlength=self.size))).astype(np.int32)
+        bundle, rows, numbers = self.accumulator.bundle, self.accumulator.rows, self.numbers[: self.inside]
+        places = (numbers // np.uint32(rows)).astype(np.int32)
+        row = numbers.astype(np.int32) - places * np.int32(rows)
+        starts = np.append(0, np.cumsum(np.bincount(places, minlength=bundle.size))).astype(np.int32)
         which = np.arange(len(numbers), dtype=np.int32)
-        found = sparse.csc_array((which, row, starts), shape=(self.rows + self.lamps, self.size)).tocsr()
+        found = sparse.csc_array((which, row, starts), shape=(rows + bundle.lamps, bundle.size)).tocsr()
         for shared in (found.indices, found.indptr):
             shared.flags.writeable = False
         return found
@@ -373,12 +371,12 @@ class DeviceAccumulator:
     """
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float, lines: int = 1) -> None:
-        self._bundle, self._rows, self.lines = bundle, int(labels.max()) + 1, lines
+        self.bundle, self.rows, self.lines = bundle, int(labels.max()) + 1, lines
         self._width = bundle.size + bundle.anchors**2
         self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
         self._labels = mi.UInt32(labels.astype(np.uint32))
         # The last entry counts refused light: negative, not finite or too bright.
-        self._entries = self._rows * self._width + 1
+        self._entries = self.rows * self._width + 1
         self.sums = dr.zeros(mi.UInt64, self._entries * lines)
         self.traced = 0
 
@@ -392,7 +390,7 @@ class DeviceAccumulator:
         layer = mi.UInt32(0)
         for part in self._parts_beyond(seen):
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
-        axes = (self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)
+        axes = (self.bundle.grid.rows, seen.row), (self.bundle.grid.columns, seen.column)
         return self._place(seen, layer, [self._cell(axis, tau) for axis, tau in axes], anchor)
 
     def shares(self, seen: Sightings, anchor: Anchor) -> Iterator[tuple[mi.UInt32, mi.Float]]:
@@ -400,8 +398,8 @@ class DeviceAccumulator:
         passed = [dr.clip(part, 0, 1) for part in self._parts_beyond(seen)]
         layers = [(mi.UInt32(k), a - b) for k, (a, b) in enumerate(pairwise([mi.Float(1), *passed, mi.Float(0)]))]
         cells = []
-        for axis, tau in ((self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)):
-            if not self._bundle.between or axis.count == 1:
+        for axis, tau in ((self.bundle.grid.rows, seen.row), (self.bundle.grid.columns, seen.column)):
+            if not self.bundle.between or axis.count == 1:
                 cells.append([(self._cell(axis, tau), mi.Float(1))])
                 continue
             position = dr.clip(self._position(axis, tau) - 0.5, 0, dr.opaque(mi.Float, axis.count - 1))
@@ -412,7 +410,7 @@ class DeviceAccumulator:
             yield self._place(seen, layer, [row, column], anchor), part * row_part * column_part
 
     def _parts_beyond(self, seen: Sightings) -> Iterator[mi.Float]:
-        for low, high in pairwise(1 / depth for depth in self._bundle.depths):
+        for low, high in pairwise(1 / depth for depth in self.bundle.depths):
             yield (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
 
     @staticmethod
@@ -423,14 +421,14 @@ class DeviceAccumulator:
         return mi.UInt32(dr.maximum(dr.floor(self._position(axis, tau)), 0))
 
     def _place(self, seen: Sightings, layer: mi.UInt32, cells: Sequence[mi.UInt32], anchor: Anchor | None) -> mi.UInt32:
-        inside, grid = mi.Bool(True), self._bundle.grid
+        inside, grid = mi.Bool(True), self.bundle.grid
         for axis, tau in ((grid.rows, seen.row), (grid.columns, seen.column)):
             position = self._position(axis, tau)
             inside &= (position >= 0) & (position < dr.opaque(mi.Float, axis.count))
-        rows, columns, anchors = (dr.opaque(mi.UInt32, count) for count in (*grid.shape, self._bundle.anchors))
+        rows, columns, anchors = (dr.opaque(mi.UInt32, count) for count in (*grid.shape, self.bundle.anchors))
         line, column = anchor or (mi.UInt32(0), mi.UInt32(0))
         place = ((layer * anchors + line) * rows + cells[0]) * (anchors * columns) + column * columns + cells[1]
-        return dr.select(inside, place, dr.opaque(mi.UInt32, self._bundle.size) + line * anchors + column)
+        return dr.select(inside, place, dr.opaque(mi.UInt32, self.bundle.size) + line * anchors + column)
 
     def add(
         self, lights: Sequence[mi.Float], pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool | bool = True
@@ -440,7 +438,7 @@ class DeviceAccumulator:
             fits = (units >= 0) & (units < 2.0**_MOST_BITS)
             lit = mi.Bool(active) & ~(light == 0)  # not a number is light to be refused
             row = dr.gather(mi.UInt32, self._labels, pixel, lit)
-            entry = dr.select(fits, place * dr.opaque(mi.UInt32, self._rows) + row, self._rows * self._width)
+            entry = dr.select(fits, place * dr.opaque(mi.UInt32, self.rows) + row, self.rows * self._width)
             amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
             index = entry * self.lines + line
             dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, lit, mode=dr.ReduceMode.Direct)
@@ -460,14 +458,13 @@ class DeviceAccumulator:
         ]
         dr.eval(lit, units)
         self.sums = dr.zeros(mi.UInt64, self._entries * self.lines)
-        found = Lit(np.array(lit), self._rows, self._bundle.size, self._bundle.lamps)
+        found = Lit(self, np.array(lit))
         compiled_kernels()
-        return [DeviceSums(self, found, np.array(each)) for each in units]
+        return [DeviceSums(found, np.array(each)) for each in units]
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceSums:
-    accumulator: DeviceAccumulator
     lit: Lit
     units: npt.NDArray[np.uint64]
 
@@ -476,8 +473,8 @@ class DeviceSums:
 
         Raises MitsimError for light that is NaN, infinite, or four million times a bright path's.
         """
-        lit, units, accumulator = self.lit, self.units, self.accumulator
-        if len(lit.numbers) and lit.numbers[-1] == accumulator._rows * accumulator._width and units[-1]:
+        lit, units, accumulator = self.lit, self.units, self.lit.accumulator
+        if len(lit.numbers) and lit.numbers[-1] == accumulator.rows * accumulator._width and units[-1]:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
@@ -487,10 +484,10 @@ class DeviceSums:
 
     def beyond(self, samples: int = 1) -> FloatArray:
         """Return the light outside by row and anchor, (rows, anchors, anchors)."""
-        lit, accumulator = self.lit, self.accumulator
-        rows, anchors = accumulator._rows, accumulator._bundle.anchors
+        lit, accumulator = self.lit, self.lit.accumulator
+        rows, anchors = accumulator.rows, accumulator.bundle.anchors
         # The last entry counts refused light: negative, not finite or too bright.
         found = np.zeros(rows * anchors**2 + 1)
-        found[lit.numbers[lit.inside :] - np.uint32(rows * accumulator._bundle.size)] = self.units[lit.inside :]
+        found[lit.numbers[lit.inside :] - np.uint32(rows * accumulator.bundle.size)] = self.units[lit.inside :]
         by_row = np.moveaxis(found[:-1].reshape(anchors, anchors, rows), 2, 0)
         return np.asarray(by_row * (accumulator._unit / samples))

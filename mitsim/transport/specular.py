@@ -174,10 +174,10 @@ class SpecularRays:
         for number in np.intersect1d(numbers, list(self._exact)) if self._exact else ():
             mine = np.flatnonzero(numbers == number)
             with np.errstate(all="ignore"):
-                old = Hits(point[mine], geometric[mine], normal[mine])
+                old = point[mine], geometric[mine], normal[mine]
                 new = self._exact[int(number)](rays.origin[mine], rays.direction[mine], old, faces[mine])
-            good = np.isfinite(new.point).all(axis=1) & np.isfinite(new.normal).all(axis=1)
-            for values, better in ((point, new.point), (geometric, new.geometric), (normal, new.normal)):
+            good = np.isfinite(new[0]).all(axis=1) & np.isfinite(new[2]).all(axis=1)
+            for values, better in zip((point, geometric, normal), new, strict=True):
                 values[mine[good]] = better[good]
         onward: list[Rays] = []
         materials = host_values(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
@@ -242,13 +242,8 @@ def _redirect(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: Fl
 # need none of it: their normal is the same all over.
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    point: FloatArray
-    geometric: FloatArray
-    normal: FloatArray
-
-
+Hits = tuple[FloatArray, FloatArray, FloatArray]
+"""Points, geometric normals and shading normals (k, 3)."""
 Meet = Callable[[FloatArray, FloatArray, Hits, IntArray], Hits]
 """Function of origins, directions, hits in single precision and numbers of faces that returns better hits."""
 
@@ -273,14 +268,14 @@ def exact_hits(shape: mi.Shape) -> Meet | None:
         start, way = across(origin - centre), across(direction)
         a, b = np.square(way).sum(axis=1), (start * way).sum(axis=1)
         root = np.sqrt(b**2 - a * (np.square(start).sum(axis=1) - radius**2))
-        near = ((hits.point - origin) * direction).sum(axis=1)
+        near = ((hits[0] - origin) * direction).sum(axis=1)
         # Of the two, the crossing that was hit: b and a root of the other sign cancel only where it is far from both.
         first, second = (-b - root) / a, (-b + root) / a
         distance = np.where(np.abs(first - near) < np.abs(second - near), first, second)
         point = origin + direction * distance[:, None]
         normal = across(point - centre) / radius
-        normal *= np.sign((normal * hits.normal).sum(axis=1))[:, None]
-        return Hits(point, normal, normal)
+        normal *= np.sign((normal * hits[2]).sum(axis=1))[:, None]
+        return point, normal, normal
 
     return meet
 
@@ -303,10 +298,10 @@ def _smooth_mesh(data: mi.SceneParameters) -> Meet:
         weights = np.stack([1 - b - c, b, c], axis=1)
         normal = (normals[face] * weights[:, :, None]).sum(axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        normal *= np.sign((normal * hits.normal).sum(axis=1))[:, None]
+        normal *= np.sign((normal * hits[2]).sum(axis=1))[:, None]
         geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
-        geometric *= np.sign((geometric * hits.geometric).sum(axis=1))[:, None]
-        return Hits(corner + along * b[:, None] + across * c[:, None], geometric, normal)
+        geometric *= np.sign((geometric * hits[1]).sum(axis=1))[:, None]
+        return corner + along * b[:, None] + across * c[:, None], geometric, normal
 
     return meet
 
