@@ -565,7 +565,7 @@ SIZES = {
     "sensor": (4, 1143),
     "sessions": (3, 802),
     "studies": (22, 5048),
-    "transport": (15, 4057),
+    "transport": (15, 4017),
     "verbs": (1, 355),
     "version": (1, 1),
 }
