@@ -47,7 +47,7 @@ PLANES = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 @dataclass(frozen=True, eq=False)
 class JointMosaic:
-    """The model of a camera with a mosaic, for one family of patterns.
+    """Model of a camera with a mosaic of filters, for one family of patterns.
 
     ``lefts`` (lines, m, n) and ``rights`` (lines, m', n') are the factors of each line, with even m and m';
     ``weights`` (4, lines) are the responses of each plane to each line.

@@ -270,18 +270,6 @@ class LeftOut(DerivedCapture):
             yield replace(each, frame=frame, light=light)
 
 
-def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defects | None:
-    noise, prepared, count = data.noise, data.prepared, data.noise.variance.size
-    mean = noise.light / count
-    variance = ratio * noise.of(mean, noise.shots)
-    found = defects_of(squares, count * variance, count)
-    if noise.shots == 1 or (whole := data.lit_everywhere) is None:
-        return found
-    # Differences of halves show little of pixels that stand still, and their sums show all of it.
-    still = defects_of(np.square(prepared.as_solved(mean) - prepared.frame(data.weights, whole)), variance / count, 1)
-    return still.with_others(found) if still else found
-
-
 def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects | None:
     mean = float(variance.mean()) or 1.0
     ratio = squares / np.clip(variance, 0.001 * mean, 4.0 * mean)
@@ -498,10 +486,7 @@ _SHOWN, _MOSTLY = 4, 0.5
 
 
 class Cause(Enum):
-    NOISE = (
-        "the frames' noise",
-        "check gain, read noise and black level of the camera file, and that the numbers are raw",
-    )
+    NOISE = "the frames' noise", "check gain, read noise and black level of the camera file, and that numbers are raw"
     READING = "another reading of the frames", "see which of the readings is true, and import the frames so"
     FRAMES = "frames that do not fit the others", "capture these frames again"
     PIXELS = "a part of the sensor or of the session", "look at the map of the misfit, and capture again"
@@ -636,8 +621,17 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     found = replace(found, noise=test, gain=digital.gain_dn_per_e, chi_square=chi_square)
     if lack := data.lack(image):
         found = replace(found, predicted=float(np.sqrt(lack[1] / energy)))
-    if with_defects and noise.stated and not sums.clipped and (defects := find_defects(data, sums.squares, ratio)):
-        return replace(found, defects=defects)  # the caller leaves them out, and tries again
+    if with_defects and noise.stated and not sums.clipped:
+        mean, count, whole_light = noise.light / noise.variance.size, noise.variance.size, data.lit_everywhere
+        variance = ratio * noise.of(mean, noise.shots)
+        defects = defects_of(sums.squares, count * variance, count)
+        if noise.shots == 2 and whole_light is not None:
+            # Differences of halves show little of pixels that stand still, and their sums show all of it.
+            off_sums = prepared.as_solved(mean) - prepared.frame(data.weights, whole_light)
+            still = defects_of(np.square(off_sums), variance / count, 1)
+            defects = still.with_others(defects) if still else defects
+        if defects:
+            return replace(found, defects=defects)  # the caller leaves them out, and tries again
     check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)
     faults, places = check.faults(), tuple(sums.places(ratio)) if noise.stated and not off else ()
     turned = noise.shots == 2 and is_negative(prepared, data.shots.patterns, sums.weights)

@@ -76,13 +76,7 @@ def psnr(image: np.ndarray) -> float:
     return -10 * float(np.log10(np.mean(np.square(image - PRINT))))
 
 
-@pytest.mark.parametrize(
-    ("patterns", "baseline", "least"),
-    [
-        ("dots:4x8", BESIDE, 47.0),
-        ("dots:8", BASELINE, 48.0),
-    ],
-)
+@pytest.mark.parametrize(("patterns", "baseline", "least"), [("dots:4x8", BESIDE, 47.0), ("dots:8", BASELINE, 48.0)])
 def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float], least: float) -> None:
     """Both depths are found, and the image has ``least`` dB: some 2 less than were found, and more than a cubic between
     columns gave at the true depths (40.4 and 41.1 dB). The true depths give 51.5 and 57.0 now: what is left to them are
@@ -148,10 +142,7 @@ def test_frames_at_fault_are_named(fault: str) -> None:
     assert named >= ({3} if fault == "black" else {2, 6}) and len(named) < 5
 
 
-@pytest.mark.parametrize(
-    ("depth", "patterns"),
-    [(380.0, "dots:4x8"), (360.0, "dots:4")],
-)
+@pytest.mark.parametrize(("depth", "patterns"), [(380.0, "dots:4x8"), (360.0, "dots:4")])
 def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
     """And the image that its own depth gives, less 1.5 dB: twice as many unknowns. At 360 mm light lies half a period
     of 4 beside. (Planted: depths looked for about the calibrated one alone; a part of the sensor left out that knows
@@ -166,13 +157,7 @@ def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
     assert image.uncertainties is None
 
 
-@pytest.mark.parametrize(
-    ("near", "far", "patterns"),
-    [
-        (330.0, 500.0, "dots:4x5"),
-        (370.0, 430.0, "dots:4"),
-    ],
-)
+@pytest.mark.parametrize(("near", "far", "patterns"), [(330.0, 500.0, "dots:4x5"), (370.0, 430.0, "dots:4")])
 def test_parallax_beyond_the_period_is_told_and_the_image_is_as_before(near: float, far: float, patterns: str) -> None:
     """Parallax of 8.2 pixels under dots 5 apart, of 3 under 4 and of 6.2 under 8. (Planted: nothing spared; no
     rivals.)"""

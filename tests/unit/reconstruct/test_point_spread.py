@@ -139,11 +139,7 @@ def test_half_the_size_sees_half_the_frame() -> None:
 
 @pytest.mark.parametrize(
     ("noise", "method", "times", "above"),
-    [
-        (0.05, "nonnegative", 1, 0.01),
-        (0.05, "tv", 10, 0.04),
-        (0.01, "tv", 1, 0.07),
-    ],
+    [(0.05, "nonnegative", 1, 0.01), (0.05, "tv", 10, 0.04), (0.01, "tv", 1, 0.07)],
 )
 def test_converged_is_said_near_the_minimum_alone(noise: float, method: str, times: float, above: float) -> None:
     """Of blocks, whose light is halved once: where the rule holds the objective is that near to what 1500 steps find,

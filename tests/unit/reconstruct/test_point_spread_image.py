@@ -126,10 +126,7 @@ def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_conver
         (*psf, "--focus", "auto"),
         (*psf, "--bounds", "0:1"),
     ]
-    refused += [
-        ("--psf", str(tmp_path / "none.npy")),
-        (*psf, "--method", "tv", "--bounds", "1:0"),
-    ]
+    refused += [("--psf", str(tmp_path / "none.npy")), (*psf, "--method", "tv", "--bounds", "1:0")]
     refused += [(*psf, "--bounds", "x", "--method", "tv"), (*psf, "--chart", "x")]
     for words in refused:
         assert call(*words, "-o", str(tmp_path / "no"))[0] == 2 and not (tmp_path / "no").exists(), words

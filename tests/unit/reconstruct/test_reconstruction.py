@@ -54,7 +54,7 @@ def shots(factors: Factors) -> Capture:
             camera={"name": "bench"},
             digital=Digital(exposure_s=1e4, gain_dn_per_e=1.0, black_level_dn=0.0, dark_current_e_per_s=0.0),
             patterns=Patterns.of(family, files),
-        ),
+        )
     )
 
 
