@@ -88,9 +88,8 @@ def flatcam(pixel_mm, order=9):
     """Weights and factors of both terms of a FlatCam mask at 2 mm, scene 120 mm wide at 400 mm."""
     mask = mls_mask("flatcam", order=order)
     pixels, scene = centred_edges(64, pixel_mm), centred_edges(N, 120 / N)
-    return [
-        (weight, scene_factor(profile, mask.feature_mm, pixels, scene, 2.0, 400.0)) for weight, profile, _ in mask.terms
-    ]
+    rest = mask.feature_mm, pixels, scene, 2.0, 400.0
+    return [(weight, scene_factor(profile, *rest)) for weight, profile, _ in mask.terms]
 
 
 def flatcam_frame(terms, image):

@@ -43,9 +43,8 @@ def test_it_is_the_model_of_each_frame(patterns: str, centre: bool) -> None:
     """Frame (i, j) is Phi_L (P_ij o X) Phi_R^T, written out pixel by pixel of the pattern; centred: C Y C."""
     model, family = factors(centre), parse_patterns(patterns, N)
     image = np.random.default_rng(5).normal(size=(N, N))
-    frames = (model.operator(family) @ image.ravel()).reshape(
-        family.left.shape[1], family.right.shape[1], ROWS, COLUMNS
-    )
+    shape = family.left.shape[1], family.right.shape[1], ROWS, COLUMNS
+    frames = (model.operator(family) @ image.ravel()).reshape(shape)
     for i in range(family.left.shape[1]):
         for j in range(family.right.shape[1]):
             frame = model.left @ (np.outer(family.left[:, i], family.right[:, j]) * image) @ model.right.T

@@ -31,15 +31,18 @@ def with_frames(shots: Capture, change: Callable[[Frames], Frames]) -> Capture:
     """The capture with its frames changed."""
     captures = shots.manifest.patterns.captures
     numbers = change([np.asarray(each, dtype=np.float64) for each in shots.dn])
-    memory = {
-        shot.file: ({"DN": np.clip(np.rint(each), 0, 2**13 - 1).astype(np.uint32)}, {})
-        for shot, each in zip(captures, numbers, strict=True)
-    }
+    whole = (np.clip(np.rint(each), 0, 2**13 - 1).astype(np.uint32) for each in numbers)
+    memory = {shot.file: ({"DN": each}, {}) for shot, each in zip(captures, whole, strict=True)}
     return Capture(shots.manifest, memory=memory)
 
 
 def image(patterns: str, change: Callable[[Frames], Frames], seed: int = 1) -> Reconstruction:
     return reconstruct(with_frames(bench().run(patterns, picture(seed), seed), change), bench().calibrated(seed))
+
+
+def named_by(found: Reconstruction) -> set[int]:
+    """Numbers of all frames at fault."""
+    return {number for reported in found.misfit.faults for number in reported.numbers}
 
 
 def dark(frame: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -73,9 +76,9 @@ def test_a_faulty_frame_is_named(patterns: str, fault: str) -> None:
     if fault == "dim" and patterns.startswith("dots"):
         pytest.skip("a picture of 16 x 16 pixels decides that powers differ, not whose")
     found = image(patterns, lambda frames: [*frames[:3], FAULTS[fault](frames), *frames[4:]])
-    assert not found.ok and found.status.verdict is Verdict.MISFIT and found.misfit is not None
+    assert not found.ok and found.status.verdict is Verdict.MISFIT
     assert found.misfit.cause is Cause.FRAMES
-    named = {number for reported in found.misfit.faults for number in reported.numbers}
+    named = named_by(found)
     first = {number for reported in found.misfit.faults[:2] for number in reported.numbers}
     assert 3 in first and len(named) <= 4
     assert "frame_00003.exr" in str(found.status) and "capture these frames again" in str(found.status)
@@ -92,25 +95,21 @@ def test_a_frame_that_is_clipped_where_noise_hides_it(patterns: str) -> None:
         return [*frames[:3], np.minimum(frames[3], np.sort(frames[3], axis=None)[-60]), *frames[4:]]
 
     misfit = reconstruct(with_frames(shots, cut), bench().calibrated(1)).misfit
-    assert misfit is not None
     assert ("clipped", (3,)) in [(reported.kind, reported.numbers) for reported in misfit.faults]
 
 
 def test_a_dim_frame_of_dim_light() -> None:
     """Where patterns overlap it puts others off, by nearly as much as itself."""
     shots = bench(peak=150.0).run("random:4", picture(1), 1)
-    found = reconstruct(
-        with_frames(shots, lambda frames: [*frames[:3], dim(frames[3]), *frames[4:]]), bench().calibrated(1)
-    )
-    assert found.misfit is not None
-    assert 3 in {number for reported in found.misfit.faults for number in reported.numbers}
+    one_dim = with_frames(shots, lambda frames: [*frames[:3], dim(frames[3]), *frames[4:]])
+    found = reconstruct(one_dim, bench().calibrated(1))
+    assert 3 in named_by(found)
 
 
 @pytest.mark.parametrize("patterns", FAMILIES)
 def test_exchanged_frames_are_named(patterns: str) -> None:
     found = image(patterns, lambda frames: [*frames[:2], frames[5], *frames[3:5], frames[2], *frames[6:]])
-    assert found.misfit is not None
-    assert {number for reported in found.misfit.faults for number in reported.numbers} >= {2, 5}
+    assert named_by(found) >= {2, 5}
 
 
 def powered(frames: Frames, powers: np.ndarray) -> Frames:
@@ -125,7 +124,7 @@ def test_a_lamp_that_flickers_between_the_halves_of_pairs() -> None:
     patterns, count = "hadamard:4", 32
     flicker = 1 + 0.04 * np.random.default_rng(5).standard_normal(count)
     found = image(patterns, lambda frames: powered(frames, flicker))
-    assert not found.ok and found.misfit is not None
+    assert not found.ok
     (reported,) = found.misfit.faults
     assert reported.kind == "power" and reported.numbers == tuple(range(count))
     differs = float(reported.words.split("differ by ")[1].split("%")[0])
@@ -139,8 +138,7 @@ def test_exchanged_halves_are_named(pair: tuple[int, int]) -> None:
     """Of two pairs, whose sums show it, and of one pair, whose difference contradicts the others."""
     one, other = pair
     found = image("hadamard:4", lambda frames: [frames[{one: other, other: one}.get(n, n)] for n in range(len(frames))])
-    assert found.misfit is not None
-    named = {number for reported in found.misfit.faults for number in reported.numbers}
+    named = named_by(found)
     assert named >= set(pair) and len(named) <= 4
 
 
@@ -159,7 +157,7 @@ def test_no_frame_of_a_fitting_run_is_named(patterns: str, print_: str) -> None:
         scene[4:7, 5:8] = 0.9
     shots = bench(peak=3e3).run(patterns, scene, 4)
     misfit = reconstruct(shots, bench().calibrated(4)).misfit
-    assert misfit is not None and not misfit.faults and not misfit.flagged and misfit.defects is None
+    assert not misfit.faults and not misfit.flagged and misfit.defects is None
 
 
 @pytest.mark.parametrize("patterns", ["dots:1x8", "hadamard:4"])
@@ -179,7 +177,7 @@ def test_frames_of_gloss_are_not_at_fault(patterns: str, seed: int) -> None:
     gloss = 1 + 0.05 * np.outer(place, np.exp(-4 * np.square(place - 0.3)))
     camera = Bench(*sides, optics=lambda light: light * gloss)
     misfit = reconstruct(camera.run(patterns, scene, seed), camera.calibrated(seed)).misfit
-    assert misfit is not None and not misfit.faults
+    assert not misfit.faults
 
 
 @pytest.mark.parametrize("seed", [0, 3])
@@ -190,7 +188,7 @@ def test_bars_along_lines_of_dots_decide_nothing(seed: int) -> None:
     bars = np.where(rng.random(64) < 0.2, 0.1, 0.85) if seed % 2 else 0.1 + 0.8 * (rng.random(64) > 0.5)
     camera = Bench(shadow(n=64), shadow(n=64))
     misfit = reconstruct(camera.run("dots:1x8", np.tile(bars, (64, 1)), seed), camera.calibrated(seed)).misfit
-    assert misfit is not None and not misfit.faults and not misfit.flagged
+    assert not misfit.faults and not misfit.flagged
     assert seed == 3 or "same along the dots' lines, to decide" in str(misfit.limits)  # four frames see no bar of 3
 
 
@@ -232,10 +230,8 @@ def test_patterns_that_repeat_may_look_alike() -> None:
     captures = shots.manifest.patterns.captures
     twice = bench().run("dots:2", picture(1), 2)
     P_L = tuple((*row, *row) for row in shots.manifest.patterns.P_L)
-    files = [
-        (shot.model_copy(update={"file": f"second{n}.exr", "row": shot.row + 2}), shot)
-        for n, shot in enumerate(captures)
-    ]
+    seconds = ({"file": f"second{n}.exr", "row": shot.row + 2} for n, shot in enumerate(captures))
+    files = [(shot.model_copy(update=new), shot) for new, shot in zip(seconds, captures, strict=True)]
     patterns = Patterns(P_L=P_L, P_R=shots.manifest.patterns.P_R, captures=(*captures, *(new for new, _ in files)))
     memory = {**shots._memory, **{new.file: twice._memory[old.file] for new, old in files}}
     both = Capture(shots.manifest.model_copy(update={"patterns": patterns}), memory=memory)
@@ -243,7 +239,6 @@ def test_patterns_that_repeat_may_look_alike() -> None:
     # But no frame with its noise comes twice.
     same = {**memory, files[0][0].file: memory[files[0][1].file]}
     found = reconstruct(Capture(both.manifest, memory=same), bench().calibrated(1)).misfit
-    assert found is not None
     assert (0, 4) in [reported.numbers for reported in found.faults if reported.kind == "repeated"]
 
 
@@ -257,8 +252,7 @@ def test_a_faulty_frame_behind_a_constant_term(change: Callable[[np.ndarray], np
     factors = replace(factors, manifest=factors.manifest.model_copy(update={"centre": True}))
     assert reconstruct(shots, factors).ok
     found = reconstruct(with_frames(shots, lambda frames: [*frames[:3], change(frames[3]), *frames[4:]]), factors)
-    assert found.misfit is not None
-    assert 3 in {number for reported in found.misfit.faults for number in reported.numbers}
+    assert 3 in named_by(found)
 
 
 # ---- A closing frame ----
@@ -290,11 +284,10 @@ def test_a_closing_frame_of_another_power(kind: str, patterns: str) -> None:
     shot.)"""
     assert closed(kind, patterns, 1.0).ok
     found = closed(kind, patterns, 1.03)
-    assert not found.ok and found.misfit is not None
+    assert not found.ok
     (fault,) = found.misfit.faults
-    assert fault.kind == "closing" and float(fault.words.split("power is ")[1].split()[0]) == pytest.approx(
-        1.03, abs=3e-3
-    )
+    assert fault.kind == "closing"
+    assert float(fault.words.split("power is ")[1].split()[0]) == pytest.approx(1.03, abs=3e-3)
 
 
 def test_a_saturated_closing_frame_decides_nothing() -> None:
@@ -319,12 +312,12 @@ def test_what_dots_leave_undecided_is_stated_until_a_closing_frame_decides_it() 
     assert 0.1 < limit["pixel"] < 0.5 and 0.005 < limit["power"] < 0.1
     simulated = shots.manifest.model_copy(update={"plan": {"systematic_error": 0.0}})
     known = reconstruct(Capture(simulated, memory=shots._memory), factors)
-    assert known.misfit is not None and not known.misfit.limits
+    assert not known.misfit.limits
     light = np.asarray(sum(each.frame for each in shots.pattern_measurements()))
     variance = np.maximum(shots.manifest.digital.variance(light), 0.0)
     shots.__dict__["closing"] = ClosingFrame("uniform", light, variance, 0)
     closed = reconstruct(shots, factors)
-    assert closed.misfit is not None and not closed.misfit.limits
+    assert not closed.misfit.limits
 
 
 def test_a_projector_that_leaks_light() -> None:
@@ -337,6 +330,6 @@ def test_a_projector_that_leaks_light() -> None:
     leaking = with_frames(shots, lambda frames: [dn + 0.05 * ((bright - even) - (dn - even)) for dn in frames])
     assert digital.black_level_dn == BLACK
     misfit = reconstruct(leaking, bench().calibrated(1)).misfit
-    assert misfit is not None and misfit.limits[0]["leak"] == pytest.approx(0.05, rel=0.05)
+    assert misfit.limits[0]["leak"] == pytest.approx(0.05, rel=0.05)
     known = reconstruct(shots, bench().calibrated(1)).misfit
-    assert known is not None and not known.limits
+    assert not known.limits

@@ -37,15 +37,9 @@ DIM = PEAK / 100
 """Electrons of the brightest pixel where noise hides which of two depths is right."""
 BASELINE = 25.0, -60.0
 WINDOW = 0.3
-PARALLAX = Parallax(
-    depth_mm=400.0,
-    row_tan=(-WINDOW / 2, WINDOW / 2),
-    column_tan=(-WINDOW / 2, WINDOW / 2),
-    row_mm=(BASELINE[0], BASELINE[0]),
-    column_mm=(BASELINE[1], BASELINE[1]),
-    pixel_pitch_mm=PITCH,
-    mask_distance_mm=2.0,
-)
+_ENDS, _PLACES = (-WINDOW / 2, WINDOW / 2), {"row_mm": (BASELINE[0],) * 2, "column_mm": (BASELINE[1],) * 2}
+_DEPTHS = {"depth_mm": 400.0, "pixel_pitch_mm": PITCH, "mask_distance_mm": 2.0}
+PARALLAX = Parallax(row_tan=_ENDS, column_tan=_ENDS, **_PLACES, **_DEPTHS)
 
 
 def shadow(depth: float, axis: int, n: int = N, baseline: tuple[float, float] = BASELINE) -> np.ndarray:
@@ -83,7 +77,6 @@ def test_moved_columns_are_those_of_the_depth(depth: float, axis: int, n: int, l
     def error(columns: np.ndarray) -> float:
         return float(np.linalg.norm((columns - truth)[known]) / np.linalg.norm(truth[known]))
 
-    print(depth, axis, error(found), error(factor), known)
     assert error(found) < limit and error(found) < error(factor) / 5
     # Light leaves the window by less than 0.04 rad, 80 um in the mask's plane: four sensor pixels, and one for margin.
     assert 0 < PIXELS - (known.stop - known.start) <= 6
@@ -148,12 +141,11 @@ def test_a_plane_off_the_calibrated_distance_comes_into_focus(depth: float) -> N
     frames, factors = shots(depth), calibrated()
     plain, given, found = (reconstruct(frames, factors, focus=focus) for focus in (None, depth, "auto"))
     own = reconstruct(frames, camera(depth).calibrated(0))
-    print([round(psnr(image), 2) for image in (plain, given, found, own)], found.focus)
     assert psnr(plain) < 20 and plain.misfit and plain.misfit.flagged and "--focus auto" in str(plain.status)
     assert psnr(given) > psnr(own) - 3 and psnr(found) > psnr(own) - 3
     assert plain.focus is None and plain.summary()["focus_mm"] is None
-    assert given.focus is not None and given.focus.mm == given.summary()["focus_mm"] == depth
-    assert found.focus is not None and abs(found.focus.mm - depth) < 1 and found.focus.error_mm < 1
+    assert given.focus.mm == given.summary()["focus_mm"] == depth
+    assert abs(found.focus.mm - depth) < 1 and found.focus.error_mm < 1
     assert not found.focus.doubt and f"focus: {found.focus.mm:.6g}" in str(found.focus)
     assert found.inputs["focus"] == "auto" and "focus" not in plain.inputs
 
@@ -189,7 +181,6 @@ def test_a_depth_is_not_taken_for_one_a_period_away(fine: Factors, depth: float,
     """Without an edge in view. Depths are tried a pixel of parallax apart, and the valley of another may lie nearer to
     one of them. (Planted: the valley of the best depth that was tried is followed alone.)"""
     found = best_depth(beside(depth, patterns, dark=8), fine, (240.0, 900.0))
-    print(depth, patterns, found)
     assert not found.doubt and not found.alternatives and abs(found.mm - depth) < 2 * found.error_mm < 0.5
 
 
@@ -199,7 +190,6 @@ def test_two_depths_that_explain_as_much_are_named(fine: Factors) -> None:
     dim, other = beside(480.0, "dots:4", DIM, dark=8), 1 / (1 / 480 + 4 * WINDOW / COARSE / 60)
     image = reconstruct(dim, fine, focus="auto")
     depth = image.focus
-    print(depth, image.status)
     assert isinstance(depth, Depth) and not image.ok and "whole periods of the dots" in str(image.status)
     named = sorted([depth.mm, *(each.mm for each in depth.alternatives)])
     assert any(abs(mm - 480) < 1 for mm in named) and any(abs(mm - other) < 1 for mm in named)
@@ -217,7 +207,6 @@ def test_a_depth_beyond_the_range_is_not_taken_for_one_within(fine: Factors, dep
     """A period of the dots from 308 mm is a depth within the range, and from 556 an end of it. (Planted: nothing beyond
     an end is tried.)"""
     found = best_depth(beside(depth, "dots:4"), fine)
-    print(found)
     assert "may lie beyond" in found.doubt and "--depth-range" in found.doubt and not found.at_end
     assert abs(found.mm - depth) < 2 * found.error_mm < 0.6
 
@@ -227,7 +216,6 @@ def test_faulty_frames_are_named_at_the_end_of_a_range(fine: Factors, depth_rang
     """Beside it, not taken for depth."""
     run = with_frames(beside(556.0, "dots:4"), lambda frames: [*frames[:5], dark(frames[5]), *frames[6:]])
     image = reconstruct(run, fine, focus="auto", depth_range=depth_range)
-    print(image.status)
     assert image.misfit and image.misfit.cause is Cause.FRAMES
     assert "frame 5" in str(image.status) and "may lie beyond" in str(image.status)
 
@@ -236,7 +224,6 @@ def test_faulty_frames_are_named_at_the_end_of_a_range(fine: Factors, depth_rang
 def test_other_patterns_tell_depth(fine: Factors, patterns: str) -> None:
     """Without a period, so that none is named."""
     found = best_depth(beside(440.0, patterns), fine)
-    print(found)
     assert not found.doubt and not found.alternatives and abs(found.mm - 440) < 2 * found.error_mm < 1
 
 
@@ -246,7 +233,6 @@ def test_light_of_a_lamp_does_not_move_depth(fine: Factors) -> None:
     lamp = left @ np.ones((COARSE, COARSE)) @ right.T
     lit = Bench(left, right, optics=lambda light: light + 0.1 * PEAK * lamp / lamp.max())
     image = reconstruct(lit.run("dots:5", picture(n=COARSE), 0), fine, focus="auto")
-    print(image.focus, image.status)
     assert isinstance(image.focus, Depth) and image.focus.error_mm is not None
     assert abs(image.focus.mm - 440) < 2 * image.focus.error_mm
     assert not image.ok and image.misfit and image.misfit.cause is Cause.MODEL
@@ -293,9 +279,8 @@ def test_light_that_the_field_stop_hides_is_told() -> None:
     factors = calibrated()
     stopped = PARALLAX.model_copy(update={"stop_tan": 0.16})
     factors = replace(factors, manifest=factors.manifest.model_copy(update={"parallax": stopped}))
-    assert move_factors(factors, 395.0).hidden == 0 and "field stop" not in str(
-        reconstruct(shots(395.0), factors).status
-    )
+    image = reconstruct(shots(395.0), factors)
+    assert move_factors(factors, 395.0).hidden == 0 and "field stop" not in str(image.status)
     image = reconstruct(shots(340.0), factors, focus=340.0)
     assert not image.ok and "the field stop takes most of the light" in str(image.status)
 
@@ -310,7 +295,7 @@ def test_noise_of_moved_columns_is_stated() -> None:
     noise = float(np.std((found - 1000)[known]))
     assert side.noise(shift) == pytest.approx(noise, rel=0.1) and noise < 0.8
     moved, own = move_factors(calibrated(), 360.0).factors.manifest.noise, calibrated().manifest.noise
-    assert moved is not None and own is not None and moved.left == pytest.approx(own.left * side.noise(shift))
+    assert moved.left == pytest.approx(own.left * side.noise(shift))
 
 
 def test_the_ambient_frame_loses_the_same_rows(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,7 +304,7 @@ def test_the_ambient_frame_loses_the_same_rows(monkeypatch: pytest.MonkeyPatch) 
     ambient.shots = 16
     monkeypatch.setattr(Capture, "ambient", ambient)
     part = there.of(shots(360.0)).ambient
-    assert part is not None and part.shots == 16 and part.rate.shape == part.variance.shape
+    assert part.shots == 16 and part.rate.shape == part.variance.shape
     assert part.rate[0, 0] == ambient.rate[there.rows.start, there.columns.start]
     assert part.rate.shape == (len(there.factors.left), len(there.factors.right)) != (PIXELS, PIXELS)
 

@@ -96,13 +96,10 @@ def test_a_wrong_gain_is_noise(patterns: str, gain: float) -> None:
     digital = shots.manifest.digital
     # The same numbers by another gain: what was divided by g is now divided by g / gain.
     stated = digital.model_copy(update={"gain_dn_per_e": digital.gain_dn_per_e / gain})
-    image = reconstruct(
-        Capture(shots.manifest.model_copy(update={"digital": stated}), memory=shots._memory), bench().calibrated(0)
-    )
+    other = Capture(shots.manifest.model_copy(update={"digital": stated}), memory=shots._memory)
+    image = reconstruct(other, bench().calibrated(0))
     found = misfit(image)
-    assert (
-        not image.ok and found.cause is Cause.NOISE and "measured" not in str(found.faults) and found.noise is not None
-    )
+    assert not image.ok and found.cause is Cause.NOISE and "measured" not in str(found.faults)
     assert found.noise.ratio == pytest.approx(gain, rel=0.25)
     if found.noise.gain_error < 0.05 * gain:
         assert abs(found.noise.gain - gain) < 5 * found.noise.gain_error
@@ -134,13 +131,10 @@ def test_a_column_that_is_hot(late: bool) -> None:
 
     def hot(frames: list[np.ndarray]) -> list[np.ndarray]:
         count = len(frames)
-        return [
-            np.where(np.arange(PIXELS) == 40, frame + 40.0 * (not late or 2 * number >= count), frame)
-            for number, frame in enumerate(frames)
-        ]
+        warm, line = (lambda number: 40.0 * (not late or 2 * number >= count)), np.arange(PIXELS) == 40
+        return [np.where(line, frame + warm(number), frame) for number, frame in enumerate(frames)]
 
     found = reconstruct(with_frames(shots, hot), bench().calibrated(1))
-    assert found.misfit is not None
     assert not found.ok or found.misfit.defects is not None
     assert "column" in str(found.status) or "40" in str(found.misfit)
 
@@ -187,9 +181,8 @@ def test_misfit_has_no_unit() -> None:
     """The same digital numbers as electrons of 10^12 seconds: light, noise and image shrink together."""
     shots, factors = bench().run("dots:3", picture(), 0), bench().calibrated(0)
     digital = shots.manifest.digital
-    longer = digital.model_copy(
-        update={"exposure_s": digital.exposure_s * 1e12, "dark_current_e_per_s": digital.dark_current_e_per_s / 1e12}
-    )
+    changes = {"exposure_s": digital.exposure_s * 1e12, "dark_current_e_per_s": digital.dark_current_e_per_s / 1e12}
+    longer = digital.model_copy(update=changes)
     other = Capture(shots.manifest.model_copy(update={"digital": longer}), memory=shots._memory)
     found, expected = misfit(reconstruct(other, factors)), misfit(reconstruct(shots, factors))
     for name in ("chi_square", "unexplained", "worst_tile"):
@@ -204,7 +197,6 @@ def test_a_faulty_frame_is_found_beside_total_variation_in_any_unit(unit: float)
         return [BLACK + (frame - BLACK) * (0.7 if number == 5 else 1) for number, frame in enumerate(frames)]
 
     factors = bench().calibrated(0)
-    assert factors.manifest.noise is not None
     noise = {side: getattr(factors.manifest.noise, side) * unit for side in ("left", "right")}
     manifest = factors.manifest.model_copy(update={"noise": factors.manifest.noise.model_copy(update=noise)})
     other = replace(factors, left=factors.left * unit, right=factors.right * unit, manifest=manifest)
@@ -228,16 +220,14 @@ def test_single_pixels(patterns: str) -> None:
     """As what they are; a good run says nothing."""
     shots, factors = bench().run(patterns, picture(1), 1), bench().calibrated(1)
     good, mended = reconstruct(shots, factors), reconstruct(with_frames(shots, broken), factors)
-    assert mended.ok and mended.misfit is not None and mended.misfit.defects is not None
+    assert mended.ok
     assert mended.misfit.defects.places == [(10, 11), (40, 51)]
     assert mended.summary()["misfit"]["defective_pixels"] == {"count": 2, "first": [(10, 11), (40, 51)]}
     assert "2 defective pixels left out, at (row, column) (10, 11), (40, 51)" in mended.trust[0]
     errors = [float(np.sqrt(np.mean(np.square(each.image - picture(1))))) for each in (good, mended)]
     assert errors[1] < 1.02 * errors[0]
-    assert good.uncertainties is not None and mended.uncertainties is not None
-    assert mended.uncertainties.budget["frame_noise"] == pytest.approx(
-        good.uncertainties.budget["frame_noise"], rel=0.02
-    )
+    noises = [each.uncertainties.budget["frame_noise"] for each in (mended, good)]
+    assert noises[0] == pytest.approx(noises[1], rel=0.02)
 
 
 @pytest.mark.parametrize("place", [(40, 51), (10, 11), (70, 30)])
@@ -253,7 +243,7 @@ def test_a_pixel_that_stands_still(place: tuple[int, int], number: float) -> Non
 
     shots = with_frames(bench(peak=300.0).run("hadamard:4", picture(1), 1), still)
     mended = reconstruct(shots, bench().calibrated(1))
-    assert mended.ok and mended.misfit is not None and mended.misfit.defects is not None
+    assert mended.ok
     assert mended.misfit.defects.places == [place]
 
 
@@ -265,7 +255,7 @@ def test_noise_alone_makes_no_defects() -> None:
         assert defects_of(squares, np.full((512, 512), float(count)), count) is None
         squares[100, 200] += 120.0 + 8 * np.sqrt(2 * count)
         found = defects_of(squares, np.full((512, 512), float(count)), count)
-        assert found is not None and found.places == [(100, 200)]
+        assert found.places == [(100, 200)]
 
 
 def test_a_spot_of_light_is_no_defect() -> None:

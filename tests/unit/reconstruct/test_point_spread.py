@@ -5,21 +5,25 @@ A camera's matrix is made here from its definition, pixel by pixel, without a tr
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import lsq_linear, nnls
+from typer.testing import CliRunner
 
-from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.point_spread import (
-    ShiftedLight,
-    find_fit,
-    frame_error,
-    frame_noise,
-    minimise,
-    reduce_frame,
-    solve_point_spread,
-)
+import mitsim as ms
+from mitsim.cli import app
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.exr import read_frame
+from mitsim.core.images import lightness, read_image
+from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
+from mitsim.core.runs import Capture, Recorder, frame_name
+from mitsim.devices.patterns import parse_patterns
+from mitsim.reconstruct import point_spread as ps
 from mitsim.reconstruct.solver import Verdict
 from mitsim.reconstruct.solvers import Prior
 from tests.unit.reconstruct.test_tv import SIZE, smoothed_minimum
@@ -33,13 +37,12 @@ def spread(rows: int = 5, columns: int = 4) -> np.ndarray:
 
 
 def dots(rows: int, columns: int, period: int) -> tuple[np.ndarray, np.ndarray]:
-    rows_lit, columns_lit = (
-        (np.arange(size)[:, None] % period == np.arange(period)).astype(float) for size in (rows, columns)
-    )
+    lit = (np.arange(size)[:, None] % period == np.arange(period) for size in (rows, columns))
+    rows_lit, columns_lit = (each.astype(float) for each in lit)
     return rows_lit, columns_lit
 
 
-def matrix(light: ShiftedLight) -> np.ndarray:
+def matrix(light: ps.ShiftedLight) -> np.ndarray:
     """(K K' m m', n n') from y[s] = sum_p h[s - p] x[p], the sensor centred in all that light reaches."""
     rows, columns = light.psf.shape
     whole = [n + k - 1 for n, k in zip(light.scene, light.psf.shape, strict=True)]
@@ -57,15 +60,15 @@ def matrix(light: ShiftedLight) -> np.ndarray:
 
 
 LIGHTS = [
-    ShiftedLight(spread(), (6, 7)),
-    ShiftedLight(spread(4, 5), (9, 3)),
-    ShiftedLight(spread(), (7, 6), dots(8, 7, 2)),
-    ShiftedLight(spread(), (12, 10), dots(8, 7, 1)),
+    ps.ShiftedLight(spread(), (6, 7)),
+    ps.ShiftedLight(spread(4, 5), (9, 3)),
+    ps.ShiftedLight(spread(), (7, 6), dots(8, 7, 2)),
+    ps.ShiftedLight(spread(), (12, 10), dots(8, 7, 1)),
 ]
 """More unknowns than data, twice; cropped frames of dots; all light of a scene, which is dark beyond."""
 
 
-def noisy(light: ShiftedLight, seed: int = 0) -> np.ndarray:
+def noisy(light: ps.ShiftedLight, seed: int = 0) -> np.ndarray:
     """Frames of a scene of numbers of both signs, with noise."""
     rng = np.random.default_rng(seed)
     frames = light.image_of(rng.normal(size=light.scene))
@@ -73,7 +76,7 @@ def noisy(light: ShiftedLight, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("light", LIGHTS)
-def test_frames_are_the_definition_s_and_their_adjoint_is_the_transpose(light: ShiftedLight) -> None:
+def test_frames_are_the_definition_s_and_their_adjoint_is_the_transpose(light: ps.ShiftedLight) -> None:
     """Where light wraps round on the small grid, it lands beside the sensor. (Planted: a grid one column smaller.)"""
     rng, whole = np.random.default_rng(0), matrix(light)
     scene = rng.normal(size=light.scene)
@@ -86,7 +89,7 @@ def test_frames_are_the_definition_s_and_their_adjoint_is_the_transpose(light: S
 
 @pytest.mark.parametrize("light", LIGHTS)
 @pytest.mark.parametrize("bounds", [(-INF, INF), (0.0, INF), (0.0, 0.5), (-INF, 0.3)])
-def test_the_image_is_that_of_active_sets(light: ShiftedLight, bounds: tuple[float, float]) -> None:
+def test_the_image_is_that_of_active_sets(light: ps.ShiftedLight, bounds: tuple[float, float]) -> None:
     """Objectives are no less than that of scipy's active sets after one step, and equal after many. (Planted: bounds
     heeded by the image only after the last step.)"""
     lam, frames, whole = 1e-2, noisy(light), matrix(light)
@@ -95,7 +98,7 @@ def test_the_image_is_that_of_active_sets(light: ShiftedLight, bounds: tuple[flo
     exact = nnls(system, target)[0] if bounds == (0, INF) else lsq_linear(system, target, bounds, "bvls", 1e-14).x
     least = 0.5 * np.square(system @ exact - target).sum()
     for iterations in (1, 4, 2000):
-        found = minimise(light, frames, Prior(ridge=lam, bounds=bounds), iterations, 1e-11)
+        found = ps.minimise(light, frames, Prior(ridge=lam, bounds=bounds), iterations, 1e-11)
         assert bounds[0] <= found.image.min() and found.image.max() <= bounds[1] and found.iterations <= iterations
         assert found.objective == pytest.approx(0.5 * np.square(system @ found.image.ravel() - target).sum(), rel=1e-9)
         assert least * (1 - 1e-9) <= found.objective
@@ -103,21 +106,24 @@ def test_the_image_is_that_of_active_sets(light: ShiftedLight, bounds: tuple[flo
     np.testing.assert_allclose(found.image.ravel(), exact, atol=np.sqrt(2e-9 * least / lam) + 1e-9)
 
 
-SQUARE = [ShiftedLight(spread(), (8, 9)), ShiftedLight(spread(), (10, 9), dots(SIZE, SIZE, 2))]
+SQUARE = [
+    ps.ShiftedLight(spread(), (8, 9)),
+    ps.ShiftedLight(spread(), (10, 9), dots(SIZE, SIZE, 2)),
+]
 """The same of scenes that the other solver takes."""
 
 
 @pytest.mark.parametrize("light", SQUARE)
 @pytest.mark.parametrize("weight", [1e-3, 0.05])
-def test_total_variation_comes_to_its_minimum(light: ShiftedLight, weight: float) -> None:
+def test_total_variation_comes_to_its_minimum(light: ps.ShiftedLight, weight: float) -> None:
     """(Planted: slopes ten times as blunt.)"""
     frames = noisy(light)
     lower, upper = smoothed_minimum(matrix(light), frames.ravel(), weight)
     for iterations in (1, 10, 3000):
-        found = minimise(light, frames, Prior(weight=weight), iterations, 1e-5)
+        found = ps.minimise(light, frames, Prior(weight=weight), iterations, 1e-5)
         assert lower * (1 - 1e-9) <= found.objective
     assert found.fall <= 1e-5 and found.objective <= upper * 1.002
-    held = minimise(light, frames, Prior(weight=weight, bounds=(0.0, 1.0)), 3000, 1e-5)
+    held = ps.minimise(light, frames, Prior(weight=weight, bounds=(0.0, 1.0)), 3000, 1e-5)
     assert held.image.min() >= 0 and held.image.max() <= 1 and held.objective >= lower * (1 - 1e-9)
 
 
@@ -125,16 +131,16 @@ def test_half_the_size_sees_half_the_frame() -> None:
     """Of a scene without fine detail; a pixel beside, the two differ by a tenth. (Planted: a start one pixel off.)"""
     for side in (70, 71):
         rows, columns = np.mgrid[:side, :side] / side - 0.5
-        light = ShiftedLight(np.exp(-60 * (rows - 0.1) ** 2 - 90 * columns**2) / 100, (80, 82))
+        light = ps.ShiftedLight(np.exp(-60 * (rows - 0.1) ** 2 - 90 * columns**2) / 100, (80, 82))
         half = light.half_size()
-        assert half is not None and half.sensor == (40, 41) and half.half_size() is None
+        assert half.sensor == (40, 41) and half.half_size() is None
         rows, columns = np.mgrid[: half.scene[0], : half.scene[1]]
         scene = 1 + np.sin(rows / 6) * np.cos(columns / 7)
-        seen, expected = reduce_frame(light.image_of(light.double(scene))[0], 2), half.image_of(scene)[0]
+        seen, expected = ps.reduce_frame(light.image_of(light.double(scene))[0], 2), half.image_of(scene)[0]
         inside = np.s_[5:-5, 5:-5]
         assert np.abs(seen - expected)[inside].max() < 4e-3 * np.ptp(expected)
     assert LIGHTS[2].half_size() is None
-    np.testing.assert_array_equal(reduce_frame(np.arange(12.0).reshape(3, 4), 2), [[2.5, 4.5]])
+    np.testing.assert_array_equal(ps.reduce_frame(np.arange(12.0).reshape(3, 4), 2), [[2.5, 4.5]])
 
 
 @pytest.mark.parametrize(
@@ -148,17 +154,17 @@ def test_converged_is_said_near_the_minimum_alone(noise: float, method: str, tim
     rng = np.random.default_rng(4)
     psf = np.zeros((70, 72))
     psf[rng.integers(8, 62, 40), rng.integers(8, 62, 40)] = 1 / 40
-    light = ShiftedLight(psf, (70, 72), precision=np.float32)
+    light = ps.ShiftedLight(psf, (70, 72), precision=np.float32)
     scene = 200.0 * np.kron(rng.random((14, 13)) > 0.6, np.ones((10, 11)))[:139, :143]
     frame = light.image_of(scene)
     frame = (frame + noise * frame.mean() * rng.normal(size=frame.shape)).astype(np.float32)
-    lam = times * solve_point_spread(light, frame, method, iterations=1).lam
-    found = solve_point_spread(light, frame, method, lam, tolerance=0.025)
+    lam = times * ps.solve_point_spread(light, frame, method, iterations=1).lam
+    found = ps.solve_point_spread(light, frame, method, lam, tolerance=0.025)
     assert found.objective is not None and found.ok and str(found.status).startswith("Converged")
     prior = Prior(weight=lam, bounds=(0, INF)) if method == "tv" else Prior(ridge=lam, bounds=(0, INF))
-    least = minimise(light, frame, prior, 1500, 1e-6).objective
+    least = ps.minimise(light, frame, prior, 1500, 1e-6).objective
     assert least <= found.objective * (1 + 1e-4) and found.objective <= least * (1 + above)
-    assert not solve_point_spread(light, frame, method, lam, None, found.iterations - 6, 0.025).ok
+    assert not ps.solve_point_spread(light, frame, method, lam, None, found.iterations - 6, 0.025).ok
 
 
 def test_noise_is_told_and_weights_follow_it() -> None:
@@ -167,11 +173,11 @@ def test_noise_is_told_and_weights_follow_it() -> None:
     rng = np.random.default_rng(3)
     frame = 50 * (rng.random((60, 80)) > 0.997) + np.linspace(0, 9, 80) ** 2
     frame = frame + 0.3 * rng.normal(size=frame.shape)
-    assert frame_noise(frame) == pytest.approx(0.3, rel=0.25) and frame_noise(frame[:2]) == 0
-    light = ShiftedLight(spread(), frame.shape)
+    assert ps.frame_noise(frame) == pytest.approx(0.3, rel=0.25) and ps.frame_noise(frame[:2]) == 0
+    light = ps.ShiftedLight(spread(), frame.shape)
 
     def automatic(frame: np.ndarray) -> list[float]:
-        return [solve_point_spread(light, frame[None], name, iterations=1).lam for name in ("tikhonov", "tv")]
+        return [ps.solve_point_spread(light, frame[None], name, iterations=1).lam for name in ("tikhonov", "tv")]
 
     lam, weight = automatic(frame)
     assert lam > 0 and automatic(7 * frame) == pytest.approx([lam, 7 * weight])
@@ -184,7 +190,7 @@ def point_and_frame(noise: float) -> tuple[np.ndarray, np.ndarray]:
     light[rng.integers(8, 40, 20), rng.integers(8, 48, 20)] = 0.3 + rng.random(20)
     light = gaussian_filter(light, 0.7)
     scene = np.kron(rng.random((12, 14)), np.ones((8, 8)))[:95, :111] ** 3
-    frame = ShiftedLight(light / light.sum(), (48, 56)).image_of(scene)
+    frame = ps.ShiftedLight(light / light.sum(), (48, 56)).image_of(scene)
     frame /= frame.mean()
     return light / light.sum(), frame + noise * rng.normal(size=frame.shape)
 
@@ -200,12 +206,12 @@ def test_light_that_is_turned_or_random_is_flagged() -> None:
             "mirrored left to right": light[:, ::-1],
             "random numbers": np.random.default_rng(0).random(light.shape),
         }
-        right = find_fit(ShiftedLight(light, (48, 56), precision=np.float32), frames.astype(np.float32), None)
+        right = ps.find_fit(ps.ShiftedLight(light, (48, 56), precision=np.float32), frames.astype(np.float32), None)
         assert right.fault == ("", "") and right.gain is not None and right.gain > 1
         if noise < 0.01:
             for name, other in wrong.items():
-                camera = ShiftedLight(np.ascontiguousarray(other / other.sum()), (48, 56), precision=np.float32)
-                found = find_fit(camera, frames.astype(np.float32), None)
+                camera = ps.ShiftedLight(np.ascontiguousarray(other / other.sum()), (48, 56), precision=np.float32)
+                found = ps.find_fit(camera, frames.astype(np.float32), None)
                 assert found.fault[0].startswith("Misfit: ") and found.summary()["flagged"], name
                 assert found.unexplained > right.unexplained, name
                 assert name == "random numbers" or (found.gain is not None and found.gain < 1)
@@ -213,12 +219,12 @@ def test_light_that_is_turned_or_random_is_flagged() -> None:
 
 def test_displaced_light_is_flagged_and_light_without_a_side_is_not_compared() -> None:
     light, frames = point_and_frame(0.01)
-    moved = find_fit(ShiftedLight(np.roll(light, 8, axis=0), (48, 56)), frames, None)
+    moved = ps.find_fit(ps.ShiftedLight(np.roll(light, 8, axis=0), (48, 56)), frames, None)
     assert "displaced" in moved.fault[0] and moved.off[0] > 6
     row, column = np.indices((21, 21)) - 10
     even = np.exp(-(row**2 + column**2) / 8.0)
-    blurred = ShiftedLight(even / even.sum(), (48, 56))
-    found = find_fit(blurred, blurred.image_of(np.random.default_rng(2).random(blurred.scene)), None)
+    blurred = ps.ShiftedLight(even / even.sum(), (48, 56))
+    found = ps.find_fit(blurred, blurred.image_of(np.random.default_rng(2).random(blurred.scene)), None)
     assert found.gain is None and found.fault == ("", "")
 
 
@@ -230,38 +236,235 @@ def test_the_error_of_frames_is_their_noise_or_that_of_the_model() -> None:
     light = gaussian_filter(rng.random((48, 56)) ** 8, 2.0)
     light *= np.exp(-((row - 23.5) ** 2 + (column - 27.5) ** 2) / 162)
     scene = np.maximum(gaussian_filter(rng.normal(size=(95, 111)), 2) * 6 + 1, 0)
-    camera = ShiftedLight(light / light.sum(), (48, 56), precision=np.float32)
+    camera = ps.ShiftedLight(light / light.sum(), (48, 56), precision=np.float32)
     frame = camera.image_of(scene)[0]
     frame /= frame.mean()
-    noisy, bent = (
-        (frame + noise * rng.normal(size=frame.shape)).astype(np.float32) ** gamma
-        for noise, gamma in ((0.005, 1.0), (0.001, 0.8))
-    )
-    assert frame_error(camera, noisy[None]) == pytest.approx(frame_noise(noisy), rel=1e-4)
-    assert frame_error(camera, bent[None]) > 3 * frame_noise(bent)
+    cases = (0.005, 1.0), (0.001, 0.8)
+    seen = ((frame + noise * rng.normal(size=frame.shape)).astype(np.float32) ** gamma for noise, gamma in cases)
+    noisy, bent = seen
+    assert ps.frame_error(camera, noisy[None]) == pytest.approx(ps.frame_noise(noisy), rel=1e-4)
+    assert ps.frame_error(camera, bent[None]) > 3 * ps.frame_noise(bent)
 
 
 def test_what_cannot_be_solved_is_refused_and_too_few_steps_are_said() -> None:
     light = LIGHTS[0]
     frames = noisy(light)
-    short = solve_point_spread(light, frames, "nonnegative", 1e-6, iterations=1, tolerance=1e-9)
+    short = ps.solve_point_spread(light, frames, "nonnegative", 1e-6, iterations=1, tolerance=1e-9)
     assert short.status.verdict is Verdict.NOT_CONVERGED and not short.ok and short.iterations == 1
     assert short.image.shape == light.sensor
     for wrong in (frames[0], frames[:, 1:], frames * np.nan):
         with pytest.raises(MitsimError, match="give 1 of 6 x 7 finite numbers"):
-            solve_point_spread(light, wrong, "tikhonov", 1.0)
+            ps.solve_point_spread(light, wrong, "tikhonov", 1.0)
     with pytest.raises(MitsimError, match="give at least 1"):
-        solve_point_spread(light, frames, "tv", 1.0, iterations=0)
+        ps.solve_point_spread(light, frames, "tv", 1.0, iterations=0)
     for lam in (-1.0, INF, "none"):
         with pytest.raises(MitsimError, match="finite number of at least 0"):
-            solve_point_spread(light, frames, "tv", lam)  # type: ignore[arg-type]
+            ps.solve_point_spread(light, frames, "tv", lam)  # type: ignore[arg-type]
     with pytest.raises(MitsimError, match="under uniform light alone"):
-        solve_point_spread(LIGHTS[2], noisy(LIGHTS[2]), "tikhonov")
+        ps.solve_point_spread(LIGHTS[2], noisy(LIGHTS[2]), "tikhonov")
     with pytest.raises(MitsimError, match="cannot be chosen; check exposure"):
-        frame_error(light, 0 * frames)
+        ps.frame_error(light, 0 * frames)
     with pytest.raises(MitsimError, match="give a point spread function of the frames' pixels"):
-        ShiftedLight(spread(), (20, 7), dots(8, 7, 2))
+        ps.ShiftedLight(spread(), (20, 7), dots(8, 7, 2))
     with pytest.raises(MitsimError, match="not all 0"):
-        ShiftedLight(np.zeros((3, 3)), (6, 7))
-    dark = solve_point_spread(light, 0 * frames, "nonnegative", 1.0)
+        ps.ShiftedLight(np.zeros((3, 3)), (6, 7))
+    dark = ps.solve_point_spread(light, 0 * frames, "nonnegative", 1.0)
     assert dark.ok and not dark.image.any() and dark.residual == 0
+
+
+# ---- Least squares of many frames ------------------------------------------------------------------------------------
+
+# Least squares of many frames of a convolutional camera: both solvers against dense algebra.
+#
+# The matrix of a camera is built from the definition y[s] = sum_p h[s - p] x[p], by slicing and without a transform.
+# All seeds are 0 unless stated. Sizes are small and awkward: psf of 14 x 11, periods that do not divide the scene.
+
+CASES = [(1, 9), (2, 9), (3, 9), (3, 10), (5, 5)]
+"""Period and scene pixels: uniform, uneven classes, even ones, and a class for each pixel."""
+
+
+def narrow_spread() -> np.ndarray:
+    light = np.random.default_rng(7).random((14, 11)) ** 8
+    return light / light.sum()
+
+
+def noisy_frames(camera: ps.ShiftedLight) -> np.ndarray:
+    """Frames of a random scene with noise of 1e-3."""
+    rng = np.random.default_rng(0)
+    frames = camera.image_of(rng.random(camera.scene))
+    return frames + 1e-3 * rng.standard_normal(frames.shape)
+
+
+def distance(image: np.ndarray, exact: np.ndarray) -> float:
+    return float(np.linalg.norm(image.ravel() - exact.ravel()) / np.linalg.norm(exact))
+
+
+@pytest.mark.parametrize("sensor", [None, (15, 12), (8, 15)])
+@pytest.mark.parametrize(("k", "n"), CASES)
+def test_both_solvers_find_the_dense_minimiser(sensor: tuple[int, int] | None, k: int, n: int) -> None:
+    """Conjugate gradients at a residual of 1e-11 are off by that times the condition, at most 1e5 here."""
+    camera = ps.ShiftedLight.of(narrow_spread(), n, sensor)
+    lit = camera.under(parse_patterns(f"dots:{k}", n))
+    frames, lam = noisy_frames(lit), 1e-4 * float(np.square(camera.psf).sum())
+    system = np.concatenate([matrix(lit), np.sqrt(lam) * np.eye(n * n)])
+    exact = np.linalg.lstsq(system, np.concatenate([frames.ravel(), np.zeros(n * n)]), rcond=None)[0]
+    iterative = ps.solve_iteratively(lit, frames, lam, 1e-11)
+    assert iterative.ok and distance(iterative.image, exact) < 1e-6
+    if sensor is None:
+        classes = ps.DotClasses(camera, k)
+        projected = classes.project(frames)
+        np.testing.assert_allclose(projected, lit.correlate(frames), atol=1e-13)
+        direct = classes.solve(projected, lam, 1e-11)
+        assert direct.ok and distance(direct.image, exact) < 1e-6
+
+
+def test_iterations_that_do_not_suffice_are_told() -> None:
+    camera = ps.ShiftedLight.of(narrow_spread(), 9)
+    short = ps.solve_iteratively(camera, noisy_frames(camera), 1e-6, 1e-10, iterations=3)
+    assert not short.ok and short.status.verdict is Verdict.NOT_CONVERGED and short.iterations == 3
+    assert "allow more iterations" in str(short.status)
+
+
+def test_a_watch_ends_the_iterations() -> None:
+    camera, seen = ps.ShiftedLight.of(narrow_spread(), 9), list[float]()
+
+    def watch(image: np.ndarray) -> bool:
+        seen.append(float(np.linalg.norm(image)))
+        return len(seen) == 4
+
+    found = ps.solve_iteratively(camera, noisy_frames(camera), 1e-6, 1e-10, 100, watch)
+    assert found.iterations == 4 and seen[-1] == np.linalg.norm(found.image)
+
+
+def test_nothing_seen_is_a_dark_image() -> None:
+    dark = ps.conjugate_gradients(lambda image: image, np.zeros((3, 3)), 0.0)
+    assert dark.ok and dark.iterations == 0 and not dark.image.any()
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda camera: ps.DotClasses(camera, 2).project(np.ones((3, 6, 6))), r"shape \(3, 6, 6\): give 4 of 6 x 6"),
+        (lambda camera: ps.solve_iteratively(camera, np.full((1, 6, 6), np.nan), 1.0), "finite numbers"),
+        (lambda camera: ps.DotClasses(camera, 5), "give 1 to 4"),
+        (lambda camera: ps.DotClasses(ps.ShiftedLight.of(camera.psf, 4, (2, 2)), 1), "where it gets all light"),
+        (lambda camera: ps.DotClasses(camera, 2).solve(np.ones((4, 4)), -1.0), "lambda is -1.0"),
+        (lambda camera: camera.under(parse_patterns("uniform", 5)), "patterns of 5"),
+        (lambda camera: ps.ShiftedLight.of(camera.psf, 4, (7, 4)), "light reaches 6 x 6"),
+        (lambda camera: ps.ShiftedLight.of(camera.psf, 0), "0 pixels a side"),
+        (lambda camera: ps.ShiftedLight.of(np.full((3, 3), np.nan), 4), "finite"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused(make: object, words: str) -> None:
+    with pytest.raises(MitsimError, match=words):
+        make(ps.ShiftedLight.of(np.ones((3, 3)), 4))  # type: ignore[operator]
+
+
+# ---- Images of a run -------------------------------------------------------------------------------------------------
+
+# Images of a run by a point spread function, from Python and from the command line: frames, files, refusals.
+
+SCENE_SIZE = 12
+
+
+def light_of_a_point() -> np.ndarray:
+    light = np.random.default_rng(5).random((40, 44)) ** 12
+    light[:15], light[-15:], light[:, :15], light[:, -15:] = 0, 0, 0, 0
+    return light / light.sum()
+
+
+def capture(name: str, sensor: tuple[int, int], saturation: float | None = None) -> tuple[Capture, np.ndarray]:
+    """Frames of a scene of two numbers, and the scene."""
+    family, memory, psf = parse_patterns(name, SCENE_SIZE), Recorder(), light_of_a_point()
+    rng = np.random.default_rng(1)
+    patterns = None if name == "uniform" else (family.left.astype(float), family.right.astype(float))
+    light = ps.ShiftedLight(psf, sensor, patterns)
+    scene = np.where(np.arange(light.scene[0])[:, None] % 4 < 2, 2000.0, 0.0) * np.ones(light.scene)
+    for index, frame in enumerate(light.image_of(scene)):
+        memory.write_frame(index, {"DN": rng.poisson(np.maximum(frame, 0) + 10).astype(np.uint32)}, {})
+    files = [frame_name(index) for index in range(light.count)]
+    head = RunHead.of({"seed": 2})
+    digital = Digital(
+        exposure_s=1.0, gain_dn_per_e=1.0, black_level_dn=10.0, dark_current_e_per_s=0.0, saturation_dn=saturation
+    )
+    manifest = RunManifest(
+        configuration=head.configuration,
+        configuration_sha256=head.configuration_sha256,
+        camera={"name": "diffuser"},
+        digital=digital,
+        patterns=Patterns.of(family, files),
+    )
+    return memory.finish(manifest), scene[light.window]
+
+
+def test_dots_find_the_scene_and_uniform_light_all_that_the_sensor_sees() -> None:
+    """To the frames' rounding. (Planted: frames in columns' order; patterns passed over.)"""
+    shots, scene = capture("dots:3", (30, 31))
+    for method, lam in (("tikhonov", 1e-7), ("nonnegative", 1e-7), ("tv", 1e-3)):
+        found = ms.reconstruct_psf(shots, light_of_a_point(), lam=lam, method=method)
+        assert found.ok, str(found.status)
+        assert np.sqrt(np.mean(np.square(found.image - scene))) < 80
+        assert found.rank is None and found.uncertainty is None and found.condition_whole is None
+    with pytest.raises(MitsimError, match="under uniform light alone"):
+        ms.reconstruct_psf(shots, light_of_a_point())
+    shots, _ = capture("uniform", (60, 62))
+    found = ms.reconstruct_psf(shots, light_of_a_point(), method="nonnegative")
+    assert found.image.shape == (60, 62) and found.image.min() >= 0 and found.lam > 0
+    reduced = ms.reconstruct_psf(shots, light_of_a_point(), reduce=2)
+    assert reduced.image.shape == (30, 31)
+
+
+def test_saturated_frames_are_flagged() -> None:
+    shots, _ = capture("uniform", (60, 62), saturation=100.0)
+    found = ms.reconstruct_psf(shots, light_of_a_point())
+    assert not found.ok and "readings are at the full well" in str(found.status)
+
+
+def test_what_is_no_light_is_refused() -> None:
+    shots, _ = capture("uniform", (60, 62))
+    for wrong in (np.zeros((3, 3)), np.ones(3)):
+        with pytest.raises(MitsimError):
+            ms.reconstruct_psf(shots, wrong)
+    with pytest.raises(MitsimError, match="reduce by less than 61"):
+        ms.reconstruct_psf(shots, np.ones((99, 99)), reduce=61)
+    for reduce in (0, True, 2.5, 1025):
+        with pytest.raises(ArgumentError, match="give a whole number"):
+            ms.reconstruct_psf(shots, light_of_a_point(), reduce=reduce)  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="comes with a calibration"):
+        ms.reconstruct_psf(shots, light_of_a_point(), method="markov")
+
+
+def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_converged(tmp_path: Path) -> None:
+    """And a picture of it whose white is the image's largest number. (Planted: 1, as of images by a calibration.)"""
+    shots, _ = capture("uniform", (60, 62))
+    run = shots.save(tmp_path / "run")
+    np.save(tmp_path / "psf.npy", light_of_a_point())
+
+    def call(*words: str) -> tuple[int, dict[str, Any]]:
+        done = CliRunner().invoke(app, ["reconstruct", str(run), *words, "--json"], standalone_mode=False)
+        if done.exception:
+            assert isinstance(done.exception, MitsimError), done.exception
+            return 2, {}
+        return done.return_value, json.loads(done.stdout)
+
+    psf = "--psf", str(tmp_path / "psf.npy")
+    status, found = call(*psf, "--method", "nonnegative", "-o", str(tmp_path / "image"))
+    assert status == 0 and found["rank"] is None and found["objective"] > 0 and found["relative_gap"] is None
+    image = read_frame(tmp_path / "image" / "image.exr")[0]["reflectance"]
+    shown = read_image(tmp_path / "image" / "image.png")
+    assert np.abs(shown - 255 * lightness(image / image.max())).max() < 0.51, "rounded"
+    assert found["white"] == pytest.approx(image.max())
+    result = json.loads((tmp_path / "image" / "result.json").read_text())
+    assert result["inputs"].keys() == {"run", "psf", "reduce", "lambda", "method"} and result["iterations"] > 0
+    status, found = call(*psf, "--method", "tv", "--bounds", "0:", "--lambda", "1e-9", "-o", str(tmp_path / "tv"))
+    assert (status == 1) == str(found["status"]).startswith("Not converged")
+    assert json.loads((tmp_path / "tv" / "result.json").read_text())["inputs"]["bounds"] == [0.0, None]
+    status, found = call(*psf, "--method", "tv", "--iterations", "6", "-o", str(tmp_path / "short"))
+    assert status == 1 and found["iterations"] == 6 and found["status"].startswith("Not converged")
+    assert json.loads((tmp_path / "short" / "result.json").read_text())["inputs"]["iterations"] == 6
+    refused = [(*psf, "--iterations", "9"), (), ("--reduce", "2"), (*psf, "--calibration", "x")]
+    refused += [(*psf, "--focus", "auto"), (*psf, "--bounds", "0:1")]
+    refused += [("--psf", str(tmp_path / "none.npy")), (*psf, "--method", "tv", "--bounds", "1:0")]
+    refused += [(*psf, "--bounds", "x", "--method", "tv"), (*psf, "--chart", "x")]
+    for words in refused:
+        assert call(*words, "-o", str(tmp_path / "no"))[0] == 2 and not (tmp_path / "no").exists(), words

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import html
+import io
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import mitsim.reconstruct
 from mitsim.core.errors import MitsimError
@@ -19,11 +24,12 @@ from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import request
 from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import may_replace, reconstruct
+from mitsim.reconstruct.reconstruct import Reconstruction, may_replace, reconstruct
 from mitsim.reconstruct.request import ImageCost
 from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Tikhonov
 from mitsim.report.reconstruct_run import reconstruct as reconstruct_folders
+from tests.ideal_sessions import Bench, bench, picture
 
 N, PIXELS = 4, 9
 
@@ -68,7 +74,7 @@ def test_memory_and_disk_give_the_same_image(shots: Capture, factors: Factors, t
     assert memory.ok and memory.status.verdict is Verdict.SOLVED and memory.inputs == disk.inputs
     assert np.abs(memory.image - shots.truth).max() < 0.1
     quality = judged.quality
-    assert quality is not None and quality.psnr_db > 20 and quality.ssim is None, "4 pixels are less than its window"
+    assert quality.psnr_db > 20 and quality.ssim is None, "4 pixels are less than its window"
 
 
 class Projected(Tikhonov):
@@ -99,11 +105,7 @@ def test_a_further_solver_is_a_class_and_its_name(
     least = reconstruct(shots, factors, 0.0)
     assert str(found.status).startswith("Solved: no pixel is negative") and found.image.min() >= 0
     np.testing.assert_allclose(found.image, np.maximum(least.image, 0), atol=1e-5)
-    assert (
-        found.uncertainties is None
-        and found.misfit is not None
-        and found.misfit.unexplained == (least.misfit and least.misfit.unexplained)
-    )
+    assert found.uncertainties is None and found.misfit.unexplained == least.misfit.unexplained
     assert json.loads((found.save(tmp_path / "image") / "result.json").read_text())["inputs"]["method"] == "projected"
     with pytest.raises(
         MitsimError, match=r"use tikhonov, markov, nonnegative, tv.* projected or the file of a trained"
@@ -138,7 +140,7 @@ def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors
 def test_what_an_image_takes_is_predicted_where_that_can_be_told(shots: Capture, factors: Factors) -> None:
     """By the stages that it states; every shot is read, and held against the model. (Planted: half of the shots.)"""
     image = reconstruct(shots, factors)
-    assert image.predicted == ImageCost.of(shots, factors) and image.predicted is not None
+    assert image.predicted == ImageCost.of(shots, factors)
     assert image.predicted.seconds.keys() == image.seconds.keys()
     summary = image.summary()
     assert summary["predicted_seconds"] == sum(summary["predicted"].values()) > 0
@@ -241,3 +243,60 @@ def test_the_folders_are_refused_before_work(
     (tmp_path / "image" / "result.json").unlink()
     with pytest.raises(MitsimError, match="run, calibration, lambda, method differ"):
         reconstruct_folders(*folders, 1.0)
+
+
+# ---- Results in a notebook -------------------------------------------------------------------------------------------
+
+# What a reconstruction shows of itself in a notebook: beside the image how far to trust each pixel, and why.
+
+
+def shown(image: Reconstruction) -> tuple[list[np.ndarray], list[str], list[str]]:
+    """Its pictures (grey levels), their captions, and the lines below them."""
+    page = image._repr_html_()
+    sources = re.findall(r"base64,([A-Za-z0-9+/=]+)", page)
+    pictures = [np.asarray(Image.open(io.BytesIO(base64.b64decode(source)))).astype(float) for source in sources]
+    captions, lines = (
+        [html.unescape(text) for text in re.findall(pattern, page)]
+        for pattern in (r"<figcaption[^>]*>([^<]*)<", r"<div>([^<]+)</div>")
+    )
+    return pictures, captions, lines
+
+
+def test_uncertainty_is_shown_with_its_scale_and_sources() -> None:
+    """(Planted: the smallest source first; the image shown again in place of its uncertainty.)"""
+    image = reconstruct(bench().run("dots:4", picture(), 0), bench().calibrated(0))
+    pictures, captions, lines = shown(image)
+    assert image.uncertainties is not None
+    assert [each.shape for each in pictures] == [(len(picture()), len(picture()))] * 2
+    least, most = float(image.uncertainty.min()), float(image.uncertainty.max())
+    assert captions[1] == f"standard uncertainty of each pixel\n{least:.3g} to {most:.3g} of reflectance"
+    assert pictures[1].min() == 0 and pictures[1].max() == 255
+    order = np.argsort(image.uncertainty.ravel(), kind="stable")
+    assert np.all(np.diff(pictures[1].ravel()[order]) >= 0), "the less certain, the lighter"
+    (line,) = (line for line in lines if line.startswith("standard uncertainty "))
+    reported = dict(re.findall(r"([a-z ]+) (\d\.\de-\d+)", line.partition(": ")[2]))
+    values = [float(value) for value in reported.values()]
+    assert values == sorted(values, reverse=True) and len(values) >= 3
+    budget = image.uncertainties.budget
+    for name, value in reported.items():
+        assert float(value) == float(f"{budget[name.strip().replace(' ', '_')]:.1e}")
+    assert line.startswith(f"standard uncertainty {image.summary()['uncertainty']:.1e} rms: ")
+
+
+def test_misfit_is_shown_and_its_cause_where_flagged() -> None:
+    """(Planted: the cause left out.)"""
+    fits = reconstruct(bench().run("dots:4", picture(), 0), bench().calibrated(0))
+    moved = reconstruct(bench(0.3).run("dots:4", picture(), 0), bench().calibrated(0))
+    for image, cause, digits in ((fits, "", ".3f"), (moved, "; light that the calibrated camera does not see", ".3g")):
+        (line,) = (line for line in shown(image)[2] if line.startswith("misfit: "))
+        assert line.startswith(f"misfit: chi-square {image.misfit.chi_square:{digits}} a datum, ")
+        assert cause in line and ("calibrated camera" in line) == bool(cause)
+
+
+def test_what_is_not_known_is_not_shown() -> None:
+    """Least total variation is not linear in the frames; as many data as unknowns tell no misfit."""
+    tv = reconstruct(bench().run("dots:4", picture(), 0), bench().calibrated(0), method="tv")
+    assert len(shown(tv)[0]) == 1 and [line[:6] for line in tv.trust] == ["misfit"]
+    square = Bench(bench().left[: len(picture())], bench().right[: len(picture())])
+    exact = reconstruct(square.run("uniform", picture(), 0), square.calibrated(0), 1.0)
+    assert exact.misfit is None and [line[:20] for line in exact.trust] == ["standard uncertainty"]

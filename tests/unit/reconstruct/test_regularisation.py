@@ -11,18 +11,8 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
+from mitsim.reconstruct import solver
 from mitsim.reconstruct.accumulation import accumulate
-from mitsim.reconstruct.solver import (
-    RISK_POWER,
-    DiagonalProblem,
-    automatic_lambda,
-    coefficient_noise,
-    end_of_range,
-    is_misfit,
-    noise_variance,
-    prepare,
-    risk_score,
-)
 from mitsim.reconstruct.solvers import solve_tv
 from tests.ideal_sessions import PIXELS, Bench, shadow
 from tests.shadow_factor import scene_factor
@@ -47,7 +37,7 @@ def captured(factor, image, k, peak=1e4, read_noise=2.24, seed=0):
     clean = {(i, j): factor[:, i::k] @ image[i::k, j::k] @ factor[:, j::k].T for i in range(k) for j in range(k)}
     gain = peak / max(frame.max() for frame in clean.values())
     rng = np.random.default_rng([seed, k])
-    prepared = prepare(factor, factor, dots, dots)
+    prepared = solver.prepare(factor, factor, dots, dots)
     sums = prepared.accumulator()
     for key, frame in clean.items():
         noisy = rng.poisson(gain * np.maximum(frame, 0)) + read_noise * rng.normal(size=frame.shape)
@@ -59,7 +49,7 @@ def under_uniform_light(model, truth, image, seed):
     """Prepared ``model``, a pair of factors, and the frame of the factor ``truth``, 1e4 electrons at most."""
     frame, one = truth @ image @ truth.T, np.ones((N, 1))
     gain, rng = 1e4 / frame.max(), np.random.default_rng([seed, 99])
-    prepared = prepare(*model, one, one)
+    prepared = solver.prepare(*model, one, one)
     sums = prepared.accumulator()
     sums.add((rng.poisson(gain * frame) + 2.24 * rng.normal(size=frame.shape)) / gain, 0, 0)
     return prepared, sums
@@ -69,11 +59,9 @@ def lost(prepared, sums, truth, **known):
     """Decibels that the automatic lambda loses against the best of 41, and that of white noise alone."""
     problem = prepared.problem(sums)
     best = max(psnr(prepared.solve(sums, problem.scale * part).image, truth) for part in np.logspace(-10, 0, 41))
-    white = automatic_lambda(replace(problem, halves=None))
-    return (
-        best - psnr(prepared.solve(sums, "auto", **known).image, truth),
-        best - psnr(prepared.solve(sums, white).image, truth),
-    )
+    white = solver.automatic_lambda(replace(problem, halves=None))
+    known_noise = psnr(prepared.solve(sums, "auto", **known).image, truth)
+    return best - known_noise, best - psnr(prepared.solve(sums, white).image, truth)
 
 
 def psnr(image, truth):
@@ -105,14 +93,14 @@ def test_a_sheet_far_from_its_place_is_seen_and_lambda_follows(factor, photograp
     profile = mls_mask().terms[0][1]
     there = scene_factor(profile, 0.06, centred_edges(512, 0.01172), centred_edges(N, 120 / N), 2.0, 380.0)
     prepared, sums = under_uniform_light((factor, factor), there, photograph, seed)
-    assert is_misfit(prepared.problem(sums))
+    assert solver.is_misfit(prepared.problem(sums))
     automatic, white = lost(prepared, sums, photograph)
     assert automatic < 1.0
     assert white > 10
     # Energy that is known to lie beyond the range is no misfit. (Planted: not taken off.)
     problem = prepared.problem(sums)
     spare = problem.data_count - np.count_nonzero(problem.sigma)
-    known = (noise_variance(problem) - problem.halves.typical) * spare
+    known = (solver.noise_variance(problem) - problem.halves.typical) * spare
     lam = prepared.solve(sums, lack=(np.zeros(problem.sigma.shape), known)).lam
     assert lam < prepared.solve(sums).lam / 100
 
@@ -128,10 +116,10 @@ def test_noise_within_the_models_range_counts_where_it_is_more(photograph, dista
     rng, one, clean = np.random.default_rng(seed), np.ones((N, 1)), near @ photograph @ near.T
     within, _, _ = np.linalg.svd(near, full_matrices=False)
     noise = rng.normal(size=clean.shape) + 0.45 * within @ rng.normal(size=(N, N)) @ within.T
-    prepared = prepare(near, near, one, one)
+    prepared = solver.prepare(near, near, one, one)
     sums = prepared.accumulator()
     sums.add(clean + 0.01 * clean.max() * noise, 0, 0)
-    assert not is_misfit(prepared.problem(sums))
+    assert not solver.is_misfit(prepared.problem(sums))
     automatic, white = lost(prepared, sums, photograph)
     assert automatic < 4
     assert white > 70
@@ -143,8 +131,8 @@ def test_a_faint_octave_before_one_that_is_seen_is_no_noise():
     sigma = np.concatenate([np.ones(64), np.full(64, 0.4), np.full(64, 0.2)]).reshape(12, 16)
     data = np.sqrt(np.select([sigma == 1, sigma == 0.4], [1.2, 1.9], 12.0))
     halves = SimpleNamespace(typical=1.0, excess=np.zeros(sigma.shape))
-    problem = DiagonalProblem(sigma, data, float(np.square(data).sum()) + 1000.0, 1192, halves)
-    np.testing.assert_allclose(coefficient_noise(problem), 1.0)
+    problem = solver.DiagonalProblem(sigma, data, float(np.square(data).sum()) + 1000.0, 1192, halves)
+    np.testing.assert_allclose(solver.coefficient_noise(problem), 1.0)
 
 
 @pytest.mark.slow
@@ -172,25 +160,25 @@ def test_the_score_is_the_expected_squared_error_up_to_a_constant():
     sigma, image, noise = np.logspace(0, -4, 30).reshape(5, 6), rng.normal(size=(5, 6)), 1e-3
     sigma[-1, -1] = 0.0  # not measured: no lambda changes it, and neither does the score
     mean_data = np.where(sigma > 0, np.sqrt(np.square(sigma * image) + noise), 0.0)
-    problem = DiagonalProblem(sigma, mean_data, float(np.square(mean_data).sum()), 1000)
+    problem = solver.DiagonalProblem(sigma, mean_data, float(np.square(mean_data).sum()), 1000)
 
     def squared_error(lam):
         bias, variance = lam * image / (sigma**2 + lam), noise * np.square(sigma / (sigma**2 + lam))
-        return np.sum((sigma**RISK_POWER * (np.square(bias) + variance))[sigma > 0])
+        return np.sum((sigma**solver.RISK_POWER * (np.square(bias) + variance))[sigma > 0])
 
     lambdas = np.logspace(-9, 1, 11)
-    constant = [risk_score(problem, lam, noise) - squared_error(lam) for lam in lambdas]
+    constant = [solver.risk_score(problem, lam, noise) - squared_error(lam) for lam in lambdas]
     # Terms of up to noise / sigma^2 x sigma^0.5 = 1e3 are added; their rounding is below 1e-12.
     np.testing.assert_allclose(constant, constant[-1], rtol=0, atol=1e-10)
 
 
 def test_no_more_data_than_unknowns_or_no_signal_is_refused():
-    prepared = prepare(np.eye(4), np.eye(4), np.ones((4, 1)), np.ones((4, 1)))
+    prepared = solver.prepare(np.eye(4), np.eye(4), np.ones((4, 1)), np.ones((4, 1)))
     sums = prepared.accumulator()
     sums.add(np.ones((4, 4)), 0, 0)
     with pytest.raises(MitsimError, match="no more data"):
         prepared.solve(sums, "auto")
-    prepared = prepare(np.eye(5, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
+    prepared = solver.prepare(np.eye(5, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
     sums = prepared.accumulator()
     sums.add(np.zeros((5, 5)), 0, 0)
     with pytest.raises(MitsimError, match="zero"):
@@ -209,7 +197,7 @@ def test_total_variation_beats_tikhonov_on_a_photograph_with_25_dots(factor, pho
 def test_total_variation_without_weight_is_least_squares():
     rng = np.random.default_rng(0)
     small, one = rng.random((12, 6)), np.ones((6, 1))
-    prepared = prepare(small, small, one, one)
+    prepared = solver.prepare(small, small, one, one)
     sums = prepared.accumulator()
     frame = small @ rng.random((6, 6)) @ small.T
     sums.add(frame + 0.01 * rng.normal(size=frame.shape), 0, 0)
@@ -246,16 +234,16 @@ def test_what_frames_are_known_to_have_beside_the_image_counts_as_noise():
     data = sigma * scene + struck + rng.normal(size=sigma.shape)
     halves = SimpleNamespace(typical=1.0, excess=np.zeros(sigma.shape))
     beyond = rng.chisquare(4000)
-    problem = DiagonalProblem(sigma, data, float(np.square(data).sum() + beyond), 4900, halves)
+    problem = solver.DiagonalProblem(sigma, data, float(np.square(data).sum() + beyond), 4900, halves)
 
     def decibels(lam):
         return -10 * np.log10(np.mean(np.square(sigma * data / (sigma**2 + lam) - scene)))
 
     best = max(decibels(lam) for lam in np.logspace(-6, 4, 41))
-    assert best - decibels(automatic_lambda(replace(problem, struck=struck))) < 1
-    assert best - decibels(automatic_lambda(problem)) > 3
+    assert best - decibels(solver.automatic_lambda(replace(problem, struck=struck))) < 1
+    assert best - decibels(solver.automatic_lambda(problem)) > 3
     more = replace(problem, energy=problem.energy + beyond)
-    assert is_misfit(more) and not is_misfit(replace(more, energy=more.energy - beyond))
+    assert solver.is_misfit(more) and not solver.is_misfit(replace(more, energy=more.energy - beyond))
 
 
 @pytest.mark.parametrize("patterns", [1, 5])
@@ -269,7 +257,7 @@ def test_behind_a_centred_mask_the_steadiest_image_is_not_black(photograph, patt
     cast = scene_factor(mls_mask().terms[0][1], 0.06, centred_edges(m, 0.02), centred_edges(n, 120 / n), 2.0, 400.0)
     signed, brightest = 2 * cast - cast.max(), cast.max() ** 2
     lit = np.ones((n, 1)) if patterns == 1 else (rng.random((n, patterns)) < 0.5).astype(float)
-    prepared = prepare(signed, signed, lit, lit, centre=True)
+    prepared = solver.prepare(signed, signed, lit, lit, centre=True)
     sums = prepared.accumulator()
     veil = 1 + 0.03 * np.cos(np.outer(np.linspace(0, 5, m), np.linspace(0, 3, m)))
     for i, rows in enumerate(lit.T):
@@ -288,7 +276,7 @@ def test_the_least_lambda_is_the_noise_of_factors_over_the_image(side):
     rng, deviation = np.random.default_rng(4), 0.01
     factors = [rng.normal(size=(30, 12)), rng.normal(size=(40, 10))]
     patterns = [np.full((12, 1), 2.0), np.ones((10, 1))] if side == 0 else [np.ones((12, 1)), np.full((10, 1), 2.0)]
-    model = prepare(*factors, *patterns)
+    model = solver.prepare(*factors, *patterns)
     stated = tuple(deviation if axis == side else 0.0 for axis in (0, 1))
     model = replace(model, noise=stated, light=tuple(float(np.square(lit).mean()) for lit in patterns))
     squares = []
@@ -319,11 +307,11 @@ def test_lambda_at_an_end_of_its_range_is_said_where_it_matters():
     sigma = np.outer(np.logspace(0, -10, 40), np.ones(20))
     image = np.random.default_rng(1).normal(size=sigma.shape)
     data = sigma * image
-    problem = DiagonalProblem(sigma, data, float(np.square(data).sum()), 1000)
-    assert automatic_lambda(problem) == 0
-    assert automatic_lambda(problem, explained=False) > 0
-    assert "smallest" in end_of_range(problem, 0.0)[0]
-    assert "largest" in end_of_range(problem, 2.0)[0]
-    assert end_of_range(problem, 1e-3) == ()
+    problem = solver.DiagonalProblem(sigma, data, float(np.square(data).sum()), 1000)
+    assert solver.automatic_lambda(problem) == 0
+    assert solver.automatic_lambda(problem, explained=False) > 0
+    assert "smallest" in solver.end_of_range(problem, 0.0)[0]
+    assert "largest" in solver.end_of_range(problem, 2.0)[0]
+    assert solver.end_of_range(problem, 1e-3) == ()
     well_measured = replace(problem, sigma=np.ones_like(sigma))
-    assert end_of_range(well_measured, 0.0) == ()
+    assert solver.end_of_range(well_measured, 0.0) == ()

@@ -83,10 +83,8 @@ def error(found: CheckedSession) -> tuple[float, float]:
     estimate = found.estimate(SIGNS, None)
     balance = np.sqrt(UNIT * np.linalg.norm(WHOLE[1]) / np.linalg.norm(WHOLE[0]))
     exact = EXACT[0] * balance, EXACT[1] * UNIT / balance
-    actual = [
-        np.linalg.norm(one - other) / np.linalg.norm(other)
-        for one, other in zip((estimate.left, estimate.right), exact, strict=True)
-    ]
+    pairs = zip((estimate.left, estimate.right), exact, strict=True)
+    actual = [np.linalg.norm(one - other) / np.linalg.norm(other) for one, other in pairs]
     return float(np.hypot(*actual)), float(np.hypot(*estimate.predicted_error))
 
 
@@ -260,7 +258,7 @@ def test_ambient_light_is_told_from_the_lamp(ambient: Callable[..., np.ndarray])
 def test_a_drifting_lamp_is_divided_out(ambient: float) -> None:
     """With and without ambient light that grows. (Planted: the trend's mean is not 1.)"""
     found = checked(frames(lambda frame, time, half: (1 + 0.05 * (time - 0.5)) * frame + ambient * time))
-    assert not found.faults and found.lamp is not None and not found.lamp["flicker"]
+    assert not found.faults and not found.lamp["flicker"]
     assert found.lamp["drift"] == pytest.approx(0.05, rel=0.05)
     assert found.lamp["drift_cost"] == pytest.approx(0.05 / np.sqrt(12) * np.sqrt(2), rel=0.2), "of both sides"
     assert error(found)[0] < (2.0 if ambient else 1.3) * CLEAN and holds(found, 0.05)
@@ -273,7 +271,7 @@ def test_a_flickering_lamp_is_divided_out(seed: int) -> None:
     """An error of 2 % becomes half a percent. (Planted: the unequal power of both frames is not divided out.)"""
     power = dict(zip(ORDER, 1 + 0.005 * np.random.default_rng(seed).standard_normal(len(ORDER)), strict=True))
     found = checked(frames(lambda frame, time, half: power[half] * frame))
-    assert not found.faults and found.lamp is not None and abs(found.lamp["drift"]) < 0.005
+    assert not found.faults and abs(found.lamp["drift"]) < 0.005
     assert found.lamp["flicker"] == pytest.approx(0.005, rel=0.25) and found.lamp["flicker_cost"] > 0.015
     actual, stated = error(found)
     assert 0.5 * stated < actual < 1.5 * stated < 0.015
