@@ -24,7 +24,7 @@ from mitsim.studies.framework.campaign import StudyResult, Where, merge, run_exp
 from mitsim.studies.framework.experiment import Scope, Setup
 from mitsim.studies.framework.panels import write_page
 from mitsim.verbs import study
-from tests.unit.studies.test_colour_by_line import main
+from tests.unit.studies.test_colour_folders import main
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 
