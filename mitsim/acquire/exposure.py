@@ -26,17 +26,8 @@ from mitsim.light.cost_model import frames_at_once
 from mitsim.light.settings import Estimate
 from mitsim.optics.frames import ExpectedFrames, Frame, add_speckle, bound_of
 from mitsim.scene.load import window_at
-from mitsim.sensor.chain import (
-    Digital,
-    dn_to_electrons,
-    electrons_from_irradiance,
-    expose,
-    mean_variance,
-    ripple_level,
-    ripple_response,
-    saturated_pixels,
-    specimen,
-)
+from mitsim.sensor import chain
+from mitsim.sensor.chain import Digital, mean_variance, saturated_pixels
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
 Used = TypeVar("Used")
@@ -53,18 +44,18 @@ class Exposer:
 
     def electrons(self, frame: Frame) -> FloatArray:
         wavelength = self.devices.projector.effective_wavelength_nm
-        return electrons_from_irradiance(frame.irradiance, self.exposure_s, self.devices.sensor, wavelength)
+        return chain.electrons_from_irradiance(frame.irradiance, self.exposure_s, self.devices.sensor, wavelength)
 
     def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
         return add_speckle(self.electrons(frame), self.speckle, stream(self.seed, "speckle", *names))
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
         shot, read = (stream(self.seed, noise, *names) for noise in ("shot", "read"))
-        return expose(electrons, self.exposure_s, self.devices.sensor, shot, read)
+        return chain.expose(electrons, self.exposure_s, self.devices.sensor, shot, read)
 
     def rate(self, digital: Digital) -> FloatArray:
         sensor = self.devices.sensor
-        return dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
+        return chain.dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
 
     def sensor_noise(self, electrons: FloatArray) -> float:
         variance = mean_variance(electrons, self.exposure_s, self.devices.sensor)
@@ -108,7 +99,7 @@ def peak_irradiance(expected: ExpectedFrames) -> float:
 
 def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str]:
     if sensor.hot_pixels or sensor.dead_pixels:
-        own = specimen(sensor, (shape[0], shape[1]))
+        own = chain.specimen(sensor, (shape[0], shape[1]))
         yield (
             f"defect pixels: {own.hot} are hot and {own.dead} dead, and frames have them as they are read; an image "
             "takes what they read for light; leave them out of the camera's file, or look at its misfit"
@@ -245,7 +236,7 @@ class Shooting:
             index, shot, frame = item
             electrons = exposer.shot_electrons(frame, *shot.names)
             digital = exposer.digital(electrons, *shot.names)
-            unit = electrons_from_irradiance(1.0, exposer.exposure_s, exposer.devices.sensor, wavelength)
+            unit = chain.electrons_from_irradiance(1.0, exposer.exposure_s, exposer.devices.sensor, wavelength)
             rendered, noise = float(np.sqrt(frame.variance) * unit), exposer.sensor_noise(electrons)
             energy = sum_of_squares(electrons)
             signal = sum_of_squares(electrons - self.always) if self.always.any() else energy
@@ -397,9 +388,9 @@ class DriftedExposer(Exposer):
         if source not in self.drift.ripples:
             return 1.0
         amplitude, hertz = self.drift.ripples[source]
-        response = ripple_response(self.devices.sensor, self._open.exposure_s, hertz, rows)
+        response = chain.ripple_response(self.devices.sensor, self._open.exposure_s, hertz, rows)
         phase = stream(self.seed, "drift", f"{source} ripple", *names).uniform(0, 2 * np.pi)
-        return ripple_level(response, amplitude, phase)
+        return chain.ripple_level(response, amplitude, phase)
 
     @cached_property
     def _open(self) -> Exposer:

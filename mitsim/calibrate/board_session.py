@@ -25,11 +25,10 @@ from mitsim.bench.layout import MOST_LOST, before_board, mask_fault, missed_pixe
 from mitsim.bench.request import Exposure
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import whole_file, write_json
+from mitsim.core.files import whole_file
 from mitsim.core.job import Cost, Job
-from mitsim.core.manifests import Digital
 from mitsim.devices.camera import CameraGeometry, side_of
-from mitsim.devices.framelist import LISTS, FrameList, StripeFile
+from mitsim.devices.framelist import StripeFile
 from mitsim.devices.patterns import Lighting, PatternFamily, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import SIDES, UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
@@ -45,12 +44,13 @@ from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.factors import SEPARABLE_RESIDUAL, decibels
-from mitsim.sensor.chain import Digital as DigitalNumbers
+from mitsim.sensor.chain import Digital
 
 _IN_RAYS = 0.5
 """Part (rms) of the geometric residual below which the residual is attributed to diffraction."""
 _PLACES = 128
 """Sensor pixels per axis on which the mask is compared, because all pixels would take gigabytes."""
+_MOST_TIFF = 2**16 - 1
 _LINES = 4
 """Rows and columns of pixels that the plan examines, such that each quarter of the window is represented."""
 
@@ -178,6 +178,22 @@ class Session:
         """Return the order of the frames; the repeats of each follow one another."""
         return halves_in_order(self.signs.shape[1], self.pairs, self.recipe.order, self.recipe.order_seed)
 
+    @property
+    def as_tiff(self) -> bool:
+        """Return True if frames are written as 16-bit TIFF, and False for NPY, which holds larger and real numbers."""
+        largest = self.bench.sensor.largest_dn
+        return largest is not None and largest <= _MOST_TIFF
+
+    @cached_property
+    def files(self) -> dict[tuple[str, int, int], StripeFile]:
+        """Return the file of each shot and repeat, numbered in the order in which they are taken."""
+        found, ending = dict[tuple[str, int, int], StripeFile](), "tif" if self.as_tiff else "npy"
+        for (side, index, sign), repeat in product(self.order, range(self.recipe.repeats)):
+            file = f"frame_{len(found):05d}.{ending}"
+            listed = StripeFile(file=file, side=side, index=index, sign=sign, repeat=repeat)
+            found[(*self.shot((side, index, sign)), repeat)] = listed
+        return found
+
     @cached_property
     def powers(self) -> Mapping[tuple[str, int], FloatArray]:
         drift, order = self.recipe.drift, self.order
@@ -304,42 +320,6 @@ def lines_held(lines: int, patterns: int, pixels: float) -> bool:
 Result = TypeVar("Result")
 SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quantisation"
 """Sources of a frame's noise."""
-MOST_TIFF = 2**16 - 1
-"""Largest digital number of a 16-bit TIFF; frames with larger or real numbers become NPY."""
-
-
-class KeptFrames:
-    """Folder of a session's frames, as a real camera's user has them."""
-
-    def __init__(self, session: Session, folder: Path) -> None:
-        self._session, self._folder, largest = session, folder, session.bench.sensor.largest_dn
-        self._tiff = largest is not None and largest <= MOST_TIFF
-        self._files: dict[tuple[str, int, int], StripeFile] = {}
-        for (side, index, sign), repeat in product(session.order, range(session.recipe.repeats)):
-            file = f"frame_{len(self._files):05d}.{'tif' if self._tiff else 'npy'}"
-            listed = StripeFile(file=file, side=side, index=index, sign=sign, repeat=repeat)
-            self._files[(*session.shot((side, index, sign)), repeat)] = listed
-
-    def write(self, shot: tuple[str, int, int], numbers: DigitalNumbers) -> None:
-        with whole_file(self._folder / self._files[shot].file) as part, part.open("wb") as file:
-            if self._tiff:
-                Image.fromarray(numbers.astype(np.uint16)).save(file, "TIFF")
-            else:
-                np.save(file, numbers)
-
-    def finish(self, digital: Digital) -> None:
-        bench, recipe = self._session.bench, self._session.recipe
-        listed = FrameList(
-            camera=bench.identity(),
-            n=bench.n,
-            signed_capture=recipe.signed_capture,
-            repeats=recipe.repeats,
-            digital=digital,
-            centre=self._session.centre,
-            board_reflectance=recipe.board_reflectance,
-            frames=tuple(self._files.values()),
-        )
-        write_json(self._folder / LISTS[1], listed.model_dump(mode="json", exclude_defaults=True))
 
 
 @dataclass(frozen=True)
@@ -374,7 +354,7 @@ class LitSession:
     white: Frame
     exposure_s: float
     speckle: float
-    kept: KeptFrames | None = None
+    kept: Path | None = None
 
     @classmethod
     def of(cls, session: Session, light: SampledLight, job: Job) -> LitSession:
@@ -512,13 +492,17 @@ class LitSession:
         exposer = Exposer(session.bench.devices, self.exposure_s, session.seed, self.speckle)
         passed = Frame(session.through_filters(irradiance), 0.0, 0.0, 0.0)
         lit = exposer.shot_electrons(passed, "calibration", side, index)
-        total: DigitalNumbers | FloatArray = np.zeros(0)
+        total: Digital | FloatArray = np.zeros(0)
         for repeat, power in enumerate(session.powers[side, index]):
             names = ("repeat", repeat) if repeat else ()
             light = power * lit
             digital = exposer.digital(light, "calibration", side, index, *names)
             if self.kept is not None:
-                self.kept.write((side, index, repeat), digital)
+                with whole_file(self.kept / session.files[side, index, repeat].file) as part, part.open("wb") as file:
+                    if session.as_tiff:
+                        Image.fromarray(digital.astype(np.uint16)).save(file, "TIFF")
+                    else:
+                        np.save(file, digital)
             saturated += int(exposer.saturates(digital, light))
             total = total + digital if repeat else digital if repeats == 1 else digital.astype(np.float64)
         rate = exposer.rate(total if repeats == 1 else total / repeats)

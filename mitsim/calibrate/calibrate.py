@@ -27,7 +27,7 @@ from mitsim.acquire.capture import colour_folder
 from mitsim.acquire.spectral import SpectralBench, without_filters
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, SessionRequest, Task
-from mitsim.calibrate.board_session import MOST_TIFF, KeptFrames, LitSession, Response, Session
+from mitsim.calibrate.board_session import LitSession, Response, Session
 from mitsim.core.arrays import FloatArray, integer, single_threaded_blas
 from mitsim.core.colour_files import CALIBRATION
 from mitsim.core.environment import deciding_versions, versions
@@ -35,6 +35,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import PARTS, output_folder, plain, remove_page, whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, resumable
+from mitsim.devices.framelist import LISTS, FrameList
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light.light import SampledLight
@@ -148,8 +149,8 @@ def calibrate(bench: Apparatus, request: SessionRequest, task: Task, frames: Pat
     session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
     with nullcontext() if frames is None else whole_folder(frames) as folder:
         if folder is not None:
-            number_bytes = 2 if (bench.sensor.largest_dn or math.inf) <= MOST_TIFF else 8
-            size = Cost(disk_bytes=float(session.shots * math.prod(bench.geometry.frame_shape) * number_bytes))
+            pixels, number_bytes = math.prod(bench.geometry.frame_shape), 2 if session.as_tiff else 8
+            size = Cost(disk_bytes=float(session.shots * pixels * number_bytes))
             size.check("frames", Limits(), folder)
         return _run_sessions([session], request, task, [task.output], folder)[0]
 
@@ -259,8 +260,7 @@ def _run_sessions(
                     parts = ("data", "indices", "indptr", "shape")
                     facts |= {f"{row.key}_{part}": getattr(group[name], part) for part in parts}
                 checkpoint.save("light", facts)
-            lit = LitSession.of(session, light, job)
-            lit = replace(lit, kept=KeptFrames(session, frames) if frames else None)
+            lit = replace(LitSession.of(session, light, job), kept=frames)
             found.append(_factors(lit, checkpoint, job))
     return found
 
@@ -270,7 +270,17 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
     bench, digital = session.bench, digital_of(session.bench.sensor, lit.exposure_s)
     (noisy, clean), saturated, faults = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
     if lit.kept is not None:
-        lit.kept.finish(digital)
+        listed = FrameList(
+            camera=bench.identity(),
+            n=bench.n,
+            signed_capture=session.recipe.signed_capture,
+            repeats=session.recipe.repeats,
+            digital=digital,
+            centre=session.centre,
+            board_reflectance=session.recipe.board_reflectance,
+            frames=tuple(session.files.values()),
+        )
+        write_json(lit.kept / LISTS[1], listed.model_dump(mode="json", exclude_defaults=True))
     physics, lacks = lit.light.simulation.physics, None
     if physics.geometry.few_wave_terms:
         lacks = lacking(session.shadow(physics.geometry, physics.spectrum), clean.left, clean.right)

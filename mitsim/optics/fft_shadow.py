@@ -70,9 +70,8 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
     mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
     assert isinstance(mask, Plate), "other masks have a closed form"
-    pixel = geometry.pixel_pitch * shadow.shrink
-    step = pixel / cells_per_pixel(geometry)
-    count = _cells(geometry, mask, step, spectrum)
+    step = geometry.pixel_pitch * shadow.shrink / cells_per_pixel(geometry)
+    count = cells_a_side(geometry, spectrum, shadow.shrink)
     if count > _LARGEST:
         problem = f"{mask.words}: its shadow needs a raster of {count} cells a side, more than {_LARGEST}"
         raise MitsimError(f"{problem}; take fewer pixels, larger features, or a mask of one or two separable terms")
@@ -87,17 +86,13 @@ def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | Non
     return Plate(step, values, mask.words, flaws=flaws, irradiance=True, averaged=max(active, 1))
 
 
-def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
-    mask = geometry.build_mask()
-    assert isinstance(mask, Plate)
-    return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry), spectrum)
-
-
-def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectrum | None) -> int:
-    """Return the cells per side for the visible part of a ``mask`` and the light that waves carry beyond.
+def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None, shrink: float = 1.0) -> int:
+    """Return the cells per side for the visible part of the mask and the light that waves carry beyond.
 
     An edge sends lambda D / (4 pi^2 x) of light, as a length, beyond x; a mean opening has two edges per axis.
     """
+    mask, step = geometry.build_mask(), geometry.pixel_pitch * shrink / cells_per_pixel(geometry)
+    assert isinstance(mask, Plate)
     half = mask.flaws.reach(mask.extent_mm) / 2
     if spectrum is not None and not mask.irradiance:
         product = float(spectrum.wavelengths_nm.max()) * 1e-6 * geometry.mask_distance
@@ -247,11 +242,9 @@ def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDA
 # The result is exact for the raster up to rounding in single precision, 1e-6 of a frame's mean; the sum of separable
 # terms gives the same (tests/unit/optics/test_correlation.py).
 
+_Phases = npt.NDArray[np.complex64]
 _APART = 8
 """Step in pixels of the first lit pixel, so that light in cells of other sizes reuses the raster's spectra."""
-
-
-_Pair = tuple[int, int]
 
 
 class Correlation:
@@ -269,7 +262,7 @@ class Correlation:
         self._spread = spreads
         reach = max(len(spread) // phases for spread, phases in zip(spreads, self._phases, strict=True))
         self._size = tuple(scipy.fft.next_fast_len(pixels + reach - 1, real=True) for pixels in self.shape)
-        self._spectra = _spectra(cast("Plate", shadow.mask), (firsts[0], firsts[1]), self._size, self._phases)
+        self._spectra = _spectra(cast("Plate", shadow.mask), tuple(firsts), self._size, self._phases)
 
     def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
         left, right = self._spread[0][:, np.asarray(rows)], self._spread[1][:, np.asarray(columns)]
@@ -290,7 +283,7 @@ def _by_phase(cells: npt.NDArray[Any], phases: tuple[int, int]) -> npt.NDArray[A
 
 
 @lru_cache(maxsize=RASTERS_KEPT)
-def _spectra(drawn: Plate, firsts: _Pair, size: _Pair, phases: _Pair) -> npt.NDArray[np.complex64]:
+def _spectra(drawn: Plate, firsts: tuple[int, ...], size: tuple[int, ...], phases: tuple[int, int]) -> _Phases:
     along = [count * each for count, each in zip(size, phases, strict=True)]
     seen = _part(_part(drawn.values, firsts[0], along[0]).T, firsts[1], along[1]).T.astype(np.float32)
     return np.stack([scipy.fft.rfft2(np.ascontiguousarray(row)) for row in _by_phase(seen, phases)])

@@ -174,9 +174,16 @@ class FrameOptics:
 
         def layer(depth: float) -> _Layer:
             if geometry.is_correlated(spectrum is not None):
-                shadow = geometry, rows, columns, depth, spectrum
-                summed = largest_terms(*shadow, places) if geometry.is_drawn(spectrum is not None) else None
-                return _Raster(shadow, weights, places, None if summed is None else _Terms(summed, weights))
+                shadow, summed = (geometry, rows, columns, depth, spectrum), None
+                if geometry.is_drawn(spectrum is not None):
+                    drawn, sides = raster(geometry, depth, spectrum), zip(weights, (rows, columns), strict=True)
+                    numbers = sum(len(side) * len(each.centres) for side, each in sides)
+                    # The terms up to 1e-4 of light are summed unless they exceed the memory limit.
+                    if 8 * number_of_terms(drawn) * numbers <= SUMMED_BYTES:
+                        cast = replace(ShadowGeometry.of(geometry, depth), mask=drawn)
+                        others = geometry.pixel_fill_factor, places, drawn.terms
+                        summed = _Terms(terms_of_raster(cast, rows, columns, *others), weights)
+                return _Raster(shadow, weights, places, summed)
             many = geometry.mask_terms > FEW or geometry.mask_motion is not None
             form = shadow_terms if many else _keep_shadow
             return _Terms(form(geometry, rows, columns, depth, spectrum, places), weights)
@@ -232,7 +239,11 @@ class FrameOptics:
         return frame, probed
 
     def _lit_layers(self, estimates: Sequence[Entries], together: bool = False) -> Iterator[tuple[_Layer, _Lit]]:
-        split = [self._split_layers(*entries) for entries in estimates]
+        size, split = self.shape[0] * self.shape[1], []
+        for every, light in estimates:
+            starts = np.arange(len(self._layers) + 1, dtype=every.dtype) * every.dtype.type(size)
+            inside = starmap(slice, pairwise(np.searchsorted(every, starts)))
+            split.append([(every[part] - start, light[part]) for start, part in zip(starts, inside, strict=False)])
         for of_depth, parts in zip(self._layers, zip(*split, strict=True), strict=True):
             most = max(len(place) for place, _ in parts)
             if not most:
@@ -253,13 +264,6 @@ class FrameOptics:
             if together:
                 lights /= len(parts)
             yield of_depth, _Lit(rows, columns, lights.reshape(-1, len(rows), len(columns)))
-
-    def _split_layers(self, flat: IntArray, light: FloatArray) -> list[Entries]:
-        if len(self._layers) == 1:
-            return [(flat, light)]
-        starts = np.arange(len(self._layers) + 1, dtype=flat.dtype) * flat.dtype.type(self.shape[0] * self.shape[1])
-        parts = starmap(slice, pairwise(np.searchsorted(flat, starts)))
-        return [(flat[part] - start, light[part]) for start, part in zip(starts, parts, strict=False)]
 
 
 def raster_error(
@@ -300,24 +304,6 @@ def raster_error(
 
 def number_of_terms(drawn: Plate) -> float:
     return drawn.largest.count if drawn.largest.left_out <= RASTER_LEFT_OUT else math.inf
-
-
-def largest_terms(
-    geometry: CameraGeometry,
-    rows: Directions,
-    columns: Directions,
-    depth: float,
-    spectrum: Spectrum | None = None,
-    places: Places | None = None,
-) -> SeparableTerms | None:
-    """Return the separable terms of a raster's shadow up to 1e-4; None if they exceed the memory limit."""
-    drawn = raster(geometry, depth, spectrum)
-    shape = geometry.frame_shape if places is None else map(len, places)
-    sides = sum(side * len(each.centres) for side, each in zip(shape, (rows, columns), strict=True))
-    if 8 * number_of_terms(drawn) * sides > SUMMED_BYTES:
-        return None
-    shadow = replace(ShadowGeometry.of(geometry, depth), mask=drawn)
-    return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places, drawn.terms)
 
 
 @lru_cache(maxsize=RASTERS_KEPT)

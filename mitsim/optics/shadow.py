@@ -133,29 +133,24 @@ def blurred_step(x: FloatArray, half: FloatArray | float, other: float, blur: fl
     Lengths have one unit, x may be -inf, and ``blur`` may be 0 only if there is no second box.
     """
     if other > _POINTLIKE * blur and other > 0:
-        ends = (_twice(x + half + other, blur) - _twice(x + half - other, blur)) / (2 * other)
-        ends -= (_twice(x - half + other, blur) - _twice(x - half - other, blur)) / (2 * other)
+        ends = (_integral(x + half + other, blur, 2) - _integral(x + half - other, blur, 2)) / (2 * other)
+        ends -= (_integral(x - half + other, blur, 2) - _integral(x - half - other, blur, 2)) / (2 * other)
         return np.asarray(ends / (2 * half))
     wide = np.asarray(half) > _POINTLIKE * blur
     width = np.where(wide, half, 1.0)
-    means = (_once(x + width, blur) - _once(x - width, blur)) / (2 * width)
+    means = (_integral(x + width, blur, 1) - _integral(x - width, blur, 1)) / (2 * width)
     point = scipy.special.ndtr(x / blur) if blur else np.asarray(x >= 0, dtype=np.float64)
     return np.asarray(np.where(wide, means, point))
 
 
-def _once(x: FloatArray, blur: float) -> FloatArray:
+def _integral(x: FloatArray, blur: float, order: int) -> FloatArray:
+    """Return the first or second antiderivative of a unit step that a Gaussian blurs."""
     if not blur:
-        return np.asarray(np.maximum(x, 0))
+        return np.asarray(np.maximum(x, 0) if order == 1 else np.square(np.maximum(x, 0)) / 2)
     z = np.maximum(x / blur, -2 * _BEYOND)  # both parts are 0 before
     density = np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi)
-    return np.asarray(blur * (z * scipy.special.ndtr(z) + density))
-
-
-def _twice(x: FloatArray, blur: float) -> FloatArray:
-    if not blur:
-        return np.asarray(np.square(np.maximum(x, 0)) / 2)
-    z = np.maximum(x / blur, -2 * _BEYOND)
-    density = np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi)
+    if order == 1:
+        return np.asarray(blur * (z * scipy.special.ndtr(z) + density))
     return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * scipy.special.ndtr(z) + z * density))
 
 

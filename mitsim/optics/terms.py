@@ -141,7 +141,8 @@ def _moving_terms(
     reach = abs(angle) * max(float(np.abs(row).max()), float(np.abs(column).max()))
     nodes = np.linspace(-reach, reach, max(2, 1 + int(np.ceil(2 * reach / (NODE_UM / 1e3)))))
     at_nodes = [shaking(float(node)) for node in nodes]
-    by_row, by_column = _hats(-angle * row, nodes), _hats(angle * column, nodes)
+    places = ((shift - nodes[0]) / (nodes[1] - nodes[0]) for shift in (-angle * row, angle * column))
+    by_row, by_column = ([np.maximum(1 - np.abs(place - k), 0.0) for k in range(len(nodes))] for place in places)
     return [
         (left * by_row[second], right * by_column[first])
         for (first, lefts), (second, rights) in product(enumerate(at_nodes), enumerate(at_nodes))
@@ -152,11 +153,6 @@ def _moving_terms(
 def _crossings(shadow: ShadowGeometry, rows: Directions, columns: Directions) -> list[FloatArray]:
     both = enumerate((rows, columns))
     return [shadow.along(axis).crossings(directions) - shadow.offset_mm[axis] for axis, directions in both]
-
-
-def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
-    place = (shift - nodes[0]) / (nodes[1] - nodes[0])
-    return [np.maximum(1 - np.abs(place - index), 0.0) for index in range(len(nodes))]
 
 
 # -------- Sums of separable terms as operators
@@ -221,7 +217,9 @@ def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacki
     values, split = _singular([*whole, (-left, right)])
     beyond = np.sqrt(np.cumsum(np.square(values[::-1]))[::-1])
     count = int(np.count_nonzero(beyond > _LEFT_OUT * beyond[0]))
-    return Lacking([split(number) for number in range(count)], float(beyond[0] / np.sqrt(_energy(whole))))
+    every_left, every_right = (np.stack([np.ravel(pair[side]) for pair in whole]) for side in (0, 1))
+    energy = max(float(((every_left @ every_left.T) * (every_right @ every_right.T)).sum()), 0.0)
+    return Lacking([split(number) for number in range(count)], float(beyond[0] / np.sqrt(energy)))
 
 
 def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
@@ -253,11 +251,6 @@ def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], Separa
 
 def centre_terms(terms: SeparableTerms) -> SeparableTerms:
     return [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
-
-
-def _energy(terms: SeparableTerms) -> float:
-    left, right = (np.stack([np.ravel(pair[side]) for pair in terms]) for side in (0, 1))
-    return max(float(((left @ left.T) * (right @ right.T)).sum()), 0.0)
 
 
 # -------- A camera as numbers that a fit can vary

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, combinations, product
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.bench.effects import EFFECTS, names
 from mitsim.core.arrays import FloatArray
@@ -97,11 +97,10 @@ class Candidates:
             most = _MARGIN * accuracy
             accurate = [table for table in self._tables if (table.systematic(sure, table.given) < most).any()]
             found = [table.predict(accuracy, sure) for table in accurate]
-            if not any(each.fits[each.best] for each in found):
+            if all(each.rank[0] for each in found):
                 found = [table.predict(accuracy, sure) for table in self._tables]
-            best = min(found, key=lambda each: each.rank)
-            table, alone = best.table, best.table.rows[[best.best]]
-            one = _Table(self.pilot_result, table.effects, table.raster_cells, alone, table.given)
+            _, table, row, *_ = min(found, key=lambda each: each.rank)
+            one = _Table(self.pilot_result, table.effects, table.raster_cells, table.rows[[row]], table.given)
             self._chosen[accuracy, sure] = one.candidate(accuracy, sure)
         return self._chosen[accuracy, sure]
 
@@ -121,7 +120,11 @@ def _table_of(pilot_result: PilotResult, settings: Settings, switches: Mapping[s
 
 def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, Approximation]:
     careful, hopeful = (candidates.choice(accuracy, sure) for sure in (SURE, 0.0))
-    unsure = _table_of(candidates.pilot_result, hopeful.settings, candidates.switches).unsure
+    result, unsure = candidates.pilot_result, dict[Approximation, float]()
+    table = _table_of(result, hopeful.settings, candidates.switches)
+    for part in result.changes.parts:
+        if weight := float(table.weight(part)[0]):
+            unsure[part] = weight**2 * (result.error(part).bound ** 2 - result.error(part).value ** 2)
     worst = max(sorted(unsure), key=lambda part: unsure[part], default=Approximation("cells", 1))
     if careful.fits:
         return careful.work - hopeful.work, worst
@@ -132,38 +135,19 @@ def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, A
 # -------- Predictions of many candidates
 
 
-@dataclass(frozen=True, eq=False)
-class _Prediction:
-    """Predictions (m,) of the rows of a table at an accuracy; ``needed`` samples may be below one."""
+class _Prediction(NamedTuple):
+    """Best row of a table at an accuracy, with its rank among the tables' best ones.
 
+    ``needed`` samples (1,) may be below one.
+    """
+
+    rank: tuple[bool, float, float]
     table: _Table
-    target: FloatArray
+    row: int
+    target: float
+    work: float
     needed: Mapping[str, FloatArray]
     samples: Mapping[str, FloatArray]
-    fits: npt.NDArray[np.bool_]
-    work: FloatArray
-    best: int
-    rank: tuple[bool, float, float]
-
-    @property
-    def settings(self) -> Settings:
-        table, result = self.table, self.table.pilot_result
-        numbers = (int(number) for number in table.rows[self.best])
-        anchors, layers, cells, followed, occluded, all_layers = numbers
-        found = ("depth", "shared", "repeats", "reach", "sharp", "occluded")
-        return Settings(
-            **{name: getattr(result, name) for name in found},
-            anchors=anchors,
-            layers=result.layers[layers] if layers > 1 else (),
-            subdivision=cells,
-            effects=table.effects,
-            samples={name: float(count[self.best]) for name, count in self.needed.items()},
-            followed_anchors=followed,
-            coarse_layers=bool(all_layers),
-            occluded_anchors=occluded,
-            raster=table.raster_cells > 0,
-            raster_cells=table.raster_cells,
-        )
 
 
 class _Table:
@@ -187,12 +171,6 @@ class _Table:
 
     # ---- errors
 
-    @property
-    def unsure(self) -> dict[Approximation, float]:
-        weights = {part: float(self._weight(part)[0]) for part in self.pilot_result.changes.parts}
-        errors = {part: self.pilot_result.error(part) for part, weight in weights.items() if weight}
-        return {part: weights[part] ** 2 * (each.bound**2 - each.value**2) for part, each in errors.items()}
-
     def systematic(self, sure: float, ignored: frozenset[Approximation]) -> FloatArray:
         result, cells = self.pilot_result, self.raster_cells
         drawn = [
@@ -212,10 +190,10 @@ class _Table:
 
     def _squares(self, ignored: frozenset[Approximation]) -> tuple[FloatArray, FloatArray]:
         changes = self.pilot_result.changes
-        weights = [self._weight(part) * (part not in ignored) for part in changes.parts]
+        weights = [self.weight(part) * (part not in ignored) for part in changes.parts]
         return changes.squared_errors(np.stack(weights, axis=1))
 
-    def _weight(self, part: Approximation) -> FloatArray:
+    def weight(self, part: Approximation) -> FloatArray:
         light, _, what = part.name.rpartition(" ")
         # Errors of even cells are of second order in their size.
         numbers, finer_cells = self.numbers, np.square(1 / self.numbers.coarse[0])
@@ -289,9 +267,11 @@ class _Table:
         best = int(np.lexsort((avoidable, work, ~chosen))[0])
         least, seconds = float(avoidable[best]), float(work[best])
         rank = (False, seconds, least) if fits[best] else (True, least, 0.0)
-        return _Prediction(self, target, found, samples, fits, work, best, rank)
+        counts = ({name: count[[best]] for name, count in each.items()} for each in (found, samples))
+        return _Prediction(rank, self, best, float(target[best]), seconds, *counts)
 
     def candidate(self, accuracy: float, sure: float) -> Candidate:
+        """Return the settings of a table of one row, with their predicted error and work."""
         result, found = self.pilot_result, self.predict(accuracy, sure)
         noise = np.zeros(len(self.rows))
         for name, count in found.samples.items():
@@ -308,15 +288,23 @@ class _Table:
         if not math.isinf(result.hits):
             one_hit = 1 / (result.hits * float(found.samples["direct"][0]))
             rest = [math.hypot(error, hits * one_hit) for error, hits in zip(rest, _OFF_BY_HITS, strict=True)]
-        return Candidate(
-            settings=found.settings,
-            systematic=Estimate(*(missing + (1 - missing) * error for error in rest)),
-            lacking=lacking,
-            target=float(found.target[0]),
-            noise=float(np.sqrt(noise)[0]),
-            fits=bool(found.fits[0]),
-            work=float(found.work[0]),
+        anchors, layers, cells, followed, occluded, all_layers = (int(number) for number in self.rows[0])
+        settings = Settings(
+            **{name: getattr(result, name) for name in ("depth", "shared", "repeats", "reach", "sharp", "occluded")},
+            anchors=anchors,
+            layers=result.layers[layers] if layers > 1 else (),
+            subdivision=cells,
+            effects=self.effects,
+            samples={name: float(count[0]) for name, count in found.needed.items()},
+            followed_anchors=followed,
+            coarse_layers=bool(all_layers),
+            occluded_anchors=occluded,
+            raster=self.raster_cells > 0,
+            raster_cells=self.raster_cells,
         )
+        systematic = Estimate(*(missing + (1 - missing) * error for error in rest))
+        left_noise = float(np.sqrt(noise)[0])
+        return Candidate(settings, systematic, lacking, found.target, left_noise, not found.rank[0], found.work)
 
     def _by_row(self, name: str, of: Callable[..., Number], *by: Number) -> FloatArray:
         found = of(cost_model.sample_costs(self.pilot_result, self.effects)[name], *by) + np.zeros(len(self.rows))

@@ -174,13 +174,21 @@ class Sample:
         entries = in_threads(grid.bundle.entries, replicates) if missing else []
         optics = grid.optics if any(len(place) for place, *_ in entries) else None
 
+        def gather(places: Labels, values: FloatArray) -> Entries:
+            lit = values != 0
+            places, values = places[lit], values[lit]
+            if size > _SPARSE * len(places):
+                found, index = np.unique(places, return_inverse=True)
+                return found, np.bincount(index, values, len(found)).astype(np.float64)
+            light = np.bincount(places, values, size).astype(np.float64)
+            found = np.flatnonzero(light)
+            return found, light[found]
+
         def form(row: int) -> None:
             frames = np.zeros((len(replicates), *self.shape))
             if optics:
                 share = patterns[row][classes_of]
-                seen = optics.probe(
-                    [gather_places(place, value * share[pixel], size) for place, value, pixel in entries]
-                )
+                seen = optics.probe([gather(place, value * share[pixel]) for place, value, pixel in entries])
                 frames = np.moveaxis(seen.reshape(len(frames[0]), len(frames), -1), 1, 0)
             # The replicates are held with the frames: their numbers must not be given to others.
             known[keys[row]] = replicates, frames
@@ -227,17 +235,6 @@ def coarsening_changes(
     one, two = frames(1, ()), frames(2, ())
     changes = {Approximation(f"{name} cells", 1): (two - one) / (1 - EVEN_CELLS)}
     return {**changes, Approximation(f"{name} layers", 1): frames(1, layers) - one} if layers else changes
-
-
-def gather_places(places: Labels, values: FloatArray, size: int) -> Entries:
-    lit = values != 0
-    places, values = places[lit], values[lit]
-    if size > _SPARSE * len(places):
-        found, index = np.unique(places, return_inverse=True)
-        return found, np.bincount(index, values, len(found)).astype(np.float64)
-    light = np.bincount(places, values, size).astype(np.float64)
-    found = np.flatnonzero(light)
-    return found, light[found]
 
 
 def norm(seen: FloatArray) -> float:

@@ -186,16 +186,19 @@ _FEW_WAVELENGTHS = 2
 """Mean width of a mask's openings, in wavelengths, below which scalar diffraction is a guess."""
 _VAGUE = 2.0
 """An error is reported as a bound if its bound is larger than this multiple of its estimate."""
-_NUMBERS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "anchors": ("falloff, gloss and parallax over the sensor: {n}x{n} anchors", {"anchors": 1, "occluded_anchors": 1}),
-    "layers": ("light from {near:.0f} to {far:.0f} mm: {n} of its depths", {"layers": ()}),
-    "cells": ("{n}x{n} cells of even light a projector pixel", {}),
+_NUMBERS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
+    "anchors": ("falloff, gloss and parallax over the sensor: {n}x{n} anchors", "",
+                {"anchors": 1, "occluded_anchors": 1}),
+    "layers": ("light from {near:.0f} to {far:.0f} mm: {n} of its depths", "", {"layers": ()}),
+    "cells": ("{n}x{n} cells of even light a projector pixel", "", {}),
     "followed_anchors": ("light over several surfaces, in mirrors and of lamps: {n}x{n} points, in cells of "
-                         "{width}x{width} pixels", {"followed_anchors": 1}),
+                         "{width}x{width} pixels", "no light over several surfaces, in mirrors or of lamps is followed",
+                         {"followed_anchors": 1}),
     # Separate anchors for hidden pixels save time: as many anchors for all pixels would take far more.
-    "occluded_anchors": ("{hidden} projector pixels are hidden from part of the sensor: {n}x{n} anchors", {}),
+    "occluded_anchors": ("{hidden} projector pixels are hidden from part of the sensor: {n}x{n} anchors",
+                         "few anchors serve all projector pixels", {}),
 }  # fmt: skip
-"""Numbers that a plan chooses: their words, and the settings with one."""
+"""Numbers that a plan chooses: their words where they count and where they do not, and the settings with one."""
 _REMEDIES = {
     choose.SHARP_LOBES: "give those surfaces more roughness, or make them perfect mirrors (conductor)",
     choose.MIRRORS_TWICE: (
@@ -256,15 +259,10 @@ def _rows(
         return max(now - sum(_stages(result, replace(settings, **changes), pace).values()), 0.0)
 
     for name, count in zip(COUNTED, choose.counts_of(settings), strict=True):
-        words, with_one = _NUMBERS[name]
+        words, unused, with_one = _NUMBERS[name]
         errors, row = result.ladders[name], name.replace("_", "-")
-        unused = {
-            "followed_anchors": "no light over several surfaces, in mirrors or of lamps is followed",
-            "occluded_anchors": "few anchors serve all projector pixels",
-        }
-        called_for = {"followed_anchors": settings.effects & FOLLOWED, "occluded_anchors": result.occluded}
-        if not called_for.get(name, True):
-            yield PlanRow(row, "off", unused[name], 0.0, 0.0)
+        if unused and not (settings.effects & FOLLOWED if name == "followed_anchors" else result.occluded):
+            yield PlanRow(row, "off", unused, 0.0, 0.0)
             continue
         reason = words.format(
             n=count, near=settings.depths[-1], far=settings.depths[0], width=settings.followed_width,

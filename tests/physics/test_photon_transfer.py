@@ -46,23 +46,14 @@ def pair(model: SensorModel, mean_e: float, side: int, exposure_s: float, name: 
     return float((a + b).mean() / 2), float(((a - b) ** 2).mean() / 2)
 
 
-def gain_side() -> int:
-    """Frame side for which GAIN_GATE is SIGMAS deviations of the mean slope over LEVELS.
+def test_the_slope_of_variance_over_mean_is_the_gain(camera: SensorModel, record_property: Record) -> None:
+    """On a side for which GAIN_GATE is SIGMAS deviations of the mean slope over LEVELS.
 
     Each level's slope (V - V_dark)/(m - m_dark) has relative deviation sqrt(2/n); their mean sqrt(2/(n J)).
     The dark pair's error is common to all levels but below 1 % of that: its variance is 2.9 DN^2 next to
     200 and more.
     """
-    return math.ceil(math.sqrt(2 / len(LEVELS)) * SIGMAS / GAIN_GATE)
-
-
-def read_noise_side() -> int:
-    """Frame side for which READ_NOISE_GATE is SIGMAS deviations: a sigma's relative one is sqrt(1/(2n))."""
-    return math.ceil(math.sqrt(1 / 2) * SIGMAS / READ_NOISE_GATE)
-
-
-def test_the_slope_of_variance_over_mean_is_the_gain(camera: SensorModel, record_property: Record) -> None:
-    side = gain_side()
+    side = math.ceil(math.sqrt(2 / len(LEVELS)) * SIGMAS / GAIN_GATE)
     dark_mean, dark_variance = pair(camera, 0.0, side, 0.0, "dark")
     slopes = []
     for level in LEVELS:
@@ -74,7 +65,7 @@ def test_the_slope_of_variance_over_mean_is_the_gain(camera: SensorModel, record
 
 
 def test_the_dark_variance_is_the_read_noise(camera: SensorModel, record_property: Record) -> None:
-    side = read_noise_side()
+    side = math.ceil(math.sqrt(1 / 2) * SIGMAS / READ_NOISE_GATE)  # a sigma's relative deviation is sqrt(1/(2n))
     _, variance = pair(camera, 0.0, side, 0.0, "read noise")
     # EMVA 1288 4.0: sigma_d^2 = (sigma_y.dark^2 - sigma_q^2) / K^2 with the ADC's 1/12 DN^2.
     measured = math.sqrt(variance - 1 / 12) / camera.gain_dn_per_e

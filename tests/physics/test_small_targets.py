@@ -98,5 +98,4 @@ def test_cards_are_within_what_is_stated(small_scene: Callable[..., Path], varia
             error, bound = off(*scene(small_scene, *cards, behind=BLACK if name == "before black" else ""), seed)
             assert error < 1e-2, (name, seed)
             beyond += [(name, seed, error, bound)] if error > bound else []
-    print(beyond)
     assert len(beyond) <= 2, beyond

@@ -54,6 +54,7 @@ def test_frames_are_those_of_a_capture_that_plans_itself(bench: Bench, captured:
     shots = bench.capture(Plan.load(file))
     assert all(np.array_equal(getattr(shots, name), getattr(captured, name)) for name in ("dn", "electrons", "truth"))
     assert shots.manifest.configuration == captured.manifest.configuration
+    assert bench.capture(Plan.load(file), accuracy=ACCURACY).manifest.configuration == shots.manifest.configuration
     assert shots.manifest.plan is not None and captured.manifest.plan is not None
     assert shots.manifest.plan["settings"] == captured.manifest.plan["settings"]
     assert shots.manifest.plan["predicted"]["plan"] == 0 < captured.manifest.plan["predicted"]["plan"]

@@ -23,7 +23,7 @@ from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.planner import planner
 from mitsim.planner.planner import make_plan
-from tests.unit.planner.invented_pilot_result import PILOT_RESULT
+from tests.unit.planner.test_choice import PILOT_RESULT
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N = 16

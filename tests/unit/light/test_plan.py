@@ -20,8 +20,8 @@ from mitsim.core.job import Cost
 from mitsim.light.passes import even
 from mitsim.light.plan import Plan
 from mitsim.light.settings import REPLICATES, Approximation, Drawn, ErrorCovariance, Estimate, SampleCost, SharpPixels
-from tests.unit.planner.invented_pilot_result import ACCURACIES, ONE_CLASS, PILOT_RESULT, SIZES, changes, plan, rows
-from tests.unit.planner.invented_pilot_result import plan as invented_plan
+from tests.unit.planner.test_choice import ACCURACIES, ONE_CLASS, PILOT_RESULT, SIZES, changes, plan, rows
+from tests.unit.planner.test_choice import plan as invented_plan
 
 
 def test_effects_that_the_scene_does_not_have_stay_off() -> None:

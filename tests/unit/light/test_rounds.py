@@ -33,7 +33,7 @@ from mitsim.light.passes import EVEN, GRIDS, PASSES, even, table_of
 from mitsim.light.settings import GROUPS, Forming, Settings
 from mitsim.optics.frames import PROBES
 from tests.exchanged import frame_of
-from tests.unit.planner.invented_pilot_result import PILOT_RESULT, plan
+from tests.unit.planner.test_choice import PILOT_RESULT, plan
 
 LIGHTS = (
     SampledPass("direct", 24, 0.165, 3.0),

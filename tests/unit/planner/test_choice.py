@@ -1,37 +1,151 @@
-"""The choice of settings: from measured changes to the least work that keeps an accuracy, all that is left counted."""
+"""Pilot result of a scene that nobody rendered: a pilot's word on every effect in, plans and their rows out.
+
+Sizes of changes are chosen so that each accuracy of ``ACCURACIES`` needs others of them.
+
+The choice of settings: from measured changes to the least work that keeps an accuracy, all that is left counted.
+
+What a plan says: of devices that the model does not cover, of effects, and as JSON; benches are plain numbers.
+
+The accuracy that a time buys, of an invented pilot: light takes PRICE / accuracy^2 seconds.
+"""
+
+from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from mitsim.api.bench import Bench
 from mitsim.bench.effects import parse_switches
-from mitsim.light.cost_model import Numbers, entries
+from mitsim.devices.patterns import Lighting
+from mitsim.light.cost_model import (
+    Numbers,
+    accumulation_seconds,
+    checking_seconds,
+    entries,
+    optics_seconds,
+    tracing_seconds,
+    truth_seconds,
+)
 from mitsim.light.passes import PASSES
+from mitsim.light.plan import Plan, PlanRow
 from mitsim.light.settings import (
     COUNTED,
     GROUPS,
     REPLICATES,
+    SURE,
     Approximation,
     ErrorCovariance,
+    Forming,
     PilotResult,
     SampleCost,
+    Settings,
     SharpPixels,
 )
-from mitsim.planner.choose import Candidates, counts_of, predicted_candidate, value_of_refining
-from tests.unit.planner.invented_pilot_result import (
-    ACCURACIES,
-    APART,
-    ONE_CLASS,
-    PILOT_RESULT,
-    SIZES,
-    changes,
-    cheapest,
-    plan,
-    with_occluded,
-    with_sample_costs,
+from mitsim.planner import planner
+from mitsim.planner.choose import Candidate, Candidates, counts_of, predicted_candidate, value_of_refining
+from mitsim.planner.planner import SceneFacts, explain_plan
+from mitsim.scene.check import Unfit
+from mitsim.scene.outline import Tag
+
+FACTS = SceneFacts(notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)
+SIZES = {
+    **{Approximation("anchors", count): size for count, size in {1: 2e-3, 2: 3e-4, 3: 4e-5, 5: 1e-5}.items()},
+    **{Approximation("layers", count): size for count, size in {1: 4e-3, 2: 6e-4, 3: 2e-4, 4: 5e-5}.items()},
+    **{Approximation("cells", count): size for count, size in {1: 6e-3, 2: 2e-3, 4: 1e-4, 8: 1e-5}.items()},
+    **{
+        Approximation(name): size
+        for name, size in {"interreflection": 2e-2, "diffraction": 0.3, "ambient": 5e-4}.items()
+    },
+    **{Approximation("followed_anchors", count): size for count, size in {1: 7e-4, 2: 9e-5, 3: 1e-5}.items()},
+    Approximation("blur"): 1e-3,
+    Approximation("anchor_residual cells", 1): 2e-4,
+    Approximation("indirect cells", 1): 4e-4,
+    Approximation("indirect layers", 1): 3e-4,
+}
+APART = {"speckle": 8e-3}
+
+
+def changes(sizes: dict[Approximation, float], noise: float = 0.0, seed: int = 0) -> ErrorCovariance:
+    """Changes at right angles to each other, each look with ``noise`` of its own: independent, of norm ``noise``."""
+    rng, count = np.random.default_rng(seed), len(sizes)
+    vectors = np.diag(list(sizes.values()))
+    space = count + 40
+    exact = np.zeros((count, space))
+    exact[:, :count] = vectors
+    replicates = exact[:, None] + noise * rng.normal(size=(count, REPLICATES, space)) / math.sqrt(space)
+    return ErrorCovariance.between(dict(zip(sizes, replicates, strict=True)), 1.0)
+
+
+PILOT_RESULT = PilotResult(
+    depth=380.0,
+    layers={1: (380.0,), 2: (400.0, 300.0), 3: (400.0, 343.0, 300.0), 4: (400.0, 369.0, 327.0, 300.0)},
+    changes=changes(SIZES),
+    sample_costs={
+        "direct": SampleCost(2e-3, 16, 16_384, 0.8),
+        "anchor_residual": SampleCost(3e-4, 4, 16_384),
+        "indirect": SampleCost(4e-3, 2, 16_384),
+        "from_camera": SampleCost(1e-2, 2, 20_000),
+        "indirect_residual": SampleCost(2e-3, 2, 36_384),
+        "camera_residual": SampleCost.none(),
+    },
+    spread=SampleCost(2e-3, 16, 16_384, 0.8),
+    forming=Forming(pixels=512, cells=150, lit=0.2, terms=3.0, shots=49, classes=49),
+    apart=APART,
 )
+ONE_CLASS = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, shots=1, classes=1))
+"""The same under one pattern, whose light takes no memory."""
+
+
+ACCURACIES = [0.1, 1e-2, 3e-3, 1e-3, 3e-4]
+
+
+def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
+    """The choice of least work that keeps ``accuracy``, or of least error if none does."""
+    return Candidates(pilot_result, switches).choice(accuracy, sure)
+
+
+def plan(
+    accuracy: float = 1e-3,
+    pilot_result: PilotResult = PILOT_RESULT,
+    effects: str = "",
+    facts: SceneFacts = FACTS,
+    pace: float = 1.0,
+) -> Plan:
+    return explain_plan(accuracy, pilot_result, facts, parse_switches(effects), pace=pace)
+
+
+def rows(found: Plan) -> dict[str, PlanRow]:
+    return {effect.name: effect for effect in found.effects}
+
+
+def stages(pilot_result: PilotResult, settings: Settings, pace: float = 1.0) -> dict[str, float]:
+    """Seconds of each stage: paths, accumulating of what they bring, looks at the error; rays of the truth; frames."""
+    forming, numbers = pilot_result.forming, Numbers.of(settings)
+    held = entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
+    rest = float(accumulation_seconds(forming, numbers, held)) + float(checking_seconds(forming, numbers))
+    return {
+        "transport": pace * sum(tracing_seconds(pilot_result, settings).values()) + rest,
+        "truth": pace * truth_seconds(pilot_result, settings),
+        "optics": float(optics_seconds(forming, numbers)),
+    }
+
+
+def with_sample_costs(pilot_result: PilotResult, **costs: SampleCost) -> PilotResult:
+    return replace(pilot_result, sample_costs={**pilot_result.sample_costs, **costs})
+
+
+def with_occluded(sizes: dict[int, float]) -> PilotResult:
+    """150 pixels that leave so much by the number of their anchors."""
+    found = changes(SIZES | {Approximation("occluded_anchors", count): size for count, size in sizes.items()})
+    several = replace(ONE_CLASS, changes=found, occluded=tuple(range(150)))
+    return with_sample_costs(several, penumbra=SampleCost(1e-4, 4, 150))
+
 
 COSTLY = {"interreflection", "ambient", "diffraction", "black-level"}
 
@@ -233,3 +347,171 @@ def test_what_interpolation_leaves_of_sharp_light_counts() -> None:
     assert chosen.fits and chosen.systematic.value == pytest.approx(math.hypot(without.systematic.value, 6e-4))
     assert not cheapest(5e-4, found, {}).fits
     assert any("anchors of sharp light (7), 6.0e-04" in warning for warning in plan(5e-4, found).warnings)
+
+
+def bench(
+    cuts: bool = False,
+    shift: float = 0.0,
+    feature: float = 0.06,
+    glare: float = 0.0,
+    mirrors: bool = False,
+    curve: object = None,
+    coloured: tuple[Tag, ...] = (),
+) -> Bench:
+    geometry = SimpleNamespace(
+        wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, diffracts=True, mask_plate=None,
+        build_mask=lambda: SimpleNamespace(opening_mm=2 * feature),
+        tilt_shift_mm=0.0, tilt_left_out=lambda waves: False, mask_tilt=(0.0, 0.0),
+    )  # fmt: skip
+    return SimpleNamespace(  # type: ignore[return-value]
+        field_stop_cuts=cuts,
+        geometry=geometry,
+        spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
+        loaded=SimpleNamespace(
+            pixels=SimpleNamespace(keystone=2.5),
+            unfit=Unfit(),
+            shapes=(),
+            mirrors=mirrors,
+            in_view=False,
+            small_lamps=(),
+            coloured=coloured,
+            parting=(),
+        ),
+        lines=None,
+        projector=SimpleNamespace(glare=glare, aperture_radius_mm=0.0),
+        sensor=SimpleNamespace(quantum_efficiency_curve=curve),
+    )
+
+
+@pytest.mark.parametrize(
+    ("device", "words"),
+    [
+        (bench(), []),
+        (bench(cuts=True), ["field stop (fov) cuts into the projector's window"]),
+        (bench(shift=0.99), []),
+        (bench(shift=1.0), ["0.5 mm shifts the far face by 1.0 features"]),
+        (bench(feature=6.2e-4), []),
+        (bench(feature=6.1e-4), ["less than 2 wavelengths of 620 nm"]),
+        (bench(glare=0.02), []),
+        (bench(mirrors=True), []),
+        (bench(glare=0.02, mirrors=True), ["0.02 of the light over mirrors alone is to be scattered"]),
+    ],
+)
+def test_devices_are_flagged_where_their_model_ends(
+    monkeypatch: pytest.MonkeyPatch, device: Bench, words: list[str]
+) -> None:
+    """At a wall's shift of one feature, and a feature of the longest wavelength."""
+    monkeypatch.setattr("mitsim.planner.planner.EFFECTS", {})
+    facts = SceneFacts.of(device)
+    assert facts.keystone == 2.5 and len(facts.warnings) == len(words)
+    for warning, part in zip(facts.warnings, words, strict=True):
+        assert part in warning
+
+
+@pytest.mark.parametrize(
+    ("lacking", "words"),
+    [
+        (
+            {"unresolved": 0.2, "left_out": 0.1},
+            "of which the frames lack most, 2.0e-01; give",
+        ),
+        ({"left_out": 9.9e-3}, "a mirror or curved glass twice, or once and a sharp lobe (left out), 9.9e-03; turn"),
+        ({"unresolved_specular": 0.2}, "alone, in beams too fine to be placed on the sensor, 2.0e-01; use fewer"),
+    ],
+)
+def test_light_that_frames_lack_is_told_with_its_part_and_a_remedy(lacking: dict[str, float], words: str) -> None:
+    """Where it breaks the accuracy, as the largest part; else it is a part of all."""
+    (warning,) = plan(1e-2, replace(PILOT_RESULT, **lacking)).warnings
+    assert "largest: light over" in warning and words in warning
+    assert not plan(1e-2, replace(PILOT_RESULT, **dict.fromkeys(lacking, 1e-4))).warnings
+    (other,) = plan(1e-6, ONE_CLASS).warnings
+    assert "largest: layers (4)" in other, "light that is all resolved is no reason"
+
+
+def test_effects_that_are_off_take_no_seconds_and_switches_are_named() -> None:
+    found = rows(plan(effects="+ambient,-interreflection"))
+    for name, row in found.items():
+        assert row.seconds == 0 or row.state != "off", name
+        assert ("switched by the user" in row.reason) == (name in ("ambient", "interreflection")), name
+    assert found["diffraction"].reason == "Fresnel number 3.2" and found["diffraction"].seconds > 0
+    assert found["blur"].reason == "" and found["blur"].state == "exact"
+    assert found["blur"].seconds == 0
+
+
+FOLLOWS = replace(PILOT_RESULT, changes=changes(SIZES | {Approximation("ambient"): 5e-2}))
+"""Light of lamps that no budget can do without, seen from two points a side of the sensor."""
+
+
+def seconds(settings: Settings, pilot_result: PilotResult = FOLLOWS) -> float:
+    return sum(stages(pilot_result, settings).values())
+
+
+@pytest.mark.parametrize("pace", [1.0, 3.0])
+def test_seconds_are_those_of_every_stage_once(pace: float) -> None:
+    """Paths at the machine's pace, which decides nothing: resuming needs the same settings everywhere."""
+    found = plan(pilot_result=FOLLOWS, pace=pace)
+    expected = stages(FOLLOWS, found.settings, pace)
+    assert found.predicted == pytest.approx(expected) and min(expected.values()) > 0
+    assert found.predicted_seconds == pytest.approx(sum(expected.values()))
+    assert found.settings == plan(pilot_result=FOLLOWS).settings
+
+
+def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
+    """Seconds with and without, samples as they are; the error of one anchor, layer and point, not of two."""
+    found = plan(pilot_result=FOLLOWS)
+    settings, reported = found.settings, rows(found)
+    assert settings.anchors > 1 and settings.layers and settings.followed_anchors == 2
+    for name, less in (
+        ("anchors", replace(settings, anchors=1)),
+        ("layers", replace(settings, layers=())),
+        ("followed-anchors", replace(settings, followed_anchors=1)),
+        ("diffraction", replace(settings, effects=settings.effects - {"diffraction"})),
+    ):
+        assert (
+            reported[name].seconds == pytest.approx(seconds(settings) - seconds(less)) and reported[name].seconds > 0
+        ), name
+    assert reported["followed-anchors"].error_if_off == pytest.approx(SIZES[Approximation("followed_anchors", 1)])
+
+
+LIGHTING, PILOT_S, FRAMES, PRICE, KEPT = Lighting(np.zeros(4, int), np.ones((4, 1))), 0.5, 0.25, 1e-6, 2e-5
+AROUND = planner._OPENING_S + FRAMES
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Accuracies of the pilots; each keeps what is looser than its own accuracy and than KEPT."""
+    seen: list[float] = []
+
+    def look(bench: object, lighting: Lighting, accuracy: float, *_: object) -> Any:
+        seen.append(accuracy)
+        return SimpleNamespace(
+            runs=SimpleNamespace(seconds=PILOT_S),
+            taken=lambda each: SimpleNamespace(fits=each >= KEPT),
+            seconds=lambda each: PRICE / each**2,
+        )
+
+    made = plan()
+    monkeypatch.setattr(planner, "_look", look)
+    monkeypatch.setattr(planner, "_explain", lambda accuracy, *_: replace(made, accuracy=accuracy))
+    monkeypatch.setattr(planner.cost_model, "frame_seconds", lambda bench, shots: {"sensor": FRAMES})
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("seconds", "bought", "pilots"),
+    [(2.26, 1e-2, 1), (3.3, 1e-3, 1), (12.0, 3.3e-4, 2), (103.0, 1e-4, 2), (1e5, KEPT, 2)],
+)
+def test_time_buys_the_accuracy_that_takes_it(tried: list[float], seconds: float, bought: float, pilots: int) -> None:
+    """Opening, frames and all pilots come off; a looser accuracy than the first pilot's needs no other. Nothing is
+    bought that is not kept, or takes longer. (Planted: pilots for nothing; an accuracy that no pilot of its own keeps;
+    the first pilot's answer in place of the second's.)"""
+    found: Any = planner.plan_within(None, LIGHTING, seconds, 3, {})  # type: ignore[arg-type]
+    assert found.asked_seconds == seconds and not found.warnings
+    assert PRICE / found.accuracy**2 + AROUND + pilots * PILOT_S <= seconds
+    assert found.accuracy == pytest.approx(bought, rel=0.27) and found.accuracy >= KEPT and len(tried) == pilots
+
+
+def test_too_few_seconds_flag_the_loosest_accuracy(tried: list[float]) -> None:
+    found: Any = planner.plan_within(None, LIGHTING, 0.1, 3, {})  # type: ignore[arg-type]
+    assert found.accuracy == planner._GRID[0] and len(tried) == 1
+    assert found.warnings[0].startswith("0.1 seconds are too few: even accuracy 0.3, which was taken, is predicted")

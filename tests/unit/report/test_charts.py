@@ -26,7 +26,7 @@ from mitsim.report.pages import Mean, round_to_error, scientific, typeset
 from mitsim.report.plots import curves, grouped_bars, image_grid
 from mitsim.report.reconstruct_run import one_paragraph
 from tests.exchanged import made
-from tests.unit.planner.invented_pilot_result import plan as invented_plan
+from tests.unit.planner.test_choice import plan as invented_plan
 
 
 def test_curves_are_in_the_order_of_their_numbers() -> None:
