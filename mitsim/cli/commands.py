@@ -45,12 +45,11 @@ from mitsim.bench.request import Variant
 from mitsim.core.configuration import LIMITS, OUTPUT, PANELS, WHAT, Options, option, shipped_files
 from mitsim.core.errors import ArgumentError, MitsimError, printable
 from mitsim.core.files import PICTURES, plain
-from mitsim.core.job import Limits, progress, running_seconds
+from mitsim.core.job import Job, Limits, progress, running_seconds
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from mitsim.core.job import Job
     from mitsim.light.plan import Plan
 
 M = TypeVar("M", bound=Options)

@@ -21,7 +21,7 @@ from dataclasses import fields
 from functools import cache
 from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Generic, TypeVar
+from typing import Any, BinaryIO, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,9 +30,6 @@ from mitsim.core.errors import MitsimError, check_root, reason_of
 from mitsim.core.files import MOST_PIXELS, check_plain, whole_file
 from mitsim.core.job import Cost, Limits
 from mitsim.core.worker import workers
-
-if TYPE_CHECKING:
-    import h5py
 
 FloatArray = npt.NDArray[np.float64]
 SeparableTerm = tuple[FloatArray, FloatArray]
@@ -275,7 +272,7 @@ _MOST_ITEMS, _DEEPEST = 100_000, 16
 
 
 @contextmanager
-def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
+def whole_hdf5(path: Path | str) -> Iterator[Any]:
     """Open an HDF5 file that replaces ``path`` on leaving, or is removed after an error; MitsimError on a full disk."""
     import h5py  # here: it takes 50 ms to import, and most work writes none
 
@@ -290,7 +287,7 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
 
 
 @contextmanager
-def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] | None = None) -> Iterator[h5py.File]:
+def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] | None = None) -> Iterator[Any]:
     """Check all content of an HDF5 file, then open it for reading; every HDF5 input is opened here.
 
     HDF5 follows links to other files, unpacks data that claim to be a million times larger, and reads data that were
@@ -309,7 +306,7 @@ def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] 
     state, found, known = check_plain(path), 0, set() if known is None else known
     mark = path, state.st_ino, state.st_size, state.st_mtime_ns
 
-    def look(group: h5py.Group, depth: int) -> Iterator[float]:
+    def look(group: Any, depth: int) -> Iterator[float]:
         nonlocal found
         for name in group:
             found, place = found + 1, f"{path}: {group.name.rstrip('/')}/{name}"

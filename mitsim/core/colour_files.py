@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -14,9 +14,6 @@ from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.files import MOST_SIDE, check_plain, read_json, write_json
 from mitsim.core.manifests import kind_of
-
-if TYPE_CHECKING:
-    import numpy as np
 
 # -------- Pictures to read, and planes of colour filters
 
@@ -69,7 +66,8 @@ class Raw(Configuration):
         return validate(cls, {"shape": [int(sides[1]), int(sides[2])], "bits": bits, "byte_order": byte_order}, "raw")
 
     @property
-    def kind(self) -> np.dtype[Any]:
+    def kind(self) -> Any:
+        """Return NumPy's type of the numbers."""
         import numpy as np  # here: most who state it read no numbers
 
         width = 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4

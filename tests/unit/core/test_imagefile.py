@@ -311,16 +311,6 @@ def test_a_file_that_is_cut_while_it_is_read_is_refused(tmp_path: Path, name: st
         list(numbers)
 
 
-def test_no_picture_is_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pillow maps plain TIFFs that it is given by name."""
-    import mmap
-
-    monkeypatch.setattr(mmap, "mmap", lambda *_, **__: pytest.fail("mapped"))
-    for name in ("a.tif", "a.png", "a.npy"):
-        np.save(tmp_path / name, NUMBERS) if name == "a.npy" else saved(NUMBERS)(tmp_path / name)
-        assert np.array_equal(read_image(tmp_path / name), NUMBERS)
-
-
 def test_a_picture_beyond_free_memory_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sparse files cost nothing on disk."""
     np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.float64, (8000, 8000)).flush()
