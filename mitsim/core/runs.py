@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-import threading
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -248,11 +247,12 @@ class Capture:
 
         MitsimError if the folder holds something, or cannot be written.
         """
-        with claim_run(Path(folder), self.manifest, resume=False) as run:
+        folder = Path(folder)
+        with claim_run(folder, self.manifest, resume=False) as run:
             if self.folder is not None:
                 for name in (*self.files, MANIFEST):
                     if (self.folder / name).is_file():
-                        shutil.copyfile(self.folder / name, run.folder / name)
+                        shutil.copyfile(self.folder / name, folder / name)
             else:
                 run.begin()
                 for index, name in enumerate(self.files):
@@ -261,7 +261,7 @@ class Capture:
                     else:
                         run.write(name, *self._memory[name])
                 run.finish(self.manifest)
-        return run.folder
+        return folder
 
     @check_arguments
     def plot(self, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None) -> Axes:
@@ -501,9 +501,7 @@ class MosaicCapture:
     def write_lines(self, folder: Path) -> None:
         for name, truth in self.truths.items():
             with output_folder(folder / name, overwrite=True) as place:
-                channels = {"reflectance": truth.reflectance, "standard_error": truth.standard_error}
-                single = {key: values.astype(np.float32) for key, values in channels.items()}
-                write_frame(place / TRUTH, single, {"board_reflectance": truth.board})
+                Recorder(place).write_truth(truth.reflectance, truth.board, truth.standard_error)
         colour_files.write_colours(folder, self.manifest)
 
     def summary(self) -> dict[str, Any]:
@@ -542,59 +540,30 @@ def frame_name(index: int) -> str:
 
 
 class Recorder:
-    """Keeper of a run's files, from any thread: here in memory, in :class:`RunFolder` on disk."""
+    """Keeper of a run's files, from any thread: in memory, or in the folder that :func:`claim_run` claims.
 
-    folder: Path | None = None
+    On resume a frame of a folder is kept if its checksum is in a finished run's manifest or, in an interrupted run, if
+    it has this run's digest, and its pixels have the checksum in its metadata.
+    """
 
-    def __init__(self) -> None:
-        self.files: dict[str, tuple[Channels, Metadata]] = {}
+    def __init__(
+        self, folder: Path | None = None, head: RunHead | None = None, known: Mapping[str, str] | None = None
+    ) -> None:
+        self.folder, self._head, self._known = folder, head or RunHead(), known or {}
+        self.files, self._checksums = dict[str, tuple[Channels, Metadata]](), dict[str, str]()
 
     def begin(self) -> None:
         """Begin to write after all input was checked."""
+        if self.folder is not None:
+            remove_page(self.folder)
+            configuration, digest = self._head.configuration, self._head.configuration_sha256
+            head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
+            manifests.write_manifest(self.folder, head)
 
     def keeps(self, index: int) -> bool:
         """Return True if shot ``index`` exists already, and count it as written."""
-        return False
-
-    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        self.files[name] = channels, metadata
-
-    def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        self.write(frame_name(index), channels, metadata)
-
-    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
-        known = {"reflectance": reflectance, "standard_error": standard_error}
-        channels = {name: values.astype(np.float32) for name, values in known.items() if values is not None}
-        self.write(TRUTH, channels, {"board_reflectance": board})
-
-    def finish(self, manifest: RunManifest) -> Capture:
-        return Capture(manifest, None, dict(sorted(self.files.items())))
-
-
-class RunFolder(Recorder):
-    """Keeper of a run in a folder, whole, resumable and checked; made by :func:`claim_run`.
-
-    On resume a frame is kept if its checksum is in a finished run's manifest or, in an interrupted run, if it has this
-    run's digest, and its pixels have the checksum in its metadata.
-    """
-
-    folder: Path
-
-    def __init__(self, folder: Path, head: RunHead, known: Mapping[str, str]) -> None:
-        super().__init__()
-        self.folder, self.head = folder, head
-        self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
-
-    def begin(self) -> None:
-        remove_page(self.folder)
-        configuration, digest = self.head.configuration, self.head.configuration_sha256
-        head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
-        manifests.write_manifest(self.folder, head)
-
-    def keeps(self, index: int) -> bool:
         name = frame_name(index)
-        path = self.folder / name
-        if not path.is_file():
+        if self.folder is None or not (path := self.folder / name).is_file():
             return False
         actual = checksum(path)
         if name in self._known:
@@ -606,24 +575,31 @@ class RunFolder(Recorder):
                 return False
             same = self._identity(index, channels).items() <= dict(metadata).items()
         if same:
-            self._note(name, actual)
+            self._checksums[name] = actual
         return same
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        self._note(name, write_frame(self.folder / name, channels, metadata))
+        if self.folder is None:
+            self.files[name] = channels, metadata
+        else:
+            self._checksums[name] = write_frame(self.folder / name, channels, metadata)
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        super().write_frame(index, channels, {**self._identity(index, channels), **metadata})
+        identity = {} if self.folder is None else self._identity(index, channels)
+        self.write(frame_name(index), channels, {**identity, **metadata})
+
+    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
+        known = {"reflectance": reflectance, "standard_error": standard_error}
+        channels = {name: values.astype(np.float32) for name, values in known.items() if values is not None}
+        self.write(TRUTH, channels, {"board_reflectance": board})
 
     def finish(self, manifest: RunManifest) -> Capture:
+        if self.folder is None:
+            return Capture(manifest, None, dict(sorted(self.files.items())))
         checksums = dict(sorted(self._checksums.items()))
         manifest = manifest.model_copy(update={"status": "complete", "checksums": checksums})
         manifests.write_manifest(self.folder, manifest)
         return Capture(manifest, self.folder)
-
-    def _note(self, name: str, value: str) -> None:
-        with self._lock:
-            self._checksums[name] = value
 
     def _identity(self, index: int, channels: Channels) -> Metadata:
         """Return the metadata that identify a frame of an interrupted run, whose manifest has no checksums yet."""
@@ -631,11 +607,11 @@ class RunFolder(Recorder):
         for name, values in sorted(channels.items()):
             digest.update(name.encode())
             digest.update(np.ascontiguousarray(values).data)
-        return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": digest.hexdigest()}
+        return {"run": self._head.configuration_sha256, "index": index, "pixels_sha256": digest.hexdigest()}
 
 
 @contextmanager
-def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
+def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[Recorder]:
     """Claim a folder for a run; a new folder is removed if the run fails before writing.
 
     ``resume`` allows an earlier run of the same configuration. MitsimError for a place that cannot be written, or that
@@ -655,4 +631,4 @@ def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
         if before.status == "complete":
             known = manifests.read_manifest(path, RunManifest).checksums
     with output_folder(path, overwrite=again) as folder:
-        yield RunFolder(folder, head, known)
+        yield Recorder(folder, head, known)

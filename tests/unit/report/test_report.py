@@ -29,7 +29,7 @@ from mitsim.core.files import write_json
 from mitsim.core.images import lightness
 from mitsim.core.job import Job
 from mitsim.core.manifests import MANIFEST
-from mitsim.core.runs import RunFolder, load_run
+from mitsim.core.runs import Recorder, load_run
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
 from mitsim.report import folder_page as R
@@ -501,7 +501,7 @@ def test_a_page_is_gone_before_what_it_shows_changes(folders: Made, image: Path,
     run = copy(folders.run, tmp_path / "run")
     report_folder(run)
     (run / "pictures" / "note.txt").write_text("mine")
-    RunFolder(run, load_run(run).manifest, {}).begin()
+    Recorder(run, load_run(run).manifest).begin()
     assert not (run / "report.html").exists() and [each.name for each in (run / "pictures").iterdir()] == ["note.txt"]
     place = tmp_path / "image"
     shutil.copytree(image, place)
