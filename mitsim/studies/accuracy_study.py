@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -202,7 +201,9 @@ def measure_reference(judge: Judge) -> list[dict[str, Value]]:
     index, rows = len(shots) // 2, list[dict[str, Value]]()
     answer, _ = stack_frames(light.frames(probe.family.lighting.shots([index]), probe.seed + 1))
     with show_pattern(probe.bench, probe.family.light(shots[index])):
-        predicted_s = _timed(lambda: render(probe.bench, REFERENCE, SAMPLES[0], 1e-3, probe.seed))  # compiles kernels
+        started = time.perf_counter()
+        render(probe.bench, REFERENCE, SAMPLES[0], 1e-3, probe.seed)  # compiles kernels
+        predicted_s = time.perf_counter() - started
         for spp in SAMPLES:
             if predicted_s > LONGEST_S:
                 break
@@ -218,12 +219,6 @@ def measure_reference(judge: Judge) -> list[dict[str, Value]]:
     return rows
 
 
-def _timed(work: Callable[[], object]) -> float:
-    started = time.perf_counter()
-    work()
-    return time.perf_counter() - started
-
-
 # -------- The study
 
 
@@ -235,8 +230,9 @@ def _points(scope: Scope) -> list[Point]:
 
 def _measure(studio: Studio, point: Point) -> Found:
     def opened() -> tuple[Judge, float]:
-        seconds = _timed(lambda: studio.bench(point.setup))
-        bench, seed = studio.bench(point.setup), int(point["seed"])
+        started, seed = time.perf_counter(), int(point["seed"])
+        bench = studio.bench(point.setup)
+        seconds = time.perf_counter() - started
         return Judge.trace(Probe(bench, bench.family(point["patterns"], seed), seed, QUOTED)), seconds
 
     judge, opening_s = studio.once("judge", 1, (point.setup, point["patterns"], point["seed"]), opened)

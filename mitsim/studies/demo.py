@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -85,11 +86,9 @@ def demo(bench: Bench, output: Path | str, request: Request | None = None, job: 
     bench.family(request.patterns, request.seed)
     names = []
     for name in dict.fromkeys((*_BEFORE, request.patterns, *_AFTER)):
-        try:
+        with suppress(MitsimError):
             bench.family(name, request.seed)
             names.append(name)
-        except MitsimError:
-            continue
     Session(bench, load_recipe(), request.seed).check_mask(job)
     # Only now, with nothing left to refuse, is an earlier demo removed.
     with study_folder(output, "demo") as folder:

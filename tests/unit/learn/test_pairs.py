@@ -208,11 +208,7 @@ def test_signed_patterns_are_differences(lab: Lab) -> None:
 def test_benches_vary_by_group(lab: Lab) -> None:
     """Mask and exposure are drawn for each group of pairs. (Planted: the mask, or the exposure, of the first.)"""
     variation = Variation.model_validate(
-        {
-            "groups": 2,
-            "exposure_fraction": [0.2, 0.8],
-            "mask": {"mask_rows_um": [-50, 50]},
-        }
+        {"groups": 2, "exposure_fraction": [0.2, 0.8], "mask": {"mask_rows_um": [-50, 50]}}
     )
     still = lab.pairs(4, "still", accuracy=1e-2)
     store = lab.pairs(4, vary=variation, accuracy=1e-2)

@@ -81,24 +81,17 @@ def test_an_exact_image_has_the_floors_colours() -> None:
 def test_verdicts_are_on_what_is_added_to_the_floor() -> None:
     """Images 2 % too bright are near it, 30 % are not. (Planted: the floor of another chart; ways changed for one
     another.)"""
-    good = STUDY.judge(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
+    found = results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01)
+    good = STUDY.judge(found)
     assert [claim.verdict for claim in good[:3]] == ["confirmed", "confirmed", "not confirmed"]
     assert {claim.verdict for claim in good[3:]} == {"confirmed"}
+    drawn = STUDY.draw(found)
+    assert set(drawn) == {"ways.png", "images.png", "daylight.png"}
+    assert [text.get_text() for text in drawn["ways.png"].axes[0].get_yticklabels()] == [OWN, ONE, "mosaic, joint"]
     assert good[2].claim.startswith("Beside D65 of 600 lx, 49 dots add (markov) at most 0.5")
     bad = STUDY.judge(results(own=1.3, one=1.01, dim=1.3, bright=1.01, joint=0.9))
     assert [claim.verdict for claim in bad[:3]] == ["not confirmed", "not confirmed", "confirmed"]
     assert {claim.verdict for claim in bad[3:]} == {"not confirmed"}
-
-
-@pytest.mark.usefixtures("draft_figures")
-def test_every_figure_is_drawn() -> None:
-    drawn = STUDY.draw(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
-    assert set(drawn) == {"ways.png", "images.png", "daylight.png"}
-    assert [text.get_text() for text in drawn["ways.png"].axes[0].get_yticklabels()] == [
-        OWN,
-        ONE,
-        "mosaic, joint",
-    ]
 
 
 @pytest.mark.slow
