@@ -455,15 +455,15 @@ def load_known(path: Path | str) -> KnownCaptures:
         lines = colour_files.open_lines(folder, colour_files.RUN, colour_files.MOSAIC)
         if lines.filters:
             raise MitsimError(f"{folder}: is behind colour filters; import its planes, or calibrate --colour mosaic")
-        manifests = {name: manifests.read_manifest(part, manifests.RunManifest) for name, part in lines.parts.items()}
+        planes = {name: manifests.read_manifest(part, manifests.RunManifest) for name, part in lines.parts.items()}
         check_plain(found.picture(capture), "picture")
         if number == 0:
-            found = KnownCaptures(path, listed, lines.colours, manifests)
-        if [*manifests] != [*found.manifests]:
-            names = [", ".join(name for name in each if name) or "no" for each in (manifests, found.manifests)]
+            found = KnownCaptures(path, listed, lines.colours, planes)
+        if [*planes] != [*found.manifests]:
+            names = [", ".join(name for name in each if name) or "no" for each in (planes, found.manifests)]
             problem = f"list {path}: {capture.run} has {names[0]} planes, but {listed.known[0].run} has {names[1]}"
             raise MitsimError(f"{problem}; give runs of one kind")
-        for name, manifest in manifests.items():
+        for name, manifest in planes.items():
             ours, run, first = found.manifests[name], f"list {path}: {capture.run}", listed.known[0].run
             if manifest.camera != ours.camera:
                 raise MitsimError(f"{run} is of another camera than {first}; calibrate each by its own")

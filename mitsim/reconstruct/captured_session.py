@@ -85,10 +85,8 @@ def calibrate_frames(
         for name, (part, least) in _COMPARED.items():
             ours, theirs = getattr(stated, name), getattr(own, name)
             if ours is not None and theirs is not None and abs(ours - theirs) > max(part * theirs, least):
-                doubts.append(
-                    f"camera {sensor.name}: digital.{name} is {ours:g} in the list, and {theirs:g} by the camera's "
-                    "file; correct the wrong one, or leave --camera out"
-                )
+                words = f"digital.{name} is {ours:g} in the list, and {theirs:g} by the camera's file"
+                doubts.append(f"camera {sensor.name}: {words}; correct the wrong one, or leave --camera out")
         absent = {name: getattr(own, name) for name in _FILLED if getattr(stated, name) is None}
         digital = stated.model_copy(update=absent)
         session = replace(session, listed=session.listed.model_copy(update={"digital": digital}))
@@ -309,10 +307,9 @@ class _Readings:
         if self._ladders is None:
             return self._read(self.session.repeats_of(half), True)
         ladder = self._ladders[half[0]]
-        rates = [
-            self._read(self.session.repeats_of(half, number), ladder.used_pixels(number)).rate
-            for number in range(len(ladder.digitals))
-        ]
+        numbers = range(len(ladder.digitals))
+        each = ((self.session.repeats_of(half, number), ladder.used_pixels(number)) for number in numbers)
+        rates = [self._read(*exposed).rate for exposed in each]
         return _Reading(ladder.merge(rates), ladder, self.session.listed.repeats)
 
     def _read(self, frames: Sequence[StripeFile | DarkFile], used: Chosen) -> _Reading:

@@ -211,10 +211,9 @@ class ColourModel:
         values = np.asarray(patches, dtype=np.float64)
         expected = len(chart().names), len(wavelengths_nm)
         if values.shape != expected or not np.isfinite(values).all():
-            raise MitsimError(
-                f"colour: patches are {values.shape} with {np.count_nonzero(~np.isfinite(values))} values that are not "
-                f"finite; give {expected[0]} patches of {expected[1]} lines"
-            )
+            lost = np.count_nonzero(~np.isfinite(values))
+            words = f"patches are {values.shape} with {lost} values that are not finite"
+            raise MitsimError(f"colour: {words}; give {expected[0]} patches of {expected[1]} lines")
         # Minimises ||values M^T - XYZ|| with M (1, ..., 1)^T = white: M = white (1, ..., 1) / L + C B^T with free C,
         # where the columns of B (L, L - 1) are orthonormal and orthogonal to (1, ..., 1).
         lines = values.shape[1]

@@ -94,10 +94,9 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
 def parallax_of(factors: Factors) -> Parallax:
     parallax = check_parallax(factors.manifest.parallax, factors.name)
     if min(factors.left.shape[1], factors.right.shape[1]) < _NEIGHBOURS:
-        raise MitsimError(
-            f"focus: calibration {factors.name} has {factors.left.shape[1]} x {factors.right.shape[1]} projector "
-            f"pixels; columns of other depths need at least {_NEIGHBOURS} a side"
-        )
+        size = f"{factors.left.shape[1]} x {factors.right.shape[1]} projector pixels"
+        least = f"columns of other depths need at least {_NEIGHBOURS} a side"
+        raise MitsimError(f"focus: calibration {factors.name} has {size}; {least}")
     return parallax
 
 
@@ -497,11 +496,9 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
     def indifferent(difference: float) -> float:
         return max(chance_difference(difference, variance, unknowns), _OPPOSED * misfit)
 
-    alternatives = tuple(
-        Alternative(1 / (inverse + other), float(np.sqrt((left - least) / basis.energy)))
-        for left, other in others
-        if left - least < indifferent(left - least)
-    )
+    rises = ((left - least, 1 / (inverse + other)) for left, other in others)
+    alike = ((more, other) for more, other in rises if more < indifferent(more))
+    alternatives = tuple(Alternative(other, float(np.sqrt(more / basis.energy))) for more, other in alike)
     doubt, at_end = "", min(abs(end - shift) for end in (first, last, *tried)) < 2 * _RESOLUTION * pixel
     if at_end or not first < shift < last:
         doubt = (

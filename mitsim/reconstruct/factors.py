@@ -413,16 +413,11 @@ class Factors:
     def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[SeparableTerm] = ()) -> Factors:
         """Return the factors of an ``estimate`` with the ``manifest`` of its camera, and the terms that they lack."""
         left, right = _single(estimate.left), _single(estimate.right)
-        own, other = (
-            float(error * float(np.linalg.norm(side)) / np.sqrt(side.size))
-            for side, error in zip((estimate.left, estimate.right), estimate.predicted_error, strict=True)
-        )
+        sides = zip((estimate.left, estimate.right), estimate.predicted_error, strict=True)
+        own, other = (float(error * float(np.linalg.norm(side)) / np.sqrt(side.size)) for side, error in sides)
         known = np.isfinite([own, other]).all()
-        update = {
-            "estimate": str(estimate.status),
-            "verdict": estimate.status.verdict.value,
-            "noise": FactorNoise(left=own, right=other, unexplained=estimate.unexplained) if known else None,
-        }
+        noise = FactorNoise(left=own, right=other, unexplained=estimate.unexplained) if known else None
+        update = {"estimate": str(estimate.status), "verdict": estimate.status.verdict.value, "noise": noise}
         terms = tuple((_single(a), _single(b)) for a, b in lacking)
         return cls(left, right, manifest.model_copy(update=update), estimate.status, estimate=estimate, lacking=terms)
 
@@ -499,10 +494,9 @@ class Factors:
             raise MitsimError(f"calibration {self.name}: {both}; calibrate {which}")
         for side, pattern, factor in zip(("P_L", "P_R"), shots.patterns, (self.left, self.right), strict=True):
             if len(pattern) != factor.shape[1]:
-                raise MitsimError(
-                    f"{shots.name}: patterns.{side} has {len(pattern)} scene pixels, but calibration {self.name} has "
-                    f"{factor.shape[1]}; calibrate with this projector"
-                )
+                own = f"patterns.{side} has {len(pattern)} scene pixels"
+                other = f"calibration {self.name} has {factor.shape[1]}"
+                raise MitsimError(f"{shots.name}: {own}, but {other}; calibrate with this projector")
 
     @check_arguments
     def operator(self, patterns: str | PatternFamily, seed: int = 0) -> LinearOperator:

@@ -462,10 +462,8 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
             "give pictures that are not symmetric, or state orientation in the list"
         )
     if read.saturated:
-        doubts.append(
-            f"saturation: {len(read.saturated)} runs have readings at the full well or the ADC's end, first "
-            f"{read.saturated[0]}, so their frames are not linear; expose for less"
-        )
+        first = f"{len(read.saturated)} runs have readings at the full well or the ADC's end, first {read.saturated[0]}"
+        doubts.append(f"saturation: {first}, so their frames are not linear; expose for less")
     found = {}
     for line, manifest in captures.manifests.items():
         left, right = codes.factors(read.places.get(line, (0.0, 0.0)), line)
@@ -485,19 +483,14 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
         )
         if error > LARGEST_ERROR:
             verdict, remedy = Verdict.MOSTLY_NOISE, "capture more pictures, or longer"
-            sentence = (
-                f"Factors are mostly noise: in frames of such pictures they have an error of {error:.0%}, allowed are "
-                f"{LARGEST_ERROR:.0%}"
-            )
+            sentence = f"Factors are mostly noise: in frames of such pictures they have an error of {error:.0%}"
+            sentence += f", allowed are {LARGEST_ERROR:.0%}"
         elif unexplained > (SEPARABLE_RESIDUAL if stated else UNKNOWN_NOISE):
             verdict = Verdict.NOT_SEPARABLE
-            sentence = (
-                f"Frames hold more than codes seen through shifts explain: {unexplained:.1%} of them is left over"
-            )
-            remedy = (
-                "check that each run is of its picture, that pictures are as light as what was shown (gamma), and that "
-                "the frames stand straight"
-            )
+            left_over = f"{unexplained:.1%} of them is left over"
+            sentence = f"Frames hold more than codes seen through shifts explain: {left_over}"
+            remedy = "check that each run is of its picture, that pictures are as light as what was shown (gamma)"
+            remedy += ", and that the frames stand straight"
             if not stated:
                 remedy = f"state digital.read_noise_e, as noise is guessed from neighbouring pixels; {remedy}"
         else:
@@ -583,10 +576,9 @@ class _KnownFrames:
                 self.sums[name] = checksum(folder / MANIFEST)
                 left, right = shots.patterns
                 if light.shape != (len(left), len(right)):
-                    raise MitsimError(
-                        f"picture {path}: is {light.shape[0]} x {light.shape[1]} pixels, but the run {folder} has "
-                        f"{len(left)} x {len(right)} scene pixels; give one of its size"
-                    )
+                    size = f"is {light.shape[0]} x {light.shape[1]} pixels"
+                    theirs = f"the run {folder} has {len(left)} x {len(right)} scene pixels"
+                    raise MitsimError(f"picture {path}: {size}, but {theirs}; give one of its size")
                 digital = shots.manifest.digital
                 for each in shots.pattern_measurements(shape):
                     if not self.exposures:

@@ -99,10 +99,8 @@ class PictureCheck:
         alike = max(float(np.quantile(parts, 0.3)) * number.max(), 1.0)
         lit = np.maximum(np.bincount(own, minlength=self._count), 1)
         lack = -self._differences(image)
-        means, shown, missing, squares, noises = (
-            np.bincount(own, each, self._count) / lit
-            for each in (roughness, image.ravel()[self._pixels], lack, np.square(lack), self._noise[self._pixels])
-        )
+        sums = roughness, image.ravel()[self._pixels], lack, np.square(lack), self._noise[self._pixels]
+        means, shown, missing, squares, noises = (np.bincount(own, each, self._count) / lit for each in sums)
         away = means - np.median(means)
         self.foreign = away / np.maximum(robust_scatter(means), np.sqrt(alike * roughness.var() / lit))
         # A black frame decides nothing of its own power, but its mean is far below the predicted one.
@@ -571,7 +569,7 @@ class Misfit:
             "foretold": self.predicted,
             "defective_pixels": self.defects.summary() if self.defects else None,
             "reading": self.readings[0].words if len(self.readings) == 1 else None,
-            "readings": [reading.summary() for reading in self.readings],
+            "readings": [{"words": r.words, "order": r.order, "unexplained": r.left} for r in self.readings],
             "places": [place.words for place in self.places],
             "faults": [fault.summary() for fault in self.faults],
             "limits": list(self.limits),

@@ -56,9 +56,8 @@ class PointSpreadFit:
 
     @property
     def fault(self) -> tuple[str, str]:
-        left = (
-            f"{self.unexplained:.1%} of the frames is left unexplained, {self.chi_square:.3g} times the noise's energy"
-        )
+        energy = f"{self.chi_square:.3g} times the noise's energy"
+        left = f"{self.unexplained:.1%} of the frames is left unexplained, {energy}"
         same = "use the light of one point as this camera sees it, as it lies in the frames"
         if self.gain is not None and self.gain < _TURNED:
             return f"Misfit: the point spread function fits better {self.reading}; {left}", f"turn it so, or {same}"
@@ -247,9 +246,11 @@ class Reconstruction(Solution):
         # First of all, so that an image which a killed process left is known to be of these inputs, and unfinished.
         write_json(folder / RESULT_FILE, {"status": _INCOMPLETE, "inputs": self.inputs})
         channels: dict[str, Any] = {IMAGE_FILE: {"reflectance": self.image.astype(np.float32)}}
-        channels[UNCERTAINTY_FILE] = self.uncertainties and self.uncertainties.channels()
+        known = self.uncertainties
+        errors = known and {"uncertainty": known.total, "random": known.random, "systematic": known.systematic}
         maps = {"depth_mm": self.depths.mm, "confidence": self.depths.confidence} if self.depths else {}
-        channels[DEPTH_FILE] = {name: values.astype(np.float32) for name, values in maps.items()}
+        for name, arrays in ((UNCERTAINTY_FILE, errors), (DEPTH_FILE, maps)):
+            channels[name] = {channel: values.astype(np.float32) for channel, values in (arrays or {}).items()}
         checksums = {}
         for name, values in channels.items():
             (folder / name).unlink(missing_ok=True)
@@ -323,10 +324,8 @@ def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | floa
     earlier = earlier if isinstance(earlier, dict) else {}
     changed = [name for name in {**asked, **earlier} if earlier.get(name) != asked.get(name)]
     if changed:
-        raise MitsimError(
-            f"output {folder}: holds an image of other inputs ({', '.join(changed)} differ); choose another folder, or "
-            "replace it with overwrite=True"
-        )
+        words = f"holds an image of other inputs ({', '.join(changed)} differ)"
+        raise MitsimError(f"output {folder}: {words}; choose another folder, or replace it with overwrite=True")
 
 
 # ---- From shots and factors to an image ------------------------------------------------------------------------------

@@ -59,9 +59,6 @@ class Reading:
     left: float
     order: str | None
 
-    def summary(self) -> dict[str, object]:
-        return {"words": self.words, "order": self.order, "unexplained": self.left}
-
 
 def is_negative(prepared: Prepared, patterns: Pair, weights: FloatArray) -> bool:
     """Return True if scene pixels that are lit together are negative in the mean, as with exchanged halves of pairs."""

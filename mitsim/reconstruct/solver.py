@@ -750,10 +750,8 @@ def prepare(
     patterns = [_matrix("patterns P_L", P_L), _matrix("patterns P_R", P_R)]
     for name, factor, pattern in zip(("left", "right"), factors, patterns, strict=True):
         if factor.shape[1] != pattern.shape[0]:
-            raise MitsimError(
-                f"{name} factor of shape {factor.shape} has {factor.shape[1]} scene pixels "
-                f"but its patterns have {pattern.shape[0]}; both need the same number"
-            )
+            own = f"{name} factor of shape {factor.shape} has {factor.shape[1]} scene pixels"
+            raise MitsimError(f"{own} but its patterns have {pattern.shape[0]}; both need the same number")
     same = np.array_equal(factors[0], factors[1]) and np.array_equal(patterns[0], patterns[1])
     if centre:
         centred = [centre_columns(factor) for factor in factors]

@@ -44,7 +44,6 @@ from scipy.fft import dct
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.exr import Channel
 from mitsim.core.manifests import FactorNoise
 from mitsim.reconstruct.accumulation import PRINT, Accumulation, Model, disagreement
 from mitsim.reconstruct.solver import DiagonalProblem, Pair, Side, Solution, coefficient_noise
@@ -97,10 +96,9 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
     duals = [side.duals for side in sides]
     even = np.outer(*(dual.sum(axis=0) for dual in duals))
     bands = [_bands(side.scene_size) for side in sides]
-    left, right = (
-        np.add.reduceat(np.square(dual.T @ dct(np.eye(side.scene_size), axis=0, norm="ortho").T), starts, axis=1)
-        for dual, side, (starts, _, _) in zip(duals, sides, bands, strict=True)
-    )
+    cosines = [dct(np.eye(side.scene_size), axis=0, norm="ortho").T for side in sides]
+    parts = zip(duals, cosines, bands, strict=True)
+    left, right = (np.add.reduceat(np.square(dual.T @ own), starts, axis=1) for dual, own, (starts, _, _) in parts)
     nodes, step = _nodes(bands[0][1] / len(duals[0]), bands[1][1] / len(duals[1]))
     shares = np.stack([left @ weight @ right.T for weight in nodes])
     # Noise that is not known to be more than rounding is that.
@@ -256,10 +254,6 @@ class Uncertainty:
         by_source = ", ".join(f"{name.replace('_', ' ')} {value:.1e}" for value, name in parts)
         known = f"; extrapolated: it is known to a factor of {self.bias_factor:.1f}" if self.extrapolated else ""
         return f"{self.gist}: {by_source or 'no noise is stated'}{known}"
-
-    def channels(self) -> dict[str, Channel]:
-        parts = {"uncertainty": self.total, "random": self.random, "systematic": self.systematic}
-        return {name: values.astype(np.float32) for name, values in parts.items()}
 
 
 @dataclass(frozen=True, eq=False)
