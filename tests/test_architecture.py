@@ -559,7 +559,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (7, 1752),
     "planner": (6, 1629),
-    "reconstruct": (16, 5525),
+    "reconstruct": (16, 5492),
     "report": (6, 1819),
     "scene": (5, 1358),
     "sensor": (4, 1143),
