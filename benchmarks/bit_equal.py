@@ -38,9 +38,7 @@ ACCEPTED = (0, 1)  # a flagged result is a result
 def runs(scene: str, folder: Path) -> list[tuple[str, list[str], list[str]]]:
     """Name, arguments and result files of each run of a scene."""
     capture = ["capture", scene, "--accuracy", ACCURACY, "--seed", "0"]
-    jobs = [
-        ("dots:3", [*capture, "--patterns", "dots:3", "-o", str(folder / "dots")], ["dots"]),
-    ]
+    jobs = [("dots:3", [*capture, "--patterns", "dots:3", "-o", str(folder / "dots")], ["dots"])]
     if scene in ("photograph", "cookie_bag", "mirror"):
         signed = [
             *capture,

@@ -65,11 +65,7 @@ class Exported(Options):
 
 @takes(Exported)
 def export(
-    run: Path | str,
-    format: str,
-    output: Path | str,
-    calibration: Path | str | None = None,
-    **options: Any,
+    run: Path | str, format: str, output: Path | str, calibration: Path | str | None = None, **options: Any
 ) -> dict[str, Any]:
     """Write a run in a format that other programs read.
 

@@ -248,12 +248,7 @@ def test_means_of_a_fine_grid_equal_fractions(measured: Recorder, a: float, b: f
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
-@given(
-    count=st.integers(1, 30),
-    place=st.floats(-1.5, 1.5),
-    width=power(-15, 3) | st.just(0.0),
-    many=st.booleans(),
-)
+@given(count=st.integers(1, 30), place=st.floats(-1.5, 1.5), width=power(-15, 3) | st.just(0.0), many=st.booleans())
 def test_samplers_of_mirrored_light_equal_fractions(
     measured: Recorder, count: int, place: float, width: float, many: bool
 ) -> None:

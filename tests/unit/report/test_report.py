@@ -90,11 +90,7 @@ def example(n: int = N, frame_size: int = 48) -> dict[str, Any]:
     )
     frames = {
         label: rng.poisson(level * (1 + np.outer(*2 * [np.sin(np.arange(frame_size) / 5)])))
-        for label, level in (
-            ("Uniform", 2400),
-            ("49 dots, frame 1 of 49", 2100),
-            ("64 Hadamard, frame 3 of 128", 2300),
-        )
+        for label, level in (("Uniform", 2400), ("49 dots, frame 1 of 49", 2100), ("64 Hadamard, frame 3 of 128", 2300))
     }
     headline, detail = R.verdict(families[3], families[0])
     return {
@@ -130,14 +126,7 @@ def example(n: int = N, frame_size: int = 48) -> dict[str, Any]:
             PlanRow("interreflection", "off", "one convex sheet: no second bounce", 0.0, 0.0),
             PlanRow("ambient light", "off", "no emitter besides the projector", None, 0.0),
         ),
-        "seconds": {
-            "plan": 0.21,
-            "calibrate": 9.4,
-            "transport": 3.1,
-            "optics": 1.4,
-            "sensor": 0.9,
-            "reconstruct": 0.6,
-        },
+        "seconds": {"plan": 0.21, "calibrate": 9.4, "transport": 3.1, "optics": 1.4, "sensor": 0.9, "reconstruct": 0.6},
         "configuration": {
             "scene": "scenes/photograph/scene.xml",
             "mask": "separable, 511 x 60 um",
