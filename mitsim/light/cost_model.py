@@ -316,7 +316,7 @@ def frames_cost(
 ) -> Cost:
     """Return memory, disk and time of a capture; frames of ``lines`` are formed one after another.
 
-    Measured runs take a third to all of the memory (tests/hard/test_memory.py). ``on_disk`` bytes of frames exist
+    Measured runs take a third to all of the memory (tests/hard/test_full_disk.py). ``on_disk`` bytes of frames exist
     already.
     """
     (shots, classes), geometry = lighting.weights.shape, bench.geometry

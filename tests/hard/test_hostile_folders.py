@@ -1,18 +1,24 @@
-"""Hostile RUN and CAL folders and camera files (TOML): refused in one line, in bounded memory and time.
+"""Hostile RUN and CAL folders, camera files (TOML) and frames: refused in one line, in bounded memory and time.
 
-Each case damages one file of a good folder.
+Each case damages one file of a good folder. Frames are OpenEXR files with a lie each; odd ones are read.
 """
 
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import OpenEXR
 import pytest
 
 from mitsim.core.configuration import read_toml
+from mitsim.core.errors import MitsimError
+from mitsim.core.exr import read_frame, write_frame
 from mitsim.devices.sensor import load_sensor
-from tests.hard.hostile.folders import Damage, folder, linked, pipe, raw, refusal, solved, sparse
+from tests.hard.hostile.folders import PIXELS, Damage, folder, linked, pipe, raw, refusal, solved, sparse
 
 pytestmark = pytest.mark.robustness("Input")
 
@@ -164,3 +170,142 @@ def test_a_camera_that_is_no_file(tmp_path: Path, damage: Damage) -> None:
     path.write_text("")
     damage(path)
     assert str(path) in refusal(lambda: read_toml(path))
+
+
+# ---- Frames ----
+
+
+def exr_file(window: tuple[int, int, int, int] = (0, 0, 7, 7), **changes: Any) -> bytes:
+    """An OpenEXR file of one float32 channel "DN", written byte by byte; ``changes`` put lies into it.
+
+    After the OpenEXR file layout: magic, version and flags, attributes, chunk table, chunks of one line each.
+    """
+
+    def attribute(name: str, kind: str, value: bytes, length: int | None = None) -> bytes:
+        size = struct.pack("<i", len(value) if length is None else length)
+        return name.encode() + b"\0" + kind.encode() + b"\0" + size + value
+
+    box = struct.pack("<4i", *window)
+    channel = changes.get(
+        "channel", b"DN\0" + struct.pack("<iiii", changes.get("pixel", 2), 0, *changes.get("sampling", (1, 1)))
+    )
+    header = struct.pack("<II", 20000630, changes.get("flags", 2))
+    header += attribute("channels", "chlist", channel * changes.get("times", 1) + b"\0", changes.get("length"))
+    header += attribute("compression", "compression", bytes([changes.get("compression", 0)]))
+    header += attribute("dataWindow", changes.get("box", "box2i"), box) + attribute("displayWindow", "box2i", box)
+    header += attribute("lineOrder", "lineOrder", b"\0") + attribute("pixelAspectRatio", "float", struct.pack("<f", 1))
+    header += attribute("screenWindowCenter", "v2f", bytes(8)) + attribute(
+        "screenWindowWidth", "float", struct.pack("<f", 1)
+    )
+    header += changes.get("more", b"") + b"\0"
+    lines, line = changes.get("lines", 8), struct.pack("<8f", *range(8))
+    start = len(header) + 8 * lines + changes.get("shift", 0)
+    table = b"".join(struct.pack("<Q", start + i * (8 + len(line))) for i in range(lines))
+    chunks = b"".join(struct.pack("<ii", i, changes.get("size", len(line))) + line for i in range(lines))
+    return header + table + chunks
+
+
+def text_attribute(name: str, value: bytes) -> bytes:
+    return f"{name}\0string\0".encode() + struct.pack("<i", len(value)) + value
+
+
+FRAMES = {
+    "text": (b"hello", "not an OpenEXR file"),
+    "magic alone": (exr_file()[:4], "not an OpenEXR file"),
+    "cut in the header": (exr_file()[:100], "cut short"),
+    "cut in the last line": (exr_file()[:-1], "damaged"),
+    "2^31 pixels": (exr_file((0, 0, 65535, 32767)), "65536x32768"),
+    "window turned round": (exr_file((7, 7, 0, 0)), "damaged"),
+    "tiled": (exr_file(flags=2 | 0x200), "damaged"),
+    "of several parts": (exr_file(flags=2 | 0x1000), "damaged"),
+    "version 77": (exr_file(flags=77), "damaged"),
+    "compression 99": (exr_file(compression=99), "damaged"),
+    "pixels of type 9": (exr_file(pixel=9), "damaged"),
+    "sampling 0": (exr_file(sampling=(0, 0)), "damaged"),
+    "sampling 2": (exr_file(sampling=(2, 2)), "leave out pixels"),
+    "no channels": (exr_file(channel=b""), "damaged"),
+    "attribute of -1 bytes": (exr_file(length=-1), "damaged"),
+    "attribute twice": (exr_file(more=text_attribute("a", b"1") * 2), "damaged"),
+    "header without end": (exr_file()[:60] + b"x" * 5000, "cut short"),
+    "100000 channels": (
+        exr_file(channel=b"".join(b"c%d\0" % i + struct.pack("<iiii", 2, 0, 1, 1) for i in range(100_000))),
+        "over 256 KiB",
+    ),
+    "chunks of -1 bytes": (exr_file(size=-1), "damaged"),
+    "metadata that is no JSON": (exr_file(more=text_attribute("mitsim.run", b"{")), "damaged"),
+    "metadata deeply nested": (exr_file(more=text_attribute("mitsim.run", b"[" * 100_000)), "nested too deep"),
+    "metadata that is a list": (exr_file(more=text_attribute("mitsim.run", b"[1]")), "no text or number"),
+    "metadata of no UTF-8": (exr_file(more=text_attribute("mitsim.run", b"\xff\xfe")), "damaged"),
+}
+
+
+def test_the_file_written_by_hand_is_good(tmp_path: Path) -> None:
+    """Without its lie, each file below is a frame: what is refused is the lie."""
+    (tmp_path / "a.exr").write_bytes(exr_file(more=text_attribute("mitsim.run", b'"x"')))
+    channels, metadata = read_frame(tmp_path / "a.exr")
+    assert np.array_equal(channels["DN"], np.tile(np.arange(8, dtype=np.float32), (8, 1))) and metadata == {"run": "x"}
+
+
+@pytest.mark.parametrize("shift", [2**40, -300])
+def test_a_damaged_table_of_offsets_is_mended_by_openexr(tmp_path: Path, shift: int) -> None:
+    """It finds the chunks by itself, and gives the right pixels."""
+    (tmp_path / "a.exr").write_bytes(exr_file(shift=shift))
+    assert np.array_equal(read_frame(tmp_path / "a.exr")[0]["DN"], np.tile(np.arange(8, dtype=np.float32), (8, 1)))
+
+
+@pytest.mark.usefixtures("bounded")
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_hostile_frame(folders: tuple[Path, Path], capfd: pytest.CaptureFixture[str], name: str) -> None:
+    """Refused with the file's name; OpenEXR says nothing beside."""
+    content, words = FRAMES[name]
+    path = folders[0] / "frame_01.exr"
+    path.write_bytes(content)
+    message = refusal(lambda: solved(*folders))
+    assert str(path) in message and words in message
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("parts", "header", "words"),
+    [(1, {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}, "tiled"), (2, {}, "several parts")],
+    ids=["tiled", "parts"],
+)
+def test_frames_of_another_make(folders: tuple[Path, Path], parts: int, header: dict[str, Any], words: str) -> None:
+    """The same two refusals for files that OpenEXR itself wrote."""
+    path = folders[0] / "frame_01.exr"
+    pixels = {"DN": np.ones((PIXELS, PIXELS), np.float32)}
+    OpenEXR.File([OpenEXR.Part(dict(header), pixels, name=f"p{i}") for i in range(parts)]).write(str(path))
+    assert words in refusal(lambda: solved(*folders))
+
+
+@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIP", "PIZ", "PXR24", "B44", "DWAB"])
+def test_compressed_frames_of_other_programs_are_read(tmp_path: Path, compression: str) -> None:
+    """A constant picture of 1024 x 1024 shrinks most: the guard against bombs must let it pass."""
+    pixels = {"DN": np.full((1024, 1024), 7, np.float32)}
+    header = {"type": OpenEXR.scanlineimage, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
+    OpenEXR.File(header, pixels).write(str(tmp_path / "a.exr"))
+    assert np.allclose(read_frame(tmp_path / "a.exr")[0]["DN"], 7)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_frame_that_is_not_finite(folders: tuple[Path, Path], value: float) -> None:
+    pixels = np.ones((PIXELS, PIXELS), np.float32)
+    pixels[3, 4] = value
+    write_frame(folders[0] / "frame_01.exr", {"DN": pixels}, {})
+    assert "1 values are not finite" in refusal(lambda: solved(*folders))
+
+
+@pytest.mark.parametrize("damage", [pipe, folder, linked("/dev/zero")], ids=["pipe", "folder", "device"])
+def test_a_frame_that_is_no_file(folders: tuple[Path, Path], damage: Damage) -> None:
+    damage(folders[0] / "frame_01.exr")
+    assert "frame_01.exr" in refusal(lambda: solved(*folders))
+    with pytest.raises(MitsimError):
+        read_frame(folders[0] / "frame_01.exr")
+
+
+def test_a_frame_of_other_channels_or_size(folders: tuple[Path, Path]) -> None:
+    path = folders[0] / "frame_01.exr"
+    write_frame(path, {"other\nname": np.ones((PIXELS, PIXELS), np.float32)}, {})
+    assert "DN is needed" in refusal(lambda: solved(*folders))
+    write_frame(path, {"DN": np.ones((PIXELS, PIXELS + 1), np.float32)}, {})
+    assert "8x9" in refusal(lambda: solved(*folders))
