@@ -552,7 +552,7 @@ SIZES = {
     "cli": (6, 1425),
     "core": (13, 2954),
     "devices": (8, 1991),
-    "exchange": (5, 1313),
+    "exchange": (5, 1309),
     "learn": (5, 1208),
     "light": (6, 1698),
     "metrics": (1, 79),
