@@ -69,15 +69,13 @@ def move_mask(bench: Apparatus, row_mm: float, column_mm: float) -> Apparatus:
 
 def ideal_places(bench: Apparatus, places_mm: Iterable[float], board_flux: float) -> Places:
     """Return factors of the paper's model; a pixel of a white board puts ``board_flux`` on the sensor [W m^-2]."""
+    uniform, white = bench.family("uniform"), np.full((bench.n, bench.n), board_flux)
 
     def camera(row: float, column: float) -> IdealCamera:
         return IdealCamera(move_mask(bench, row, column), bench.geometry.mask)
 
-    def white(row: float, column: float) -> Frame:
-        (frame,) = camera(row, column).frames(bench.family("uniform"), np.full((bench.n, bench.n), board_flux))
-        return frame
-
-    return _consistent({place: camera(place, place).calibrated(board_flux) for place in places_mm}, bench, white)
+    sides = {place: camera(place, place).calibrated(board_flux) for place in places_mm}
+    return _consistent(sides, bench, lambda *at: next(iter(camera(*at).frames(uniform, white))))
 
 
 def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, accuracy: float = 1e-3) -> Places:

@@ -113,9 +113,7 @@ def within(quantity: Mean, low: float = -math.inf, high: float = math.inf) -> Ho
 
 def every(*holds: Holds) -> Holds:
     """Return whether all parts of a claim hold; one part that fails decides."""
-    if False in holds:
-        return False
-    return None if None in holds else True
+    return False if False in holds else None if None in holds else True
 
 
 def tally(claims: Sequence[Claim]) -> str:

@@ -320,12 +320,20 @@ def group_by_setup(points: Sequence[Point]) -> list[Point]:
     return sorted(points, key=lambda point: order[point.setup])
 
 
+@cache
 def find_experiment(name: str) -> Study:
     """Return the study ``name``: a shipped one, or a user's file or dotted module; MitsimError for another."""
     check_study(name)
     module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
     try:
-        loaded = _load_file(module) if module.endswith(".py") else importlib.import_module(module)
+        if module.endswith(".py"):
+            spec = importlib.util.spec_from_file_location(f"mitsim_study_{Path(module).stem}", module)
+            assert spec is not None and spec.loader is not None, "a file of Python has a loader"
+            loaded: Any = importlib.util.module_from_spec(spec)
+            sys.modules[spec.name] = loaded  # dataclasses of the file look for it there
+            spec.loader.exec_module(loaded)
+        else:
+            loaded = importlib.import_module(module)
         found: Study = loaded.STUDIES[name] if name in SHARED else loaded.STUDY
     except (ImportError, AttributeError, OSError, SyntaxError) as error:
         raise MitsimError(
@@ -341,16 +349,6 @@ def check_study(name: str) -> None:
         raise MitsimError(f"study {name}: is no study of its own any more; use `mitsim {GONE[name]}`")
     if name not in (*EXPERIMENTS, ALL) and "." not in name:
         raise MitsimError(f"study {name!r}: there is no such study; use {', '.join(EXPERIMENTS)}")
-
-
-@cache
-def _load_file(path: str) -> Any:
-    found = importlib.util.spec_from_file_location(f"mitsim_study_{Path(path).stem}", path)
-    assert found is not None and found.loader is not None, "a file of Python has a loader"
-    module = importlib.util.module_from_spec(found)
-    sys.modules[found.name] = module  # dataclasses of the file look for it there
-    found.loader.exec_module(module)
-    return module
 
 
 # -------- Knobs and measures of a sweep, in the words of a command line
