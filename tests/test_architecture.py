@@ -564,7 +564,7 @@ SIZES = {
     "scene": (5, 1358),
     "sensor": (4, 1143),
     "sessions": (3, 802),
-    "studies": (22, 5045),
+    "studies": (22, 5042),
     "transport": (15, 4017),
     "verbs": (1, 355),
     "version": (1, 1),
