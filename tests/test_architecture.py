@@ -430,10 +430,7 @@ def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("lines", "heavy"),
-    [
-        (WITHOUT_NUMPY, {"numpy"}),
-        (WITHOUT_RENDERER, {"mitsuba", "drjit", "scipy", "matplotlib", "skimage"}),
-    ],
+    [(WITHOUT_NUMPY, {"numpy"}), (WITHOUT_RENDERER, {"mitsuba", "drjit", "scipy", "matplotlib", "skimage"})],
     ids=["numpy", "renderer"],
 )
 def test_a_refusal_imports_nothing_heavy(refusing: Path, lines: tuple[str, ...], heavy: set[str]) -> None:

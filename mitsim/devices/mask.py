@@ -421,9 +421,7 @@ def within(plate: Plate, reach_mm: float) -> Plate:
     return plate
 
 
-def _distinct(
-    values: FloatArray,
-) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
+def _distinct(values: FloatArray) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
     """Return the distinct rows and columns of ``values``, weighted by their number.
 
     The result has the (N,) index of each row and column, roots of the weights, and weighted (rows, columns) values.

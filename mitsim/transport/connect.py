@@ -507,10 +507,7 @@ class ProjectorConnector:
             sample, _ = self.emitter.sample_direction(probe, mi.Point2f(0.5))
             u, v = host_values(sample.uv.x, 2), host_values(sample.uv.y, 2)
             rows, columns = projector.canvas
-            self._pixel_at_unit = (
-                _PROBE_STEP / (abs(u[1] - u[0]) * columns),
-                _PROBE_STEP / (abs(v[1] - v[0]) * rows),
-            )
+            self._pixel_at_unit = (_PROBE_STEP / (abs(u[1] - u[0]) * columns), _PROBE_STEP / (abs(v[1] - v[0]) * rows))
 
     def lens_point(self, rng: mi.PCG32) -> mi.Point3f:
         if self.projector.aperture == 0:

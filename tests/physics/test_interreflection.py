@@ -188,10 +188,7 @@ def test_radiance_of_one_reflection_is_that_of_its_irradiance() -> None:
 
 @pytest.mark.parametrize(
     ("name", "rho"),
-    [
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("path", 0.8), ("factored", 0.3))),
-        ("factored", 0.8),
-    ],
+    [*(pytest.param(*case, marks=pytest.mark.slow) for case in (("path", 0.8), ("factored", 0.3))), ("factored", 0.8)],
 )
 def test_corner(small_scene: Callable[..., Path], name: str, rho: float) -> None:
     found = ESTIMATORS[name](write_corner(small_scene, rho), 256, 7)

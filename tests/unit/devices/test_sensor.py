@@ -1,6 +1,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -8,6 +9,13 @@ from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import load_sensor
 from tests.invented import sensor
+
+CURVE = {"wavelengths_nm": [450.0, 550, 650.0], "efficiency": [0.5, 0.7, 0.4]}
+PLANES = {
+    name: {"wavelengths_nm": [400.0, 700.0], "efficiency": values}
+    for name, values in (("R", [0.0, 0.6]), ("G", [0.2, 0.1]), ("B", [0.5, 0.0]))
+}
+COLOUR = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": PLANES}
 
 
 def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
@@ -23,15 +31,31 @@ def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
+    ("change", "message"),
     [
-        *(("full_well_e", -1.0), ("full_well_e", 1e13), ("quantum_efficiency", 1.01), ("quantum_efficiency", 1e-9)),
-        *(("binning", 2.0), ("colour", "red")),
+        *(
+            ({"full_well_e": -1.0}, "full_well_e"),
+            ({"full_well_e": 1e13}, "full_well_e"),
+            ({"binning": 2.0}, "binning"),
+        ),
+        *(({"quantum_efficiency": value}, "quantum_efficiency") for value in (1.01, 1e-9)),
+        *(
+            ({"colour": "red"}, "colour"),
+            ({"temperature_c": 40.0}, "dark_doubling_c"),
+            ({"crosstalk": 0.6}, "crosstalk"),
+        ),
+        *(({"hot_pixels": 0.1}, "go together"), ({"mosaic": "RGGB"}, "go together")),
+        ({"linearity": (0.1,), "full_well_e": math.inf}, "finite full_well_e"),
+        *(({"linearity": (math.nan,)}, "linearity"), ({**COLOUR, "binning": 2}, "mosaic RGGB: binning 2")),
+        ({"quantum_efficiency_curve": CURVE}, "quantum_efficiency and quantum_efficiency_curve; give one"),
+        ({"quantum_efficiency_curve": {**CURVE, "wavelengths_nm": [450.0, 550.0]}}, "2 wavelengths_nm and 3"),
+        ({"quantum_efficiency_curve": {**CURVE, "efficiency": [0.5, 1.01, 0.5]}}, "efficiency.1"),
+        ({"quantum_efficiency_curve": {"wavelengths_nm": [500.0], "efficiency": [0.5]}}, "at least 2"),
     ],
 )
-def test_a_value_out_of_range_is_refused(field: str, value: object) -> None:
-    with pytest.raises(ValidationError, match=field):
-        sensor(**{field: value})
+def test_numbers_of_no_camera_are_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        sensor(**change)
 
 
 @pytest.mark.parametrize(
@@ -69,3 +93,40 @@ def test_a_camera_s_identity_has_the_effects_that_it_names_and_no_others() -> No
         "quantum_efficiency", "gain_dn_per_e", "black_level_dn", "bits",
     }  # fmt: skip
     assert sensor(prnu_row=0.01).identity == {**plain, "prnu_row": 0.01}
+
+
+# ---- electrons per photon: one number, a curve, or curves under colour filters
+
+
+def test_a_curve_is_linear_between_its_points() -> None:
+    model = sensor(quantum_efficiency=None, quantum_efficiency_curve=CURVE)
+    found = [model.efficiency(wavelength) for wavelength in (450.0, 500.0, 550.0, 575.0, 650.0)]
+    np.testing.assert_allclose(found, [0.5, 0.6, 0.7, 0.625, 0.4], rtol=1e-14)
+
+
+@pytest.mark.parametrize("wavelength", [449.9, 650.1, float("nan")])
+def test_outside_its_curve_a_camera_tells_nothing(wavelength: float) -> None:
+    model = sensor(quantum_efficiency=None, quantum_efficiency_curve=CURVE)
+    with pytest.raises(MitsimError, match=r"^sensor 'invented': got \S+ nm; .* 450 to 650 nm; use light of these"):
+        model.efficiency(wavelength)
+
+
+def test_each_plane_of_a_mosaic_has_its_curve() -> None:
+    model = sensor(**COLOUR)
+    assert [model.efficiency(550.0, plane) for plane in ("R", "G", "B")] == pytest.approx([0.3, 0.15, 0.25], rel=1e-14)
+    with pytest.raises(MitsimError, match="mosaic RGGB, and monochrome frames"):
+        model.efficiency(550.0)
+    with pytest.raises(MitsimError, match="no mosaic, and plane G"):
+        sensor().efficiency(550.0, "G")
+
+
+def test_a_file_states_curves_as_tables(tmp_path: Path) -> None:
+    numbers = {"pixel_pitch_um": 2.0, "full_well_e": 1000.0, "read_noise_e": 1.0, "gain_dn_per_e": 1.0}
+    plain = "".join(f"{name} = {value}\n" for name, value in numbers.items())
+    plain += 'name = "colour"\nsource = "invented"\nmosaic = "GRBG"\n[mosaic_curves]\n'
+    line = "{wavelengths_nm = [400, 700], efficiency = [0.1, 0.3]}"
+    (tmp_path / "a.toml").write_text(plain + "".join(f"{plane} = {line}\n" for plane in "RGB"))
+    assert load_sensor(tmp_path / "a.toml").efficiency(550.0, "B") == pytest.approx(0.2)
+    (tmp_path / "b.toml").write_text(plain + "".join(f"{plane} = {line}\n" for plane in "RG"))
+    with pytest.raises(MitsimError, match=r"b\.toml: mosaic_curves\.B: is missing"):
+        load_sensor(tmp_path / "b.toml")

@@ -440,10 +440,7 @@ HOSTILE = {
     "demosaiced.npy": (npy(np.ones((12, 10, 3), np.uint16)), "holds 12 x 10 pixels of 3 numbers, as of red, green and"),
     "lossy.tif": (picture("L", "tiff", compression="jpeg"), "cannot be read"),
     "inks.tif": (picture("CMYK", "tiff"), "is no grey TIFF of 8, 16 or 32 bits"),
-    "transparent.tif": (
-        tiff(values=np.ones((12, 10, 2), np.uint16), extrasamples=["unassalpha"]),
-        "is no grey TIFF",
-    ),
+    "transparent.tif": (tiff(values=np.ones((12, 10, 2), np.uint16), extrasamples=["unassalpha"]), "is no grey TIFF"),
     "double.tif": (tiff(values=np.ones((12, 10))), "is no grey TIFF"),
     "not finite.tif": (tiff(values=NOT_FINITE), "120 values are not finite"),
     "no page.tif": (b"II*\0\0\0\0\0", "has 0 pages"),

@@ -10,8 +10,6 @@ import pytest
 from scipy import stats
 
 from mitsim.core.arrays import stream
-from mitsim.core.configuration import validate
-from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor import chain
 from mitsim.sensor.chain import dark_current_variance, mean_dark_current, neighbours, response_variance, specimen
@@ -256,23 +254,6 @@ def test_charge_that_is_binned_on_chip_is_read_once() -> None:
     assert (after.largest_dn, on_chip.largest_dn) == (4 * 4095, 4095)
     assert after.superpixel_full_well_e == on_chip.superpixel_full_well_e == 8000
     assert after.superpixel_dark_current_e_per_s == on_chip.superpixel_dark_current_e_per_s == 80
-
-
-# ---- refusals
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        *(({"temperature_c": 40.0}, "dark_doubling_c"), ({"hot_pixels": 0.1}, "go together")),
-        ({"linearity": (0.1,), "full_well_e": math.inf}, "finite full_well_e"),
-        *(({"linearity": (math.nan,)}, "linearity"), ({"crosstalk": 0.6}, "crosstalk")),
-    ],
-)
-def test_numbers_that_cannot_be_are_refused_in_a_line(changes: dict[str, object], message: str) -> None:
-    values = {**camera().model_dump(), **changes}
-    with pytest.raises(MitsimError, match=message):
-        validate(SensorModel, values, "file x.toml")
 
 
 @pytest.mark.parametrize("name", ["offsets", "row noise", "crosstalk"])
