@@ -15,6 +15,8 @@ PLANES = {
     name: {"wavelengths_nm": [400.0, 700.0], "efficiency": values}
     for name, values in (("R", [0.0, 0.6]), ("G", [0.2, 0.1]), ("B", [0.5, 0.0]))
 }
+BEYOND = [("full_well_e", -1.0), ("full_well_e", 1e13), ("binning", 2.0), ("colour", "red"), ("crosstalk", 0.6)]
+BEYOND += [("quantum_efficiency", 1.01), ("quantum_efficiency", 1e-9)]
 COLOUR = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": PLANES}
 
 
@@ -33,17 +35,8 @@ def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        *(
-            ({"full_well_e": -1.0}, "full_well_e"),
-            ({"full_well_e": 1e13}, "full_well_e"),
-            ({"binning": 2.0}, "binning"),
-        ),
-        *(({"quantum_efficiency": value}, "quantum_efficiency") for value in (1.01, 1e-9)),
-        *(
-            ({"colour": "red"}, "colour"),
-            ({"temperature_c": 40.0}, "dark_doubling_c"),
-            ({"crosstalk": 0.6}, "crosstalk"),
-        ),
+        *(({name: value}, name) for name, value in BEYOND),
+        ({"temperature_c": 40.0}, "dark_doubling_c"),
         *(({"hot_pixels": 0.1}, "go together"), ({"mosaic": "RGGB"}, "go together")),
         ({"linearity": (0.1,), "full_well_e": math.inf}, "finite full_well_e"),
         *(({"linearity": (math.nan,)}, "linearity"), ({**COLOUR, "binning": 2}, "mosaic RGGB: binning 2")),
