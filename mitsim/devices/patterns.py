@@ -376,8 +376,11 @@ def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.N
 
     row, column, sign = np.array([(shot.row, shot.column, shot.sign) for shot in patterns.captures]).T
     walks = {"row-major": (row, column), "column-major": (column, row)}
-    changes = [_sign_changes(side) for side in patterns.matrices]
-    if sign.any() and all(map(len, changes)):
+    sizes = [side.shape[1] for side in patterns.matrices]
+    squares = [side[:size] for side, size in zip(patterns.matrices, sizes, strict=True)]
+    sylvester = all(size & (size - 1) == 0 for size in sizes)
+    if sign.any() and sylvester and all(map(np.array_equal, squares, map(hadamard_matrix, sizes))):
+        changes = [np.array(np.count_nonzero(np.diff(square, axis=0), axis=0)) for square in squares]
         sequency = changes[0][row], changes[1][column]
         # The pattern with s sign changes is number s ^ (s >> 1), the Gray code of s, in Paley's order.
         dyadic = sequency[0] ^ (sequency[0] >> 1), sequency[1] ^ (sequency[1] >> 1)
@@ -402,14 +405,3 @@ def _places(*keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     import numpy as np
 
     return np.argsort(np.lexsort(keys[::-1]))
-
-
-def _sign_changes(side: FloatArray) -> npt.NDArray[np.int64]:
-    """Return the sign changes of each column of a +-1 ``side``; empty unless Sylvester's matrix."""
-    import numpy as np
-
-    count = side.shape[1]
-    square = side[:count]
-    if count & (count - 1) or not np.array_equal(square, hadamard_matrix(count)):
-        return np.zeros(0, np.int64)
-    return np.array(np.count_nonzero(np.diff(square, axis=0), axis=0))

@@ -212,13 +212,6 @@ def mean_electrons(
     return (light, dark) if own.dark_e_per_s is None else (light + own.dark_e_per_s * exposure_s, 0.0)
 
 
-def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: SensorModel) -> float:
-    if model.has_fixed_pattern or model.crosstalk:
-        light, dark = mean_electrons(expected_electrons, exposure_s, model)
-        return float((light + dark).max())
-    return float(add_dark_current(expected_electrons.max(), exposure_s, model))
-
-
 def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Generator | None) -> FloatArray | None:
     """Return the fixed offset and, with `rng`, row noise for each pixel, flat [electrons], or None."""
     fixed = specimen(model, _frame_shape(shape, model)).offset_e if any(model.offset_parts) else None
@@ -673,28 +666,19 @@ def _between(expected: FloatArray, nodes: FloatArray, mean: FloatArray, variance
 
 def _read_moments(electrons: FloatArray, model: SensorModel) -> Moments:
     signal = amplify(bend(clip_at_full_well(electrons, model), model), model)
-    read = np.full(signal.shape, model.superpixel_reading_noise_e * model.gain_dn_per_e)
+    read = model.superpixel_reading_noise_e * model.gain_dn_per_e
     if model.largest_dn is None:
-        return signal, np.square(read)
-    return _round_moments(signal, read, model.largest_dn)
+        return signal, np.full(signal.shape, read * read)
+    return (_cut_moments if read >= _SMOOTH else _code_moments)(signal, read, model.largest_dn)
 
 
-def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> Moments:
-    first, second = np.empty_like(mean), np.empty_like(mean)
-    wide = deviation >= _SMOOTH
-    for part, moments in ((wide, _cut_moments), (~wide, _code_moments)):
-        if part.any():
-            first[part], second[part] = moments(mean[part], deviation[part], largest)
-    return first, second
-
-
-def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> Moments:
+def _cut_moments(mean: FloatArray, deviation: float, largest: int) -> Moments:
     """Return moments of a rounded normal signal for deviations of at least 2 DN.
 
     The sum over codes is the midpoint rule for a closed-form integral, with Euler and Maclaurin's first term.
     """
     # Noise far wider than the ADC leaves its two ends, whatever its width; and 40 deviations beyond an end are enough.
-    narrower = np.minimum(deviation, 1e4 * largest)
+    narrower = min(deviation, 1e4 * largest)
     mean, deviation = mean * (narrower / deviation), narrower
     mean = np.clip(mean, -40 * deviation, largest + 40 * deviation)
     low, high = -mean / deviation, (largest - mean) / deviation
@@ -703,25 +687,19 @@ def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> Momen
     first = low * under + high * over + slope_low - slope_high
     second = low**2 * under + high**2 * over + (1 - under - over) + low * slope_low - high * slope_high
     first = deviation * first + (slope_high - slope_low) / (24 * deviation)
-    second = deviation**2 * second + (1 - under - over + high * slope_high - low * slope_low) / 12
+    second = deviation * deviation * second + (1 - under - over + high * slope_high - low * slope_low) / 12
     return mean + first, np.maximum(second - first**2, 0.0)
 
 
-def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> Moments:
+def _code_moments(mean: FloatArray, deviation: float, largest: int) -> Moments:
     """Return moments of a rounded normal signal for deviations below 2 DN, code by code."""
-    nearest = np.clip(np.rint(mean), 0, largest)
-    if not deviation.any():
-        return nearest, np.zeros_like(mean)
-    scale = np.where(deviation > 0, deviation, 1)
-    first, second = np.zeros_like(mean), np.zeros_like(mean)
-    for step in range(1, math.ceil(8 * float(deviation.max())) + 2):
-        up = scipy.special.ndtr((mean - (nearest + step - 0.5)) / scale) * (nearest + step <= largest)
-        down = scipy.special.ndtr(((nearest - step + 0.5) - mean) / scale) * (nearest - step >= 0)
+    nearest, first, second = np.clip(np.rint(mean), 0, largest), np.zeros_like(mean), np.zeros_like(mean)
+    # Next to no noise resolves a tie as `quantise` does, to the even code.
+    for step in range(1, math.ceil(8 * deviation) + 2) if deviation >= 1e-9 else ():
+        up = scipy.special.ndtr((mean - (nearest + step - 0.5)) / deviation) * (nearest + step <= largest)
+        down = scipy.special.ndtr(((nearest - step + 0.5) - mean) / deviation) * (nearest - step >= 0)
         first += up - down
         second += (2 * step - 1) * (up + down)
-    # Next to no noise resolves a tie as `quantise` does, to the even code.
-    still = deviation < 1e-9
-    first[still], second[still] = 0, 0
     return nearest + first, np.maximum(second - first**2, 0.0)
 
 
@@ -733,7 +711,8 @@ def saturated_pixels(digital: Digital, expected_electrons: FloatArray, exposure_
     well, brightest = model.superpixel_full_well_e, float(digital.max())
     ends = math.inf if model.largest_dn is None else float(model.largest_dn)
     if np.isfinite(well) and brightest >= np.floor(model.full_well_dn):
-        peak = most_gathered(expected_electrons, exposure_s, model)
+        light, dark = mean_electrons(expected_electrons, exposure_s, model)
+        peak = float(np.max(light + dark))
         if scipy.special.pdtrc(np.ceil(well) - 1, peak) * digital.size >= _CAN_SATURATE:
             ends = min(ends, float(np.floor(model.full_well_dn)))
     return int(np.count_nonzero(digital >= ends)) if brightest >= ends else 0
