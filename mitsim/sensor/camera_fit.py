@@ -98,25 +98,12 @@ def nonuniform(taken: Sequence[Alike]) -> tuple[int, int]:
 # ---- fit of means and variances --------------------------------------------------------------------------------------
 
 
-def average_moments(
-    electrons: npt.ArrayLike, exposure_s: float, model: SensorModel, spread: float, response: float = 0.0
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean and variance [DN] averaged over different pixels, and the variance of their means over pixels.
-
-    Offset (`spread` [DN]) and relative `response` share the nodes of a Gauss-Hermite sum, because offsets matter in the
-    dark and responses at saturation.
-    """
-    light = np.asarray(electrons, dtype=np.float64)
-    if not spread and not response:
-        return *frame_moments(light, exposure_s, model), np.zeros(light.shape)
+def average_moments(electrons: FloatArray, model: SensorModel, spread: float) -> tuple[FloatArray, ...]:
+    """Return mean and variance [DN] averaged over pixels, and the variance of their means, if offsets `spread` [DN]."""
     places, weights = np.polynomial.hermite_e.hermegauss(_NODES)
-    lit = np.multiply.outer(np.maximum(1 + response * places, 0.0), light)
-    if spread:
-        models = [model.model_copy(update={"black_level_dn": model.black_level_dn + z * spread}) for z in places]
-        found = [frame_moments(part, exposure_s, each) for part, each in zip(lit, models, strict=True)]
-        means, noises = (np.stack(part) for part in zip(*found, strict=True))
-    else:
-        means, noises = frame_moments(lit, exposure_s, model)
+    models = [model.model_copy(update={"black_level_dn": model.black_level_dn + z * spread}) for z in places]
+    found = [frame_moments(electrons, 0.0, each) for each in models]
+    means, noises = (np.stack(part) for part in zip(*found, strict=True))
     mean, noise = (np.average(part, axis=0, weights=weights) for part in (means, noises))
     return mean, noise, np.average(np.square(means - mean), axis=0, weights=weights)
 
@@ -235,7 +222,7 @@ class _Problem:
         if not self.hidden:
             return *frame_moments(electrons, 0.0, model), spatial
         spread = max(spatial, float(_LEAST_STEPS[-1]))
-        mean, noise, between = average_moments(electrons, 0.0, model, math.sqrt(spread))
+        mean, noise, between = average_moments(electrons, model, math.sqrt(spread))
         return mean, noise, float(between[self.still]) * spatial / spread
 
     def begin(self) -> Transfer:

@@ -76,14 +76,7 @@ def psnr(image: np.ndarray) -> float:
     return -10 * float(np.log10(np.mean(np.square(image - PRINT))))
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize(("patterns", "baseline", "least"), [("dots:4x8", BESIDE, 47.0), ("dots:8", BASELINE, 48.0)])
-=======
-@pytest.mark.parametrize(
-    ("patterns", "baseline", "least"),
-    [("dots:4x8", BESIDE, 47.0), ("dots:8", BASELINE, 48.0)],
-)
->>>>>>> f7498690 (Numbers of no camera are refused in one test)
 def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float], least: float) -> None:
     """Both depths are found, and the image has ``least`` dB: some 2 less than were found, and more than a cubic between
     columns gave at the true depths (40.4 and 41.1 dB). The true depths give 51.5 and 57.0 now: what is left to them are
@@ -159,14 +152,7 @@ def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
     assert image.uncertainties is None
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize(("near", "far", "patterns"), [(330.0, 500.0, "dots:4x5"), (370.0, 430.0, "dots:4")])
-=======
-@pytest.mark.parametrize(
-    ("near", "far", "patterns"),
-    [(330.0, 500.0, "dots:4x5"), (370.0, 430.0, "dots:4")],
-)
->>>>>>> f7498690 (Numbers of no camera are refused in one test)
 def test_parallax_beyond_the_period_is_told_and_the_image_is_as_before(near: float, far: float, patterns: str) -> None:
     """Parallax of 8.2 pixels under dots 5 apart, of 3 under 4 and of 6.2 under 8. (Planted: nothing spared; no
     rivals.)"""

@@ -150,8 +150,8 @@ def test_rounding_shows_offsets_by_its_slope() -> None:
     """
     model = sensor(bits=8, gain_dn_per_e=0.02, read_noise_e=12.0, black_level_dn=5.0, full_well_e=11_000.0)
     wave = [math.exp(-2 * (math.pi * k * 0.24) ** 2) for k in (1, 2)]
-    mean, _, between = average_moments(np.zeros(1), 0.0, model, 1e-3)
+    mean, _, between = average_moments(np.zeros(1), model, 1e-3)
     assert mean[0] == pytest.approx(5, abs=1e-6)
     assert math.sqrt(between[0]) == pytest.approx(1e-3 * (1 - 2 * wave[0] + 2 * wave[1]), rel=2e-3)
-    _, _, between = average_moments(np.array([1e4]), 0.0, model, 0.05)
+    _, _, between = average_moments(np.array([1e4]), model, 0.05)
     assert math.sqrt(between[0]) == pytest.approx(0.05, rel=1e-2)  # noise of light dithers
