@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import sys
@@ -46,8 +47,15 @@ def compiled_kernels() -> dict[str, float]:
         return dict(_kernels)
 
 
+SECONDS_A_LINE = 60.0
+"""Least time between two lines of progress in a log [s]."""
+
+
 class Watch:
-    """Receiver of progress that ignores it."""
+    """Receiver of progress that writes a line a minute to stderr if it ``logs``, and ignores progress otherwise."""
+
+    def __init__(self, logs: bool = False) -> None:
+        self._written = time.monotonic() if logs else math.inf
 
     def begin(self, stage: str) -> None:
         """Note that the ``stage`` goes on from here."""
@@ -57,6 +65,10 @@ class Watch:
 
     def report(self, stage: str, fraction: float) -> None:
         """Note the finished ``fraction`` of a ``stage``, or of a loop over several: a :data:`Progress`."""
+        if time.monotonic() - self._written >= SECONDS_A_LINE:
+            self._written = time.monotonic()
+            sys.stderr.write(f"mitsim: {printable(stage)} ({fraction:.0%})\n")
+            sys.stderr.flush()
 
 
 @checked_fields
@@ -275,9 +287,6 @@ def size_text(count: float) -> str:
 
 # -------- Progress on a terminal or in a log
 
-SECONDS_A_LINE = 60.0
-"""Least time between two lines of progress in a log [s]."""
-
 
 @check_arguments
 @contextmanager
@@ -305,7 +314,7 @@ def progress(limits: Limits | None = None, hidden: bool = False, start: float = 
     ...     shots = ms.open_bench("photograph").capture("dots:7", job=job)
     """
     if hidden or not has_rows():
-        watch = Watch() if hidden else _Log()
+        watch = Watch(not hidden)
         yield Job(Clock(start, watch), watch.report, limits or Limits())
         return
     from rich.console import Console
@@ -317,17 +326,6 @@ def progress(limits: Limits | None = None, hidden: bool = False, start: float = 
     with Bars(*columns, console=Console(stderr=True), transient=True, refresh_per_second=5) as bars:
         rows = _Rows(bars)
         yield Job(Clock(start, rows), rows.report, limits or Limits())
-
-
-class _Log(Watch):
-    def __init__(self) -> None:
-        self._written = time.monotonic()
-
-    def report(self, stage: str, fraction: float) -> None:
-        if time.monotonic() - self._written >= SECONDS_A_LINE:
-            self._written = time.monotonic()
-            sys.stderr.write(f"mitsim: {printable(stage)} ({fraction:.0%})\n")
-            sys.stderr.flush()
 
 
 class _Rows(Watch):
