@@ -66,6 +66,8 @@ def slope_of_reference(bench: Bench) -> tuple[float, float, float, float]:
     return float(slopes.mean()), error, float(np.mean(seeds)), float(factored.mean())
 
 
+# -------- A mask off the axis
+
 LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))
 CAMERA = CameraGeometry(pixels=40, pixel_pitch=0.017, mask_order=5, scene_distance=30.0)
 ROWS, COLUMNS = Directions(np.linspace(-0.3, 0.28, 9), 0.01), Directions(np.linspace(-0.2, 0.3, 7), 0.01)
@@ -169,6 +171,8 @@ def test_calibrations_of_cameras_without_an_offset_fit_on(small_scene: Callable[
     geometry = open_bench(path, variant).identity()["geometry"]
     assert geometry["mask_offset_row"] == 0.3 and "mask_offset_column" not in geometry
 
+
+# -------- A thick mask
 
 WIDTH, THICK = 0.06, 0.1
 
@@ -334,6 +338,9 @@ def test_a_mask_reaching_into_the_scene_is_refused() -> None:
     at = Directions([0.0], 0.0)
     with pytest.raises(MitsimError, match=r"beyond the mask at 2\.5 mm"):
         shadow_terms(CameraGeometry(mask_thickness=0.5), at, at, 2.2)
+
+
+# -------- Drawn masks
 
 
 def drawn(kind: str, order: int) -> np.ndarray:

@@ -372,6 +372,8 @@ def test_responses_have_the_mean_and_the_noise_of_the_closed_form(mode: str) -> 
     assert np.abs(total / np.sqrt(seeds * variance.mean())).max() < 7  # of pixels up to twice as noisy as the mean
 
 
+# -------- Frames of stripes, and the cost of sessions
+
 N, ROWS, COLUMNS = 12, 20, 23
 
 

@@ -165,6 +165,9 @@ def test_a_fill_factor_dims_both_axes_once_and_shades_each_by_its_own_directions
 Terms = list[tuple[np.ndarray, np.ndarray]]
 
 
+# -------- Operators of separable terms
+
+
 def random_terms(count: int, seed: int) -> Terms:
     """Factors (7, 4) and (6, 5): no two sizes are equal, so that no axis can be mistaken."""
     random = np.random.default_rng(seed)
@@ -215,6 +218,8 @@ def test_what_factors_of_stripes_lack_is_the_rest_of_the_operator(count: int) ->
 DEPTH = 400.0
 CAMERA = CameraGeometry(pixels=24, pixel_pitch=0.25, mask_offset_row=0.1, mask_offset_column=-0.07)
 """As wide as the anchor's sensor, with pixels 20 times as large: what turns moves by up to 3 um at its edge."""
+# -------- A mask that is turned or shakes
+
 ROWS = Directions.cells(np.linspace(-0.1, 0.1, 6))
 COLUMNS = Directions.cells(np.linspace(-0.12, 0.08, 5))
 

@@ -147,6 +147,8 @@ def with_occluded(sizes: dict[int, float]) -> PilotResult:
     return with_sample_costs(several, penumbra=SampleCost(1e-4, 4, 150))
 
 
+# -------- The choice of settings
+
 COSTLY = {"interreflection", "ambient", "diffraction", "black-level"}
 
 
@@ -349,6 +351,9 @@ def test_what_interpolation_leaves_of_sharp_light_counts() -> None:
     assert any("anchors of sharp light (7), 6.0e-04" in warning for warning in plan(5e-4, found).warnings)
 
 
+# -------- What a plan says, of benches that are plain numbers
+
+
 def bench(
     cuts: bool = False,
     shift: float = 0.0,
@@ -472,6 +477,8 @@ def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
         ), name
     assert reported["followed-anchors"].error_if_off == pytest.approx(SIZES[Approximation("followed_anchors", 1)])
 
+
+# -------- The accuracy that a time buys
 
 LIGHTING, PILOT_S, FRAMES, PRICE, KEPT = Lighting(np.zeros(4, int), np.ones((4, 1))), 0.5, 0.25, 1e-6, 2e-5
 AROUND = planner._OPENING_S + FRAMES
