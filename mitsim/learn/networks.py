@@ -323,12 +323,10 @@ class LearnedSolver(Solver):
         else:
             difference = 1.0  # of the products of both sides; of other shapes all of it
             if all(a.shape == b.shape for a, b in zip(self.sides, camera.sides, strict=True)):
+                pairs = (self.sides, self.sides), (camera.sides, camera.sides), (self.sides, camera.sides)
                 own, theirs_too, both = (
-                    float(np.prod([np.vdot(a, b) for a, b in zip(first, second, strict=True)]))
-                    for first, second in (
-                        (self.sides, self.sides), (camera.sides, camera.sides), (self.sides, camera.sides),
-                    )
-                )  # fmt: skip
+                    float(np.prod([np.vdot(a, b) for a, b in zip(*pair, strict=True)])) for pair in pairs
+                )
                 difference = float(np.sqrt(max(own + theirs_too - 2 * both, 0.0) / own))
             if difference > _SAME_CAMERA:
                 doubts.append(f"The network was trained with a calibration that differs by {difference:.1%}.")

@@ -80,15 +80,16 @@ def test_programs_make_the_same_pairs(lab: Lab) -> None:
     for index in range(2):
         assert_array_equal(own.frames(index), other.frames(index))
     assert float(np.max(bench.capture("dots:1", accuracy=1e-2).truth)) < 0.6
-    with pytest.raises(MitsimError, match="own"):
-        ms.make_pairs(bench, folder, 2, "dots:2")
-    with pytest.raises(MitsimError, match="nowhere: is no folder"):
-        ms.make_pairs(bench, lab.folder / "timed", 2, pictures="nowhere")
-    with pytest.raises(MitsimError, match="count 0: give a number from 1 to"):
-        ms.make_pairs(bench, lab.folder / "timed", 0)
-    with pytest.raises(MitsimError, match=r"^2 pairs"):
-        ms.make_pairs(bench, lab.folder / "timed", 2, "dots:2", job=ms.Job(limits=ms.Limits(memory_bytes=1e6)))
-    assert not (lab.folder / "timed").exists()
+    timed = lab.folder / "timed"
+    for output, count, options, words in (
+        (folder, 2, {}, "own"),
+        (timed, 2, {"pictures": "nowhere"}, "nowhere: is no folder"),
+        (timed, 0, {}, "count 0: give a number from 1 to"),
+        (timed, 2, {"job": ms.Job(limits=ms.Limits(memory_bytes=1e6))}, "^2 pairs"),
+    ):
+        with pytest.raises(MitsimError, match=words):
+            ms.make_pairs(bench, output, count, "dots:2", **options)
+    assert not timed.exists()
 
 
 def test_light_lies_in_the_pictures_pixel_of_its_own_row_and_column() -> None:
@@ -164,18 +165,14 @@ def test_frames_are_what_the_camera_exposes_of_what_is_expected(drawn: PairStore
     exposer = Exposer(bench.devices, drawn.exposure_s(pair), integer(3, "pair", pair))
     unit = electrons_per_joule(bench)
     light = [Frame(frame.astype(np.float64) / unit, 0.0, 0.0, 0.0) for frame in drawn.expected_frames(pair)]
-    shots = [
-        (frame, exposer.electrons(frame), shot.names)
-        for frame, shot in zip(light, drawn.manifest.family.shots, strict=True)
-    ]
-    exposed = np.stack([exposer.rate(exposer.digital(electrons, *names)) for _, electrons, names in shots])
+    shots = zip(light, drawn.manifest.family.shots, strict=True)
+    exposed = np.stack([exposer.rate(exposer.digital(exposer.electrons(frame), *shot.names)) for frame, shot in shots])
     frames = drawn.frames(pair)
     assert frames.dtype == np.float32
     step = 1 / drawn.manifest.digital.gain_dn_per_e / drawn.exposure_s(pair)
     assert (abs(frames - exposed) > 0.01 * step).mean() < 1e-3, "a count here and there lies between two"
-    assert drawn.exposure_s(pair) == pytest.approx(
-        bench.devices.sensor.superpixel_full_well_e * 0.8 / exposed.max(), rel=0.02
-    )
+    full_e = bench.devices.sensor.superpixel_full_well_e
+    assert drawn.exposure_s(pair) == pytest.approx(full_e * 0.8 / exposed.max(), rel=0.02)
 
 
 def test_noise_is_drawn_anew_by_its_seed(drawn: PairStore) -> None:
@@ -217,9 +214,8 @@ def test_benches_vary_by_group(lab: Lab) -> None:
     assert [(shard.first, shard.count, shard.group) for shard in store.manifest.shards] == [(0, 2, 0), (2, 2, 1)]
     for index, group in ((1, first), (3, second)):
         assert np.array_equal(store.picture(index), still.picture(index))
-        filled = (
-            store.expected_frames(index).max() * store.exposure_s(index) / lab.bench().sensor.superpixel_full_well_e
-        )
+        full_e, brightest = lab.bench().sensor.superpixel_full_well_e, store.expected_frames(index).max()
+        filled = brightest * store.exposure_s(index) / full_e
         assert filled == pytest.approx(group["exposure_fraction"], rel=0.02), "lamps and dark current bring the rest"
         # The shadow of a sheet at 400 mm behind a mask at 2 mm moves by 400 / 398 of what the mask moves.
         pixels = group["mask.mask_rows_um"] / 11.72 * 400 / 398
