@@ -550,7 +550,7 @@ SIZES = {
     "core": (13, 2953),
     "devices": (8, 1985),
     "exchange": (5, 1309),
-    "learn": (5, 1208),
+    "learn": (5, 1200),
     "light": (6, 1698),
     "metrics": (1, 79),
     "mitsim": (1, 26),
