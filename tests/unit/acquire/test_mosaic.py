@@ -13,6 +13,8 @@ import pytest
 
 from mitsim.acquire.spectral import MosaicFrames, MosaicLight, without_filters
 from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.request import SessionRequest, Task
+from mitsim.calibrate import calibrate
 from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.core.errors import MitsimError
@@ -120,6 +122,16 @@ def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans
     # The brightest pixel behind its filter fills the well, so light is gathered longer than without.
     bare = Session(bench, recipe, 0)
     assert lit.exposure_s == pytest.approx(2 * LitSession.of(bare, lit.light, job).exposure_s, rel=0.1)
+
+
+def test_a_session_behind_filters_repeats_its_frames_by_default(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four times, where no recipe is given. (Seen: TypeError, because the request is no dataclass.)"""
+    lines = SimpleNamespace(manifest=SimpleNamespace(wavelengths_nm=()), names=(), benches=(), whole=bench)
+    sessions: list[Any] = []
+    monkeypatch.setattr(calibrate, "SpectralBench", SimpleNamespace(of=lambda *_: lines))
+    monkeypatch.setattr(calibrate, "_run_sessions", lambda _, request, *__: sessions.append(request) or [])
+    assert calibrate.calibrate_lines(coloured(bench), SessionRequest(), Task(None, False, Job()), mosaic=True) == {}
+    assert sessions[0].recipe.repeats == 4
 
 
 def test_only_a_camera_with_filters_has_a_mosaic(bench: Bench) -> None:
