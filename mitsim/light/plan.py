@@ -193,7 +193,10 @@ class Plan:
             differs = _difference(self.made_of.get(what), here)
             if differs is not None:
                 place, planned, found = differs
-                one, other = _value_text(planned), _value_text(found)
+                one, other = (
+                    "none" if value is None else cut(value if isinstance(value, str) else json.dumps(value), 40)
+                    for value in (planned, found)
+                )
                 alike = what == "scene" or one == other  # checksums, or what is cut before it differs
                 differs_by = f"the content of {place.strip()} differs" if alike else f"{place}{one} there, {other} here"
                 raise ArgumentError(
@@ -270,7 +273,3 @@ def _words(value: Any) -> str:
     if isinstance(value, dict):
         return ",".join(f"{'+' if on else '-'}{name}" for name, on in value.items()) or "none"
     return repr(value)
-
-
-def _value_text(value: Any) -> str:
-    return "none" if value is None else cut(value if isinstance(value, str) else json.dumps(value), 40)

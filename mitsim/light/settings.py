@@ -143,10 +143,6 @@ class SampleCost:
     rate: float = 0.5
 
     @classmethod
-    def none(cls) -> SampleCost:
-        return cls(0.0, 1, 0)
-
-    @classmethod
     def relative(cls, error: float, light: float, samples: int, paths: int, rate: float = 0.5) -> SampleCost:
         return cls(error / light if light else 0.0, samples, paths, rate)
 

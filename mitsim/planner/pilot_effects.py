@@ -211,7 +211,7 @@ class FollowedRuns(AnchorRuns):
         found, tracers = {}, self._simulation().at_anchors
         every = self._beyond_mean(1, ()) if self.changes else None
         for place, (name, tracer) in enumerate(zip(("indirect_residual", "camera_residual"), tracers, strict=True)):
-            found[name] = SampleCost.none()
+            found[name] = SampleCost(0.0, 1, 0)
             if every is not None and tracer is not None:
                 seen = every
                 if None not in tracers:
@@ -419,7 +419,7 @@ class EffectRuns:
             else:
                 continue
             found[name] = SampleCost.relative(error, self.light, samples, paths, rate)
-        return {**dict.fromkeys(_FOLLOWED, SampleCost.none()), **found}
+        return {**dict.fromkeys(_FOLLOWED, SampleCost(0.0, 1, 0)), **found}
 
     def _direct(self, simulation: Simulation) -> list[PathSamples]:
         return simulation.direct.replicates(self.seeds, self.sample.direct)[0]

@@ -7,8 +7,7 @@ The geometry is that of ``test_lamps``: a point lamp, a sheet at 400 mm, an open
 times what it sees of a lamp of intensity 1 over a sheet of reflectance 1; I / 470 nm is the lamp's spectral intensity.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,11 @@ import pytest
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.core.colour_files import RUN
-from mitsim.devices.patterns import Lighting
-from mitsim.devices.projector import SPECTRA_NM, CountedLamps, Response, Spectrum
-from mitsim.light.passes import Grid, Simulation, expected_of
+from mitsim.devices.projector import SPECTRA_NM
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
 from mitsim.transport.integrator import Paths
-from mitsim.transport.records import PathSamples
 from tests.conftest import write_small_scene
 from tests.system.conftest import CAMERA
 from tests.unit.bench.test_lamps import ALBEDO, POSITION, seen
@@ -148,32 +145,3 @@ def test_light_beyond_a_curve_is_known_to_be_missing(light: Mapping[Any, dict[st
         ends = min(CURVE), max(CURVE)
         inside, whole = counted(*case, *ends), counted(*case)
         assert light[case]["unknown"] == pytest.approx((whole - inside) / whole, abs=0.01)
-
-
-def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callable[..., Path], variant: str) -> None:
-    """A spot of each band alone makes the frame of a spot of its spectrum, beside a projector that is not lit.
-
-    (Planted: rows of bands taken from the end.)
-    """
-    nm = [(420.0,), (500.0, 540.0), (600.0,), (760.0,)]
-    spectra = tuple(Spectrum(np.array(at), np.full(len(at), 1 / len(at))) for at in nm)
-    lamp = '<emitter type="constant"/>'
-    bench = open_bench(small_scene(extra=lamp), variant, None, "mp_cl1")
-    response = Response.of_each(bench.sensor)[0]
-    bench = replace(bench, counted_lamps=CountedLamps((response,), response.bands(4), spectra, np.full(4, 0.25)))
-    settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
-    simulation, labels = Simulation(bench, settings), np.zeros(bench.n**2, dtype=np.int64)
-    frames = []
-    for band, spectrum in enumerate(spectra):
-        none, place = np.zeros(1, np.int64), np.full(1, 0.02)
-        spot = PathSamples(
-            none + bench.n**2 + band, none, none, place, place, place / 8, np.ones(1), none.astype(np.int16)
-        )
-        light = simulation.accumulate("indirect", spot, labels, 1)
-        expected = expected_of([(simulation, [light])], labels[:1], Lighting.uniform(bench.n).shots([0]), 0)
-        alone = Grid(simulation.grids["fine"].bundle, bench.geometry, spectrum).optics
-        found = expected.projector_off.irradiance
-        row = light["fine"][[1 + band]].tocsr()
-        assert np.allclose(found, alone.frame(row.indices, row.data), rtol=1e-12, atol=1e-15 * found.max())
-        frames.append(found)
-    assert np.linalg.norm(frames[0] - frames[3]) > 0.05 * np.linalg.norm(frames[0])

@@ -257,7 +257,7 @@ def test_the_middle_of_the_sharpest_lobe_is_light(ball: Bench, variant: str) -> 
 
 # -------- Glare
 #
-# Glare: a traced chessboard has its projector's ANSI contrast, and scattered rays carry what pixels lack.
+# A traced chessboard has its projector's ANSI contrast.
 
 FIELD, GROUPS, RAYS = 4, 8, 256
 CONTRAST = 20.0

@@ -92,7 +92,7 @@ PILOT_RESULT = PilotResult(
         "indirect": SampleCost(4e-3, 2, 16_384),
         "from_camera": SampleCost(1e-2, 2, 20_000),
         "indirect_residual": SampleCost(2e-3, 2, 36_384),
-        "camera_residual": SampleCost.none(),
+        "camera_residual": SampleCost(0.0, 1, 0),
     },
     spread=SampleCost(2e-3, 16, 16_384, 0.8),
     forming=Forming(pixels=512, cells=150, lit=0.2, terms=3.0, shots=49, classes=49),
