@@ -32,18 +32,7 @@ from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.job import Progress, silent
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.session import load_recipe
-from mitsim.light.cost_model import (
-    BOARD_SAMPLES,
-    CHECKED_SHOTS,
-    MOST_CHECKED,
-    MOST_RAYS,
-    MOST_SAMPLES,
-    SHARED_COST,
-    TRUTH_GROUPS,
-    TRUTH_PART,
-    TRUTH_SAMPLES,
-    tells_all,
-)
+from mitsim.light import cost_model
 from mitsim.light.passes import EVEN, GRIDS, PASSES, Grid, LightEstimate, Simulation, even, expected_of
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, PATHS_AT_ONCE, Estimate, Settings
@@ -100,11 +89,12 @@ def trace_truth(bench: Apparatus, settings: Settings, seed: int, flux_error: Flo
 
 def trace_truths(bench: Apparatus, settings: Settings, seed: int, flux_errors: FloatArray) -> list[Truth]:
     effects = names(lambda effect: effect.in_truth) & settings.effects
-    board = _Flux(before_board(bench, load_recipe().board_reflectance), effects, seed, "board", BOARD_SAMPLES)
+    white = before_board(bench, load_recipe().board_reflectance)
+    board = _Flux(white, effects, seed, "board", cost_model.BOARD_SAMPLES)
     unit = board.mean
-    target = np.maximum(TRUTH_PART * _rms(_over(flux_errors, unit)), _FINEST)
+    target = np.maximum(cost_model.TRUTH_PART * _rms(_over(flux_errors, unit)), _FINEST)
     board.refine(unit, _BOARD_PART * target, np.ones(unit.shape[1]))
-    scene = _Flux(bench, effects, seed, "scene", TRUTH_SAMPLES)
+    scene = _Flux(bench, effects, seed, "scene", cost_model.TRUTH_SAMPLES)
     likely = np.square(_over(flux_errors, unit)).sum(axis=0)
     scene.refine(unit, float(np.sqrt(1 - _BOARD_PART**2)) * target, likely)
     reflectance = _over(scene.mean, board.mean)
@@ -121,13 +111,13 @@ class _Flux:
         self._tracer = FluxTracer(setup, loaded.glossy)
         self._seed = integer(seed, "truth", name)
         lines = len(bench.lines.shares) if physics.projector.by_line and bench.lines else 1
-        self._sums, self._samples = np.zeros((lines, TRUTH_GROUPS, pixels)), np.zeros(pixels, np.int64)
+        self._sums, self._samples = np.zeros((lines, cost_model.TRUTH_GROUPS, pixels)), np.zeros(pixels, np.int64)
         self._shape, self._first = (bench.n, bench.n), samples
         self._sample(np.full(pixels, samples))
 
     @property
     def rays(self) -> int:
-        return int(TRUTH_GROUPS * self._samples.sum())
+        return int(cost_model.TRUTH_GROUPS * self._samples.sum())
 
     @property
     def mean(self) -> FloatArray:
@@ -135,7 +125,7 @@ class _Flux:
 
     @property
     def standard_error(self) -> FloatArray:
-        return np.asarray(self._sums.std(axis=1, ddof=1) / self._samples / np.sqrt(TRUTH_GROUPS))
+        return np.asarray(self._sums.std(axis=1, ddof=1) / self._samples / np.sqrt(cost_model.TRUTH_GROUPS))
 
     def refine(self, unit: FloatArray, target: FloatArray, likely: FloatArray) -> None:
         """Trace more where that reduces the error most, until every line meets its target or needs too many rays.
@@ -146,7 +136,7 @@ class _Flux:
         # An edge goes on in the next pixel, where all samples so far may have missed it.
         likely = likely + mean_of_neighbours(likely.reshape(self._shape)).ravel()
         likely += _ANYWHERE * likely.mean() or 1.0
-        most = max(MOST_RAYS, MOST_SAMPLES * len(unit)) // TRUTH_GROUPS
+        most = max(cost_model.MOST_RAYS, cost_model.MOST_SAMPLES * len(unit)) // cost_model.TRUTH_GROUPS
         while ((error := _rms(_over(self.standard_error, unit))) > target).any():
             part = float(np.square(_AIM * target / np.maximum(error, np.finfo(float).tiny)).min())
             # The doublings that reduce the variance most for their rays come first.
@@ -169,7 +159,7 @@ class _Flux:
         place = np.repeat(np.arange(len(pixels)), blocks)
         within = np.arange(len(place)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
         starts = done[place] + block * within
-        light = self._tracer.sums(self._seed, TRUTH_GROUPS, pixels[place], starts, block)
+        light = self._tracer.sums(self._seed, cost_model.TRUTH_GROUPS, pixels[place], starts, block)
         for groups, parts in zip(self._sums, light, strict=True):
             for sums, part in zip(groups, parts, strict=True):
                 sums += np.bincount(pixels[place], part, len(sums))
@@ -454,8 +444,8 @@ def _check(
     predicted: float,
 ) -> _Check:
     shots, classes = lighting.weights.shape
-    whole = tells_all(classes, shots, light.bench.geometry.frame_side)
-    seen = lighting if whole else _some(lighting, MOST_CHECKED if followed else CHECKED_SHOTS)
+    whole = cost_model.tells_all(classes, shots, light.bench.geometry.frame_side)
+    seen = lighting if whole else _some(lighting, cost_model.MOST_CHECKED if followed else cost_model.CHECKED_SHOTS)
     # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
     each = [(light.simulation, groups) for groups in parts.values()]
     expected = expected_of(each, light.rows_of(seen), seen, light.seed, leaking=False)
@@ -594,7 +584,7 @@ def next_samples(
     work = {
         name: PASSES[name].unit_cost
         * each.tracer.paths_per_sample
-        * (SHARED_COST if isinstance(each.tracer, PathReuseTracer) else 1)
+        * (cost_model.SHARED_COST if isinstance(each.tracer, PathReuseTracer) else 1)
         for name, each in simulation.passes.items()
     }
     lights = [SampledPass(name, count, variances[name], work[name]) for name, count in done.items()]

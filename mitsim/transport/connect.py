@@ -30,20 +30,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
 from mitsim.optics.image_formation import anchor_positions
-from mitsim.transport.plugins.base import (
-    Light,
-    Numbers,
-    Surface,
-    channels,
-    device_vectors,
-    generator,
-    host_values,
-    panchromatic,
-    rows_columns,
-    streams,
-    turn_and_origin,
-    x_y,
-)
+from mitsim.transport.plugins import base
+from mitsim.transport.plugins.base import Light, Numbers, Surface, generator, host_values, rows_columns, x_y
 from mitsim.transport.records import Sightings
 from mitsim.transport.transmission import Passage, refracted_way
 
@@ -136,7 +124,7 @@ class CanvasMap:
 
     @classmethod
     def of(cls, emitter: mi.Emitter) -> CanvasMap:
-        turn, origin = turn_and_origin(mi.traverse(emitter)["to_world"])
+        turn, origin = base.turn_and_origin(mi.traverse(emitter)["to_world"])
         reach = _FIRST_REACH
         for _ in range(2):  # first near the axis, to learn the field of view, then over all of it
             x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-reach, reach, _PROBES)] * 2))
@@ -238,7 +226,7 @@ class PinholeRays:
         for chosen in wavelengths:
             place = self._map.turn, self.origin, local, chosen
             _, emitted, depth, cosine = _direction_samples(projector.emitter, *place)
-            parts.append(channels(mi.unpolarized_spectrum(emitted), len(centre)) * (cosine * depth**2)[:, None])
+            parts.append(base.channels(mi.unpolarized_spectrum(emitted), len(centre)) * (cosine * depth**2)[:, None])
         self.power = np.concatenate(parts, axis=1)
         if mi.is_spectral and projector.lines is not None:
             self.power *= line_wavelengths(projector.lines)[1]
@@ -268,7 +256,7 @@ def _direction_samples(
     world = local @ turn.T
     world *= depth / (world @ forward)[:, None]
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(local))
-    interaction.p = mi.Point3f(*device_vectors(origin + world))
+    interaction.p = mi.Point3f(*base.device_vectors(origin + world))
     if wavelengths is not None:
         interaction.wavelengths = wavelengths
     sample, emitted = emitter.sample_direction(interaction, mi.Point2f(0.5), True)
@@ -372,7 +360,7 @@ class OpticalSetup:
     def board(self) -> float:
         pixel = dr.arange(mi.UInt32, self.projector.n**2)
         wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), self.projector.lines)
-        flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
+        flux = np.array(base.panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
         return float(flux.mean(dtype=np.float64)) / (math.pi * self.geometry.scene_distance**2)
 
     def receive(self, si: Surface, toward: mi.Vector3f, local: mi.Point3f, active: mi.Bool) -> Reception:
@@ -582,7 +570,7 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
     x, y = (mi.Float(axis.ravel()) for axis in np.meshgrid(edge, edge))
     to_world, sensor = camera.world_transform(), dr.zeros(mi.SurfaceInteraction3f, _SENSOR_POINTS**2)
     sensor.p = to_world @ mi.Point3f(x, y, 0)
-    _, rng = streams(0, dr.arange(mi.UInt32, _SENSOR_POINTS**2), mi.UInt32(0))
+    _, rng = base.streams(0, dr.arange(mi.UInt32, _SENSOR_POINTS**2), mi.UInt32(0))
     sensor.wavelengths, _ = sample_wavelengths(camera, rng)
     ds, light = lamp.sample_direction(sensor, mi.Point2f(0.5), True)
     met = _in_view(camera, ds.d) & (dr.max(mi.unpolarized_spectrum(light)) > 0)
@@ -594,7 +582,7 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
 
 @keep_scenes()
 def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
-    _, rng = streams(0, dr.arange(mi.UInt32, _LAMP_POINTS), mi.UInt32(0))
+    _, rng = base.streams(0, dr.arange(mi.UInt32, _LAMP_POINTS), mi.UInt32(0))
     to_world, place = (
         camera.world_transform(),
         shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32())),

@@ -30,20 +30,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsim.transport import integrator
 from mitsim.transport.connect import Way
-from mitsim.transport.integrator import (
-    MEMBERS,
-    SIDE,
-    IndirectTracer,
-    InFlight,
-    ProjectorPaths,
-    blocks_of,
-    camera_part,
-    matt_part,
-    projector_part,
-    shading_correction,
-    tilt,
-)
+from mitsim.transport.integrator import MEMBERS, SIDE, IndirectTracer, InFlight, ProjectorPaths, blocks_of, tilt
 from mitsim.transport.plugins.base import Light, Surface, generator, sobol_point, split_by_line
 from mitsim.transport.records import INDIRECT, DeviceAccumulator, PathSamples, Sightings, check_finite
 
@@ -205,7 +194,7 @@ class ReusedPaths(ProjectorPaths):
         return self._factors(dr.select(active & dr.isfinite(value), value, 0))
 
     def _turn_on(self, si: Surface, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> ByLine:
-        kept = projector_part(si, tilt(si, toward) / tilt(si, onward)) if self.rules.steep else 1
+        kept = integrator.projector_part(si, tilt(si, toward) / tilt(si, onward)) if self.rules.steep else 1
         return [light * kept for light in self._turn(si, toward, onward, active)]
 
     def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
@@ -280,8 +269,8 @@ class ReusedPaths(ProjectorPaths):
         def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
             local = si.to_local(direction)
             reflected, pdf = si.bsdf().eval_pdf(context, si, local, active)
-            correction = dr.abs(shading_correction(si, local, direction, toward))
-            correction *= matt_part(si) if self.rules.steep else 1
+            correction = dr.abs(integrator.shading_correction(si, local, direction, toward))
+            correction *= integrator.matt_part(si) if self.rules.steep else 1
             return self._factors(mi.unpolarized_spectrum(reflected) * correction), pdf
 
         return send
@@ -293,9 +282,9 @@ class ReusedPaths(ProjectorPaths):
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.to_sensor_way, at, active)
             reception = self.setup.received(second, toward, replace(way, open=way.open & active))
-            part = 1 - camera_part(reception.pdf)
+            part = 1 - integrator.camera_part(reception.pdf)
             if self.rules.steep:
-                part *= projector_part(second, tilt(second, toward))
+                part *= integrator.projector_part(second, tilt(second, toward))
             connected = self._factors(reception.irradiance * part)
             beyond, turned = (
                 [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)

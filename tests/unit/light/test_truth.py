@@ -15,6 +15,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light import light as module
+from mitsim.light.cost_model import TRUTH_SAMPLES
 from mitsim.light.light import Sampling, Truth, trace_light, trace_truth
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.planner.planner import make_plan
@@ -148,9 +149,9 @@ def test_it_shares_no_error_with_the_frames(bench: Bench, printed: np.ndarray) -
     """Correlation over 256 pixels, with as many samples of each, below 4 / 16. (Planted: the frames' streams.)"""
     lighting = parse_patterns("dots:4", N).lighting
     plan = make_plan(bench, lighting, 1e-2, 0, dict.fromkeys(EFFECTS, False))
-    plan = replace(plan, settings=replace(plan.settings, samples={"direct": float(module.TRUTH_SAMPLES)}))
+    plan = replace(plan, settings=replace(plan.settings, samples={"direct": float(TRUTH_SAMPLES)}))
     light = trace_light(bench, replace(plan, sampling_target=np.inf), lighting, 3, Sampling(by_pixel=False))
-    assert light.paths == GROUPS * N**2 * module.TRUTH_SAMPLES, "the first round is what was predicted"
+    assert light.paths == GROUPS * N**2 * TRUTH_SAMPLES, "the first round is what was predicted"
     found, answer = trace_truth(bench, plan.settings, 3, np.full(N * N, np.inf)), exact(printed / 255)
     of_frames = (light.flux / found.board_flux).reshape(N, N) - answer
     of_truth = found.reflectance - answer
