@@ -551,7 +551,7 @@ SIZES = {
     "devices": (8, 1985),
     "exchange": (5, 1309),
     "learn": (5, 1200),
-    "light": (6, 1698),
+    "light": (6, 1686),
     "metrics": (1, 79),
     "mitsim": (1, 26),
     "optics": (7, 1752),
@@ -562,7 +562,7 @@ SIZES = {
     "sensor": (4, 1117),
     "sessions": (3, 802),
     "studies": (22, 5042),
-    "transport": (15, 4014),
+    "transport": (15, 3991),
     "verbs": (1, 355),
     "version": (1, 1),
 }
