@@ -395,12 +395,12 @@ class Ladder:
             weights /= weights.sum(axis=0)
         return cls(tuple(digitals), weights)
 
-    def merge(self, rates: Iterable[FloatArray], rows: slice = slice(None)) -> FloatArray:
+    def merge(self, rates: Iterable[FloatArray]) -> FloatArray:
         each = iter(rates)
         if self.weights is None:
             return next(each)
-        total = self.weights[0, rows] * next(each)
-        for weight, rate in zip(self.weights[1:, rows], each, strict=True):
+        total = self.weights[0] * next(each)
+        for weight, rate in zip(self.weights[1:], each, strict=True):
             total += weight * rate
         return total
 

@@ -146,6 +146,7 @@ def test_flatcam_leak_where_the_mask_does_not_cover_the_view():
         ({"horizontal": responses(*factors())[0][:-1]}, "only 15 horizontal"),
         ({"vertical": responses(*factors())[1] * 2}, "more than 16 vertical"),
         ({"horizontal": []}, "only 0 horizontal"),
+        ({"vertical": []}, "only 0 vertical"),
         ({"vertical": [np.ones((3, 3))] * N}, "shape"),
         ({"horizontal": [np.full((M, M + 5), np.nan)] * N}, "not finite"),
         ({"horizontal": [np.zeros((M, M + 5))] * N, "vertical": [np.zeros((M, M + 5))] * N}, "zero everywhere"),
@@ -180,14 +181,6 @@ def test_a_uniform_response_is_split_as_its_svd_would_be(shape, next_one):
     if next_one < 1 or size == 1:
         np.testing.assert_allclose(np.outer(a, v), 3.0 * np.outer(left[:, 0], right[:, 0]), atol=1e-11)
     assert np.linalg.norm(mean @ v) == pytest.approx(3.0 * np.linalg.norm(v), rel=1e-12)
-
-
-def test_responses_that_are_missing_are_counted() -> None:
-    """(Planted: from one.)"""
-    horizontal, vertical = responses(*factors())
-    for sides in (([], vertical), (horizontal, [])):
-        with pytest.raises(MitsimError, match="only 0"):
-            estimate_factors(*sides, H)
 
 
 @pytest.mark.parametrize("centre", [False, True])

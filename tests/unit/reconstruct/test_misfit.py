@@ -28,10 +28,8 @@ OTHER = Bench(*(np.roll(shadow()[::-1], 31, axis=0) * np.linspace(1, 3, N),) * 2
 """Another camera, its mask turned and moved."""
 
 
-def recovered(
-    camera: Bench, patterns: str = "dots:4", seed: int = 0, calibrated: Bench | None = None
-) -> Reconstruction:
-    return reconstruct(camera.run(patterns, picture(seed), seed), (calibrated or bench()).calibrated(seed))
+def recovered(camera: Bench, patterns: str = "dots:4", seed: int = 0, own: Bench | None = None) -> Reconstruction:
+    return reconstruct(camera.run(patterns, picture(seed), seed), (own or bench()).calibrated(seed))
 
 
 def misfit(image: Reconstruction) -> Misfit:
@@ -146,19 +144,19 @@ def test_saturation_is_named() -> None:
 
 def test_another_camera_is_flagged() -> None:
     """Factors of another camera that goes by the same name: its mask's features in another order."""
-    image = recovered(bench(), calibrated=OTHER)
+    image = recovered(bench(), own=OTHER)
     assert not image.ok and misfit(image).cause in (Cause.MODEL, Cause.PIXELS)
 
 
 def test_without_stated_noise_only_gross_misfit_is_flagged() -> None:
     plain = bench(stated=False)
-    image = recovered(bench(SHIFT / 3, stated=False), calibrated=plain)
+    image = recovered(bench(SHIFT / 3, stated=False), own=plain)
     found = misfit(image)
     assert image.ok and not found.stated and found.chi_square > 2
-    gross = recovered(plain, calibrated=replace(OTHER, stated=False))
+    gross = recovered(plain, own=replace(OTHER, stated=False))
     assert not gross.ok and misfit(gross).cause is Cause.MODEL
     # Few photons leave more than a tenth of the frames unexplained, and are no misfit.
-    assert recovered(bench(peak=40.0, stated=False), calibrated=plain).ok
+    assert recovered(bench(peak=40.0, stated=False), own=plain).ok
 
 
 def test_a_bad_verdict_of_the_solver_stays() -> None:

@@ -94,9 +94,7 @@ class Projected(Tikhonov):
         return Solution(image, 0.0, float(residual / np.sqrt(problem.energy)), status, iterations=spent)
 
 
-def test_a_further_solver_is_a_class_and_its_name(
-    shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_further_solver(shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Asked for by its name, judged for misfit, written and refused as all are. (Planted: its image replaced by the
     closed form's; uncertainties of an image that is not linear in the frames.)"""
     monkeypatch.setitem(SOLVERS, "projected", Projected())
@@ -148,9 +146,7 @@ def test_what_an_image_takes_is_predicted_where_that_can_be_told(shots: Capture,
     assert reconstruct(shots, factors, method="tv").summary()["predicted_memory_bytes"] is None
 
 
-def test_the_memory_that_is_asked_for_holds_the_factorised_model(
-    shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_holds_the_model(shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch) -> None:
     """At least what the slabs and bases take, at most thirty times as much (of so few numbers)."""
     asked: list[float] = []
     monkeypatch.setattr(Cost, "check", lambda self, *_: asked.append(self.memory_bytes))
@@ -160,9 +156,7 @@ def test_the_memory_that_is_asked_for_holds_the_factorised_model(
     assert len(asked) == 1 and held <= asked[0] <= 30 * held
 
 
-def test_the_noise_of_the_ambient_frame_is_that_of_rows_and_of_columns(
-    shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_noise_of_an_ambient_frame(shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch) -> None:
     """Means of its variance; of pairs, whose ambient light takes itself off, there is none."""
     variance = np.random.default_rng(0).random((PIXELS, PIXELS))
     ambient = SimpleNamespace(variance=variance, rate=np.zeros((PIXELS, PIXELS)))
@@ -208,9 +202,8 @@ def test_another_image_is_not_overwritten(shots: Capture, factors: Factors, tmp_
             other.save(tmp_path / "image")
     assert (tmp_path / "image" / "image.exr").read_bytes() == kept
     others[0].save(tmp_path / "image", overwrite=True)
-    assert np.array_equal(
-        read_frame(tmp_path / "image" / "image.exr")[0]["reflectance"], others[0].image.astype(np.float32)
-    )
+    seen = read_frame(tmp_path / "image" / "image.exr")[0]["reflectance"]
+    assert np.array_equal(seen, others[0].image.astype(np.float32))
     result = json.loads((tmp_path / "image" / "result.json").read_text())
     assert result["lambda"] == 2.0 and result["status"] == str(others[0].status)
 

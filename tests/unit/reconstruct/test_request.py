@@ -37,9 +37,7 @@ def test_what_an_image_may_be_asked_by_is_taken(asked: tuple[float | str, str, f
 
 
 @pytest.mark.parametrize(("asked", "name", "reported"), REFUSED)
-def test_what_no_image_is_made_by_is_refused(
-    asked: tuple[float | str, str, float | str | None], name: str, reported: str
-) -> None:
+def test_wrong_ones_are_refused(asked: tuple[float | str, str, float | str | None], name: str, reported: str) -> None:
     """By the name of the argument, and by what it may be. (Planted: 0 taken for a depth, a bool for a number.)"""
     with pytest.raises(ArgumentError, match=reported) as refusal:
         ImageRequest(**dict(zip(("lam", "method", "focus"), asked, strict=True)))

@@ -47,15 +47,14 @@ def light(half: Half, exact: list[np.ndarray] = EXACT, lit: np.ndarray | None = 
     return UNIT * np.outer(*sides)
 
 
-def frames(
-    change: Callable[[np.ndarray, float, Half], np.ndarray] = lambda frame, time, half: frame, noise: float = 1e-3
-) -> Frames:
+Change = Callable[[np.ndarray, float, Half], np.ndarray]
+
+
+def frames(change: Change = lambda frame, time, half: frame, noise: float = 1e-3) -> Frames:
     """All frames, each after a ``change`` by time (0 to 1) and half, with ``noise``."""
     rng, last = np.random.default_rng(3), len(ORDER) - 1
-    return {
-        half: change(light(half), place / last, half) + noise * rng.standard_normal(PIXELS)
-        for place, half in enumerate(ORDER)
-    }
+    shown = ((half, change(light(half), place / last, half)) for place, half in enumerate(ORDER))
+    return {half: frame + noise * rng.standard_normal(PIXELS) for half, frame in shown}
 
 
 def sums_of(shown: Frames, pairs: bool = True) -> tuple[StripeSums, StripeSums]:
@@ -131,9 +130,7 @@ def test_a_good_session_is_left_as_it_is_to_the_bit(pairs: bool) -> None:
         lambda frame: np.minimum(frame, np.quantile(frame, 0.7)),
     ],
 )
-def test_the_other_frame_of_its_pair_replaces_a_wrong_one(
-    change: Callable[[np.ndarray], np.ndarray], half: Half
-) -> None:
+def test_the_other_frame_replaces_a_wrong_one(change: Callable[[np.ndarray], np.ndarray], half: Half) -> None:
     """(Planted: the other frame is left out; the sum's deviation is added with the wrong sign.)"""
     found = checked({**frames(), half: change(light(half))})
     (fault,) = found.faults

@@ -202,9 +202,7 @@ def under_dots(rows: int, period: int) -> tuple[Prepared, Accumulator, np.ndarra
 @pytest.mark.parametrize(("rows", "period"), [(14, 1), (14, 2), (6, 1)])
 @pytest.mark.parametrize("lam", [1e-2, 1.0])
 @pytest.mark.parametrize("bounds", [None, (0.0, 0.5), (-0.3, np.inf)])
-def test_the_image_is_that_of_active_sets(
-    rows: int, period: int, lam: float, bounds: tuple[float, float] | None
-) -> None:
+def test_the_image_is_of_active_sets(rows: int, period: int, lam: float, bounds: tuple[float, float] | None) -> None:
     """scipy's active sets end at a vertex of the right face; the gap is nowhere below what the objective is above
     theirs. Of more unknowns than data (6 rows of 9), too. (Planted: a ridge that the gap forgets; multipliers of the
     wrong sign.)"""
