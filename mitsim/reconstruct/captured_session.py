@@ -399,7 +399,7 @@ class Ladder:
         each = iter(rates)
         if self.weights is None:
             return next(each)
-        total = self.weights[0] * next(each)
+        total: FloatArray = self.weights[0] * next(each)
         for weight, rate in zip(self.weights[1:], each, strict=True):
             total += weight * rate
         return total
