@@ -117,7 +117,7 @@ def list_table(kind: str) -> str:
     entries = [*KINDS[kind]()]
     two = any(each.what for each in entries)
     rows = [f"| `{each.name}` |{f' {each.what} |' if two else ''} {each.serves} |" for each in entries]
-    return "\n".join(["| name | what | for |" if two else "| name | what |", "|---" * (2 + two) + "|", *rows])
+    return "\n".join(["| name | description | use |" if two else "| name | description |", "|---" * (2 + two) + "|", *rows])
 
 
 def rewritten(text: str) -> str:
