@@ -337,7 +337,7 @@ class MaskProfile(Configuration):
     """Material and flaws of a mask; the scene states its place."""
 
     kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"]
-    """What it is made as; `mitsim list masks` says what each is."""
+    """Kind of mask; `mitsim list masks` describes each."""
     feature_mm: float = Field(ge=1e-6, le=1e3)
     """Side of a feature, or of a picture's pixel [mm].
 
@@ -349,27 +349,27 @@ class MaskProfile(Configuration):
     open_part: float = Field(default=0.5, gt=0, le=1)
     """Random: probability that a feature is open."""
     seed: int = Field(default=0, ge=0, le=2**63 - 1)
-    """Random: which of all such masks."""
+    """Random: seed of the draw."""
     file: str | None = Field(default=None, min_length=1, max_length=4096)
     """Drawing, psf: PNG, TIFF, NPY or OpenEXR file."""
     psf_distance_mm: float | None = Field(default=None, gt=0, le=1e10)
-    """Psf: from the sensor to the point that the picture shows the light of [mm]."""
+    """Psf: distance from the sensor to the point whose light the picture shows [mm]."""
     aperture_mm2: float | None = Field(default=None, gt=0, le=1e8)
-    """Psf: area of the mask that lets light through."""
+    """Psf: area of the mask that transmits light."""
     psf_reduce: int = Field(default=1, ge=1, le=1024)
-    """Psf: pixels a side of the picture that become one."""
+    """Psf: number of the picture's pixels a side that are averaged to one."""
     edge_blur_um: float = Field(default=0.0, ge=0, le=1000)
     """Standard deviation of a Gaussian blur of the transmission [um]."""
     opaque_transmission: float = Field(default=0.0, ge=0, le=1)
-    """Part of the light that a closed feature lets through."""
+    """Fraction of the light that a closed feature transmits."""
     clear_transmission: float = Field(default=1.0, ge=0, le=1)
-    """Part of the light that an open feature lets through."""
+    """Fraction of the light that an open feature transmits."""
     rotation_deg: float = Field(default=0.0, ge=-180, le=180)
-    """Turn in its plane, from the rows' direction to the columns' [degrees]."""
+    """Rotation in the mask's plane, from the rows' direction to the columns' [degrees]."""
     tilt_row_mrad: float = Field(default=0.0, ge=-300, le=300)
-    """How its distance grows down the rows [mrad]."""
+    """Increase of the mask's distance down the rows [mrad]."""
     tilt_column_mrad: float = Field(default=0.0, ge=-300, le=300)
-    """The same along the columns [mrad]."""
+    """Increase of the mask's distance along the columns [mrad]."""
 
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> MaskProfile:

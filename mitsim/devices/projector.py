@@ -124,15 +124,15 @@ class ProjectorModel(Configuration):
     """
 
     name: str
-    """What the projector is called in reports."""
+    """Name of the projector in reports."""
     effective_wavelength_nm: Nanometres
-    """One wavelength that carries as many photons per watt [nm]."""
+    """Single wavelength with the same number of photons per watt [nm]."""
     wavelengths_nm: tuple[Nanometres, ...] = Field(default=(), strict=False, max_length=256)
     """Spectral lines [nm]; none: the effective wavelength.
 
     A lamp's visible spectrum in steps of 2 nm has 200; each costs a shadow of its own."""
     radiant_shares: tuple[Share, ...] = Field(default=(), strict=False)
-    """Part of the power in each line, relative to their sum."""
+    """Power of each line, relative to their sum."""
     contrast_ratio: float = Field(default=math.inf, gt=1, allow_inf_nan=True)
     """Light of a white pixel over that of a black one.
 
@@ -154,13 +154,13 @@ class ProjectorModel(Configuration):
 
     A millimetre, for microscopes, to 10 km."""
     speckle_contrast: float = Field(default=0.0, ge=0, le=1)
-    """Of one sensor pixel's light; see docs/physics.md.
+    """Speckle contrast of one sensor pixel's light; see docs/effects.md.
 
     1 is speckle fully developed; more needs light that is not laser light."""
     speckle: Coherence | None = None
-    """Table, in place of a number: what the contrast is computed from."""
+    """Table from which the contrast is computed, in place of a number."""
     blur_pixels: float = Field(default=0.0, ge=0, le=16)
-    """Spot's standard deviation [pixels].
+    """Standard deviation of a pixel's spot [pixels].
 
     16 leaves 0.7 % of the contrast of stripes of 16 pixels: a projector with fewer pixels than it says."""
     luminous_flux_lm: float | None = Field(default=None, ge=1e-3, le=1e6)
@@ -168,7 +168,7 @@ class ProjectorModel(Configuration):
 
     The largest cinemas have 75 000."""
     luminous_efficacy_lm_per_w: float | None = Field(default=None, ge=0, le=684)
-    """Lumens per watt of light.
+    """Luminous efficacy of the light [lm/W].
 
     683 at most, at 555 nm."""
     radiant_flux_w: float | None = Field(default=None, ge=1e-9, le=1e5)
@@ -176,15 +176,15 @@ class ProjectorModel(Configuration):
 
     The largest cinemas have some 300."""
     throw_ratio: float | None = Field(default=None, ge=0.01, le=100)
-    """Distance over width of the picture.
+    """Distance of the picture over its width.
 
     0.2 beside the screen, 15 across a hall."""
     columns: int | None = Field(default=None, ge=1, le=65536)
-    """Pixels a row of the device's own raster."""
+    """Columns of the device's own raster."""
     rows: int | None = Field(default=None, ge=1, le=65536)
     """Rows of the device's own raster."""
     pixel_aspect: float = Field(default=1.0, ge=0.1, le=10)
-    """Width of a pixel of this raster on the scene, over its height; 1: square.
+    """Width of a pixel of this raster on the scene, divided by its height; 1: square.
 
     0.1 to 10: a picture of 16:9 in a raster ten times too wide or too high."""
     laser_class: Literal["1", "1C", "1M", "2", "2M", "3R", "3B", "4"] | None = None
@@ -194,7 +194,7 @@ class ProjectorModel(Configuration):
     derived: tuple[str, ...] = Field(default=(), strict=False)
     """Fields computed from others."""
     source: str = ""
-    """Where the numbers come from."""
+    """Source of the numbers."""
 
     @model_validator(mode="after")
     def _fields_fit_together(self) -> ProjectorModel:

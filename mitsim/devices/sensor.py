@@ -47,17 +47,17 @@ class SensorModel(Configuration, defer_build=True):
     """
 
     name: str
-    """What the sensor is called in reports."""
+    """Name of the sensor in reports."""
     pixel_pitch_um: float = Field(ge=1e-3, le=1e4)
     """Distance between centres of pixels in a row, um.
 
     Pixels of telephones have 0.5 um, those of X-ray panels some 100 um."""
     row_pitch_um: float | None = Field(default=None, ge=1e-3, le=1e4)
-    """Distance between rows of pixels that are not square, um; none: as above."""
+    """Distance between rows of pixels that are not square, um; none: the pitch of columns."""
     rows: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
     """Rows of pixels that are read, before binning, about the sensor's middle; none: those of the scene's film."""
     columns: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
-    """Columns of the same."""
+    """Columns of pixels that are read, in the same way."""
     binning: int = Field(default=1, ge=1, le=64)
     """Pixels summed along each side of a superpixel.
 
@@ -71,61 +71,61 @@ class SensorModel(Configuration, defer_build=True):
 
     0.2 in the quietest cameras, some 1e4 in photodiode arrays."""
     dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
-    """Electrons a second and pixel.
+    """Dark electrons a second and pixel.
 
     Warm infrared arrays have 1e8."""
     dark_current_temperature_c: float | None = Field(default=None, ge=-273.15, le=200)
-    """Temperature that the dark current is stated at, degrees Celsius."""
+    """Temperature of the stated dark current, degrees Celsius."""
     dark_doubling_c: float | None = Field(default=None, ge=1, le=100)
     """Rise of the temperature that doubles the dark current, kelvin.
 
     5 to 10 in silicon."""
     temperature_c: float | None = Field(default=None, ge=-273.15, le=200)
-    """Temperature of the sensor, degrees Celsius; none: as stated."""
+    """Temperature of the sensor, degrees Celsius; none: that of the stated dark current."""
     dark_current_spread_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
-    """Its standard deviation over the pixels, electrons a second."""
+    """Standard deviation of the dark current over the pixels, electrons a second."""
     dsnu_pixel_e: float = Field(default=0.0, ge=0, le=1e6)
     """Standard deviation of pixels' offsets, electrons."""
     dsnu_row_e: float = Field(default=0.0, ge=0, le=1e6)
-    """The same of offsets that a row shares."""
+    """Standard deviation of offsets that the pixels of a row share, electrons."""
     dsnu_column_e: float = Field(default=0.0, ge=0, le=1e6)
-    """The same of offsets that a column shares.
+    """Standard deviation of offsets that the pixels of a column share, electrons.
 
     As read noise."""
     prnu_pixel: float = Field(default=0.0, ge=0, le=0.1)
     """Relative standard deviation of pixels' response."""
     prnu_row: float = Field(default=0.0, ge=0, le=0.1)
-    """The same of what a row shares."""
+    """Relative standard deviation of the response that the pixels of a row share."""
     prnu_column: float = Field(default=0.0, ge=0, le=0.1)
-    """The same of what a column shares.
+    """Relative standard deviation of the response that the pixels of a column share.
 
     Cameras have some 1e-2; beyond 0.1 the normal law of the response would reach zero."""
     row_noise_e: float = Field(default=0.0, ge=0, le=1e6)
-    """Standard deviation of a noise that a row's pixels share, electrons."""
+    """Standard deviation of noise that the pixels of a row share in each frame, electrons."""
     hot_pixels: float = Field(default=0.0, ge=0, le=0.5)
-    """Part of the pixels that are hot."""
+    """Fraction of hot pixels."""
     hot_dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
-    """What a hot pixel has of dark current beyond others, electrons a second."""
+    """Additional dark current of a hot pixel, electrons a second."""
     dead_pixels: float = Field(default=0.0, ge=0, le=0.5)
-    """Part of the pixels that do not respond to light."""
+    """Fraction of pixels that do not respond to light."""
     pattern_seed: int = Field(default=0, ge=0, lt=2**64)
-    """Which specimen: root of all that is fixed in space, apart from a run's."""
+    """Seed of everything that is fixed in space (the specimen), independent of a run's seed."""
     linearity: Annotated[tuple[float, ...], Field(strict=False, max_length=4)] = ()
-    """c_k of N (1 + sum c_k (N/F)^k), k = 1, 2, ..: what N of F electrons are read as."""
+    """c_k of N (1 + sum c_k (N/F)^k), k = 1, 2, ..: the reading of N electrons in a full well of F."""
     crosstalk: float = Field(default=0.0, ge=0, le=0.5)
-    """Part of a pixel's light that its four neighbours get, a quarter each."""
+    """Fraction of a pixel's light that its four neighbours receive, a quarter each."""
     binning_on_chip: bool = False
-    """Charge is summed and read once, in place of readings."""
+    """True if charge is summed on chip and read once; otherwise readings are summed."""
     binned_full_well_e: float | None = Field(default=None, ge=0.1, le=1e14)
     """Electrons a superpixel holds on chip; none: binning^2 full wells."""
     shutter: Literal["global", "rolling"] = "global"
-    """Whether all rows are exposed at once, or each some time after the one before."""
+    """`global`: all rows are exposed at once; `rolling`: each row begins `line_time_us` after the row before."""
     line_time_us: float | None = Field(default=None, ge=1e-3, le=1e6)
-    """From the begin of a row's exposure to that of the next one, us; needed where light ripples.
+    """Time between the beginnings of the exposures of two rows, us; needed if light ripples.
 
     Some 1 to 100 in cameras; long exposures of a telephone's sensor stretch it to 1e4."""
     quantum_efficiency: float | None = Field(default=None, ge=1e-6, le=1)
-    """Electrons per photon, at source's wavelength; none: no source gives it.
+    """Electrons per photon, at the source's wavelength; none: no source states it.
 
     One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
     quantum_efficiency_curve: EfficiencyCurve | None = None
@@ -143,11 +143,11 @@ class SensorModel(Configuration, defer_build=True):
 
     Below the largest ADC's last number."""
     bits: int | None = Field(default=None, ge=1, le=24)
-    """Bits of the ADC; None = real output.
+    """Bits of the ADC; none: real output.
 
     Cameras have up to 16, laboratory converters 24."""
     source: str
-    """Where the numbers come from."""
+    """Source of the numbers."""
 
     @field_validator("full_well_e")
     @classmethod
