@@ -117,7 +117,8 @@ def list_table(kind: str) -> str:
     entries = [*KINDS[kind]()]
     two = any(each.what for each in entries)
     rows = [f"| `{each.name}` |{f' {each.what} |' if two else ''} {each.serves} |" for each in entries]
-    return "\n".join(["| name | description | use |" if two else "| name | description |", "|---" * (2 + two) + "|", *rows])
+    head = "| name | description | use |" if two else "| name | description |"
+    return "\n".join([head, "|---" * (2 + two) + "|", *rows])
 
 
 def rewritten(text: str) -> str:
