@@ -424,10 +424,11 @@ class _Steps:
             calibration = self._source(step, "calibration")
         if "run" in values and ("calibration" in values or calibration is None):
             check_export(run, output=place, calibration=calibration, **how)
-        if step.output not in self.made:
-            check_output(place, kind="folder" if values["format"] == PNG else "file")
+        pictures = values["format"] == PNG  # a folder of which is not replaced, so it is refused before any work
+        if not self.is_finished(step) if pictures else step.output not in self.made:
+            check_output(place, kind="folder" if pictures else "file")
         yield
-        again = values["format"] != PNG and self.asked.resume
+        again = self.asked.resume and not pictures
         found = export(run, output=place, calibration=calibration, overwrite=again, **how)
         return f"{found['frames']} frames as {found['format']}", ()
 

@@ -215,3 +215,16 @@ def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
         with pytest.raises(ms.MitsimError) as refused:
             ms.run(step, "out", pictures=False)
         assert words in str(refused.value) and not (place / "out").exists(), step
+
+
+def test_pictures_of_other_inputs_are_refused_before_any_step_works(place: Path) -> None:
+    """A folder of exported pictures is not replaced. (Planted: refused only after the image is made anew.)"""
+    tables = {"reconstruct": [{**IMAGE}], "export": [{"format": "png", "run": "run", "output": "shown"}]}
+    ms.run(tables, "out", pictures=False)
+    assert taken(tables, resume=True) == [True, True]
+    (place / "out" / "shown" / "patterns.json").write_text("{}")
+    (place / "out" / "image" / "image.png").unlink()
+    summary = (place / "out" / "session.json").read_bytes()
+    with pytest.raises(ms.MitsimError, match="the folder holds files already"):
+        ms.run(tables, "out", resume=True)
+    assert (place / "out" / "session.json").read_bytes() == summary and not (place / "out/image/image.png").exists()
