@@ -560,7 +560,7 @@ SIZES = {
     "report": (6, 1819),
     "scene": (5, 1358),
     "sensor": (4, 1117),
-    "sessions": (3, 802),
+    "sessions": (3, 803),
     "studies": (22, 5042),
     "transport": (15, 3991),
     "verbs": (1, 355),
