@@ -328,11 +328,11 @@ def test_the_devices_are_drawn_as_they_are_shipped() -> None:
     finally:
         sys.path.pop(0)
     camera, scene = CameraGeometry(), text_of("scenes/photograph/scene.xml")
-    assert (
-        camera.scene_distance,
-        camera.mask_distance,
-        camera.fov,
-    ) == (drawings.SCENE_MM, drawings.MASK_MM, drawings.FIELD_DEGREES)
+    assert (camera.scene_distance, camera.mask_distance, camera.fov) == (
+        drawings.SCENE_MM,
+        drawings.MASK_MM,
+        drawings.FIELD_DEGREES,
+    )
     assert (camera.pixel_pitch, camera.pixels) == (drawings.PITCH_MM, drawings.SENSOR_PIXELS)
     assert (camera.mask_feature, 2**camera.mask_order - 1) == (drawings.FEATURE_MM, drawings.FEATURES)
     assert f'<translate x="{drawings.BASELINE_MM:g}" y="0" z="0"/>' in scene

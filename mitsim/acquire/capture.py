@@ -68,11 +68,7 @@ class Light(SampledLight):
 
     @takes(Request, without="patterns")
     def expose(
-        self,
-        patterns: str = "dots:7",
-        output: Path | str | None = None,
-        job: Job | None = None,
-        **request: Any,
+        self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
     ) -> Capture:
         """Expose one noisy frame for each shot of the family ``patterns``; ``output`` None keeps them in memory.
 

@@ -308,11 +308,7 @@ class Opening(LitScene):
         return self.variant if colour in (NO, AUTO) else spectral_of(self.variant)
 
     def check(
-        self,
-        scene: Path | str,
-        patterns: str | None = None,
-        timing: Exposure | None = None,
-        colour: str = NO,
+        self, scene: Path | str, patterns: str | None = None, timing: Exposure | None = None, colour: str = NO
     ) -> None:
         """Refuse, before the renderer is imported, what the scene and its devices cannot have.
 

@@ -328,7 +328,7 @@ _OWN = {
 }
 """Fields that each kind has beside its name and the feature size; those with ! are required."""
 _FLAWS = {
-    *("edge_blur_um", "opaque_transmission", "clear_transmission", "rotation_deg", "tilt_row_mrad", "tilt_column_mrad"),
+    *("edge_blur_um", "opaque_transmission", "clear_transmission", "rotation_deg", "tilt_row_mrad", "tilt_column_mrad")
 }
 """The fields that every kind has."""
 

@@ -87,11 +87,7 @@ def test_a_shift_by_whole_features_shifts_the_profile(spectrum: Spectrum | None,
     geometric. (Planted: the other sign; one axis for both; the axis's own directions kept, thick mask.)"""
     feature = CAMERA.mask_feature
     moved = CAMERA.model_copy(
-        update={
-            "mask_offset_row": 4 * feature,
-            "mask_offset_column": -2 * feature,
-            "mask_thickness": thickness,
-        }
+        update={"mask_offset_row": 4 * feature, "mask_offset_column": -2 * feature, "mask_thickness": thickness}
     )
     shadow = ShadowGeometry.of(moved, 30.0)
     bits = shadow.mask.bits

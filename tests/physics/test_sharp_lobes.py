@@ -53,8 +53,7 @@ def points(bench: Bench, step: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("alpha", "accuracy"),
-    [(3e-2, 5e-3), (1e-2, 5e-3), (3e-3, 1e-2), (1e-3, 1e-2), (3e-4, 1e-2), (1e-4, 2e-2)],
+    ("alpha", "accuracy"), [(3e-2, 5e-3), (1e-2, 5e-3), (3e-3, 1e-2), (1e-3, 1e-2), (3e-4, 1e-2), (1e-4, 2e-2)]
 )
 def test_a_plate_of_any_roughness(traced: Callable[..., SampledLight], alpha: float, accuracy: float) -> None:
     light = traced(accuracy, **glossy(alpha, sheet=False))

@@ -219,7 +219,10 @@ def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
 
 def test_pictures_of_other_inputs_are_refused_before_any_step_works(place: Path) -> None:
     """A folder of exported pictures is not replaced. (Planted: refused only after the image is made anew.)"""
-    tables = {"reconstruct": [{**IMAGE}], "export": [{"format": "png", "run": "run", "output": "shown"}]}
+    tables = {
+        "reconstruct": [{**IMAGE}],
+        "export": [{"format": "png", "run": "run", "output": "shown", "projector": "mp_cl1"}],
+    }
     ms.run(tables, "out", pictures=False)
     assert taken(tables, resume=True) == [True, True]
     (place / "out" / "shown" / "patterns.json").write_text("{}")

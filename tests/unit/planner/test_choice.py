@@ -416,10 +416,7 @@ def test_devices_are_flagged_where_their_model_ends(
 @pytest.mark.parametrize(
     ("lacking", "words"),
     [
-        (
-            {"unresolved": 0.2, "left_out": 0.1},
-            "of which the frames lack most, 2.0e-01; give",
-        ),
+        ({"unresolved": 0.2, "left_out": 0.1}, "of which the frames lack most, 2.0e-01; give"),
         ({"left_out": 9.9e-3}, "a mirror or curved glass twice, or once and a sharp lobe (left out), 9.9e-03; turn"),
         ({"unresolved_specular": 0.2}, "alone, in beams too fine to be placed on the sensor, 2.0e-01; use fewer"),
     ],

@@ -106,10 +106,7 @@ def test_the_image_is_that_of_active_sets(light: ps.ShiftedLight, bounds: tuple[
     np.testing.assert_allclose(found.image.ravel(), exact, atol=np.sqrt(2e-9 * least / lam) + 1e-9)
 
 
-SQUARE = [
-    ps.ShiftedLight(spread(), (8, 9)),
-    ps.ShiftedLight(spread(), (10, 9), dots(SIZE, SIZE, 2)),
-]
+SQUARE = [ps.ShiftedLight(spread(), (8, 9)), ps.ShiftedLight(spread(), (10, 9), dots(SIZE, SIZE, 2))]
 """The same of scenes that the other solver takes."""
 
 
