@@ -542,9 +542,9 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 
 SIZES = {
     "__main__": (1, 18),
-    "acquire": (5, 1241),
+    "acquire": (5, 1237),
     "api": (2, 202),
-    "bench": (5, 1141),
+    "bench": (5, 1137),
     "calibrate": (5, 1220),
     "cli": (6, 1425),
     "core": (13, 2953),
