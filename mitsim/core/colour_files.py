@@ -330,7 +330,8 @@ class SpectralFolder(Coloured):
         if self.colours is not None:
             check_lines(self.colours, str(self.folder), calibration)
         elif is_coloured(calibration):
-            raise ArgumentError("calibration", f"{calibration}: is coloured, but {self.folder} is not; give one line's")
+            fault = f"{calibration}: is coloured, but {self.folder} is not; give a line's folder"
+            raise ArgumentError("calibration", fault)
         return open_lines(calibration, CALIBRATION)
 
 

@@ -35,7 +35,7 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.model import calibrate_model, model_of
 from mitsim.calibrate.session_plan import plan_calibration
-from mitsim.core.configuration import shipped_path
+from mitsim.core.configuration import shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job, Limits
 from mitsim.devices.camera import CameraGeometry, centred_edges
@@ -330,7 +330,7 @@ def test_wall_shift_in_features() -> None:
 
 def test_a_mask_reaching_into_the_scene_is_refused() -> None:
     with pytest.raises(MitsimError, match="mask_thickness 398"):
-        CameraGeometry.build("here", mask_thickness=398.0)
+        validate(CameraGeometry, {"mask_thickness": 398.0}, "here")
     at = Directions([0.0], 0.0)
     with pytest.raises(MitsimError, match=r"beyond the mask at 2\.5 mm"):
         shadow_terms(CameraGeometry(mask_thickness=0.5), at, at, 2.2)
