@@ -276,7 +276,7 @@ class Variant(Options):
 
     variant: Annotated[str, validated_by(check_variant)] = option(
         DEFAULT_VARIANT,
-        "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
+        "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ad_mono and so on",
         metavar="VARIANT",
         panel=configuration.LIMITS,
     )
