@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from mitsim.cli.shelf_verbs import KINDS, meanings
-from mitsim.core.colour_files import ColourManifest, Crop, Line, MosaicManifest, Preparation, Raw
+from mitsim.core.colour_files import ColourManifest, Line, MosaicManifest
 from mitsim.core.manifests import (
     AmbientFile,
     CalibrationManifest,
@@ -30,6 +30,7 @@ from mitsim.core.manifests import (
     ShotFile,
     _Head,
 )
+from mitsim.core.picture_files import Crop, Preparation, Raw
 from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.framelist import ChartPlace, DarkFile, FrameList, KnownCapture, KnownList, StripeFile
 from mitsim.devices.projector import Coherence, ProjectorModel

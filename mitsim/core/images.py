@@ -23,7 +23,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, npy_header
-from mitsim.core.colour_files import (
+from mitsim.core.errors import MitsimError, reason_of
+from mitsim.core.files import FRAME_LIMITS, MOST_SIDE, check_plain, fits_a_frame
+from mitsim.core.job import Cost, Limits
+from mitsim.core.manifests import Digital
+from mitsim.core.picture_files import (
     BARE,
     BGGR,
     FORMATS,
@@ -35,10 +39,6 @@ from mitsim.core.colour_files import (
     image_files,
     planes_of,
 )
-from mitsim.core.errors import MitsimError, reason_of
-from mitsim.core.files import FRAME_LIMITS, MOST_SIDE, check_plain, fits_a_frame
-from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import Digital
 
 # -------- Pictures of other programs
 

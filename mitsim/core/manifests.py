@@ -1,4 +1,4 @@
-"""Models of manifest.json, whose fields docs/formats.md shows as tables."""
+"""Models of manifest.json, whose fields docs/folders.md lists."""
 
 from __future__ import annotations
 

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, field_validator, model_validator
 
-from mitsim.core import colour_files, manifests
-from mitsim.core.colour_files import Preparation, Wanted
+from mitsim.core import colour_files, manifests, picture_files
 from mitsim.core.configuration import Configuration, Positive, locate, read_table, validate
 from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.core.files import check_plain, read_json
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Plain
+from mitsim.core.picture_files import Preparation, Wanted
 from mitsim.devices.patterns import stripe_count
 from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, halves_in_order
@@ -123,7 +123,7 @@ class FrameList(Configuration):
     """Reflectance of the board that counts as 1 in the image; none: unknown."""
     parallax: manifests.Parallax | None = None
     """How the factors move with depth; none: not known, and no `--focus`."""
-    raw: colour_files.Raw | None = None
+    raw: picture_files.Raw | None = None
     """How frames without a header are read; none: there are none."""
     prepare: Preparation = Preparation()
     """Table: what is done to the files' numbers before they are frames."""
@@ -153,7 +153,7 @@ class SessionFrames:
 
     @property
     def planes(self) -> tuple[str, ...]:
-        return colour_files.PLANES if self.listed.prepare.channel == colour_files.ALL else ("",)
+        return picture_files.PLANES if self.listed.prepare.channel == picture_files.ALL else ("",)
 
     def of_plane(self, name: str) -> SessionFrames:
         if not name:
@@ -171,7 +171,7 @@ class SessionFrames:
             return self
         from mitsim.core.images import Preparer
 
-        if self.listed.prepare.channel == colour_files.ALL:
+        if self.listed.prepare.channel == picture_files.ALL:
             raise _refusal(self.folder, "prepare.channel all is of every plane; take one, by `of_plane`")
         preparer = Preparer.of(self.listed.prepare, self.listed.digital, self.wanted, self.folder)
         return replace(self, listed=self.listed.model_copy(update={"digital": preparer.digital}), preparer=preparer)
@@ -224,7 +224,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
     ]
     frames, dark = listed.frames, listed.dark
     if not frames:
-        names = [path.name for path in colour_files.image_files(folder, Wanted(raw=listed.raw))]
+        names = [path.name for path in picture_files.image_files(folder, Wanted(raw=listed.raw))]
         dark = dark or tuple(DarkFile(file=name) for name in names if name.startswith(DARK))
         names = [name for name in names if name not in {frame.file for frame in dark}]
         if len(names) != len(wanted):
@@ -326,7 +326,7 @@ class FlatList(Configuration):
     """Photons that fall on a pixel in a second under a `light` of 1; none: not known, and no quantum efficiency."""
     source: str = Field(default="measured by mitsim characterise", max_length=1000)
     """Which specimen, gain setting and temperature: goes into the camera's file."""
-    raw: colour_files.Raw | None = None
+    raw: picture_files.Raw | None = None
     """How frames without a header are read; none: there are none."""
     lit: Annotated[tuple[LitSet, ...], FailFast()] = Field(strict=False, max_length=_MOST_SETS)
     """Sets under even light."""

@@ -9,12 +9,13 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from mitsim.core import colour_files, configuration, manifests
-from mitsim.core.colour_files import CORRECTIONS, ColourManifest, Crop, Preparation, Raw, Wanted, image_files
+from mitsim.core import colour_files, configuration, manifests, picture_files
+from mitsim.core.colour_files import ColourManifest
 from mitsim.core.configuration import Configuration, FilePath, Options, Positive, option, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital
+from mitsim.core.picture_files import CORRECTIONS, Crop, Preparation, Raw, Wanted, image_files
 from mitsim.devices.framelist import Identity
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
@@ -135,7 +136,7 @@ class RealCapture:
     def colours(self) -> ColourManifest | None:
         """Return all planes as lines of a coloured folder; None for a single plane, or a picture without mosaic."""
         prepare = self.listed.prepare
-        if prepare.channel != colour_files.ALL:
+        if prepare.channel != picture_files.ALL:
             return None
         return colour_files.lines_of_planes(colour_files.RUN, prepare.wavelengths_nm)
 
@@ -274,7 +275,7 @@ class FrameFacts(Options):
 
     def of(self, source: Path) -> RealCapture:
         bare = any(
-            path.suffix.lower() in colour_files.BARE
+            path.suffix.lower() in picture_files.BARE
             for path in (source, *(source.iterdir() if source.is_dir() else ()))
         )
         if self.shape is None or not bare:
@@ -286,7 +287,7 @@ class FrameFacts(Options):
         given = {name: str(each) if isinstance(each, Path) else each for name, each in self if each is not None}
         prepare |= {field: given[name] for name, field in _PREPARED.items() if name in given}
         if self.channel is not None:
-            colour_files.check_channel(self.channel)
+            picture_files.check_channel(self.channel)
         if self.crop is not None:
             prepare["crop"] = Crop.of(_text_of(self.crop, ","))
         if self.turn is not None:

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.core import colour_files, configuration, manifests
+from mitsim.core import colour_files, configuration, manifests, picture_files
 from mitsim.core.configuration import FilePath, Options, option, takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, check_root
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
@@ -187,7 +187,7 @@ def import_file(
         raise ArgumentError("source", f"{source}: give a file that ends in {', '.join(READERS)}, or use import_frames")
     check_plain(source)  # refused before numpy is imported
     if channel is not None:
-        colour_files.check_channel(channel)
+        picture_files.check_channel(channel)
     with _function(READERS[source.suffix.lower()])(source, channel) as (run, calibration):
         wanted = {
             "run": ("output", output, run),

@@ -18,13 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, read_variables, write_variables
-from mitsim.core.colour_files import ALL, CALIBRATION, WAVELENGTHS_NM, lines_of_planes
+from mitsim.core.colour_files import CALIBRATION, lines_of_planes
 from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
 from mitsim.core.exr import Channel
 from mitsim.core.files import whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import SIDES, CalibrationManifest, ClosingKind, Patterns, RunManifest
+from mitsim.core.picture_files import ALL, WAVELENGTHS_NM
 from mitsim.core.runs import TRUTH, Capture
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import parse_patterns, stripe_signs

@@ -19,7 +19,7 @@ import numpy as np
 
 from mitsim.core import colour_files, manifests
 from mitsim.core.arrays import PACKED, checked_hdf5, hdf5_errors, whole_hdf5
-from mitsim.core.colour_files import CORRECTIONS, ColourManifest, Preparation, image_files
+from mitsim.core.colour_files import ColourManifest
 from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError, cut
@@ -46,6 +46,7 @@ from mitsim.core.manifests import (
     RunManifest,
     ShotFile,
 )
+from mitsim.core.picture_files import CORRECTIONS, Preparation, image_files
 from mitsim.core.runs import AMBIENT, CLOSING, TRUTH, frame_name, load_run
 from mitsim.devices.patterns import PatternFamily, parse_patterns, shot_orders
 from mitsim.devices.sensor import PITCH_TOLERANCE

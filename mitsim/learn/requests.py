@@ -9,9 +9,9 @@ from typing import Annotated
 from pydantic import AfterValidator, Field, field_validator
 
 from mitsim.bench.request import Exposure, Request, Seeded
-from mitsim.core.colour_files import PRINTS
 from mitsim.core.configuration import LIMITS, QUALITY, Configuration, FilePath, Options, load_model, option, validate
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
+from mitsim.core.picture_files import PRINTS
 from mitsim.devices.session import Drift
 
 # -------- Pairs

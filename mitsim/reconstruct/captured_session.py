@@ -56,7 +56,7 @@ def calibrate_frames(
     Parameters
     ----------
     folder
-        Folder with the frames and their list (docs/formats.md), or what :func:`load_frames` returns.
+        Folder with the frames and their list (docs/real_camera.md), or the result of :func:`load_frames`.
     output
         CAL folder that is written; None keeps the factors in memory.
     job

@@ -17,7 +17,6 @@ import pytest
 import tifffile
 from PIL import Image, PngImagePlugin
 
-from mitsim.core.colour_files import Raw, Wanted, image_files
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.images import (
@@ -33,6 +32,7 @@ from mitsim.core.images import (
     span,
     table,
 )
+from mitsim.core.picture_files import Raw, Wanted, image_files
 
 NUMBERS = (np.arange(35).reshape(5, 7) * 113).astype(np.uint16)
 LARGE = np.arange(35, dtype=np.uint32).reshape(5, 7) * 120_000_000

@@ -25,19 +25,11 @@ from typer.testing import CliRunner
 
 import mitsim as ms
 from mitsim.cli import app
-from mitsim.core.colour_files import (
-    CALIBRATION,
-    PLANES,
-    Crop,
-    Preparation,
-    Wanted,
-    lines_of_planes,
-    planes_of,
-    write_colours,
-)
+from mitsim.core.colour_files import CALIBRATION, lines_of_planes, write_colours
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import Preparer, read_image, read_images
 from mitsim.core.manifests import Digital
+from mitsim.core.picture_files import PLANES, Crop, Preparation, Wanted, planes_of
 from mitsim.devices.framelist import load_frames
 from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
 from mitsim.exchange.packed import import_capture

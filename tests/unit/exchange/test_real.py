@@ -18,10 +18,10 @@ import tifffile
 from PIL import Image
 
 import mitsim as ms
-from mitsim.core.colour_files import Preparation, Raw, Wanted
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.picture_files import Preparation, Raw, Wanted
 from mitsim.devices.patterns import shot_orders
 from mitsim.exchange import packed
 from mitsim.exchange.capture_list import CaptureList, RealCapture

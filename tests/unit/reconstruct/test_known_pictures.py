@@ -12,11 +12,12 @@ import pytest
 from PIL import Image
 
 from mitsim import calibrate_known, load_calibration, load_run, reconstruct
-from mitsim.core.colour_files import CALIBRATION, Preparation, read_colours
+from mitsim.core.colour_files import CALIBRATION, read_colours
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.images import Preparer, orient
 from mitsim.core.manifests import Digital
+from mitsim.core.picture_files import Preparation
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.known_pictures import TURNS, guess_noise, plane_offsets
 from mitsim.reconstruct.solver import Verdict

@@ -13,9 +13,9 @@ from PIL import Image
 from scipy import ndimage
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.colour_files import Crop, Preparation
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
+from mitsim.core.picture_files import Crop, Preparation
 from mitsim.reconstruct.known_pictures import Codes, Pose, Side, plane_offsets
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.studies import find_files, twin_study
