@@ -45,8 +45,8 @@ from harness import ROOT, arguments, held, show, write
 
 import mitsim as ms
 from mitsim.acquire.exposure import Exposer, Totals
-from mitsim.core.arrays import integer
 from mitsim.core.exr import read_frame
+from mitsim.core.seeds import integer
 from mitsim.light import light as light_module
 from mitsim.light.light import Sampling, trace_light
 from mitsim.planner.choose import predicted_candidate

@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from harness import arguments, ratios, show, write
 
-from mitsim.core.arrays import single_threaded_blas
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs

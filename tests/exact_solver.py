@@ -28,9 +28,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas, stream
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Progress
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.metrics import relative_error
 from mitsim.reconstruct.solver import Prepared, prepare

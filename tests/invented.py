@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mitsim.core.arrays import stream
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.chain import expose
 

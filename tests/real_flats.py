@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.core.arrays import stream
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.chain import expose
 from tests.invented import sensor

@@ -23,14 +23,16 @@ from mitsim.bench.effects import names, present
 from mitsim.bench.layout import obstacles
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, Request, Task, check_accuracy, check_samples
 from mitsim.core import colour_files, manifests
-from mitsim.core.arrays import FloatArray, integer, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import takes
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, keep_scenes, load_variant, versions
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, write_frame
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Cost, Job
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe

@@ -12,12 +12,14 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.core.arrays import Behind, FloatArray, in_threads, stream, sum_of_squares
+from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel
 from mitsim.core.job import Job
 from mitsim.core.manifests import MOST_SHOTS
+from mitsim.core.parallel import Behind, in_threads
 from mitsim.core.runs import Recorder
+from mitsim.core.seeds import stream
 from mitsim.devices.camera import Devices
 from mitsim.devices.patterns import PatternFamily, Shot
 from mitsim.devices.sensor import SensorModel

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.bench.request import Exposure, Irradiance, check_ending, check_image
-from mitsim.core.arrays import FloatArray, npy_header, stream
+from mitsim.core.arrays import FloatArray, npy_header
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame, whole_file
 from mitsim.core.images import from_above
 from mitsim.core.job import Cost, Limits
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak
 

@@ -25,8 +25,9 @@ from mitsim.bench.effects import present
 from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request
 from mitsim.core import colour_files
-from mitsim.core.arrays import FloatArray, integer
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import SPECTRA_NM, Band, CountedLamps, Lines, Response, Spectrum, line_units
 from mitsim.light.cost_model import frame_seconds, frames_cost

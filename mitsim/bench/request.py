@@ -19,9 +19,10 @@ from mitsim.core import configuration
 from mitsim.core.colour_files import BANDS, LINES, bands_of, spectral_of
 from mitsim.core.configuration import CAMERA, PROJECTOR, QUALITY, FilePath, Options, option, shipped_names, validated_by
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
-from mitsim.core.errors import ArgumentError, MitsimError, check_root, short_text
+from mitsim.core.errors import ArgumentError, MitsimError, short_text
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
+from mitsim.core.seeds import check_root
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel, load_sensor

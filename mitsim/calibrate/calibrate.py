@@ -28,13 +28,15 @@ from mitsim.acquire.spectral import SpectralBench, without_filters
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, SessionRequest, Task
 from mitsim.calibrate.board_session import LitSession, Response, Session
-from mitsim.core.arrays import FloatArray, integer, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import CALIBRATION
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PARTS, output_folder, plain, remove_page, whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, resumable
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer
 from mitsim.devices.framelist import LISTS, FrameList
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, load_recipe

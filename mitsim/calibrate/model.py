@@ -18,12 +18,13 @@ from scipy.optimize import least_squares
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import SessionRequest
 from mitsim.calibrate.board_session import LitSession, Session
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, FactorNoise, FittedNumber, ModelledFactors
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.framelist import SessionFrames, load_frames
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.sensor import digital_of

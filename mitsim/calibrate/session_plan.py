@@ -26,10 +26,11 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, Request, check_psnr
 from mitsim.calibrate.board_session import LitSession, Session, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
-from mitsim.core.arrays import single_threaded_blas, stream
 from mitsim.core.errors import check_arguments
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_FRACTION, digital_of
 from mitsim.devices.session import MOST_REPEATS, SIDES, SessionRecipe, load_recipe
 from mitsim.metrics import psnr as psnr_of

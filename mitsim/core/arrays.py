@@ -1,4 +1,4 @@
-"""Arrays that several rooms exchange, their random streams and threads, and NPY, NPZ, HDF5 and MATLAB files.
+"""Arrays that several rooms exchange, and NPY, NPZ, HDF5 and MATLAB files.
 
 A header's claims are compared with the file before memory is allocated, and files are never mapped, because a mapped
 file that is cut short ends the process. HDF5 is written through Python, because its own writer fails on a full disk.
@@ -6,30 +6,23 @@ file that is cut short ends the process. HDF5 is written through Python, because
 
 from __future__ import annotations
 
-import hashlib
 import io
 import math
-import os
-import sys
-import threading
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
-from functools import cache
 from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO, Generic, TypeVar
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.errors import MitsimError, check_root, reason_of
+from mitsim.core.errors import MitsimError, reason_of
 from mitsim.core.files import MOST_PIXELS, check_plain, whole_file
 from mitsim.core.job import Cost, Limits
-from mitsim.core.worker import workers
 
 FloatArray = npt.NDArray[np.float64]
 SeparableTerm = tuple[FloatArray, FloatArray]
@@ -68,147 +61,6 @@ class ByValue:
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-
-
-# -------- Independent random streams by root seed and name
-# A stream depends only on the root and its own name, so frame 17's shot noise does not depend on frames 0 to 16.
-
-
-def stream(root: int, *names: str | int) -> np.random.Generator:
-    """Return the generator of a name, for example ``stream(seed, "shot", frame)``; MitsimError for an invalid root."""
-    return np.random.Generator(np.random.PCG64(_sequence(root, "stream", names)))
-
-
-def integer(root: int, *names: str | int) -> int:
-    """Return a seed in [0, 2^32) for libraries that need an integer, unrelated to the :func:`stream` of that name."""
-    return int(_sequence(root, "integer", names).generate_state(1, np.uint32)[0])
-
-
-def _sequence(root: int, purpose: str, names: tuple[str | int, ...]) -> np.random.SeedSequence:
-    check_root(root)
-    digest = hashlib.sha256()
-    # Type and length go in as well, so that ("a", "b"), ("ab",), (1,) and ("1",) are four different names.
-    for name in (purpose, *names):
-        text = str(name).encode()
-        kind = b"s" if isinstance(name, str) else b"i"
-        digest.update(kind + len(text).to_bytes(8, "little") + text)
-    words = np.frombuffer(digest.digest(), dtype="<u4")
-    return np.random.SeedSequence(entropy=int(root), spawn_key=tuple(int(word) for word in words))
-
-
-# -------- Threads over items, with BLAS restricted to one thread
-# For many small frames they beat BLAS's own threads, which wait for each other at every product. Results do not depend
-# on the number of threads.
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-_counting = threading.Lock()
-_inside_blas = 0
-_before = dict[str, tuple[Any, int]]()
-"""Libraries of BLAS that are restricted, by path, and their earlier numbers of threads."""
-
-_BRING_BLAS = "scipy.linalg", "scipy.special"
-"""Every part of SciPy that uses BLAS imports one of these modules, which load SciPy's own BLAS."""
-
-
-@contextmanager
-def single_threaded_blas() -> Iterator[None]:
-    """Restrict BLAS to one thread inside the context.
-
-    Contexts of several threads may overlap, therefore the last one that ends restores the earlier numbers of threads.
-    """
-    global _inside_blas
-    with _counting:
-        for library in _libraries(*(name in sys.modules for name in _BRING_BLAS)):
-            _before.setdefault(library.filepath, (library, library.num_threads))
-        _inside_blas += 1
-        _set_threads((library, 1) for library, _ in _before.values())
-    try:
-        yield
-    finally:
-        with _counting:
-            _inside_blas -= 1
-            if _inside_blas == 0:
-                _set_threads(_before.values())
-                _before.clear()
-
-
-def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:
-    for library, number in numbers:
-        # Since 3.8 threadpoolctl heeds one thread's wishes at a time, and ignores those of others in silence.
-        forget = getattr(library, "clear_controlling_thread", lambda **_: None)
-        forget(force=True)
-        library.set_num_threads(number)
-        forget(force=True)
-
-
-@cache
-def _libraries(*_: bool) -> tuple[Any, ...]:
-    """Return the libraries of BLAS, cached until one of :data:`_BRING_BLAS` is imported: a search takes 1 ms."""
-    # Imported here: threadpoolctl sets an environment variable when it is imported, and importing mitsim sets none.
-    from threadpoolctl import ThreadpoolController
-
-    return tuple(ThreadpoolController().select(user_api="blas").lib_controllers)
-
-
-def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Apply a numpy-bound ``function`` to ``items``, one thread a processor; results are in order.
-
-    Nested calls and single items run in the calling thread. After an error or Control-C, items that have not begun are
-    skipped, and running ones are finished.
-    """
-    todo = list(items)
-    with single_threaded_blas():
-        if len(todo) < 2 or getattr(_inside, "thread", False):
-            return [function(item) for item in todo]
-        begun = [_pool(workers()).submit(function, item) for item in todo]
-        try:
-            return [future.result() for future in begun]
-        finally:
-            for future in begun:
-                future.cancel()
-            wait(begun)
-
-
-_inside = threading.local()
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return a pool that is reused, because starting threads takes as long as forming a small frame."""
-    # Each thread is known as one of ours: were it to wait for others, all might wait.
-    return ThreadPoolExecutor(threads, initializer=setattr, initargs=(_inside, "thread", True))
-
-
-os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not live on in a forked process
-
-
-class Behind(Generic[Item]):
-    """Context that works on items in threads while the caller makes the next ones; it ends when all are done.
-
-    Errors are raised by the next wait. After an error or Control-C, items that have not begun are skipped, and running
-    ones are finished.
-    """
-
-    def __init__(self, function: Callable[[Item], Any]) -> None:
-        self._function, self._pool = function, ThreadPoolExecutor(workers())
-        self._begun: list[Future[Any]] = []
-
-    def __enter__(self) -> Behind[Item]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-    def give(self, items: Iterable[Item]) -> None:
-        """Wait for the earlier items, and begin these ``items``."""
-        self.wait()
-        self._begun = [self._pool.submit(self._function, item) for item in items]
-
-    def wait(self) -> None:
-        for future in self._begun:
-            future.result()
-        self._begun = []
 
 
 # -------- NumPy's files

@@ -200,13 +200,3 @@ def is_path(value: object) -> bool:
         return False
     short = len(data) <= _LONGEST_PATH and all(len(name) <= _LONGEST_NAME for name in data.split(os.sep.encode()))
     return bool(data) and b"\0" not in data and short
-
-
-_LARGEST_ROOT = 2**64
-"""Seeds are unsigned 64-bit integers in a frame's metadata and in other programs."""
-
-
-def check_root(root: int) -> int:
-    if not 0 <= root < _LARGEST_ROOT:
-        raise MitsimError(f"seed: got {root}; allowed are whole numbers from 0 to 2^64 - 1")
-    return root

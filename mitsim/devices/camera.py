@@ -16,13 +16,14 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from mitsim.core.arrays import FloatArray, stream
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
 from mitsim.core.images import image_pages, own_end, read_image
 from mitsim.core.job import Cost, Limits
 from mitsim.core.picture_files import Wanted
+from mitsim.core.seeds import stream
 from mitsim.devices.mask import FEW, LARGEST, NO_FLAWS, CameraMask, Flaws, Mask, MaskKind, Plate, mls_mask, within
 from mitsim.devices.patterns import is_prime
 from mitsim.devices.projector import ProjectorModel

@@ -16,8 +16,10 @@ from typing import ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import ByValue, FloatArray, single_threaded_blas, stream
+from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 
 MaskKind = Literal["separable", "flatcam", "open"]
 CameraMask = Literal["separable", "flatcam", "open", "plate"]

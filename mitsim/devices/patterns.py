@@ -292,7 +292,7 @@ def random_binary(axis: PatternAxis) -> PatternFactor:
     Each pixel of an ``axis`` is lit by at least one column: the union must cover the scene."""
     import numpy as np
 
-    from mitsim.core.arrays import stream
+    from mitsim.core.seeds import stream
 
     rng = stream(axis.seed, "patterns", "random", axis.name)
     bits = rng.integers(0, 2, size=(axis.n, axis.k), dtype=np.int8)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.core import colour_files, configuration, manifests, picture_files
 from mitsim.core.configuration import FilePath, Options, option, takes
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, check_root
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest
+from mitsim.core.seeds import check_root
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.exchange.capture_list import CAMERAS, PROJECTORS, TURNED, FrameFacts, said
 

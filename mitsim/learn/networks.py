@@ -37,13 +37,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mitsim.core.arrays import FloatArray, Labels, integer, single_threaded_blas, stream
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
 from mitsim.core.files import check_plain, json_text, whole_file
 from mitsim.core.job import Cost, Job
 from mitsim.core.manifests import SIDES
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer, stream
 from mitsim.learn.pair_store import ModelManifest, PairStore
 from mitsim.learn.requests import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, FLATNET, REFINED, UNROLLED, Training
 from mitsim.reconstruct.factors import Factors

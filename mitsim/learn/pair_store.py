@@ -22,22 +22,14 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import sparse
 
-from mitsim.core.arrays import (
-    PACKED,
-    FloatArray,
-    Labels,
-    checked_hdf5,
-    hdf5_errors,
-    integer,
-    single_threaded_blas,
-    stream,
-    whole_hdf5,
-)
+from mitsim.core.arrays import PACKED, FloatArray, Labels, checked_hdf5, hdf5_errors, whole_hdf5
 from mitsim.core.configuration import Configuration, Positive, validate
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import PAIRS, read_json
 from mitsim.core.manifests import FORMAT as MODEL_FORMAT
 from mitsim.core.manifests import Digital, Plain
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import Lighting, PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.optics.frames import AccumulatedLight, ExpectedFrames, add_speckle

@@ -31,12 +31,13 @@ from mitsim.api.bench import Bench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import show_white
 from mitsim.bench.request import Task
-from mitsim.core.arrays import FloatArray, Labels, integer, stream
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PAIRS, check_plain, output_folder, plain, write_json
 from mitsim.core.images import read_reflectance
 from mitsim.core.job import Cost
+from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import Drift

@@ -52,7 +52,7 @@ class Variation(Configuration):
 
     def draw(self, seed: int, group: int) -> dict[str, float]:
         """Return the drawn numbers of bench number ``group``: `exposure_fraction`, and `mask.` with a field's name."""
-        from mitsim.core.arrays import stream  # here: it imports numpy
+        from mitsim.core.seeds import stream
 
         rng, ranges = stream(seed, "bench", group), {f"mask.{name}": limits for name, limits in self.mask.items()}
         if self.exposure_fraction is not None:

@@ -18,18 +18,11 @@ from scipy import sparse
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import Physics, names
 from mitsim.bench.layout import before_board
-from mitsim.core.arrays import (
-    PACKED,
-    Behind,
-    FloatArray,
-    Labels,
-    integer,
-    mean_of_neighbours,
-    single_threaded_blas,
-    whole_hdf5,
-)
+from mitsim.core.arrays import PACKED, FloatArray, Labels, mean_of_neighbours, whole_hdf5
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.job import Progress, silent
+from mitsim.core.parallel import Behind, single_threaded_blas
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.session import load_recipe
 from mitsim.light import cost_model

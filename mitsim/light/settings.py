@@ -11,8 +11,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from mitsim.core.arrays import FloatArray, in_threads
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import NonNegative, Positive
+from mitsim.core.parallel import in_threads
 
 Number = float | FloatArray
 Count = Annotated[int, Field(ge=1, le=4096)]

@@ -18,8 +18,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from mitsim.core.arrays import FloatArray, in_threads
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import NO_FLAWS, Flaws, Mask, Plate, Term
 from mitsim.devices.projector import Spectrum

@@ -18,7 +18,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from mitsim.core.arrays import FloatArray, Labels, in_threads, stream
+from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.parallel import in_threads
+from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, Devices, side_of
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Coherence, Spectrum

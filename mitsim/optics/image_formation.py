@@ -17,7 +17,8 @@ from itertools import pairwise, product, starmap
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, in_threads
+from mitsim.core.arrays import FloatArray
+from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import FEW, RASTER_LEFT_OUT, Plate
 from mitsim.devices.projector import Spectrum

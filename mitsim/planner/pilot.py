@@ -14,8 +14,9 @@ import numpy as np
 from mitsim.bench import effects
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import EFFECTS
-from mitsim.core.arrays import FloatArray, Labels, integer
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import Numbers, forming_seconds
 from mitsim.light.passes import PASSES, Simulation

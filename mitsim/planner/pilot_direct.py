@@ -14,7 +14,9 @@ import numpy as np
 from scipy import sparse
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.core.arrays import FloatArray, Labels, in_threads, integer
+from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.parallel import in_threads
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.cost_model import cells_to_choose, drawing_seconds

@@ -13,7 +13,8 @@ import numpy as np
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import DIRECT, EFFECTS, FOLLOWED
-from mitsim.core.arrays import FloatArray, integer
+from mitsim.core.arrays import FloatArray
+from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.passes import PASSES, Grid, Simulation, emission
 from mitsim.light.settings import REPLICATES, WIDE, Approximation, ErrorCovariance, SampleCost, Settings

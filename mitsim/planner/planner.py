@@ -18,7 +18,9 @@ import drjit as dr
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import EFFECTS
 from mitsim.bench.request import HIGHEST_ACCURACY, check_accuracy
-from mitsim.core.arrays import Labels, integer, single_threaded_blas
+from mitsim.core.arrays import Labels
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light import cost_model
 from mitsim.light.passes import FOLLOWED, PASSES, Simulation

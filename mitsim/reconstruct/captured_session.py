@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, in_threads, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import CALIBRATION, lines_of_planes, write_colours
 from mitsim.core.configuration import CAMERA, locate
 from mitsim.core.environment import versions
@@ -29,6 +29,7 @@ from mitsim.core.files import output_folder
 from mitsim.core.images import CommonFactor, image_pages, own_end, read_image
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital
+from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.worker import workers
 from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.devices.patterns import stripe_signs

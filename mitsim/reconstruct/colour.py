@@ -33,8 +33,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
 
 if TYPE_CHECKING:
     from mitsim.reconstruct.solver import Solution

@@ -35,9 +35,10 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, median_filter, minimum_filter
 from scipy.optimize import minimize_scalar
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.accumulation import CHANCE, DerivedCapture, FrameNoise, factor_energy
 from mitsim.reconstruct.factors import Factors

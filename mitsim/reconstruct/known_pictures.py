@@ -33,7 +33,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import CALIBRATION, write_colours
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
@@ -42,6 +42,7 @@ from mitsim.core.files import output_folder
 from mitsim.core.images import orient, own_end, read_image
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, FactorNoise
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.picture_files import BGGR, PLANES, Preparation, Wanted, planes_of
 from mitsim.core.runs import load_run
 from mitsim.devices.framelist import MOST_TERMS, KnownCaptures, load_known, preparation_of

@@ -51,9 +51,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.job import Cost, Job, Limits
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.devices.camera import load_psf
 from mitsim.devices.patterns import PatternFamily

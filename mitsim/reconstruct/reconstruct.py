@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields
 from mitsim.core.exr import verify_files, write_frame
 from mitsim.core.files import output_folder, plain, read_json, remove_page, write_bytes, write_json
 from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Cost, Job, Limits
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise, accumulate, check_factorising, print_energy
 from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map, move_factors, parallax_of

@@ -47,8 +47,9 @@ import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 from scipy.sparse.csgraph import connected_components
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
 
 # ---- Solution and status ---------------------------------------------------------------------------------------------
 

@@ -32,11 +32,12 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import Layout, Preview, Surface, layout_of, previews
 from mitsim.bench.request import Exposure, check_view
 from mitsim.calibrate.board_session import DARK, READ, ROUNDING, SHOT
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import write_bytes
 from mitsim.core.images import lightness
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import CameraMask
 from mitsim.devices.patterns import PatternFamily

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, in_threads
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import write_bytes
 from mitsim.core.images import data_uri, png
 from mitsim.core.job import size_text
+from mitsim.core.parallel import in_threads
 
 if TYPE_CHECKING:
     from jinja2 import Environment

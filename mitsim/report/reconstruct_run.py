@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import (
     COLOUR,
     IMAGE,
@@ -32,6 +32,7 @@ from mitsim.core.files import output_folder, read_json, write_bytes
 from mitsim.core.images import png
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, read_manifest
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import load_mosaic, load_run
 from mitsim.devices.camera import load_psf
 from mitsim.devices.framelist import ChartPlace

@@ -20,10 +20,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from mitsim.core.arrays import FloatArray, stream
+from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import compiled_arrays
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import compiled_kernels
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 
 Digital = FloatArray | npt.NDArray[np.uint32]

@@ -22,11 +22,12 @@ import numpy as np
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.manifests import SIDES as FACTORS
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, Drift, load_recipe

@@ -20,12 +20,14 @@ import scipy
 from matplotlib.figure import Figure
 
 from mitsim.bench.request import Procedure
-from mitsim.core.arrays import FloatArray, in_threads, stream
+from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import write_json, write_text
 from mitsim.core.images import image_pages, read_image
 from mitsim.core.job import Cost, Job
+from mitsim.core.parallel import in_threads
+from mitsim.core.seeds import stream
 from mitsim.devices.framelist import DarkSet, FlatFrames, LitSet, capacity_of
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.report.pages import Mean, page_figure, round_to_error, typeset

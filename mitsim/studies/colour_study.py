@@ -23,10 +23,12 @@ from mitsim.acquire.exposure import Exposer
 from mitsim.acquire.spectral import SpectralBench, plan_request
 from mitsim.bench.request import Exposure, Request, SessionRequest, Task
 from mitsim.calibrate.calibrate import calibrate_lines
-from mitsim.core.arrays import FloatArray, integer, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import JOINT, RUN
 from mitsim.core.configuration import CAMERA, load_model, locate
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer
 from mitsim.devices.framelist import load_chart
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import SensorModel

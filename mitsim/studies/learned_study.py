@@ -28,11 +28,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.bench.request import Request, Task
-from mitsim.core.arrays import FloatArray, single_threaded_blas, stream
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import grey_png
 from mitsim.core.job import Job
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 from mitsim.learn.pair_store import WHITE
 from mitsim.learn.pairs import DrawnPictures, make_pairs
 from mitsim.learn.requests import FLATNET, REFINED, UNROLLED, PairsRequest, Training, Variation, check_torch

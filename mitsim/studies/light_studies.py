@@ -38,9 +38,10 @@ from math import inf
 import numpy as np
 from scipy import sparse
 
-from mitsim.core.arrays import FloatArray, single_threaded_blas
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import PatternFamily
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr

@@ -31,9 +31,11 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.board_session import LitSession, Session
 from mitsim.calibrate.calibrate import estimate
-from mitsim.core.arrays import FloatArray, integer, single_threaded_blas, stream
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer, stream
 from mitsim.devices.camera import load_psf
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel

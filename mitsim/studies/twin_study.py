@@ -27,13 +27,15 @@ import numpy as np
 from scipy import ndimage
 
 from mitsim.api.bench import open_bench
-from mitsim.core.arrays import FloatArray, single_threaded_blas, stream
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import read_toml, shipped_path, validate
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import Preparer, grey_png, read_image
 from mitsim.core.manifests import Digital
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.picture_files import BGGR, PLANES, Preparation, Wanted, planes_of
+from mitsim.core.seeds import stream
 from mitsim.devices.camera import load_psf
 from mitsim.reconstruct.known_pictures import Codes, Exposure, Pose, Shape, find_pose, fit_codes, plane_offsets
 from mitsim.reconstruct.solver import centre_frame

@@ -36,8 +36,9 @@ from mitsim.acquire.capture import capture
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
-from mitsim.core.arrays import FloatArray, Labels, integer
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import SensorModel
 from mitsim.light.light import SampledLight, Truth, traced_again

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from scipy import special, stats
 
 from mitsim.acquire.exposure import Exposer
-from mitsim.core.arrays import stream
 from mitsim.core.configuration import shipped_path, validate
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain
 from tests.invented import draw_electrons, sensor

@@ -19,7 +19,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core import arrays
+from mitsim.core import parallel
 from mitsim.core.configuration import shipped_path
 from mitsim.core.exr import read_frame
 from mitsim.light import light
@@ -44,11 +44,11 @@ CHILD = """
 import random, sys, time
 import drjit as dr
 from mitsim.api.bench import open_bench
-from mitsim.core import arrays, job
+from mitsim.core import parallel, job
 scene, output, camera, patterns, accuracy, *effects = sys.argv[1:]
 bench = open_bench(scene, camera=camera or None, for_render=not camera)
 dr.set_thread_count(3)
-arrays.workers = lambda: 3
+parallel.workers = lambda: 3
 sys.setswitchinterval(1e-5)
 rng, now = random.Random(1), 0.0
 
@@ -92,7 +92,7 @@ def threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], object]
 
     def limit(count: int) -> object:
         dr.set_thread_count(count)
-        monkeypatch.setattr(arrays, "workers", lambda: count)
+        monkeypatch.setattr(parallel, "workers", lambda: count)
         return threadpool_limits(count)
 
     yield limit
@@ -181,7 +181,7 @@ def test_mixing_does_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch, colu
     weights, basis = rng.random((49, 49)), rng.random((49, columns))
     found = set()
     for count in (*THREADS, 5, 7):
-        monkeypatch.setattr(arrays, "workers", lambda count=count: count)
+        monkeypatch.setattr(parallel, "workers", lambda count=count: count)
         found.add(forming.mix_frames(weights, basis).tobytes())
     assert len(found) == 1
     assert np.allclose(np.frombuffer(found.pop()), (weights @ basis).ravel(), rtol=1e-13, atol=0)
@@ -189,8 +189,8 @@ def test_mixing_does_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch, colu
 
 def test_results_keep_their_order_in_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     for count in (*THREADS, 64):
-        monkeypatch.setattr(arrays, "workers", lambda count=count: count)
-        assert arrays.in_threads(lambda item: item**2, range(100)) == [item**2 for item in range(100)]
+        monkeypatch.setattr(parallel, "workers", lambda count=count: count)
+        assert parallel.in_threads(lambda item: item**2, range(100)) == [item**2 for item in range(100)]
 
 
 def test_the_plan_does_not_depend_on_the_clock(

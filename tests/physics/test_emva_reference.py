@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.core.arrays import stream
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.chain import expose
 from mitsim.sensor.emva import Session, alike, figures, pairs_of

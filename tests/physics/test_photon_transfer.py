@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.core.arrays import stream
 from mitsim.core.configuration import shipped_path
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain
 from tests.invented import draw_electrons

@@ -26,7 +26,7 @@ import pytest
 from mitsim.acquire.exposure import Totals
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench import effects
-from mitsim.core.arrays import integer
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.passes import Simulation, expected_of

@@ -49,8 +49,9 @@ import mitsuba as mi
 import numpy as np
 import scipy
 
-from mitsim.core.arrays import FloatArray, integer, stream
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer, stream
 from mitsim.transport.plugins.base import Surface, host_values, vectors
 
 PLUGIN = "mitsim_projector"

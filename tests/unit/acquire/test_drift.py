@@ -13,9 +13,9 @@ import pytest
 from mitsim.acquire.exposure import AmbientFrame, DriftedExposer, Exposer, drift_mask, levels, taken_off, warmer
 from mitsim.api.bench import Bench
 from mitsim.calibrate.board_session import Session
-from mitsim.core.arrays import stream
 from mitsim.core.configuration import load_model, shipped_path
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, Devices, MaskProfile
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.projector import ProjectorModel

@@ -12,8 +12,10 @@ import pytest
 from scipy.ndimage import uniform_filter
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mitsim.core.arrays import Behind, in_threads, integer, mean_of_neighbours, single_threaded_blas, stream
+from mitsim.core.arrays import mean_of_neighbours
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import Behind, in_threads, single_threaded_blas
+from mitsim.core.seeds import integer, stream
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (1, 4), (2, 1), (16, 16)])

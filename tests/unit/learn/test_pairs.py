@@ -19,8 +19,8 @@ import mitsim as ms
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Request, Task
-from mitsim.core.arrays import integer, stream
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer, stream
 from mitsim.learn import pairs as pairs_module
 from mitsim.learn.pair_store import PairStore, PrintPart
 from mitsim.learn.pairs import DrawnPictures, FolderPictures, electrons_per_joule, make_pairs, pink_noise

@@ -8,7 +8,8 @@ import pytest
 from scipy import stats
 from scipy.special import ndtri
 
-from mitsim.core.arrays import single_threaded_blas, stream
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence, ProjectorModel, Spectrum
 from mitsim.optics.fft_shadow import geometric_samplers, wave_samplers

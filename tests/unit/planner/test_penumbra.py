@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.arrays import integer
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import Settings

@@ -15,8 +15,8 @@ from mitsim.acquire.exposure import Totals
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench import effects
 from mitsim.bench.effects import EFFECTS
-from mitsim.core.arrays import integer
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.settings import REPLICATES, WIDE, PilotResult, Settings

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mitsim.core.arrays import stream
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
 from mitsim.sensor import chain
 from tests.invented import draw_electrons, sensor
 

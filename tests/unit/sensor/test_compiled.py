@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from mitsim.core.arrays import in_threads, stream
+from mitsim.core.parallel import in_threads
+from mitsim.core.seeds import stream
 from mitsim.sensor import chain
 from mitsim.sensor.chain import by_pixel
 from tests.invented import sensor

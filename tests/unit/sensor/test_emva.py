@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mitsim.core.arrays import stream
+from mitsim.core.seeds import stream
 from mitsim.sensor.emva import Pair, Session, Stack, alike, figures
 
 

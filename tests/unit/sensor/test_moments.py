@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mitsim.core.arrays import stream
 from mitsim.core.configuration import shipped_path
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import load_sensor
 from mitsim.sensor import chain
 from mitsim.sensor.camera_fit import average_moments

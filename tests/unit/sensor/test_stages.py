@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.core.arrays import stream
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor import chain
 from mitsim.sensor.chain import dark_current_variance, mean_dark_current, neighbours, response_variance, specimen
