@@ -154,7 +154,7 @@ def test_blas_that_is_loaded_later_has_one_thread_too(module: str) -> None:
     that had kept NumPy's to one before.)"""
     program = f"""if True:
         from threadpoolctl import threadpool_info, threadpool_limits
-        from mitsim.core.arrays import single_threaded_blas
+        from mitsim.core.parallel import single_threaded_blas
         import numpy
 
         def threads():
