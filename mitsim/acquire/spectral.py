@@ -396,8 +396,7 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
     """Return the bench with lamps at wavelengths of their own, or unchanged without lamps.
 
     Raises MitsimError for a camera whose efficiency is unknown in the lamps' spectra, or that is blind to the
-    projector's
-    lines.
+    projector's lines.
     """
     if not bench.loaded.lamps or not effects.get("ambient", True):
         return bench
