@@ -37,7 +37,6 @@ from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe
 from mitsim.exchange.capture_list import CaptureList
-from mitsim.learn.pair_store import ModelManifest, PairsManifest, Shard
 from mitsim.learn.requests import Variation
 from mitsim.light.plan import PlanFile
 
@@ -53,8 +52,7 @@ MODELS = (
     *(ColourManifest, Line, ChartPlace),
     MosaicManifest,
     PlanFile,
-    *(PairsManifest, Shard, Variation),
-    ModelManifest,
+    Variation,
 )
 
 

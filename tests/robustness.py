@@ -3,12 +3,10 @@
     pytestmark = pytest.mark.robustness("Optics")           # or on one test: the table in which it stands
 
     def test_a_slit(measured) -> None:
-        '''What holds, in the words that the page prints.'''
         measured(error, at_most=1e-12, what="far field")    # holds the gate, and writes figure and gate down
 
-A row of the page is a test that measured: its name in words, the first paragraph of its docstring, figures and gates.
-Other marked tests are counted below their table. The rest of the page is tests/robustness.md, where a table's name in
-braces stands for it.
+A row of the page is a test that measured: its name in words, linked to its file, figures and gates. Other marked tests
+are counted below their table. The rest of the page is tests/robustness.md, where a table's name in braces stands for it.
 """
 
 from __future__ import annotations
@@ -57,13 +55,12 @@ class Row:
     file: str
     line: int
     name: str
-    text: str
     cases: list[str] = field(default_factory=list)
     figures: dict[str, Figure] = field(default_factory=dict)
 
     def add(self, other: Row) -> None:
         """The cases and figures of another run of the same test, which replace older ones."""
-        self.line, self.text = other.line, other.text
+        self.line = other.line
         self.cases = list(dict.fromkeys([*self.cases, *other.cases]))
         self.figures |= other.figures
 
@@ -109,9 +106,8 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     result = yield
     marker = item.get_closest_marker("robustness")
     if marker is not None and isinstance(item, pytest.Function):
-        text = " ".join((item.function.__doc__ or "").strip().split("\n\n")[0].split())
         identity = item.nodeid[item.nodeid.index("[") + 1 : -1] if "[" in item.nodeid else ""
-        row = Row(marker.args[0], item.location[0], item.location[1] or 0, item.originalname, text, [identity])
+        row = Row(marker.args[0], item.location[0], item.location[1] or 0, item.originalname, [identity])
         for what, figure in RECORDER.figures.items():
             row.figures[", ".join(filter(None, (identity, what)))] = figure
         item.user_properties.append(("robustness", asdict(row)))
@@ -171,8 +167,7 @@ def table_of(rows: list[Row]) -> str:
     lines = ["| case | measured | gate |", "|---|---|---|"]
     for row in rows:
         if row.figures:
-            cells = f"{link(row)}. {row.text}".replace("|", "\\|"), *figures_of(row)
-            lines.append(f"| {' | '.join(cells)} |")
+            lines.append(f"| {' | '.join((link(row), *figures_of(row)))} |")
     lines = lines if len(lines) > 2 else []
     others = Counter(row.file for row in rows if not row.figures)
     if others:

@@ -479,10 +479,10 @@ def test_a_row_shows_the_figure_nearest_to_its_gate() -> None:
     figures = Recorder()
     for value in (1e-9, 3e-7, -2e-8):
         figures(value, at_most=1e-6, what="error")
-    row = Row("Optics", "tests/t.py", 1, "test_a_b", "What | holds.", ["x", "y"], figures.figures)
-    page = page_of("{Optics}\n", [row, Row("Optics", "tests/t.py", 2, "test_c", "")])
+    row = Row("Optics", "tests/t.py", 1, "test_a_b", ["x", "y"], figures.figures)
+    page = page_of("{Optics}\n", [row, Row("Optics", "tests/t.py", 2, "test_c")])
     assert page.splitlines()[2:] == [
-        "| [a b](../tests/t.py) (2 cases). What \\| holds. | error: 3e-7 | <= 1e-6 |",
+        "| [a b](../tests/t.py) (2 cases) | error: 3e-7 | <= 1e-6 |",
         "",
         "Tests without a figure: 1 in [t.py](../tests/t.py).",
     ]
