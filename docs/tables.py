@@ -38,7 +38,6 @@ from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe
 from mitsim.exchange.capture_list import CaptureList
 from mitsim.learn.requests import Variation
-from mitsim.light.plan import PlanFile
 
 PAGES = sorted(Path(__file__).parent.glob("*.md"))
 MODELS = (
@@ -51,7 +50,6 @@ MODELS = (
     *(CaptureList, KnownList, KnownCapture),
     *(ColourManifest, Line, ChartPlace),
     MosaicManifest,
-    PlanFile,
     Variation,
 )
 

@@ -5,8 +5,9 @@
     def test_a_slit(measured) -> None:
         measured(error, at_most=1e-12, what="far field")    # holds the gate, and writes figure and gate down
 
-A row of the page is a test that measured: its name in words, linked to its file, figures and gates. Other marked tests
-are counted below their table. The rest of the page is tests/robustness.md, where a table's name in braces stands for it.
+A row of the page is a test that measured: its name in words, figures and gates. The files of a table, and the number of
+their other marked tests, are below it. The rest of the page is tests/robustness.md, where a table's name in braces
+stands for it.
 """
 
 from __future__ import annotations
@@ -163,22 +164,23 @@ def page_of(template: str, rows: list[Row]) -> str:
 
 
 def table_of(rows: list[Row]) -> str:
-    """Return a row for each test that measured something, and the number of other tests by file."""
+    """Return a row for each test that measured something, and the files of all tests with the number of other ones."""
     lines = ["| case | measured | gate |", "|---|---|---|"]
     for row in rows:
         if row.figures:
-            lines.append(f"| {' | '.join((link(row), *figures_of(row)))} |")
+            lines.append(f"| {' | '.join((named(row), *figures_of(row)))} |")
     lines = lines if len(lines) > 2 else []
-    others = Counter(row.file for row in rows if not row.figures)
-    if others:
-        files = ", ".join(f"{number} in [{Path(file).name}](../{file})" for file, number in others.items())
-        lines += [*([""] if lines else []), f"Tests without a figure: {files}."]
+    files = Counter({row.file: 0 for row in rows})
+    files.update(row.file for row in rows if not row.figures)
+    if files:
+        links = (f"[{Path(file).name}](../{file})" + (f" ({n} more)" if n else "") for file, n in files.items())
+        lines += [*([""] if lines else []), f"Tests: {', '.join(links)}."]
     return "\n".join([*lines, ""])
 
 
-def link(row: Row) -> str:
-    cases = f" ({len(row.cases)} cases)" if len(row.cases) > 1 else ""
-    return f"[{row.words}](../{row.file}){cases}"
+def named(row: Row) -> str:
+    """Return the name of a test in words, with the number of its cases."""
+    return row.words + (f" ({len(row.cases)} cases)" if len(row.cases) > 1 else "")
 
 
 def figures_of(row: Row) -> tuple[str, str]:

@@ -482,9 +482,9 @@ def test_a_row_shows_the_figure_nearest_to_its_gate() -> None:
     row = Row("Optics", "tests/t.py", 1, "test_a_b", ["x", "y"], figures.figures)
     page = page_of("{Optics}\n", [row, Row("Optics", "tests/t.py", 2, "test_c")])
     assert page.splitlines()[2:] == [
-        "| [a b](../tests/t.py) (2 cases) | error: 3e-7 | <= 1e-6 |",
+        "| a b (2 cases) | error: 3e-7 | <= 1e-6 |",
         "",
-        "Tests without a figure: 1 in [t.py](../tests/t.py).",
+        "Tests: [t.py](../tests/t.py) (1 more).",
     ]
 
 
@@ -496,6 +496,7 @@ def test_the_page_of_figures_has_every_test_that_measures() -> None:
         whole = re.search(r"^pytestmark = .*mark\.robustness\(", source, flags=re.M)
         mark = "" if whole else r"@pytest\.mark\.robustness\(.*\n"
         names = re.findall(rf"^{mark}(?:@.*\n)*def test_(\w+)\([^)]*\bmeasured\b", source, flags=re.M)
-        link = os.path.relpath(path, ROOT)
-        missing += [name for name in names if f"[{name.replace('_', ' ')}](../{link})" not in page]
+        table = f"](../{os.path.relpath(path, ROOT)})" in page
+        rows = {row.replace(" ", "_") for row in re.findall(r"^\| ([\w ]+?) (?:\(|\|)", page, flags=re.M)}
+        missing += [name for name in names if not table or name not in rows]
     assert not missing, missing
