@@ -16,7 +16,7 @@ def documents() -> ModuleType:
 
 
 def test_the_tables_are_those_of_the_models_and_of_mitsim_list() -> None:
-    """(Planted: a row of a page removed, also of the table of studies; a mark removed; a model removed from the list.)"""
+    """(Planted: a row of a page removed, of the table of studies too; a mark or a model removed.)"""
     tables = documents()
     texts = {page: page.read_text(encoding="utf-8") for page in tables.PAGES}
     stale = [page.name for page, text in texts.items() if tables.rewritten(text) != text]
