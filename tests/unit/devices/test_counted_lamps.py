@@ -34,6 +34,8 @@ def test_a_curve_that_goes_on_beyond_spectra_says_how_far() -> None:
     at = np.linspace(830, 1030, 20001)
     exact = np.trapezoid(0.5 * (1030 - at) / 200 * at, at) / (0.5 * 830)
     assert response.range_nm == (400.0, 830.0) and response.beyond_nm == pytest.approx(exact, rel=1e-6)
+    blind = {"wavelengths_nm": [400.0, 830.0, 1030.0], "efficiency": [0.5, 0.0, 0.5]}  # nothing to be relative to
+    assert Response.of_each(sensor(quantum_efficiency=None, quantum_efficiency_curve=blind))[0].beyond_nm == 0
 
 
 def test_a_camera_that_sees_no_spectrum_is_refused() -> None:

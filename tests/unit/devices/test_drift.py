@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import TypeAdapter
 
-from mitsim.core.configuration import shipped_path
+from mitsim.core.configuration import Configuration, shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.session import DRIFTS, Drift, MaskMotion, load_recipe
+from mitsim.devices.session import DRIFTS, BoardShape, Drift, Exposures, MaskMotion, SessionRecipe, load_recipe
 
 
 def test_one_kind_alone() -> None:
@@ -43,6 +45,35 @@ def test_the_shipped_drift_is_of_the_shipped_session(tmp_path: Path) -> None:
     bad.write_text(shipped_path("calibration", "drift.toml").read_text().replace("power = 0.005", 'power = "5 %"'))
     with pytest.raises(MitsimError, match=r"drift\.power"):
         load_recipe(bad)
+
+
+@pytest.mark.parametrize(
+    ("model", "taken", "beyond"),
+    [
+        (Drift, {"power_ramp": -1.0}, {"power_ramp": -1.001}),  # a lamp that ends dark
+        (Drift, {"temperature_k": 200.0}, {"temperature_k": 200.001}),
+        (Drift, {"temperature_k": -200.0}, {"temperature_k": -200.001}),
+        (BoardShape, {"size_mm": 250.0, "bow_mm": -25.0}, {"size_mm": 250.0, "bow_mm": -25.001}),
+        (SessionRecipe, {"repeats": 1}, {"repeats": 0}),
+    ],
+)
+def test_a_session_is_taken_up_to_its_limits(
+    model: type[Configuration], taken: dict[str, Any], beyond: dict[str, Any]
+) -> None:
+    """(Planted: a negative power taken; a limit one larger; a board that may not bow a tenth.)"""
+    recipe = {"board_reflectance": 0.9, "exposure_fraction": 0.8, "signed_capture": "pair", "source": ""}
+    stated = recipe if model is SessionRecipe else {}
+    assert validate(model, stated | taken, "here").model_dump(include=set(taken)) == taken
+    with pytest.raises(MitsimError, match=list(beyond)[-1]):
+        validate(model, stated | beyond, "here")
+
+
+def test_exposures_of_one_frame_rise_from_1() -> None:
+    ladder: TypeAdapter[tuple[float, ...]] = TypeAdapter(Exposures)
+    assert ladder.validate_python((1, 4, 16)) == (1, 4, 16)
+    for wrong in ((1, 4, 4), (2, 4), (1, 8, 4)):
+        with pytest.raises(ValueError, match="rising numbers"):
+            ladder.validate_python(wrong)
 
 
 def test_a_camera_that_moves_is_another() -> None:
