@@ -161,9 +161,14 @@ _MASKS: dict[str, dict[str, Any]] = {
 }
 """Fields that masks of each kind begin with: features as fine and about as many as those of the shipped scenes, or a
 picture beside the file."""
-_FEATURE_MM = 0.06
-"""Side of a feature of the shipped scenes' mask."""
-_HEAD = "# Further fields are in docs/formats.md.", ""
+_MASK = {"feature_mm": 0.06, "distance_mm": 2.0}
+"""Side of a feature, and distance, of the shipped scenes' mask."""
+_HEAD = (
+    "# Use it in a command as --{field} {path}, in a session file as {field} = \"{path}\" in the table [scene],",
+    "# in Python as mitsim.open_bench(\"photograph\", {field}=\"{path}\"). The scene states the place of the {field}.",
+)
+"""Places that take a device, for the file of a ``field`` at a ``path``."""
+_MORE = "# Further fields are in docs/device_files.md.", ""
 _CAPTURE = "mitsim capture photograph -o run --patterns dots:7 --camera {}"
 
 
@@ -212,7 +217,7 @@ def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
         yield from begun(load_sensor(like), name=name)
     if kind == "mask":
         yield ""
-        yield from starter(MaskProfile, {"kind": mask, "feature_mm": _FEATURE_MM, **_MASKS[mask]}, "mask")
+        yield from starter(MaskProfile, {"kind": mask, **_MASK, **_MASKS[mask]}, "mask")
     elif kind == "projector":
         yield from begun(load_model(like, ProjectorModel), name=name)
     elif kind == "recipe":
@@ -282,7 +287,9 @@ def new(asked: Beginning) -> int:
         with whole_folder(output) as folder:
             shutil.copytree(source.parent, folder, dirs_exist_ok=True)
     else:
-        head = [f"# {kind.capitalize()} {name}, for: {use}", *([] if kind == "session" else _HEAD)]
+        field = {"mask": "camera"}.get(kind, kind)
+        places = [line.format(field=field, path=output) for line in _HEAD if field in ("camera", "projector")]
+        head = [f"# {kind.capitalize()} {name}, for: {use}", *places, *([] if kind == "session" else _MORE)]
         lines = _lines(kind, name, source, like if like is not None and like in masks else "separable")
         text = "\n".join([*(head if ending == ".toml" else []), *lines]) + "\n"
         with output_file(output) as place:

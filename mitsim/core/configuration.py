@@ -160,6 +160,8 @@ def validate(model: type[Model], data: dict[str, Any], where: str, context: obje
 
 CAMERA, PROJECTOR, RECIPE, LIST = "full_well_e", "effective_wavelength_nm", "board_reflectance", "patterns"
 """Required fields that identify shipped cameras, projectors, recipes and lists of known frames."""
+_SHIPPED = {CAMERA: "camera", PROJECTOR: "projector", RECIPE: "recipe", LIST: "list", "chart.json": "chart"}
+"""Words for shipped files of a field or an ending."""
 
 
 def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"], ending: str, field: str = "") -> Path:
@@ -174,14 +176,14 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"]
         return path / ending if inside and path.is_dir() else path
     folder = shipped_path(shelf)
     known = folder / text / ending if inside else folder / f"{text}{ending}"
-    if known.is_file():
+    if known.is_file() and (not field or field in read_toml(known)):
         return known
     if path.exists():
         return path / ending if inside and path.is_dir() else path
-    names = shipped_files(shelf, ending, field)
+    names, kind = shipped_files(shelf, ending, field), _SHIPPED.get(field or ending, shelf.removesuffix("s"))
     raise MitsimError(
-        f"{name}: no such file, and none of that name is shipped; {near_name(text, names)}"
-        f"shipped are {', '.join(names)}"
+        f"{kind} {name}: no such file, and no shipped {kind} has that name; {near_name(text, names)}"
+        f"shipped {kind}s are {', '.join(names)}"
     )
 
 

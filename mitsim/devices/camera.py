@@ -40,6 +40,8 @@ _NOT_KNOWN_BEFORE = (
 """Beginnings of the names of fields that calibrations of 0.4 lack."""
 
 
+_MASKS_OF_SCENES = "a scene has separable, flatcam or open; a camera file with a table [mask] gives other masks"
+
 PIXELS = 1, 16384
 """Sensor pixels a side: more than the largest square sensors have, 10 560, of which a region is read."""
 
@@ -62,7 +64,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     roi: tuple[int, int, int, int] | None = Field(default=None, strict=False)
     """Region of interest: its first row and column, rows and columns; none: all."""
     mask: CameraMask = "separable"
-    """Mask construction; plate: what a camera file's [mask] gives."""
+    """Kind of mask; plate: the mask of a camera file's table [mask], given feature by feature."""
     mask_order: int = Field(default=9, ge=2, le=16)
     """Order of the maximum length sequence.
 
@@ -124,7 +126,8 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     @classmethod
     def _scenes_have_few_masks(cls, kind: object) -> object:
         if kind not in get_args(CameraMask):
-            raise ValueError("a scene has separable, flatcam or open; others come with --camera and its table [mask]")
+            like = f" --like {kind}" if kind in KINDS else ""
+            raise ValueError(f"{_MASKS_OF_SCENES}: `mitsim new mask NAME{like}` writes one")
         return kind
 
     @model_validator(mode="after")
@@ -144,7 +147,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
             raise ValueError(f"{rows} x {columns} pixels; {FRAME_LIMITS} are written and read, so read a part by roi")
         plate = self.mask_plate
         if (self.mask == "plate") != (plate is not None):
-            raise ValueError("mask: got 'plate'; use separable, flatcam or open, or --camera with a table [mask]")
+            raise ValueError(f"mask: got 'plate'; {_MASKS_OF_SCENES}")
         if plate is not None and self.mask_thickness and not (plate.crosses is not None and plate.flaws == NO_FLAWS):
             drawn = f"blurred, dusty, turned or tilted ({plate.words})"
             problem = f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms"
@@ -335,7 +338,7 @@ _FLAWS = {
 
 
 class MaskProfile(Configuration):
-    """Material and flaws of a mask; the scene states its place."""
+    """Material, flaws and distance of a mask; the scene states its offsets."""
 
     kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"]
     """Kind of mask; `mitsim list masks` describes each."""
@@ -343,6 +346,10 @@ class MaskProfile(Configuration):
     """Side of a feature, or of a picture's pixel [mm].
 
     As a scene's ``mask_feature``."""
+    distance_mm: float | None = Field(default=None, ge=1e-9, le=1e7)
+    """Distance from the sensor to the mask's near face [mm]; none: the scene's `mask_distance`.
+
+    As a scene's ``mask_distance``."""
     order: int = Field(default=9, ge=2, le=16)
     """Separable, flatcam, open: order of the maximum length sequence."""
     features: int | None = Field(default=None, ge=1, le=LARGEST)
@@ -376,12 +383,12 @@ class MaskProfile(Configuration):
     def _fields_of_its_kind(self) -> MaskProfile:
         flaws = set() if self.kind == "psf" else _FLAWS
         own = _OWN[self.kind].split()
-        foreign = self.model_fields_set - {"kind", "feature_mm", *(name.rstrip("!") for name in own), *flaws}
+        foreign = self.model_fields_set - {"kind", "feature_mm", "distance_mm", *(name.rstrip("!") for name in own), *flaws}
         if foreign:
-            raise ValueError(f"{min(foreign)} says nothing of a mask {self.kind}; remove it")
+            raise ValueError(f"{min(foreign)} has no effect on a mask of kind {self.kind}; remove it")
         missing = [name[:-1] for name in own if name.endswith("!") and getattr(self, name[:-1]) is None]
         if missing:
-            raise ValueError(f"a mask {self.kind} needs {missing[0]}; add it")
+            raise ValueError(f"a mask of kind {self.kind} needs {missing[0]}; add it")
         if self.kind == "mura" and not (is_prime(self.features or 0) and self.features != 2):
             raise ValueError(f"features: got {self.features}; a MURA has an odd prime, as 101 or 251")
         if self.opaque_transmission >= self.clear_transmission:
@@ -423,10 +430,13 @@ class MaskProfile(Configuration):
 
     def put_on(self, camera: CameraGeometry, folder: Path) -> CameraGeometry:
         mask: dict[str, object] = {"mask": "plate", "mask_feature": self.feature_mm, "mask_plate": None}
+        if self.distance_mm is not None:
+            mask["mask_distance"] = self.distance_mm
         if self.kind == "psf":
             # The light behind a phase mask as a plate: brightness relative to light without a mask. A point at depth z0
             # lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask at distance d.
-            path, near, far = folder / str(self.file), camera.mask_distance, self.psf_distance_mm or 0.0
+            path, far = folder / str(self.file), self.psf_distance_mm or 0.0
+            near = camera.mask_distance if self.distance_mm is None else self.distance_mm
             if far <= near:
                 raise MitsimError(f"mask psf: psf_distance_mm is {far:g}; give more than the mask's {near:g} mm")
             light = load_psf(path, self.psf_reduce, LARGEST // 2)

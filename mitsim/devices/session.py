@@ -12,7 +12,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mitsim.core.configuration import Configuration, load_model, shipped_path, validate
+from mitsim.core.configuration import RECIPE, Configuration, load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields
 from mitsim.devices.sensor import ExposureFraction
 
@@ -258,7 +258,7 @@ class SessionRecipe(Configuration):
 @check_arguments
 def load_recipe(path: Path | str | None = None) -> SessionRecipe:
     """Return the recipe in the TOML file at ``path``, or the shipped one; errors name the field that breaks a rule."""
-    return load_model(Path(path) if path is not None else shipped_path("calibration", "session.toml"), SessionRecipe)
+    return load_model(locate("session" if path is None else path, "calibration", ".toml", RECIPE), SessionRecipe)
 
 
 def recipe_text(recipe: SessionRecipe) -> str:

@@ -481,7 +481,7 @@ class Factors:
     @check_arguments
     def check_fit(self, shots: Capture) -> None:
         """Raise MitsimError if ``shots`` are of another camera, mask, distance, projector or light."""
-        ours, theirs = (_parts(each.manifest.camera) for each in (shots, self))
+        ours, theirs = (camera_parts(each.manifest.camera) for each in (shots, self))
         for name in sorted({*ours, *theirs}, key=lambda name: (not name.endswith("name"), name)):
             own, other = ours.get(name), theirs.get(name)
             if own == other or (name in _LIGHT and None in (own, other)):
@@ -489,8 +489,7 @@ class Factors:
             which = "the run's camera, with its scene, --camera, --projector and -D"
             if name in _LIGHT:
                 which = "in this light: its diffraction at the mask differs"
-            said = [cut("that of a camera file" if each == "plate" else str(each)) for each in (other, own)]
-            both = f"{cut(name)} is {said[0]}, but {shots.name} has {said[1]}"
+            both = f"{cut(name)} is {cut(str(other))}, but {shots.name} has {cut(str(own))}"
             raise MitsimError(f"calibration {self.name}: {both}; calibrate {which}")
         for side, pattern, factor in zip(("P_L", "P_R"), shots.patterns, (self.left, self.right), strict=True):
             if len(pattern) != factor.shape[1]:
@@ -569,12 +568,14 @@ def _single(values: FloatArray) -> FloatArray:
     return values.astype(np.float32).astype(np.float64)
 
 
-def _parts(camera: Mapping[str, Any]) -> dict[str, Any]:
+def camera_parts(camera: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the facts of a manifest's ``camera`` by dotted name, with the mask of a camera file in words."""
     found: dict[str, Any] = {}
     for part, value in camera.items():
         inner = value.items() if isinstance(value, Mapping) else ()
         found |= {f"{part}.{name}": each for name, each in inner} if inner else {part: value}
-    return found
+    words = found.pop("geometry.mask_plate", None)
+    return found if words is None else {**found, "geometry.mask": words}
 
 
 @check_arguments

@@ -32,7 +32,7 @@ from mitsim.devices.framelist import ChartPlace
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality, psnr, summary_of, truth_for
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
-from mitsim.reconstruct.factors import load_calibration
+from mitsim.reconstruct.factors import camera_parts, load_calibration
 from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.reconstruct import (
     DEPTH_FILE,
@@ -234,7 +234,7 @@ def _tables(manifest: Any, folder: Path, known: Mapping[str, Any]) -> dict[str, 
     numbers = {key: value for key, value in manifest.model_dump().items() if key not in _ELSEWHERE}
     return {
         "Numbers": {**lines_of(known), **lines_of(numbers), "files": sizes},
-        "Camera": lines_of(manifest.camera),
+        "Camera": lines_of(camera_parts(manifest.camera)),
         "Configuration": lines_of(manifest.configuration),
         "Versions": manifest.versions,
     }

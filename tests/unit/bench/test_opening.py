@@ -143,7 +143,8 @@ def test_a_camera_blind_to_the_projector_is_refused(loader: Loader, scene: Path,
 def test_a_mask_of_the_camera_is_worn_and_is_the_only_one(loader: Loader, scene: Path) -> None:
     """(Planted: the mask left off when a bench is opened anew; both taken.)"""
     seen: list[Any] = []
-    loader.mask = SimpleNamespace(put_on=lambda geometry, folder: seen.append((geometry.pitches, folder)) or "mask")
+    worn = lambda geometry, folder: seen.append((geometry.pitches, folder)) or "mask"  # noqa: E731
+    loader.mask = SimpleNamespace(put_on=worn, distance_mm=None)
     bench = open_bench(scene, albedo=0.25)
     folder = opening.check_devices(None, None)[0].parent
     assert loader.worn == ["mask"] and seen == [(PITCHES, folder)]

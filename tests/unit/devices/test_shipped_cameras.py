@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+import mitsim
 from mitsim.api.bench import open_bench
 from mitsim.bench import apparatus as opening
 from mitsim.core.configuration import shipped_path
@@ -86,6 +87,49 @@ def test_a_sensor_has_no_more_rows_than_its_base(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('base = "imx250"\nrows = 4000\nbinning = 4\n')
     with pytest.raises(MitsimError, match=r"rows: got 4000, but imx250 has \d+; give no more"):
         load_sensor(tmp_path / "own.toml")
+
+
+@pytest.mark.parametrize(("camera", "projector"), [("session", None), ("mp_cl1", None), (None, "imx249")])
+def test_a_shipped_file_of_another_kind_is_no_device(camera: str | None, projector: str | None) -> None:
+    """The refusal lists devices of the right kind only. (Seen: eight mistakes in session.toml, each with 38 fields.
+    Planted: any file of the folder.)"""
+    kind, known = ("camera", "imx249, imx249_rggb") if camera else ("projector", "mp_cl1")
+    with pytest.raises(MitsimError, match=f"{kind} {camera or projector}: .*shipped {kind}s are {known}") as refusal:
+        opening.check_devices(camera, projector)
+    assert "session," not in str(refusal.value) and "flatcam" not in str(refusal.value)
+
+
+def test_a_camera_file_states_mask_and_distance(tmp_path: Path, variant: str) -> None:
+    """The camera file replaces the scene's own distance with a note, also in another variant, and the user's -D is
+    refused unless it is the same. (Planted: the scene's distance kept; -D overridden; no note.)"""
+    own = tmp_path / "own.toml"
+    mask = '[mask]\nkind = "separable"\nfeature_mm = 0.06\norder = 9\n'
+    own.write_text(f'base = "small"\n{mask}distance_mm = 1.5\n')
+    with pytest.warns(UserWarning, match="mask: 1.5 mm before the sensor, as its camera file says, in place of the"):
+        bench = open_bench("photograph", variant, camera=own)
+    for each in (bench, bench.in_variant(variant)):
+        assert each.geometry.mask_distance == each.loaded.camera.geometry.mask_distance == 1.5
+    with pytest.raises(MitsimError, match=r"has distance_mm 1.5, and mask_distance was set to 3; give one of the two"):
+        open_bench("photograph", variant, camera=own, mask_distance=3)
+    with pytest.warns(UserWarning) as notes:
+        assert open_bench("photograph", variant, camera=own, mask_distance=1.5).geometry.mask_distance == 1.5
+    assert "mask:" not in str(notes[0].message)
+    own.write_text(f'base = "small"\n{mask}')
+    with pytest.warns(UserWarning):
+        assert open_bench("photograph", variant, camera=own, mask_distance=3).geometry.mask_distance == 3
+
+
+def test_the_small_camera_does_the_main_job() -> None:
+    """Capture, calibration and image of the photograph at the usual accuracy. Four seconds of one processor.
+
+    The factors are flagged, because 64 rows of pixels do not resolve 128 projector rows without patterns. (Planted: a
+    region of 64 pixels without binning, whose image has 31 dB.)"""
+    with pytest.warns(UserWarning, match="64 x 64 pixels of 23.44"):
+        bench = open_bench("photograph", camera="small")
+    shots, factors = bench.capture("dots:7"), bench.calibrate()
+    assert shots.dn.shape == (49, 64, 64) and len(factors.warnings) == 1 and "rank 64 of 128" in factors.warnings[0]
+    image = mitsim.reconstruct(shots, factors)
+    assert mitsim.psnr(image.image, shots.truth) > 38 and "every direction of the image is measured" in str(image.status)
 
 
 @pytest.mark.slow
