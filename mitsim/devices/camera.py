@@ -383,7 +383,8 @@ class MaskProfile(Configuration):
     def _fields_of_its_kind(self) -> MaskProfile:
         flaws = set() if self.kind == "psf" else _FLAWS
         own = _OWN[self.kind].split()
-        foreign = self.model_fields_set - {"kind", "feature_mm", "distance_mm", *(name.rstrip("!") for name in own), *flaws}
+        common = {"kind", "feature_mm", "distance_mm", *flaws}
+        foreign = self.model_fields_set - common - {name.rstrip("!") for name in own}
         if foreign:
             raise ValueError(f"{min(foreign)} has no effect on a mask of kind {self.kind}; remove it")
         missing = [name[:-1] for name in own if name.endswith("!") and getattr(self, name[:-1]) is None]

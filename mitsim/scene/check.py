@@ -522,7 +522,8 @@ def _check_camera(checked: CheckedScene, node: mi.parser.SceneNode) -> None:
             got = values.get(name, "its default")
             shown = repr(got) if isinstance(got, str) else f"{got:g}"
             ranged = problem["type"].startswith(("greater", "less"))
-            rule = f"give a number {limits_of(CameraGeometry.model_fields[name])}" if ranged else problem["msg"].removeprefix("Value error, ")
+            rule = problem["msg"].removeprefix("Value error, ")
+            rule = f"give a number {limits_of(CameraGeometry.model_fields[name])}" if ranged else rule
             found.append(checked.outline.tag(node, name).refusal(name, shown, rule))
         if len(found) == 1:
             raise found[0] from None

@@ -130,7 +130,8 @@ def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors
     manifest = factors.manifest.model_copy(update={"camera": {"name": "other"}})
     with pytest.raises(MitsimError, match=r"name is other, but .* has bench; calibrate the run's camera"):
         reconstruct(shots, Factors(factors.left, factors.right, manifest, factors.status))
-    masked = manifest.model_copy(update={"camera": {**shots.manifest.camera, "geometry": {"mask": "plate", "mask_plate": "MURA of 101"}}})
+    geometry = {"mask": "plate", "mask_plate": "MURA of 101"}
+    masked = manifest.model_copy(update={"camera": {**shots.manifest.camera, "geometry": geometry}})
     with pytest.raises(MitsimError, match=r"mask is MURA of 101, but"):
         reconstruct(shots, Factors(factors.left, factors.right, masked, factors.status))
 
