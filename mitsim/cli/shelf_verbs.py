@@ -164,8 +164,8 @@ picture beside the file."""
 _MASK = {"feature_mm": 0.06, "distance_mm": 2.0}
 """Side of a feature, and distance, of the shipped scenes' mask."""
 _HEAD = (
-    "# Use it in a command as --{field} {path}, in a session file as {field} = \"{path}\" in the table [scene],",
-    "# in Python as mitsim.open_bench(\"photograph\", {field}=\"{path}\"). The scene states the place of the {field}.",
+    '# Use it in a command as --{field} {path}, in a session file as {field} = "{path}" in the table [scene],',
+    '# in Python as mitsim.open_bench("photograph", {field}="{path}"). The scene states the place of the {field}.',
 )
 """Places that take a device, for the file of a ``field`` at a ``path``."""
 _MORE = "# Further fields are in docs/device_files.md.", ""
