@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -35,12 +36,15 @@ from mitsim.light.cost_model import (
 from mitsim.light.passes import PASSES
 from mitsim.light.plan import Plan, PlanRow
 from mitsim.light.settings import (
+    CELLS_OF_COARSE,
     COUNTED,
     GROUPS,
     REPLICATES,
     SURE,
+    WIDE,
     Approximation,
     ErrorCovariance,
+    Estimate,
     Forming,
     PilotResult,
     SampleCost,
@@ -217,6 +221,8 @@ def test_the_total_is_predicted_from_all_that_is_left(accuracy: float) -> None:
     expected = math.sqrt(squares)
     assert chosen.systematic.value == pytest.approx(expected, rel=1e-6)
     assert chosen.total.value == pytest.approx(math.hypot(expected, chosen.noise))
+    seconds = stages(PILOT_RESULT, settings)
+    assert chosen.work == pytest.approx(seconds["transport"] + seconds["optics"])
 
 
 def test_opposite_errors_are_left_together() -> None:
@@ -261,6 +267,42 @@ def test_what_the_pilot_cannot_tell_is_on() -> None:
     worth, part = value_of_refining(1e-3, Candidates(unsure, {}))
     assert worth > 0 and part == Approximation("interreflection") and "interreflection" not in hopeful
     assert value_of_refining(1e-3, Candidates(sure, {}))[0] == 0
+
+
+@pytest.mark.parametrize("name", ["anchors", "layers", "followed_anchors"])
+def test_a_switch_leaves_one_number_or_the_cheapest_of_several(name: str) -> None:
+    """Switched on where one would do, two are taken; switched off where the accuracy needs several, there is one.
+    (Planted: two counted as one; the depth of a single layer stated.)"""
+    several = cheapest(0.1, PILOT_RESULT, {name: True}).settings
+    assert dict(zip(COUNTED, counts_of(several), strict=True))[name] == 2
+    one = cheapest(1e-3, PILOT_RESULT, {name: False}).settings
+    assert dict(zip(COUNTED, counts_of(one), strict=True))[name] == 1 and (name != "layers" or one.layers == ())
+
+
+class Doubtful(PilotResult):
+    """Pilot result whose doubt of each approximation is stated."""
+
+    doubt: Mapping[Approximation, float]
+
+    def error(self, part: Approximation) -> Estimate:
+        return Estimate(0.0, self.doubt.get(part, 0.0))
+
+
+def test_the_largest_doubt_is_looked_at_as_it_counts_in_the_choice() -> None:
+    """An error of one wide cell of even light counts by the area of the cells that are chosen, so that its doubt must
+    be c^2 times as large as another one. Without any doubt the cells are measured again. (Planted: the weight without
+    its square.)"""
+    settings = cheapest(1e-3, PILOT_RESULT, parse_switches("+interreflection")).settings
+    settings = replace(settings, subdivision=4 * CELLS_OF_COARSE, coarse_layers=True)
+    chosen = replace(predicted_candidate(1e-3, PILOT_RESULT, settings, {}), fits=True, work=2.0)
+    points, even = Approximation("anchors", settings.anchors), Approximation("indirect cells", 1)
+    result = Doubtful(**{each.name: getattr(PILOT_RESULT, each.name) for each in fields(PILOT_RESULT)})
+    found: Any = SimpleNamespace(pilot_result=result, switches={}, choice=lambda *_: chosen)
+    for doubt, worst in ((0.7, points), (1.4, even)):
+        object.__setattr__(result, "doubt", {points: 1e-4, even: doubt * 1e-4 * settings.coarse_cells**2})
+        assert settings.coarse_cells == 4 and value_of_refining(1e-3, found) == (0.0, worst)
+    found.pilot_result = replace(result, changes=changes({}))
+    assert value_of_refining(1e-3, found) == (0.0, Approximation("cells", 1))
 
 
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-4, 1e-6])
@@ -362,9 +404,11 @@ def bench(
     mirrors: bool = False,
     curve: object = None,
     coloured: tuple[Tag, ...] = (),
+    lens: float = 0.0,
 ) -> Bench:
     geometry = SimpleNamespace(
-        wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, diffracts=True, mask_plate=None,
+        wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, mask_distance=2.0, diffracts=True,
+        mask_plate=None,
         build_mask=lambda: SimpleNamespace(opening_mm=2 * feature),
         tilt_shift_mm=0.0, tilt_left_out=lambda waves: False, mask_tilt=(0.0, 0.0),
     )  # fmt: skip
@@ -377,13 +421,16 @@ def bench(
             unfit=Unfit(),
             shapes=(),
             mirrors=mirrors,
-            in_view=False,
+            in_view=bool(lens),
+            camera=SimpleNamespace(world_transform=lambda: None),
+            scene=None,
             small_lamps=(),
             coloured=coloured,
             parting=(),
         ),
         lines=None,
-        projector=SimpleNamespace(glare=glare, aperture_radius_mm=0.0),
+        projector=SimpleNamespace(glare=glare, aperture_radius_mm=lens),
+        projector_optics=SimpleNamespace(canvas_map=SimpleNamespace(origin=(30.0, 40.0, 0.0))),
         sensor=SimpleNamespace(quantum_efficiency_curve=curve),
     )
 
@@ -413,6 +460,22 @@ def test_devices_are_flagged_where_their_model_ends(
         assert part in warning
 
 
+def test_a_lens_and_lamps_in_view_are_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lens of 3 mm radius 50 mm from the camera blurs the shadow of a mask 2 mm from the sensor by 2 x 3 x 2 / 50 mm.
+    It is no flaw of frames without lens or mirrors. A lamp is named by its type. (Planted: never flagged; no type.)"""
+    monkeypatch.setattr("mitsim.planner.planner.EFFECTS", {})
+    monkeypatch.setattr(planner, "turn_and_origin", lambda transform: (None, (0.0, 0.0, 0.0)))
+    (warning,) = SceneFacts.of(bench(lens=3.0)).warnings
+    assert "as a pinhole" in warning and "by 0.24 mm" in warning
+    for off in ("aperture", "mirrors"):
+        assert not SceneFacts.of(bench(lens=3.0), {off: False}).warnings
+    monkeypatch.setattr(planner, "shines_in", lambda *_: True)
+    lamp = Tag(Path("room.xml"), 7, "emitter", {"type": "point"})
+    loaded: Any = SimpleNamespace(small_lamps=((None, lamp),), scene=None, camera=None, shapes=())
+    (said,) = planner.unseen_lamps(loaded, 100.0, "the reference")
+    assert said.startswith("room.xml:7: light: got 'point' in <emitter")
+
+
 @pytest.mark.parametrize(
     ("lacking", "words"),
     [
@@ -430,6 +493,59 @@ def test_light_that_frames_lack_is_told_with_its_part_and_a_remedy(lacking: dict
     assert "largest: layers (4)" in other, "light that is all resolved is no reason"
 
 
+FOLLOWS = replace(PILOT_RESULT, changes=changes(SIZES | {Approximation("ambient"): 5e-2}))
+"""Light of lamps that no budget can do without, seen from two points a side of the sensor."""
+
+
+def seconds(settings: Settings, pilot_result: PilotResult = FOLLOWS) -> float:
+    return sum(stages(pilot_result, settings).values())
+
+
+def test_a_miss_and_a_window_off_square_are_told() -> None:
+    """Followed light in cells of 2 x 2 pixels leaves a quarter of what cells of 4 x 4 leave, and is the largest part.
+    (Planted: cells of two pixels not named; the row's name and state exchanged.)"""
+    chosen = cheapest(1e-3, with_wide := replace(FOLLOWS, changes=changes(SIZES | {WIDE: 0.4})), {})
+    wide = replace(chosen.settings, followed_anchors=2, subdivision=2 * CELLS_OF_COARSE, coarse_layers=True)
+    missed = predicted_candidate(1e-3, with_wide, wide, {})
+    (warning, *_) = planner._shortfall(1e-3, with_wide, missed)
+    assert wide.followed_width == 2 and "cells of their light (2 pixels), 1.0e-01" in warning
+    found = rows(plan(facts=SceneFacts(notes={}, keystone=2.5)))["keystone"]
+    assert found.state == "exact" and "2.5 of its pixels off a square" in found.reason
+
+
+def test_seconds_of_a_look_are_its_stages_and_sharp_lobes_get_paths() -> None:
+    """Where light over sharp lobes is found, light over two of them needs 2^21 paths from the camera at least.
+    (Planted: the smaller number of paths; no seconds.)"""
+    sharp = SharpPixels((3, 4), 7, (-0.1, 0.1, -0.1, 0.1), 1e-5)
+    light = {"sharp": SampleCost(1e-4, 4, 98, 0.75)}
+    for result in (FOLLOWS, with_sample_costs(replace(FOLLOWS, sharp=sharp), **light)):
+        runs: Any = SimpleNamespace(pilot_result=result)
+        look = planner._Look(runs, Candidates(result, {}), ())
+        taken, plain = look.taken(1e-2).settings, cheapest(1e-2, result, {}).settings
+        least = 2**21 / (GROUPS * 20_000) if result.sharp else 0.0
+        assert taken.samples["from_camera"] == max(plain.samples["from_camera"], least)
+        assert plain.samples["from_camera"] < 2**21 / (GROUPS * 20_000)
+        assert look.seconds(1e-2) == pytest.approx(seconds(taken, result))
+
+
+def test_the_pace_is_measured_in_the_longest_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Planted: the pass whose name is last.)"""
+    monkeypatch.setattr(planner.cost_model, "tracing_seconds", lambda *_: {"direct": 5.0, "indirect": 2.0})
+    traced: list[str] = []
+    passes = {
+        name: SimpleNamespace(
+            tracer=SimpleNamespace(paths_per_sample=64),
+            whole=100,
+            trace=lambda *_, name=name: traced.append(name),
+        )
+        for name in ("indirect", "direct", "from_camera")
+    }
+    simulation: Any = SimpleNamespace(
+        settings=plan().settings, passes=passes, accumulator=lambda *_: None, accumulate=lambda *_: None
+    )
+    assert planner._measure_pace(FOLLOWS, simulation, np.zeros(4, int), 0) > 0 and traced == ["direct"] * 2
+
+
 def test_effects_that_are_off_take_no_seconds_and_switches_are_named() -> None:
     found = rows(plan(effects="+ambient,-interreflection"))
     for name, row in found.items():
@@ -438,14 +554,6 @@ def test_effects_that_are_off_take_no_seconds_and_switches_are_named() -> None:
     assert found["diffraction"].reason == "Fresnel number 3.2" and found["diffraction"].seconds > 0
     assert found["blur"].reason == "" and found["blur"].state == "exact"
     assert found["blur"].seconds == 0
-
-
-FOLLOWS = replace(PILOT_RESULT, changes=changes(SIZES | {Approximation("ambient"): 5e-2}))
-"""Light of lamps that no budget can do without, seen from two points a side of the sensor."""
-
-
-def seconds(settings: Settings, pilot_result: PilotResult = FOLLOWS) -> float:
-    return sum(stages(pilot_result, settings).values())
 
 
 @pytest.mark.parametrize("pace", [1.0, 3.0])
