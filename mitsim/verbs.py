@@ -239,21 +239,21 @@ class StudyOptions(Opening, Seeded):
     VERB = "study"
 
     patterns: Annotated[str, validated_by(family_of)] | None = option(None, pattern_names(), metavar="PATTERNS")
-    recipe: FilePath | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
-    data: FilePath | None = option(None, "of twin and learned: folder of real captures", metavar="DIR")
-    experiment: str | None = option(None, "of merge: the module, where the study is one of your own", metavar="MODULE")
-    quick: bool = option(False, "a few points, for a first look", panel=QUALITY)
-    shard: str = option(WHOLE, "measure part I of N of the points", metavar="I/N", panel=LIMITS)
-    jobs: int | None = option(None, "processes; one a processor if not given", panel=LIMITS)
+    recipe: FilePath | None = option(None, "only with calibration and drift: session recipe", metavar="FILE.toml")
+    data: FilePath | None = option(None, "only with twin and learned: folder of real captures", metavar="DIR")
+    experiment: str | None = option(None, "only with merge of your own study: its module", metavar="MODULE")
+    quick: bool = option(False, "measure a few points only, for a first look", panel=QUALITY)
+    shard: str = option(WHOLE, "measure part I of N of the points, on one of N machines", metavar="I/N", panel=LIMITS)
+    jobs: int | None = option(None, "number of processes", show_default="one for each processor", panel=LIMITS)
     scheduler: str | None = option(None, "Dask scheduler that measures the points", metavar="ADDRESS", panel=LIMITS)
     over: Mapping[str, Any] | Sequence[str] = option(
         (),
-        "what sweep varies: a parameter of the scene, patterns, exposure, seed, accuracy, method; FIRST:LAST:COUNT or "
-        "VALUE,VALUE; may be given again",
+        "only with sweep and drift: quantity to vary, with values FIRST:LAST:COUNT or VALUE,VALUE; in sweep a "
+        "parameter of the scene, patterns, exposure, seed, accuracy or method; repeatable",
         metavar="NAME=VALUES",
         kind=list[str],
     )
-    measure: str = option("psnr", "what sweep shows: psnr, ssim, misfit, ...", metavar="NAME,...")
+    measure: str = option("psnr", "only with sweep: results to plot, such as psnr, ssim, misfit", metavar="NAME,...")
 
     @property
     def varied(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
@@ -423,7 +423,7 @@ class RunOptions(Options):
 
     VERB = "run"
 
-    resume: bool = option(False, "go on where an interrupted one of the same options stopped", panel=OUTPUT)
+    resume: bool = option(False, "continue interrupted work that was begun with the same options", panel=OUTPUT)
     pictures: bool = option(True, "make pictures and pages", kind=False)
 
 
@@ -469,7 +469,7 @@ def characterise(
     if camera is None:
         if not isinstance(frames, (str, Path)):
             raise MitsimError(
-                "characterise: got no camera; give one to simulate, or as frames the folder of a real one"
+                "characterise: got no camera; name one to simulate, or give as frames the folder of a real one"
             )
         asked.refuse(asked.given, "on frames of a real camera")
         listed = load_flats(Path(frames))
@@ -480,7 +480,7 @@ def characterise(
         return characterise_frames(listed, output, job)
     sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     if isinstance(frames, (str, Path)):
-        raise ArgumentError("frames", f"{frames}: give the frames of each stack, or no camera, to measure a real one")
+        raise ArgumentError("frames", f"{frames}: a folder is for a real camera; leave out either it or {camera}")
     if sensor.quantum_efficiency_curve is None:
         asked.refuse(["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
     done = Procedure(frames=frames, **options)

@@ -51,7 +51,7 @@ CALLS = {
 """Python calls that do what a verb does, by its name."""
 ONE_CALL = ["demo", "run", "study", "import", "patterns", "characterise", "sense", "doctor", "export"]
 """Verbs that are one call with the same options."""
-ALIKE = {"scenes": "scene", "family": "patterns", "repeated": "folder", "stacks": "frames"}
+ALIKE = {"scenes": "scene", "family": "patterns", "repeated": "folder", "stacks": "frames", "stack_size": "frames"}
 """Arguments that the command line calls otherwise."""
 OF_THE_COMMAND_LINE = {"as_json", "quiet", "verbose", "help", "variant", "no_pictures", "max_seconds", "max_memory"}
 """Options that say how it is reported and bounded, as a job does; the variant is a bench's."""
@@ -258,7 +258,7 @@ def test_options_of_every_model_are_checked() -> None:
 def test_help_of_a_call_states_its_options() -> None:
     """(Planted: a docstring without them.)"""
     text = pydoc.render_doc(ms.Bench.calibrate, renderer=pydoc.plaintext)
-    assert "accuracy: float = 0.001" in text and "relative rms error of the expected frames" in text
+    assert "accuracy: float = 0.001" in text and "allowed relative rms error of the expected frames" in text
     assert "**" not in str(inspect.signature(ms.Bench.calibrate))
 
 

@@ -158,7 +158,7 @@ def family_of(patterns: str) -> str:
 class Seeded(Options):
     """The root of all random streams."""
 
-    seed: Annotated[int, validated_by(check_root)] = option(0, "root of every random stream", panel=QUALITY)
+    seed: Annotated[int, validated_by(check_root)] = option(0, "seed of all random numbers", panel=QUALITY)
 
 
 class Family(Options):
@@ -174,7 +174,7 @@ Effects = Annotated[Any, validated_by(_switches)]
 class Accurate(Options):
     """How well light is known."""
 
-    accuracy: Accuracy = option(1e-3, "relative rms error of the expected frames", panel=QUALITY)
+    accuracy: Accuracy = option(1e-3, "allowed relative rms error of the expected frames", panel=QUALITY)
 
 
 class Sampled(Seeded, Accurate):
@@ -184,8 +184,8 @@ class Sampled(Seeded, Accurate):
 class Timed(Seeded):
     """How long the camera is exposed."""
 
-    exposure: float | Literal["auto"] = option("auto", "seconds a frame, or auto", metavar="auto|SECONDS")
-    exposure_fraction: float = option(0.8, "brightest pixel, as a part of full well", metavar="PART")
+    exposure: float | Literal["auto"] = option("auto", "seconds for each frame, or auto", metavar="auto|SECONDS")
+    exposure_fraction: float = option(0.8, "automatic exposure: brightest pixel as part of full well", metavar="PART")
 
     def model_post_init(self, context: object) -> None:
         """Refuse an exposure that no camera has."""
@@ -207,9 +207,9 @@ class Planned(Sampled, Family):
     """Which light is simulated, and how finely."""
 
     seconds: float | None = option(
-        None, "the accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
+        None, "use the best accuracy reachable within S seconds", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
     )
-    effects: Effects = option({}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY)
+    effects: Effects = option({}, "force effects on or off, such as +glare", metavar="+NAME,-NAME", panel=QUALITY)
 
     def model_post_init(self, context: object) -> None:
         """Refuse an accuracy beside the seconds that decide it."""
@@ -222,7 +222,7 @@ class Request(Timed, Planned):
     """Which shots of a scene are wanted, and how well."""
 
     ambient_frame: Literal["auto", "yes", "no"] = option(
-        "auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no"
+        "auto", "record a frame with the projector off; auto: if lamps are on", metavar="auto|yes|no"
     )
 
     @classmethod
@@ -244,7 +244,7 @@ class SessionRequest(Sampled):
     """Which factors a calibration is to find, and how well."""
 
     recipe: SessionRecipe | None = option(
-        None, "session recipe, TOML", metavar="FILE.toml", kind=Path, read=load_recipe
+        None, "session recipe, a file of `mitsim new recipe`", metavar="FILE.toml", kind=Path, read=load_recipe
     )
 
 
@@ -277,7 +277,7 @@ class Variant(Options):
 
     variant: Annotated[str, validated_by(check_variant)] = option(
         DEFAULT_VARIANT,
-        "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ad_mono and so on",
+        "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; on an NVIDIA GPU cuda_ad_mono and so on",
         metavar="VARIANT",
         panel=configuration.LIMITS,
     )
@@ -289,10 +289,10 @@ class LitScene(Variant):
     PANEL = configuration.DEVICES
 
     projector: FilePath | None = option(
-        None, "projector: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, PROJECTOR)
+        None, "projector: shipped name, or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, PROJECTOR)
     )
     parameters: Mapping[str, Any] = option(
-        {}, "set a <default> of the scene", "-D", metavar="NAME=VALUE", kind=list[str], read=_parameters
+        {}, "set a parameter of the scene; repeatable", "-D", metavar="NAME=VALUE", kind=list[str], read=_parameters
     )
     allow_outside_files: bool = option(False, "let the scene read files outside its own folder")
 
@@ -301,7 +301,7 @@ class Opening(LitScene):
     """What opens a bench, beside its scene."""
 
     camera: FilePath | None = option(
-        None, "camera electronics: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, CAMERA)
+        None, "camera: shipped name, or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, CAMERA)
     )
 
     def traced_in(self, colour: str) -> str:
@@ -366,13 +366,18 @@ def _known_colour(colour: str) -> None:
         raise ArgumentError("colour", f"{colour!r}: use {NO}, {LINES}, {BANDS}:K or {MOSAIC}")
 
 
+_COLOUR_WORDS = (
+    "no: grey; lines: one folder for each spectral line of the projector; bands:K: one folder for each of K bands of "
+    "these lines; mosaic: all lines at once, with a camera that has colour filters"
+)
+
+
 class Coloured(Options):
     """Which of the projector's light is told apart."""
 
     colour: Annotated[str, validated_by(_known_colour)] = option(
         NO,
-        "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K bands of "
-        "its lines; mosaic: all lines at once, by a camera under colour filters; no: light that is not told apart",
+        _COLOUR_WORDS,
         metavar="no|lines|bands:K|mosaic",
     )
 
@@ -382,7 +387,7 @@ class AnyColour(Coloured):
 
     colour: Annotated[str, validated_by(lambda colour: None if colour == AUTO else _known_colour(colour))] = option(
         NO,
-        "as of calibrate: no, lines, bands:K or mosaic; auto: no if that keeps half of the accuracy, else lines",
+        f"{_COLOUR_WORDS}; auto: no if grey light costs at most half of the accuracy, otherwise lines",
         metavar="no|lines|bands:K|mosaic|auto",
     )
 
@@ -398,7 +403,7 @@ _LARGEST_PNG = 2**16 - 1
 class Lit(Options):
     """Light of one wavelength."""
 
-    wavelength: float = option(550.0, "of the light [nm]", ge=1, le=1e6)
+    wavelength: float = option(550.0, "wavelength of the light [nm]", ge=1, le=1e6)
 
 
 class Irradiance(Timed, Lit):
@@ -406,12 +411,12 @@ class Irradiance(Timed, Lit):
 
     VERB = "sense"
 
-    exposure: float | Literal["auto"] = option("auto", "seconds, or auto", metavar="auto|SECONDS")
+    exposure: float | Literal["auto"] = option("auto", "exposure time [s], or auto", metavar="auto|SECONDS")
     f_number: float | None = option(
-        None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N", ge=0.5, le=1e100
+        None, "f-number of a lens; the image is then radiance [W/m^2/sr] in front of it", metavar="N", ge=0.5, le=1e100
     )
-    scale: float = option(1.0, "what its numbers are multiplied by", gt=0, lt=math.inf)
-    channel: str | None = option(None, "of several channels, the one to take", metavar="NAME")
+    scale: float = option(1.0, "factor that multiplies the image", gt=0, lt=math.inf)
+    channel: str | None = option(None, "channel to use, if the image has several", metavar="NAME")
 
 
 class Procedure(Lit, Seeded):
@@ -422,10 +427,10 @@ class Procedure(Lit, Seeded):
 
     VERB = "characterise"
 
-    pixels: int = option(256, "rows and columns of the frames", ge=32, le=4096)
-    steps: int = option(50, "steps of light, from dark to beyond saturation", ge=20, le=1000)
+    pixels: int = option(256, "rows and columns of the simulated frames", ge=32, le=4096)
+    steps: int = option(50, "number of light levels, from dark to beyond saturation", ge=20, le=1000)
     frames: int = option(100, "frames of each stack", kind=False, ge=2, le=10_000)
-    wavelength: float = option(550.0, "of the light, for a curve of quantum efficiency [nm]", ge=1, le=1e6)
+    wavelength: float = option(550.0, "wavelength [nm], for cameras with a quantum efficiency curve", ge=1, le=1e6)
 
     @property
     def stated(self) -> dict[str, float]:

@@ -90,19 +90,19 @@ def _fail(*lines: str) -> None:
 
 
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="print the version and exit")] = False) -> None:
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
     if version:
         print(mitsim.__version__)
         raise typer.Exit
 
 
 _VERBS = {
-    "The main job": (demo, run_, view, plan, capture, calibrate, reconstruct),
-    "The bench": (render, sense, characterise),
-    "Studies": (study,),
-    "Learning": (pairs, train),
-    "Exchange": (export, import_, patterns, transport),
-    "Files and machine": (report, list_, new, doctor),
+    "Main steps": (demo, run_, view, plan, capture, calibrate, reconstruct),
+    "Light and sensor alone": (render, sense, characterise),
+    "Experiments": (study,),
+    "Neural networks": (pairs, train),
+    "Real devices and other programs": (export, import_, patterns, transport),
+    "Files and installation": (report, list_, new, doctor),
 }
 """Verbs by heading, in the order of the help."""
 for _panel, _verbs in _VERBS.items():

@@ -19,6 +19,7 @@ from mitsim.bench.request import (
     Planned,
     Request,
     Task,
+    Variant,
     by_line,
     check_samples,
     check_view,
@@ -62,14 +63,14 @@ class Showing(DemoRequest, Common):
     FIRST = "scene output patterns"
 
     scene: str = scene_named("photograph")
-    output: Path = to_make(Path("demo-output"), "folder of the demo", "DIR")
+    output: Path = to_make(Path("demo-output"), "folder to make; an earlier demo there is replaced", "DIR")
 
 
 @command
 def demo(asked: Showing) -> int:
-    """Do the whole job, from plan to images of five pattern families.
+    """Plan, capture, calibrate and reconstruct one scene.
 
-    Plans, captures, calibrates and reconstructs one scene, and writes report.html.
+    The page report.html compares the images of five pattern families.
 
     $ mitsim demo
     $ mitsim demo cookie_bag -o bag --accuracy 0.01
@@ -77,26 +78,26 @@ def demo(asked: Showing) -> int:
     return asked.call(mitsim.demo, asked.scene, asked.output, **asked.given_of(DemoRequest))
 
 
-class Running(RunOptions, LimitedPictured):
+class Running(RunOptions, Variant, LimitedPictured):
     """Options of `mitsim run`."""
 
     PANEL = WHAT
 
-    session: str | None = argument(None, "session file, or the name of a shipped one", "SESSION.toml")
+    session: str | None = argument(None, "session file, or the name of a shipped session", "SESSION.toml")
     output: Path | None = to_make(
-        None, "folder to make; of --from, session file", "FOLDER", show_default="session-output"
+        None, "folder to make; with --from, session file to write", "FOLDER", show_default="session-output"
     )
     values: list[str] | None = option(
-        None, "set a field of the file; may be given again", "-D", metavar="TABLE.FIELD=VALUE", kind=list[str]
+        None, "set a field of the session file; repeatable", "-D", metavar="TABLE.FIELD=VALUE", kind=list[str]
     )
-    repeated: Path | None = option(None, "write the session file that repeats a folder", "--from", metavar="FOLDER")
+    repeated: Path | None = option(None, "write the session file that repeats this folder", "--from", metavar="FOLDER")
 
 
 @command
 def run_(asked: Running) -> int:
-    """Take all steps of a session file, or write that of a folder.
+    """Run all steps of a session file, or write one from a folder.
 
-    Each step, such as capture, has its folder in that of the session.
+    Each step, such as capture, has its own folder inside the output folder.
 
     $ mitsim run demo -o out
     $ mitsim run fig1.toml -o out -D capture.patterns=dots:5
@@ -136,14 +137,14 @@ def run_(asked: Running) -> int:
 class Viewing(OfScene, Opening, Common):
     """Options of `mitsim view`."""
 
-    output: Path = to_make(Path("view.png"), "picture, or page to turn the bench on", "FILE.png|FILE.html")
+    output: Path = to_make(Path("view.png"), "picture or interactive page; replaces an old file", "FILE.png|FILE.html")
 
 
 @command
 def view(asked: Viewing) -> int:
-    """Draw the bench to scale, before any light is simulated.
+    """Draw the bench to scale, without simulating light.
 
-    With its distances, the depths that light is seen at, and what the camera sees. A page (.html) can be turned.
+    The drawing shows distances, the depths of the lit surfaces, and the camera's view.
 
     $ mitsim view cookie_bag
     $ mitsim view photograph -D sheet_z=420 -o bench.html
@@ -167,22 +168,22 @@ class Studying(StudyOptions, Common):
 
     name: str = argument(
         ...,
-        "of the study, all or merge; of one of your own its file, or its module with a dot",
+        "study from `mitsim list studies`; all: those of the paper; merge: join the parts of --shard; or path or "
+        "dotted module name of your own study",
         "NAME",
         complete=lambda: (*EXPERIMENTS, ALL, "merge"),
     )
     scenes: list[str] | None = scene_named(
-        None, "scene XML, or the name of a shipped scene; of merge, folders", kind=list[str]
+        None, "scene XML file, or the name of a shipped scene; for merge, the folders of the parts", kind=list[str]
     )
-    output: Path = to_make(Path("study-output"), "folder of the study", "DIR")
+    output: Path = to_make(Path("study-output"), "folder to make; an earlier run there is continued or replaced", "DIR")
 
 
 @command
 def study(asked: Studying) -> int:
-    """Run an experiment with figures, CSV and JSON.
+    """Run an experiment, and write its figures, CSV and JSON.
 
-    `mitsim list studies` says what each is for; all is those of the paper on one page, and merge joins the parts of
-    --shard. One of your own is a file, or a module named with a dot.
+    `mitsim list studies` shows the question of each study.
 
     $ mitsim study patterns -o patterns --quick
     $ mitsim study sweep photograph --over sheet_z=395,400 --over accuracy=0.03
@@ -191,9 +192,13 @@ def study(asked: Studying) -> int:
     return asked.call(mitsim.study, asked.name, asked.scenes, asked.output, **asked.given_of(StudyOptions))
 
 
+class Checking(Variant, Common):
+    """Options of `mitsim doctor`."""
+
+
 @command
-def doctor(asked: Common) -> int:
-    """Check what works on this machine, and what mends the rest.
+def doctor(asked: Checking) -> int:
+    """Check the installation, and name a command for each fault.
 
     $ mitsim doctor
     $ mitsim doctor --variant llvm_ad_spectral
@@ -217,15 +222,15 @@ class Planning(OfScene, Planned, AnyColour, Opening, Overwritten, Common):
 
     FIRST = "scene patterns colour"
 
-    output: Path | None = to_make(None, "file to make, for capture --plan", "FILE.json")
-    everything: bool = option(False, "all effects, and all of their reasons", "--all", panel=OUTPUT)
+    output: Path | None = to_make(None, "file to write the plan to, for `mitsim capture --plan`", "FILE.json")
+    everything: bool = option(False, "list all effects, with their reasons", "--all", panel=OUTPUT)
 
 
 @command
 def plan(asked: Planning) -> int:
-    """Plan what a capture will simulate, and at what cost.
+    """Choose which effects to simulate, and predict the cost.
 
-    A short look at the scene finds the cheapest combination of effects whose error is within the accuracy.
+    Short simulations of the scene find the cheapest combination of effects whose error is within the accuracy.
 
     $ mitsim plan cookie_bag
     $ mitsim plan photograph --accuracy 1e-4 -D sheet_z=380
@@ -300,16 +305,16 @@ class Capturing(OfScene, Request, KnownPlan, Resumed, AnyColour, Opening, Limite
     """Options of `mitsim capture`."""
 
     FIRST = "scene patterns exposure exposure_fraction ambient_frame"
-    CHANGES = shown(patterns={"default": None, "help": f"{pattern_names()}; needed without --plan"})
+    CHANGES = shown(patterns={"default": None, "help": f"{pattern_names()}; required unless --plan is given"})
 
     output: Path = to_make(..., "run folder to make", "RUN")
 
 
 @command
 def capture(asked: Capturing) -> int:
-    """Simulate the frames of a scene: one for each pattern.
+    """Simulate the frames of a scene, one for each pattern.
 
-    Renders, exposes and writes them; in colour, one for each pattern and line of the projector.
+    With --colour lines there is one frame for each pattern and spectral line of the projector.
 
     $ mitsim capture photograph -o run --patterns dots:7
     $ mitsim capture cookie_bag -o bag --patterns hadamard:8 --seconds 20
@@ -429,10 +434,10 @@ class Rendering(OfScene, Planned, LitScene, LimitedPictured):
 
     FIRST, HIDDEN = "scene output estimator spp", "patterns seconds"
 
-    output: Path = to_make(..., "frame to write", "FRAME.exr")
-    estimator: str = option("reference", "reference or factored", metavar="NAME", panel=QUALITY)
+    output: Path = to_make(..., "frame to write; an existing file is replaced", "FRAME.exr")
+    estimator: str = option("reference", "reference (path by path), or factored", metavar="NAME", panel=QUALITY)
     spp: int | None = option(
-        None, "samples a pixel of the reference", show_default="the scene's sample_count, or 64", panel=QUALITY
+        None, "samples for each pixel of the reference", show_default="the scene's sample_count, or 64", panel=QUALITY
     )
 
 
@@ -442,9 +447,10 @@ _OF_OTHER = {"reference": ("accuracy", "effects"), "factored": ("spp",)}
 
 @command
 def render(asked: Rendering) -> int:
-    """Render the irradiance on the sensor in the scene's own light.
+    """Render the irradiance on the sensor with the scene's lights.
 
-    The reference follows path by path through the mask, without diffraction; factored is what other verbs use.
+    The reference estimator traces single paths through the mask, without diffraction. The factored estimator is the one
+    that all other verbs use.
 
     $ mitsim render photograph -o frame.exr --spp 16
     $ mitsim render photograph -o fast.exr --estimator factored
@@ -485,9 +491,9 @@ class Tracing(OfScene, Planned, KnownPlan, Overwritten, Opening, Limited):
 
 @command
 def transport(asked: Tracing) -> int:
-    """Trace a scene's light, for frames of any pattern.
+    """Trace a scene's light once, to compute frames of any pattern.
 
-    Written by projector pixel, for programs without mitsim.
+    The HDF5 file holds the light of each projector pixel, for programs that do not use mitsim.
 
     $ mitsim transport photograph -o light.h5
     """
@@ -518,16 +524,16 @@ class Pairing(OfScene, PairOptions, Request, Resumed, Opening, Limited):
     """Options of `mitsim pairs`."""
 
     FIRST, HIDDEN = "scene output count", "seconds"
-    CHANGES = shown(exposure={"help": "seconds a frame, or auto: each pair for itself"})
+    CHANGES = shown(exposure={"help": "exposure time of each frame [s]; auto: chosen for each pair"})
 
-    output: Path = to_make(..., "folder to make", "DIR")
+    output: Path = to_make(..., "folder to make for the pairs", "DIR")
 
 
 @command
 def pairs(asked: Pairing) -> int:
-    """Make pairs to learn from: pictures and their frames.
+    """Make training pairs: pictures, and the frames recorded of them.
 
-    Pictures stand on a scene's print, and the camera takes frames of them.
+    Each picture replaces the print of the scene, and the camera records its frames.
 
     $ mitsim pairs photograph --count 500 -o pairs
     $ mitsim pairs photograph --count 500 --pictures photos -o mine

@@ -1,6 +1,6 @@
 """`mitsim calibrate`: factors of a simulated session, of real frames, of known pictures, or of a fitted model.
 
-`--plan` makes none of these, and plans a session.
+`--plan-session` only plans a session.
 """
 
 from __future__ import annotations
@@ -33,21 +33,23 @@ class Calibrating(SessionRequest, Coloured, Opening, LimitedPictured, Resumed):
 
     PANEL = WHAT
 
-    scene: str | None = scene_named(None, "scene XML, or the name of a shipped scene; none with --frames")
-    output: Path | None = to_make(None, "calibration folder to make; of --plan, recipe to write", "CAL")
-    frames: Path | None = option(None, "folder with the frames of a real session, instead of a scene", metavar="DIR")
-    known: Path | None = option(None, "list of captures of known pictures, instead of a scene", metavar="LIST.toml")
+    scene: str | None = scene_named(None, "scene XML file, or the name of a shipped scene")
+    output: Path | None = to_make(None, "folder to make; with --plan-session, recipe file to write", "CAL")
+    frames: Path | None = option(None, "folder with the frames of a real session", metavar="DIR")
+    known: Path | None = option(None, "list of real captures of known pictures", metavar="LIST.toml")
     write_frames: Path | None = option(
-        None, "folder to write the simulated frames to, for --frames", metavar="DIR", panel=OUTPUT
+        None, "also write the simulated frames to this folder, which --frames reads", metavar="DIR", panel=OUTPUT
     )
-    planning: bool = option(False, "find the light that an image of --psnr needs; calibrates nothing", "--plan")
-    psnr: float | None = option(None, "wanted of --plan's image [dB]", metavar="DB")
-    patterns: str | None = option(None, "of --plan's capture", show_default="dots:7", metavar="PATTERNS")
+    planning: bool = option(False, "only find the light that an image of --psnr needs", "--plan-session", "--plan")
+    psnr: float | None = option(None, "with --plan-session: PSNR that the image is to reach [dB]", metavar="DB")
+    patterns: str | None = option(None, "patterns for --plan-session", show_default="dots:7", metavar="PATTERNS")
     model: str | None = option(
-        None, "model the factors, its devices fitted to a few frames; of --frames with SCENE", metavar="geometric|wave"
+        None, "compute the factors from a device model that is fitted to a few frames", metavar="geometric|wave"
     )
-    frames_used: int | None = option(None, "frames that --model is fitted to, at most", show_default="16", metavar="K")
-    fit: str | None = option(None, "what --model fits", show_default="mask, magnification, gain", metavar="NAME,...")
+    frames_used: int | None = option(None, "with --model: most frames to fit", show_default="16", metavar="K")
+    fit: str | None = option(
+        None, "with --model: quantities to fit", show_default="mask, magnification, gain", metavar="NAME,..."
+    )
 
 
 def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memory: float) -> int:
@@ -154,7 +156,7 @@ def _known(asked: Calibrating, folder: Path) -> int:
 def _plan(asked: Calibrating, _: Path) -> int:
     """Plan a session that an image of a given PSNR needs."""
     if asked.scene is None or asked.psnr is None:
-        raise MitsimError("--plan: give a scene, and the PSNR that the image is to have, such as --psnr 35")
+        raise MitsimError("--plan-session: give a scene, and the PSNR that the image is to reach, such as --psnr 35")
     recipe, output = asked.recipe or load_recipe(), asked.output
     recipe.of_one_depth()
     if output is not None:
@@ -219,10 +221,17 @@ _MODES = {
 
 @command
 def calibrate(asked: Calibrating) -> int:
-    """Estimate the camera's two factors, simulated or real.
+    """Estimate the calibration factors of a simulated or real camera.
 
-    Renders a Hadamard session on a white board, or reads the frames of a real one (--frames) or of known pictures
-    (--known).
+    There are five ways:
+
+    simulate a session     mitsim calibrate SCENE -o CAL
+    real session's frames  mitsim calibrate --frames DIR -o CAL --camera NAME
+    known pictures         mitsim calibrate --known LIST.toml -o CAL
+    fit a device model     mitsim calibrate SCENE --model wave -o CAL
+    only plan a session    mitsim calibrate SCENE --plan-session --psnr 35
+
+    A session records stripe patterns on a white board. --model fits simulated frames, or those of --frames.
 
     $ mitsim calibrate photograph -o cal
     $ mitsim calibrate photograph -o few --model wave

@@ -8,6 +8,7 @@ Help is plain text, because rich's panels take half as long again to show.
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 import json
@@ -41,8 +42,8 @@ from typing import (
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from mitsim.bench.request import Variant
-from mitsim.core.configuration import LIMITS, OUTPUT, PANELS, WHAT, Options, option, shipped_files
+from mitsim.core.configuration import LIMITS, OUTPUT, PANELS, WHAT, Options, option, shipped_files, validated_by
+from mitsim.core.environment import DEFAULT_VARIANT, check_variant
 from mitsim.core.errors import ArgumentError, MitsimError, printable
 from mitsim.core.files import PICTURES, plain
 from mitsim.core.job import Job, Limits, progress, running_seconds
@@ -68,7 +69,7 @@ def to_make(default: Any, help: str, metavar: str, **shown: Any) -> Any:
 
 
 def scene_named(
-    default: Any, help: str = "scene XML, or the name of a shipped scene", metavar: str = "[SCENE]", **shown: Any
+    default: Any, help: str = "scene XML file, or the name of a shipped scene", metavar: str = "[SCENE]", **shown: Any
 ) -> Any:
     """Declare the scene of a verb."""
     return argument(default, help, metavar, complete=lambda: shipped_files("scenes", "scene.xml"), **shown)
@@ -79,8 +80,8 @@ def shown(**changes: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
     return changes
 
 
-class Common(Variant):
-    """Options of every verb.
+class Common(Options):
+    """Options of every verb; the variant is listed only by verbs that open a scene.
 
     Of the fields of a verb's model those of ``FIRST`` are listed first, those of ``HIDDEN`` belong to Python alone, and
     ``CHANGES`` shows some otherwise than the models that it derives from; names have spaces between.
@@ -91,9 +92,12 @@ class Common(Variant):
     HIDDEN: ClassVar[str] = ""
     CHANGES: ClassVar[Mapping[str, Mapping[str, Any]]] = shown()
 
-    as_json: bool = option(False, "one JSON object on stdout, nothing else there", "--json")
-    quiet: bool = option(False, "no progress")
-    verbose: bool = option(False, "say all that was found, not the result alone")
+    variant: Annotated[str, validated_by(check_variant)] = option(
+        DEFAULT_VARIANT, "Mitsuba variant", metavar="VARIANT", panel=LIMITS, hidden=True
+    )
+    as_json: bool = option(False, "print one JSON object on standard output, and nothing else", "--json")
+    quiet: bool = option(False, "show no progress")
+    verbose: bool = option(False, "print details as well as the result")
 
     def given_of(self, model: type[Options]) -> dict[str, Any]:
         """Return the options that were given of those that a ``model`` has."""
@@ -130,9 +134,9 @@ class Limited(Common):
 
     PANEL = LIMITS
 
-    max_seconds: float = option(Limits().seconds, "refuse work that would take longer", metavar="S")
+    max_seconds: float = option(Limits().seconds, "refuse work that is predicted to take longer [s]", metavar="S")
     max_memory: float | None = option(
-        None, "refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
+        None, "refuse work that is predicted to need more [GiB]; default: 0.9 of the free memory", metavar="GIB"
     )
 
     @property
@@ -145,7 +149,7 @@ class Pictured(Common):
 
     PANEL = OUTPUT
 
-    no_pictures: bool = option(False, "leave out pictures and the page report.html")
+    no_pictures: bool = option(False, "make neither pictures nor the page report.html")
 
     def finish_folder(
         self, folder: Path, payload: Mapping[str, Any], lines: Sequence[str], warnings: Sequence[str]
@@ -212,7 +216,7 @@ class Resumed(Options):
 
     PANEL = OUTPUT
 
-    resume: bool = option(False, "go on where an interrupted one of the same options stopped")
+    resume: bool = option(False, "continue interrupted work that was begun with the same options")
 
 
 class Overwritten(Options):
@@ -220,13 +224,13 @@ class Overwritten(Options):
 
     PANEL = OUTPUT
 
-    overwrite: bool = option(False, "replace the file")
+    overwrite: bool = option(False, "replace an existing file")
 
 
 class KnownPlan(Options):
     """A plan that is made already."""
 
-    plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", metavar="FILE")
+    plan: Path | None = option(None, "use a plan from a file of `mitsim plan -o` instead of a new one", metavar="FILE")
 
     def read(self, changes: Mapping[str, Any], same_patterns: bool) -> Plan | None:
         """Return the plan in the file, None without one.
@@ -290,7 +294,7 @@ def command(function: Callable[[M], int]) -> Callable[..., int]:
             "help": extra.get("help", field.description),
             "metavar": extra.get("metavar") or next((_METAVARS[one] for one in _kinds(kind) if one in _METAVARS), None),
             "autocompletion": complete and _completion(complete),
-            **{key: extra[key] for key in ("show_default", "min", "max") if key in extra},
+            **{key: extra[key] for key in ("show_default", "min", "max", "hidden") if key in extra},
         }
         if extra.get("positional"):
             mark = typer.Argument(**shown)
@@ -368,8 +372,9 @@ def message_of(error: MitsimError) -> str:
 
 
 def help_of(text: str | None) -> str:
-    """Return a docstring as click takes it, with its commands, the lines after a $, as they are in the end."""
+    """Return a docstring for click: the lines of tables are kept, and commands, the lines after a $, are examples."""
     prose, *examples = re.split(r"\n\s*\$ ", inspect.cleandoc(text or ""))
+    prose = re.sub(r"\n\n(?=.*\S {2})", "\n\n\b\n", prose)
     return "\n\n".join([prose.rstrip(), "\b\n" + "\n".join(["Examples:", *(f"  {line}" for line in examples)])])
 
 
@@ -387,9 +392,11 @@ class Verb(TyperCommand):
     """Verb whose page has a heading for each panel of its options."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments and options, by panels."""
+        """Write arguments and options, by panels; of several long spellings only the first, because others are old."""
         rows = []
-        for each in self.get_params(ctx):
+        for each in map(copy.copy, self.get_params(ctx)):
+            old = [name for name in each.opts if name.startswith("--")][1:]
+            each.opts = [name for name in each.opts if name not in old]
             panel: str = getattr(each, "rich_help_panel", None) or OUTPUT
             rows.append((panel if each.param_type_name == "option" else "Arguments", each.get_help_record(ctx)))
         _write_panels(formatter, (row for row in rows if row[1]))

@@ -51,16 +51,16 @@ class Reconstructing(ImageRequest, Pictured):
     FIRST = "run output calibration"
     CHANGES = shown(method={"read": lambda name: load_network(name) if name.endswith(MODEL) else name})
 
-    run: Path = argument(..., "folder of `mitsim capture`", "RUN")
-    output: Path | None = to_make(None, "folder for the image; RUN/reconstruction if not given", "DIR")
-    calibration: Path | None = option(None, "folder of `mitsim calibrate`; needed without --psf", metavar="CAL")
+    run: Path = argument(..., "run folder, of `mitsim capture` or `mitsim import`", "RUN")
+    output: Path | None = to_make(None, "folder to make for the image", "DIR", show_default="RUN/reconstruction")
+    calibration: Path | None = option(None, "calibration folder; required unless --psf is given", metavar="CAL")
     psf: Path | None = option(
-        None, "in place of a calibration: picture of the light of a scene point, of the frames' pixels", metavar="FILE"
+        None, "measured point spread function, a picture, in place of a calibration", metavar="FILE"
     )
-    reduce: int = option(1, "with --psf: pixels a side, of frames and picture, that become one", min=1, metavar="K")
+    reduce: int = option(1, "only with --psf: average blocks of K x K pixels", min=1, metavar="K")
     chart: str | None = option(
         None,
-        "of a coloured run: the chart in the image that colours are fitted on, a scene's name or a file",
+        "only for coloured runs: colour chart in the image, to which the colours are fitted; name of a scene, or file",
         metavar="NAME|FILE.json",
     )
     overwrite: bool = option(False, "replace an earlier image in the folder", panel=OUTPUT)
@@ -94,9 +94,9 @@ class Reconstructing(ImageRequest, Pictured):
 
 @command
 def reconstruct(asked: Reconstructing) -> int:
-    """Recover the image from frames and a calibration alone.
+    """Compute the image from frames and a calibration.
 
-    Of coloured folders, an image of each line, and one in colour.
+    A coloured run gives one image for each spectral line, and one in colour.
 
     $ mitsim reconstruct run --calibration cal
     $ mitsim reconstruct run --calibration cal --method markov -o smooth
@@ -179,14 +179,14 @@ def _colours_lines(found: ColourImage, common: Pictured) -> list[str]:
 class Reporting(Common):
     """Options of `mitsim report`."""
 
-    folder: Path = argument(..., "of capture, calibrate, reconstruct or import", "FOLDER")
+    folder: Path = argument(..., "folder that capture, calibrate, reconstruct or import made", "FOLDER")
 
 
 @command
 def report(asked: Reporting) -> int:
     """Make the pictures and the page of a folder again.
 
-    From its files alone: a run, a calibration or an image.
+    Only the files of the folder are read. It holds a run, a calibration or an image.
 
     $ mitsim report run
     $ mitsim report cal
@@ -197,37 +197,42 @@ def report(asked: Reporting) -> int:
 
 # ---- A camera's sensor alone -----------------------------------------------------------------------------------------
 
-_CAMERA: dict[str, Any] = {"help": "camera electronics: name or TOML file", "complete": lambda: shipped_names(CAMERA)}
+_CAMERA: dict[str, Any] = {"help": "camera: shipped name, or TOML file", "complete": lambda: shipped_names(CAMERA)}
 
 
 class Characterising(Procedure, Common):
     """Options of `mitsim characterise`."""
 
     camera: str | None = argument(None, metavar="[CAMERA]", show_default=False, **_CAMERA)
-    output: Path = to_make(Path("characterise-output"), "folder of page, plots, JSON and camera.toml", "DIR")
-    stacks: str = option(
-        "100",
-        "frames of each stack; without CAMERA: folder of a real camera's frames under even light and in the dark",
+    output: Path = to_make(Path("characterise-output"), "folder to make; an earlier result is replaced", "DIR")
+    stacks: str | None = option(
+        None,
+        "folder of a real camera's frames, in uniform light and in the dark",
         "--frames",
-        metavar="N|DIR",
+        metavar="DIR",
         panel=WHAT,
     )
+    stack_size: int | None = option(None, "frames in each simulated stack; default: 100", panel=WHAT, ge=2, le=10_000)
 
 
 @command
 def characterise(asked: Characterising) -> int:
-    """Measure a camera after EMVA 1288, simulated or real.
+    """Measure a simulated or real camera by the standard EMVA 1288.
 
-    On simulated frames, beside what the camera's file sets, or on real frames (--frames DIR).
+    With CAMERA, frames are simulated, and the results are compared with the camera's file. With --frames DIR, a real
+    camera is measured.
 
     $ mitsim characterise imx249 -o figures
     $ mitsim characterise --frames flats -o mine
     """
-    if asked.camera is None and "stacks" not in asked.given:
-        raise MitsimError("characterise: got no CAMERA; give one to simulate, or --frames DIR of a real one")
-    simulated = asked.stacks.isdecimal() and asked.camera is not None
-    stacks = int(asked.stacks) if simulated else Path(asked.stacks)
-    return asked.call(mitsim.characterise, asked.camera, asked.output, stacks, **asked.given_of(Procedure))
+    frames: int | Path = asked.stack_size or 100
+    if asked.stacks is not None:
+        asked.refuse(["stack_size"], "with --frames")
+        simulated = asked.stacks.isdecimal() and asked.camera is not None  # --frames N, the earlier --stack-size N
+        frames = int(asked.stacks) if simulated else Path(asked.stacks)
+    elif asked.camera is None:
+        raise MitsimError("characterise: got no CAMERA; name one to simulate, or give --frames DIR of a real one")
+    return asked.call(mitsim.characterise, asked.camera, asked.output, frames, **asked.given_of(Procedure))
 
 
 class Sensing(Irradiance, Pictured):
@@ -235,16 +240,16 @@ class Sensing(Irradiance, Pictured):
 
     FIRST = "image output camera exposure exposure_fraction"
 
-    image: Path = argument(..., "irradiance [W/m^2], OpenEXR or NPY", "IMAGE.exr")
-    output: Path = to_make(..., "frame to write", "FRAME.png|exr|npy")
+    image: Path = argument(..., "image of irradiance [W/m^2], OpenEXR or NPY", "IMAGE.exr")
+    output: Path = to_make(..., "frame to write; an existing file is replaced", "FRAME.png|exr|npy")
     camera: str = option(..., metavar="NAME|FILE", panel=DEVICES, **_CAMERA)
 
 
 @command
 def sense(asked: Sensing) -> int:
-    """Put an image of any renderer behind a camera's sensor.
+    """Convert irradiance to the noisy digital numbers of a camera.
 
-    Out come digital numbers, with the sensor's noise.
+    The image may come from any renderer.
 
     $ mitsim sense frame.exr --camera imx249 -o frame.png
     $ mitsim sense photo.exr --camera imx249 --f-number 2.8 -o photo.png
@@ -271,12 +276,12 @@ def sense(asked: Sensing) -> int:
 class Exporting(Exported, Common):
     """Options of `mitsim export`."""
 
-    run: Path = argument(..., "folder of `mitsim capture`", "RUN")
+    run: Path = argument(..., "run folder, of `mitsim capture` or `mitsim import`", "RUN")
 
 
 @command
 def export(asked: Exporting) -> int:
-    """Write a run in a format that other programs read.
+    """Convert a run to a file that other programs read.
 
     $ mitsim export run --format hdf5 -o run.h5
     $ mitsim export run --format mat -o run.mat --calibration cal
@@ -292,22 +297,28 @@ def export(asked: Exporting) -> int:
 class Importing(FrameFacts, Pictured):
     """Options of `mitsim import`."""
 
+    FIRST = "source list"
     CHANGES = shown(seed={"default": 0}, byte_order={"default": "little"})
 
-    source: Path = argument(..., "file of `mitsim export`, or frames: a folder of them, or one file", "SOURCE")
-    output: Path | None = to_make(None, "run folder to make", "RUN")
+    source: Path = argument(..., "folder of frames, or one frame; or an exported file", "SOURCE")
+    output: Path | None = to_make(None, "folder to make for the run", "RUN")
     calibration_output: Path | None = option(
-        None, "folder to make of the file's calibration", metavar="CAL", panel=OUTPUT
+        None, "folder to make for the calibration that the file holds", metavar="CAL", panel="An exported file"
     )
 
 
 @command
 def import_(asked: Importing) -> int:
-    """Make a run of a real camera's frames, or of an exported file.
+    """Make a run from a real camera's frames or an exported file.
+
+    A real camera's frames are a folder of pictures, or one picture. Options, or a list, state what the pictures do not:
+    camera, exposure, patterns, and the calibration that they are to be reconstructed with.
+
+    An exported file ends in .h5, .hdf5 or .mat, and states all of this itself.
 
     $ mitsim import frames -o run --list mine.toml --calibration cal
     $ mitsim import hand.png -o hand --list diffusercam
-    $ mitsim import run.h5 -o copy
+    $ mitsim import run.h5 -o copy --calibration-output cal
     """
     source, output, calibration, facts = (
         asked.source,
@@ -347,15 +358,15 @@ class Drawing(Pictures, Common):
 
     CHANGES = shown(seed={"default": 0}, signed_capture={"default": "pair"})
 
-    family: str = argument(..., f"{pattern_names()}; or stripes, those of a calibration", "PATTERNS|stripes")
-    output: Path = to_make(..., "folder to make", "DIR")
+    family: str = argument(..., f"{pattern_names()}; or stripes, for a calibration session", "PATTERNS|stripes")
+    output: Path = to_make(..., "folder to make for the pictures", "DIR")
 
 
 @command
 def patterns(asked: Drawing) -> int:
-    """Draw patterns as pictures for a real projector.
+    """Draw patterns as pictures to show with a real projector.
 
-    Or a calibration's stripes, with the list that its frames need.
+    With stripes, the pictures of a calibration session are drawn, with the session file that their frames need.
 
     $ mitsim patterns dots:7 -o pictures
     $ mitsim patterns stripes -o stripes --camera imx249 --exposure 0.02
@@ -388,18 +399,18 @@ class Learning(Schedule, Resumed, Limited):
     FIRST = "method pairs output calibration"
 
     method: str = argument(..., f"{', '.join(METHODS[:-1])} or {METHODS[-1]}", "METHOD", complete=lambda: METHODS)
-    pairs: Path = argument(..., "folder of `mitsim pairs`", "PAIRS")
-    output: Path = to_make(..., "file to make", "MODEL.pt")
+    pairs: Path = argument(..., "folder with training pairs, of `mitsim pairs`", "PAIRS")
+    output: Path = to_make(..., "file to write the trained network to", "MODEL.pt")
     calibration: Path | None = option(
-        None, "folder of `mitsim calibrate`", metavar="CAL", show_default="PAIRS/calibration", panel=WHAT
+        None, "calibration folder of the pairs' camera", metavar="CAL", show_default="PAIRS/calibration", panel=WHAT
     )
 
 
 @command
 def train(asked: Learning) -> int:
-    """Train a network that makes images of frames.
+    """Train a network that computes images from frames.
 
-    For reconstruct --method MODEL.pt. Needs torch: mitsim[learn].
+    The network is then used with `mitsim reconstruct --method MODEL.pt`. This needs torch: pip install 'mitsim[learn]'.
 
     $ mitsim train unrolled pairs -o model.pt
     $ mitsim reconstruct run --calibration cal --method model.pt

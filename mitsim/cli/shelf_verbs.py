@@ -23,6 +23,7 @@ from mitsim.core.configuration import (
     DEFAULT_CAMERA,
     PROJECTOR,
     RECIPE,
+    WHAT,
     load_model,
     opening_words,
     option,
@@ -122,7 +123,7 @@ def _clause(text: str) -> str:
 class Listing(Common):
     """Options of `mitsim list`."""
 
-    kind: str | None = argument(None, f"{', '.join(KINDS)}; all if not given", "[KIND]", complete=lambda: KINDS)
+    kind: str | None = argument(None, f"{', '.join(KINDS)}; by default all", "[KIND]", complete=lambda: KINDS)
 
 
 @command
@@ -236,14 +237,14 @@ class Beginning(Common):
     """Options of `mitsim new`."""
 
     kind: str = argument(..., ", ".join(_STARTERS), "KIND", complete=lambda: _STARTERS)
-    name: str = argument(..., "letters, digits, - and _, a letter first", "NAME")
-    output: Path | None = to_make(None, "file to make, of a scene a folder; named after NAME if not given", "PATH")
+    name: str = argument(..., "name of letters, digits, - and _ that begins with a letter", "NAME")
+    output: Path | None = to_make(None, "file to write, or folder for a scene; by default named after NAME", "PATH")
     like: str | None = option(
         None,
-        "shipped one that it begins as; of a mask also its kind",
+        "shipped file to copy from; for a mask also a kind of masks (`mitsim list masks`)",
         metavar="NAME",
         show_default="imx249, mp_cl1, photograph, session, demo",
-        panel="What",
+        panel=WHAT,
         complete=lambda: dict.fromkeys(
             name for kind, each in _STARTERS.items() if each.like for name in [*_shipped(kind), *_MASKS]
         ),
@@ -252,10 +253,10 @@ class Beginning(Common):
 
 @command
 def new(asked: Beginning) -> int:
-    """Write a file to begin with: commented, whole, valid as it is.
+    """Write a commented, valid file to start from.
 
-    A mask is a camera file with a table [mask], a recipe is of
-    calibrate --recipe, a list is of import --list.
+    A mask is a camera file with a table [mask]. A recipe is for `mitsim calibrate --recipe`, a list for
+    `mitsim import --list`.
 
     $ mitsim new camera mine
     $ mitsim new scene bench --like cookie_bag

@@ -220,7 +220,7 @@ def toml_value(value: object) -> str:
 
 # -------- Options of verbs
 
-WHAT, QUALITY, DEVICES = "What", "Quality", "Scene and devices"
+WHAT, QUALITY, DEVICES = "Main options", "Quality", "Scene and devices"
 OUTPUT, LIMITS = "Output", "Machine and limits"
 PANELS = WHAT, QUALITY, DEVICES, OUTPUT, LIMITS
 

@@ -234,44 +234,43 @@ class FrameFacts(Options):
     """Facts about a real camera's frames that replace a list's; None if unknown."""
 
     VERB = "import_frames"
+    PANEL = "A real camera's frames"
 
     list: FilePath | None = said(
-        "of frames: list of what is known of them; options take its place", metavar="NAME|FILE", complete=LISTS
+        "list of facts about the capture; other options replace its entries", metavar="NAME|FILE", complete=LISTS
     )
-    patterns: str | None = said("of frames: the family, or patterns.json of export", metavar="NAME|FILE")
-    camera: FilePath | None = said(
-        "of frames: camera electronics, name or TOML file", metavar="NAME|FILE", complete=CAMERAS
-    )
-    exposure: float | None = said("of frames: seconds of each", metavar="SECONDS")
-    calibration: FilePath | None = said("of frames: calibration of the same camera, for its identity", metavar="CAL")
-    projector_pixels: int | None = said("of frames: projector pixels a side, without a calibration", metavar="N")
-    black_level: float | None = said("of frames: number of a pixel without charge; the camera's if not given")
+    patterns: str | None = said("patterns that were shown: a family, or a file patterns.json", metavar="NAME|FILE")
+    camera: FilePath | None = said("camera: shipped name, or TOML file", metavar="NAME|FILE", complete=CAMERAS)
+    exposure: float | None = said("exposure time of each frame [s]", metavar="SECONDS")
+    calibration: FilePath | None = said("calibration folder of the same camera", metavar="CAL")
+    projector_pixels: int | None = said("rows and columns of the patterns, if no calibration is given", metavar="N")
+    black_level: float | None = said("digital number of a dark pixel; by default that of the camera")
     ambient_frame: FilePath | None = said("frame, or folder of frames, with the projector off", metavar="PATH")
-    ambient_shots: int | None = said("shots that a single such frame is the mean of", metavar="N")
+    ambient_shots: int | None = said("number of shots that were averaged to one ambient frame", metavar="N")
     closing_frame: Literal["first", "uniform"] | None = said(
-        "the last frame checks lamp, camera and scene: the first one again, or a uniform one", metavar="first|uniform"
+        "the last frame is a check: it repeats the first pattern, or shows uniform light", metavar="first|uniform"
     )
-    closing_exposure: float | None = said("seconds of that frame; those of all if not given", metavar="SECONDS")
+    closing_exposure: float | None = said("exposure time of the closing frame [s], if it differs", metavar="SECONDS")
     order: str | None = said(
-        "in which the shots were taken, such as column-major; row-major if not given", metavar="NAME"
+        "order in which the patterns were shown, such as column-major; by default row-major", metavar="NAME"
     )
-    shape: str | tuple[int, int] | None = said("of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS")
-    bits: int | None = said("of a number in such a file", metavar="N")
-    byte_order: str | None = said("of such a file: little or big", metavar="ORDER")
-    channel: str | None = said("plane of a colour sensor, as FlatCam names it, or all of them", metavar="r|gb|gr|b|all")
+    shape: str | tuple[int, int] | None = said("frame size, for .raw, .bin and .dat files", metavar="ROWSxCOLUMNS")
+    bits: int | None = said("bits of each number in .raw, .bin and .dat files", metavar="N")
+    byte_order: str | None = said("byte order of .raw, .bin and .dat files: little or big", metavar="ORDER")
+    channel: str | None = said("colour plane to use behind colour filters, or all planes", metavar="r|gb|gr|b|all")
     mosaic: str | None = said(
-        "of frames: filters of the first 2 x 2 pixels; the camera's if not given", metavar="RGGB|BGGR|GRBG|GBRG"
+        "colour filters of the first 2 x 2 pixels; by default those of the camera", metavar="RGGB|BGGR|GRBG|GBRG"
     )
-    divide: int | None = said("of frames: factor that all numbers have; found if not given", metavar="N")
+    divide: int | None = said("factor that all numbers contain, such as 16; by default it is detected", metavar="N")
     dark_frame: FilePath | None = said("frame, or folder of frames, without any light", metavar="PATH")
-    flat_frame: FilePath | None = said("the same of even light without a mask", metavar="PATH")
-    flat_dark_frame: FilePath | None = said("the same without light, of the flat's exposure", metavar="PATH")
-    orientation: int | None = said("of frames: turned as Exif numbers it", min=1, max=8, metavar="1..8")
-    turn: float | None = said("of frames: turned counter-clockwise after that", metavar="DEGREES")
+    flat_frame: FilePath | None = said("frame, or folder of frames, of uniform light without the mask", metavar="PATH")
+    flat_dark_frame: FilePath | None = said("dark frame, or folder, with the flat frame's exposure", metavar="PATH")
+    orientation: int | None = said("orientation of the frames, as numbered by Exif", min=1, max=8, metavar="1..8")
+    turn: float | None = said("angle to rotate the frames counter-clockwise, after --orientation", metavar="DEGREES")
     crop: str | tuple[int, ...] | None = said(
-        "of frames: part that is taken in the end", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
+        "part of the frames to keep, after all rotations", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
     )
-    seed: int | None = said("root of every random stream", panel=configuration.QUALITY)
+    seed: int | None = said("only for random patterns: seed of their random numbers")
 
     def of(self, source: Path) -> RealCapture:
         bare = any(

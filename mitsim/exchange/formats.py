@@ -54,13 +54,13 @@ class Exported(Options):
     VERB = "export"
 
     format: str = option(..., "hdf5, mat, torch or png", metavar="FORMAT")
-    output: FilePath = option(..., "file to make; of png, a folder", "-o", "--output", metavar="FILE", kind=Path)
+    output: FilePath = option(..., "file to make; with png, a folder", "-o", "--output", metavar="FILE", kind=Path)
     calibration: FilePath | None = option(
-        None, "folder of `mitsim calibrate` that goes with it", metavar="CAL", panel=configuration.WHAT, kind=Path
+        None, "calibration folder to include in the file", metavar="CAL", panel=configuration.WHAT, kind=Path
     )
-    overwrite: bool = option(False, "replace the file")
+    overwrite: bool = option(False, "replace an existing file")
     projector: str | None = option(
-        None, "projector: name or TOML file", panel=configuration.DEVICES, metavar="NAME|FILE", complete=PROJECTORS
+        None, "only with png: projector to use", panel=configuration.DEVICES, metavar="NAME|FILE", complete=PROJECTORS
     )
 
 
@@ -265,21 +265,21 @@ class Pictures(Options):
     VERB = "pattern_pictures"
 
     projector: FilePath = option(
-        "mp_cl1", "projector of known rows and columns: name or TOML file", metavar="NAME|FILE", complete=PROJECTORS
+        "mp_cl1", "projector with stated rows and columns: name or TOML file", metavar="NAME|FILE", complete=PROJECTORS
     )
-    projector_pixels: int = option(128, "projector pixels a side of the patterns", min=1, max=MOST_PIXELS, metavar="N")
-    seed: int | None = said("root of every random stream", panel=configuration.QUALITY)
+    projector_pixels: int = option(128, "rows and columns of the patterns", min=1, max=MOST_PIXELS, metavar="N")
+    seed: int | None = said("only for random patterns: seed of their random numbers", panel=configuration.QUALITY)
     closing_frame: Literal["first", "uniform"] | None = said(
-        "last picture, to check lamp, camera and scene: the first one again, or a uniform one",
+        "add a last picture, the first one again or a uniform one, to check that lamp, camera and scene did not change",
         metavar="first|uniform",
         panel=configuration.WHAT,
     )
     camera: FilePath | None = said(
-        "of stripes: camera electronics, name or TOML file", metavar="NAME|FILE", complete=CAMERAS
+        "only with stripes: camera that records them, name or TOML file", metavar="NAME|FILE", complete=CAMERAS
     )
-    exposure: float | None = said("of stripes: seconds of each frame", metavar="SECONDS")
+    exposure: float | None = said("only with stripes: exposure time of each frame [s]", metavar="SECONDS")
     signed_capture: Literal["pair", "uniform"] | None = said(
-        "of stripes: both halves of each, or one and a uniform frame", metavar="pair|uniform"
+        "only with stripes: show both signs of each pattern, or one sign and a uniform frame", metavar="pair|uniform"
     )
 
 

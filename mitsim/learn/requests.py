@@ -63,13 +63,13 @@ class Variation(Configuration):
 class PairOptions(Options):
     VERB = "make_pairs"
 
-    count: int = option(..., "pairs to make", metavar="N", ge=1, le=MOST_PAIRS)
+    count: int = option(..., "number of pairs to make", metavar="N", ge=1, le=MOST_PAIRS)
     pictures: FilePath | None = option(
-        None, "folder of pictures; drawn by code if not given", metavar="FOLDER", kind=Path
+        None, "folder of pictures; by default mitsim draws its own", metavar="FOLDER", kind=Path
     )
     vary: Variation | None = option(
         None,
-        "how benches vary from one group of pairs to the next",
+        "file that varies exposure and mask from one group of pairs to the next",
         metavar="FILE.toml",
         kind=Path,
         read=lambda path: load_model(path, Variation),
@@ -119,10 +119,10 @@ class Schedule(Seeded):
     PANEL = QUALITY
 
     # A million steps are ten days of the smallest network on two processors.
-    steps: int = option(4000, "of the optimiser", ge=1, le=1_000_000)
-    batch: int = option(4, "pairs a step", ge=1, le=256)
-    rate: float = option(2e-3, "largest learning rate of the cycle", gt=0, le=1)
-    device: str = option("cpu", "that torch works on", metavar="NAME", panel=LIMITS)
+    steps: int = option(4000, "number of steps of the optimiser", ge=1, le=1_000_000)
+    batch: int = option(4, "number of pairs in each step", ge=1, le=256)
+    rate: float = option(2e-3, "largest learning rate of the schedule", gt=0, le=1)
+    device: str = option("cpu", "device that torch uses, by its name in torch", metavar="NAME", panel=LIMITS)
 
 
 class Training(Schedule):

@@ -29,8 +29,8 @@ def holds_image(folder: Path) -> bool:
 
 
 def method_names() -> str:
-    notes = {MARKOV: f"{MARKOV} (neighbouring pixels alike: for noisy frames)"}
-    return ", ".join([*(notes.get(name, name) for name in METHODS), f"or MODEL{MODEL}, a file of mitsim train"])
+    notes = {MARKOV: f"{MARKOV} (assumes similar neighbouring pixels, for noisy frames)"}
+    return ", ".join([*(notes.get(name, name) for name in METHODS), f"or MODEL{MODEL}, a network of `mitsim train`"])
 
 
 def _two(name: str, rule: str, low: float | None = None, high: float | None = None) -> Callable[[str], Any]:
@@ -64,31 +64,32 @@ class ImageRequest(Options):
     PANEL = QUALITY
     VERB = "reconstruct"
 
-    lam: float | Literal["auto"] = option("auto", "regularisation, or auto", "--lambda", metavar="auto|VALUE")
+    lam: float | Literal["auto"] = option("auto", "regularisation strength, or auto", "--lambda", metavar="auto|VALUE")
     """lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation."""
     method: Any = option(TIKHONOV, method_names(), metavar="NAME|MODEL.pt", kind=str, complete=lambda: METHODS)
     """One of :data:`METHODS`, or a :class:`mitsim.reconstruct.solvers.Solver`, such as a trained network."""
     focus: float | Literal["auto", "map"] | None = option(
         None,
-        "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
+        "depth of the scene [mm]; auto: estimate it; map: estimate one for each pixel, from dots patterns; by default "
+        "the depth of the calibration",
         metavar="auto|MM|map",
     )
     depth_range: Two = option(
         None,
-        "nearest and farthest depth that auto and map look for; 1/z within a quarter of the calibrated one's if not "
-        "given",
+        "with focus auto or map: nearest and farthest depth to try [mm]; by default 1/z differs by at most a quarter "
+        "from that of the calibration",
         metavar="A:B",
         read=_two("depth_range", "give the nearest and the farthest depth [mm], such as 350:450"),
     )
     bounds: Two = option(
         None,
-        "least and largest number of the image, by nonnegative and tv; either may be left out; if not given, 0: of "
-        "nonnegative and with --psf",
+        "with nonnegative or tv: least and largest value of the image, such as 0:1 or 0:; by default 0: with "
+        "nonnegative and with a point spread function",
         metavar="LOW:HIGH",
         read=_two("bounds", "give the least and the largest number, such as 0:1 or 0:", -math.inf, math.inf),
     )
     iterations: int | None = option(
-        None, "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given", min=1, metavar="N"
+        None, "with nonnegative or tv: most iterations; by default 5000, or 300 with --psf", min=1, metavar="N"
     )
 
     def model_post_init(self, context: object) -> None:

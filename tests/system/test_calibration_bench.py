@@ -52,11 +52,11 @@ def test_modelled_factors_are_a_calibration_that_says_so(call: Call, lab: Any, t
 
 
 REFUSED = [
-    (("--plan",), ("the PSNR that the image is to have",)),
+    (("--plan",), ("the PSNR that the image is to reach",)),
     (("--plan", "--psnr", 0), ("--psnr 0", "1 to 100 dB")),
     (("--plan", "--psnr", 20, "--patterns", "stars"), ("stars",)),
     (("--plan", "--psnr", 20, "--resume"), ("--resume",)),
-    (("--plan", "--psnr", 20, "--model", "wave"), ("--model", "by --plan")),
+    (("--plan", "--psnr", 20, "--model", "wave"), ("--model", "by --plan-session")),
     (("--psnr", 20), ("--psnr", "by scene")),
     (("--model", "ray"), ("--model 'ray'", "geometric or wave")),
     (("--model", "wave", "--frames-used", 1), ("--frames-used 1", "2 or more")),

@@ -88,12 +88,15 @@ def test_a_page_has_its_options_below_headings_and_examples_that_run(verb: str) 
     command, lines = PROGRAM.commands[verb], page(verb).splitlines()
     assert max(map(len, lines)) <= 80
     headings = [line[:-1] for line in lines if line.endswith(":") and not line.startswith(" ")]
-    assert headings == [each for each in ("Arguments", WHAT, QUALITY, DEVICES, OUTPUT, LIMITS) if each in headings]
+    order = "Arguments", "A real camera's frames", "An exported file", WHAT, QUALITY, DEVICES, OUTPUT, LIMITS
+    assert headings == [each for each in order if each in headings]
     for each in command.params:
         names = [re.split(r"\s{2,}", line[2:])[0].replace(",", "").split() for line in lines if line.startswith("  -")]
-        named = [words for words in names if {*each.opts} <= {*words}]
-        assert each.param_type_name == "argument" or len(named) == 1, each.opts
-    examples = [line.strip() for line in lines if line.startswith("    mitsim ")]
+        old = [name for name in each.opts if name.startswith("--")][1:]
+        named = [words for words in names if {*each.opts} - {*old} <= {*words}]
+        assert each.param_type_name == "argument" or len(named) == (not each.hidden), each.opts
+        assert not any({*old} & {*words} for words in names), each.opts
+    examples = [line[line.index("mitsim ") :] for line in lines if re.match(r"    mitsim |  .* {2}mitsim ", line)]
     assert any(line.startswith(f"mitsim {verb}") for line in examples)
     for line in examples:
         _, name, *words = shlex.split(line)
@@ -154,6 +157,33 @@ def shown(function: Any) -> dict[str, Any]:
     return {each.name: each.annotation.__metadata__[0] for each in parameters if each.name != "context"}
 
 
+def test_variants_are_listed_by_verbs_that_open_a_scene() -> None:
+    """All other verbs accept the option. (Planted: shown by all.)"""
+    marks = {
+        name: next(each for each in verb.params if each.name == "variant") for name, verb in PROGRAM.commands.items()
+    }
+    opening = ["demo", "run", "view", "plan", "capture", "calibrate", "render", "study", "pairs", "transport", "doctor"]
+    assert {name for name, mark in marks.items() if not mark.hidden} >= {*opening}
+    assert all(marks[name].hidden for name in ("reconstruct", "sense", "characterise", "train", "export", "list"))
+
+
+def test_a_way_to_calibrate_has_a_line_with_its_command() -> None:
+    """(Planted: the option of one of them misspelt, which the test of pages finds, too.)"""
+    lines = [line for line in page("calibrate").splitlines() if re.match(r"  \w.* {2}mitsim calibrate ", line)]
+    assert [next((each for each in line.split() if each in WAYS), "") for line in lines] == WAYS
+
+
+WAYS = ["", "--frames", "--known", "--model", "--plan-session"]
+
+
+def test_old_spellings_are_read_and_not_shown() -> None:
+    """(Planted: the old spelling dropped.)"""
+    for words in ("--plan", "--plan-session"):
+        context = PROGRAM.commands["calibrate"].make_context("calibrate", ["photograph", words])
+        assert context.params["planning"] is True
+    assert "--plan " not in page("calibrate") and "--frames N" not in page("characterise")
+
+
 def test_the_fields_of_a_model_are_options() -> None:
     """Those that are given make the model, which knows them. (Planted: defaults that count as given.)"""
     asked = call("here", "--name", "x")
@@ -173,7 +203,7 @@ def test_a_verb_shows_some_fields_as_it_needs() -> None:
     """(Planted: changes of one verb that all others have, too.)"""
     for _ in range(2):
         assert {name: mark.help for name, mark in shown(of_some).items()} == {"seed": "another"}
-    assert shown(of_a_group)["seed"].help == Group.model_fields["seed"].description == "root of every random stream"
+    assert shown(of_a_group)["seed"].help == Group.model_fields["seed"].description == "seed of all random numbers"
 
 
 @pytest.mark.parametrize("words", ["here", "here --name x --seed y", "--name x", "here --name x --size 1"])
