@@ -116,7 +116,7 @@ class SpectralBench:
             plan = replace(plan_request(roughest, switched, len(self.benches)), request=request)
         return replace(plan, made_of=self.whole.deciding)
 
-    def roughest(self, seed: int, lit: float = 1.0) -> Apparatus:
+    def roughest(self, seed: int, lit: float) -> Apparatus:
         """Return the line that is planned for: the one whose light differs most between neighbouring projector pixels.
 
         Discretisation errs most for such light. Of equal lines the longest is the worst because its fringes are the

@@ -176,14 +176,7 @@ class DrawnPictures:
             cover = np.asarray(page, dtype=np.float64) / WHITE
             canvas += cover * (rng.choice([0.02, 0.98]) - canvas)
         elif kind < _LETTERS + _STRIPES:
-            top, left = (int(at) for at in rng.uniform(0, 0.5 * side, 2))
-            box = canvas[top : top + int(rng.uniform(0.2, 0.5) * side), left : left + int(rng.uniform(0.2, 0.5) * side)]
-            width, turn = side * math.exp(rng.uniform(math.log(0.02), math.log(0.15))), rng.uniform(0, math.pi)
-            down, across = np.arange(box.shape[0])[:, None], np.arange(box.shape[1])[None]
-            phase = (math.cos(turn) * down + math.sin(turn) * across) / width
-            wave = np.clip(0.5 + np.sin(2 * math.pi * phase) * width / math.pi, 0.0, 1.0)
-            dark, bright = sorted(rng.random(2))
-            box[...] = dark + (bright - dark) * wave
+            _lay_stripes(canvas, rng)
         small = canvas.reshape(n, _OVER, n, _OVER).mean(axis=(1, 3))
         low, high = np.quantile(small, (_TAILS, 1 - _TAILS))
         dark, bright = rng.uniform(*_DARKEST), rng.uniform(*_BRIGHTEST)
@@ -225,6 +218,18 @@ def _lay_leaves(canvas: FloatArray, texture: FloatArray, rng: np.random.Generato
         patch = np.roll(texture, tuple(rng.integers(0, side, 2)), (0, 1))[: bottom - top, : right - left]
         leaf = grey + slopes[0] * down + slopes[1] * across + roughness * patch
         canvas[top:bottom, left:right] += cover * (leaf - canvas[top:bottom, left:right])
+
+
+def _lay_stripes(canvas: FloatArray, rng: np.random.Generator) -> None:
+    side = len(canvas)
+    top, left = (int(at) for at in rng.uniform(0, 0.5 * side, 2))
+    box = canvas[top : top + int(rng.uniform(0.2, 0.5) * side), left : left + int(rng.uniform(0.2, 0.5) * side)]
+    width, turn = side * math.exp(rng.uniform(math.log(0.02), math.log(0.15))), rng.uniform(0, math.pi)
+    down, across = np.arange(box.shape[0])[:, None], np.arange(box.shape[1])[None]
+    phase = (math.cos(turn) * down + math.sin(turn) * across) / width
+    wave = np.clip(0.5 + np.sin(2 * math.pi * phase) * width / math.pi, 0.0, 1.0)
+    dark, bright = sorted(rng.random(2))
+    box[...] = dark + (bright - dark) * wave
 
 
 @dataclass(frozen=True)

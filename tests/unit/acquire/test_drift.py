@@ -57,7 +57,9 @@ def test_without_drift_frames_are_the_same_bit_for_bit() -> None:
 
 
 def test_power_scales_the_projectors_light_and_lamps_that_of_lamps() -> None:
-    """(Planted: the lamps' light scaled with the projector's.)"""
+    """Without lamps all light is the projector's. (Planted: the lamps' light scaled with the projector's.)"""
+    dark = DriftedExposer(DEVICES, SECONDS, SEED, 0.0, Drift(power=0.1), FAMILY)
+    assert np.allclose(dark.shot_electrons(FRAMES[0], *FAMILY.shots[0].names), 1.1 * dark.electrons(FRAMES[0]))
     for camera, power, lamp in ((exposer(power=0.1), 1.1, 1.0), (exposer(lamp=0.3), 1.0, 1.3)):
         for shot, frame in zip(FAMILY.shots, FRAMES, strict=True):
             expected = power * (frame.irradiance - AMBIENT) + lamp * AMBIENT

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsim.acquire.exposure import Exposer, Shooting, camera_warnings
+from mitsim.acquire.exposure import AmbientFrame, Exposer, Shooting, camera_warnings
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -170,6 +170,21 @@ def test_shots_are_the_same_however_many_are_exposed_at_a_time(together: int, mo
         assert getattr(first, reported) == getattr(second, reported)
     electrons = np.array([channels["electrons"] for channels, _ in one.files.values()], dtype=np.float64)
     assert first.sensor_noise**2 * np.square(electrons).sum() == pytest.approx((electrons + 9).sum(), rel=1e-6)
+
+
+def test_noise_is_stated_relative_to_the_light_without_lamps() -> None:
+    """With an ambient frame of four shots, whose noise is in every frame; here a datum's variance is its electrons and
+    9. (Planted: the noise of one frame's ambient light for all; lamps counted as light.)"""
+    camera, recorder = exposer(), Recorder()
+    lamps = camera.electrons(frame(1e-6))
+    shooting = Shooting(FAMILY, recorder, camera, AmbientFrame(4, lamps, lamps, False), lamps)
+    shooting.shoot(FRAMES, Job())
+    electrons = np.array([channels["electrons"] for channels, _ in recorder.files.values()], dtype=np.float64)
+    energy, signal = np.square(electrons).sum(), np.square(electrons - lamps).sum()
+    noise, ambient = (electrons + 9).sum(), 25 * (lamps + 9).sum() / 4
+    assert shooting.noise_to_signal**2 == pytest.approx((noise + ambient) / signal, rel=1e-5)
+    assert shooting.dilution**2 == pytest.approx(energy / signal, rel=1e-5)
+    assert shooting.ambient_part == pytest.approx(25 * lamps.sum() / electrons.sum(), rel=1e-5)
 
 
 def test_a_file_that_cannot_be_written_ends_the_shooting(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.acquire import spectral
 from mitsim.acquire.spectral import MosaicFrames, MosaicLight, without_filters
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import SessionRequest, Task
@@ -74,8 +75,8 @@ def test_lamps_are_in_every_frame_and_alone_in_the_dark_one(apart: bool) -> None
     """Their error is its own, or goes together with the lines'. (Planted: lamps in no frame; errors in squares.)"""
     rng, spread = np.random.default_rng(3), np.sqrt(np.square(WEIGHTS).mean(axis=0))
     own, theirs = (np.outer(*[rng.random(8) - 0.5] * 2) for _ in range(2))
-    lines = [Frame(rng.random((4, 4)), np.trace(own), 0.0, 0.0, own) for _ in range(2)]
-    lamps = Frame(rng.random((4, 4)), np.trace(theirs), 0.0, 0.0, theirs)
+    lines = [Frame(rng.random((4, 4)), np.trace(own), removed, 0.0, own) for removed in (0.1, 0.2)]
+    lamps = Frame(rng.random((4, 4)), np.trace(theirs), 0.3, 0.0, theirs)
     passed, given = behind(WEIGHTS, (4, 4)), [Frames([line]) for line in lines]
     frames = MosaicFrames(given, passed, lamps, apart)  # type: ignore[arg-type]
     (dark,) = MosaicFrames(given, passed)  # type: ignore[arg-type]
@@ -84,7 +85,7 @@ def test_lamps_are_in_every_frame_and_alone_in_the_dark_one(apart: bool) -> None
     assert lit.irradiance == pytest.approx(dark.irradiance + lamps.irradiance)
     root = spread.sum() * np.sign(own) * np.sqrt(abs(own)) + np.sign(theirs) * np.sqrt(abs(theirs))
     assert lit.by_group == pytest.approx(dark.by_group + theirs if apart else root * abs(root))
-    assert lit.variance == pytest.approx(np.trace(lit.by_group))
+    assert lit.variance == pytest.approx(np.trace(lit.by_group)) and (lit.removed, dark.removed) == (0.3, 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +176,8 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
         accumulated = simulation.accumulate("indirect", PathSamples.join([lamps, spot]), none[:1].repeat(n**2), 1)
         plan: Any = SimpleNamespace(settings=settings)
         zeros = np.zeros(n**2)
-        truth = Truth(np.zeros((n, n)), np.zeros((n, n)), np.ones(n**2), 1)
+        seen_by = nm / 1e3  # another reflectance in each line, under boards of the same light
+        truth = Truth(np.full((n, n), seen_by), np.zeros((n, n)), np.ones(n**2), 1)
         light = SampledLight((accumulated,), simulation, plan, 0, none[:1].repeat(n**2), zeros, zeros, 1, 0.0, True)
         lights.append(replace(light, known_truth=truth))
     whole = MosaicLight.of(replace(seen, counted_lamps=counted_lamps), lights, [nm for nm, _ in units])
@@ -197,6 +199,27 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     weights = np.array(seen.counting.planes([nm for nm, _ in units])) * [nm for nm, _ in units]
     passed = behind(weights / seen.projector.effective_wavelength_nm, expected.shape)
     assert lit.irradiance - expected == pytest.approx(np.einsum("lij,lij->ij", passed, np.array(lines)), rel=1e-6)
+    counted = passed.mean(axis=(1, 2))
+    assert whole.apparent.board_flux == pytest.approx(counted.sum())
+    assert whole.apparent.reflectance == pytest.approx(counted @ [0.6, 0.5] / counted.sum())
+
+
+def test_lamps_behind_filters_are_sampled_until_each_filters_light_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the light of every filter is three times less certain than all light, the error is three times larger; it
+    is never smaller, and without lamps it is what it is. (Planted: errors multiplied; lamps without bands.)"""
+    names = (SimpleNamespace(part=0.25), SimpleNamespace(part=0.5))
+    rows = [slice(0, 2), slice(2, 4)]
+    lamps = SimpleNamespace(responses=names, rows=rows.__getitem__, shares=np.array([0.1, 0.2, 0.3, 0.4]))
+    for counted, each, whole, expected in (
+        (lamps, 0.03, 0.01, 3.0), (lamps, 0.005, 0.01, 1.0), (lamps, 0.03, 0.0, 1.0), (None, 0.03, 0.01, 1.0),
+    ):  # fmt: skip
+
+        def alone(_: Any, bands: slice, __: int, each: float = each, whole: float = whole) -> Any:
+            return SimpleNamespace(sampling_error=lambda: (whole if bands == slice(None) else each, 0))
+
+        monkeypatch.setattr(spectral, "_lamps_alone", alone)
+        light: Any = SimpleNamespace(bench=SimpleNamespace(counted_lamps=counted), seed=1)
+        assert spectral.excess_behind_filters([light]) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("part", [{"rows": 63}, {"roi": (0, 3, 20, 20)}, {"roi": (2, 0, 21, 20)}])

@@ -80,8 +80,13 @@ def trained(path: Path, method: str = "unrolled") -> Trained:
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> LearnedSolver:
-    return trained(tmp_path_factory.mktemp("model") / "m.pt").model
+def training(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    return trained(tmp_path_factory.mktemp("model") / "m.pt")
+
+
+@pytest.fixture(scope="module")
+def model(training: Trained) -> LearnedSolver:
+    return training.model
 
 
 def summed(solver: Any, patterns: str = "uniform") -> tuple[Any, Any]:
@@ -144,6 +149,24 @@ def test_an_image_is_the_mean_over_all_ways(model: LearnedSolver) -> None:
     assert not network.training
 
 
+def test_a_method_adds_the_change_of_its_networks(model: LearnedSolver) -> None:
+    """Networks that return a constant brighten an image by it: once, and before each step of the frames, if these count
+    for nothing. (Planted: the change taken off.)"""
+    prepared, sums = summed(model)
+    data = Data.of(prepared.problem(sums).projected[None], 1.0, DOUBLE)
+    diagonal = Diagonal.of(prepared, DOUBLE)
+    for method, steps in (("refined", 1), ("unrolled", networks.Unrolled.STEPS)):
+        network = networks.CLASSES[method]((16, 16)).double()
+        with torch.no_grad():
+            if method == "unrolled":
+                network.log_rho += 60
+            start = network.start(data, diagonal) + 0.5
+            for name, values in network.named_parameters():
+                if name.endswith("last.bias"):
+                    values.fill_(0.125)
+            assert_allclose(network(data, diagonal), start + 0.125 * steps, rtol=1e-9)
+
+
 # -------- The camera's model
 
 
@@ -171,9 +194,9 @@ def test_the_step_of_the_frames_is_the_closed_form() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_learns(method: str, tmp_path: Path) -> None:
+def test_every_method_learns(method: str, training: Trained, tmp_path: Path) -> None:
     """Of a few pairs, on pairs that did not teach, and on frames of one more. (Planted: truths of other pairs.)"""
-    made = trained(tmp_path / "m.pt", method)
+    made = training if method == training.model.manifest.method else trained(tmp_path / "m.pt", method)
     assert made.curve[0][0] == 0 and max(value for _, value in made.curve) > made.curve[0][1] + 0.5
     blank = replace(made.model, network=networks.first_network(Training(method=method), (16, 16)))
     before, after = (psnr(image_of(each).image, picture(5)) for each in (blank, made.model))
@@ -236,6 +259,23 @@ def test_a_turned_picture_has_the_frames_of_its_own(tmp_path: Path) -> None:
     assert_allclose(moved.weights, expected, rtol=2e-4, atol=2e-4 * float(expected.abs().max()))
 
 
+def test_the_learning_rate_rises_and_falls(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line up to the rate asked for, over 15 % of the steps, then half a cosine to nothing. (Planted: another
+    cosine.)"""
+    store, request = FakeStore(8), Training(method="refined", steps=40, batch=1, rate=0.02)
+    prepared = SOLVERS["tikhonov"].init(bench().calibrated(1), store.patterns)
+    sums = networks.Sums.of(store, prepared, Job())
+    trainer = networks.Trainer(request, prepared, sums, networks.first_network(request, (16, 16)))
+    monkeypatch.setattr(trainer, "gradients", lambda *_: 0.0)
+    rates = np.empty(40)
+    for number in range(40):
+        trainer.step(number)
+        rates[number] = trainer.optimiser.param_groups[0]["lr"]
+    assert_allclose(np.diff(rates[:6]), 0.02 / 6)
+    assert_allclose([rates[6], rates[22:24].mean(), rates[39]], [0.02, 0.01, 0], atol=2e-5)
+    assert_allclose(rates[6:] + rates[:5:-1], 0.02, err_msg="odd about its middle")
+
+
 def test_oblong_pictures_are_turned_to_their_own_shape_alone() -> None:
     """(Planted: taken for square.)"""
     model = SimpleNamespace(sigma=torch.ones(()), coefficients=lambda images: images)
@@ -249,12 +289,14 @@ def test_oblong_pictures_are_turned_to_their_own_shape_alone() -> None:
 @pytest.mark.parametrize(("count", "files"), [(24, 24), (100, 3), (2000, 2000), (1200, 12)])
 def test_no_photograph_teaches_and_judges(count: int, files: int) -> None:
     """Crops of one photograph stay on one side, for five seeds, and no side is empty; pairs beyond those that judge do
-    not teach either. (Planted: a permutation of pairs; one part for choosing and judging.)"""
+    not teach either; each photograph has its part. (Planted: a permutation of pairs; one part for choosing and judging;
+    photographs left out.)"""
     photographs = np.arange(count) % files
     for seed in range(5):
         parts = networks.part_photographs(photographs, seed)
         shown = [set(photographs[part]) for part in parts]
         assert all(len(part) for part in parts) and not any(a & b for a, b in itertools.combinations(shown, 2))
+        assert set.union(*shown) == {*photographs}
         assert len(parts[0]) > count / 4 and max(map(len, parts[1:])) <= 48
 
 
@@ -276,7 +318,7 @@ def test_the_stated_psnr_is_of_photographs_that_neither_teach_nor_choose(
     assert len(looks) == len(made.curve) == 3 and {*np.concatenate(looks)}.isdisjoint({*before, *after})
     summary = made.summary()
     assert (summary["psnr_before_db"], summary["psnr_db"]) == (made.psnr_before_db, made.psnr_db)
-    assert made.psnr_db != max(value for _, value in made.curve)
+    assert made.psnr_db != max(value for _, value in made.curve) and summary["steps"] == 2
 
 
 def test_trainings_that_are_refused(tmp_path: Path) -> None:
@@ -294,6 +336,14 @@ def test_trainings_that_are_refused(tmp_path: Path) -> None:
         with pytest.raises(MitsimError, match=words):
             train_network(pairs, camera, Training(method="unrolled", steps=2), tmp_path / "m.pt", job)
     assert not (tmp_path / "m.pt").exists()
+    request = Training(method="unrolled", batch=4, steps=1)
+    half = 0.6 if networks.has_half(torch.device("cpu")) else 1.0
+    # Torch; three networks of 16 channels, each with 100 bytes a channel and pixel; truths and data of 8 pairs.
+    needed = 6e8 + 4 * 256 * 3 * 16 * 100 * half + 8 * 256 * 2 * 4
+    for bytes_, seconds, words in ((needed - 512, 1e5, "of memory"), (needed + 512, 0.01, "allowed are 0.01 s")):
+        with pytest.raises(MitsimError, match=words):
+            limits = Limits(seconds=seconds, memory_bytes=bytes_)
+            train_network(store, factors, request, tmp_path / "m.pt", Job(limits=limits))
     prepared = SOLVERS["tikhonov"].init(factors, store.patterns)
     held = 8 * (256 + prepared.sigma.size) * 4  # truths and data of 8 pairs in 32 bits
     networks.Sums.of(store, prepared, Job(limits=Limits(memory_bytes=1.01 * held)))
@@ -327,6 +377,21 @@ def test_an_image_says_by_what_it_was_found(model: LearnedSolver, tmp_path: Path
         reconstruct(shots, factors, 1.0, method=model)
 
 
+def test_an_image_states_its_part_of_the_frames(model: LearnedSolver) -> None:
+    """The residual is the frame less that of the image, written out; frames without noise have that of single
+    precision. (Planted: energy outside the model taken off; noise by another power of the energy.)"""
+    camera = bench()
+    shots, factors = camera.run("uniform", picture(1), 1), camera.calibrated(1)
+    (shown,) = shots.pattern_measurements()
+    prepared, sums = summed(model)
+    solution = model.compute(prepared, sums, "auto")
+    off = shown.frame - factors.left @ solution.image @ factors.right.T
+    assert solution.residual == pytest.approx(np.linalg.norm(off) / np.linalg.norm(shown.frame), rel=1e-6)
+    prepared = model.init(factors, model.patterns)
+    ideal = factors.left @ picture(1) @ factors.right.T
+    assert networks.relative_noise(prepared.problem(prepared.accumulator([(ideal, 0, 0)]))) == pytest.approx(1e-7)
+
+
 def test_a_file_gives_the_same_image(model: LearnedSolver, tmp_path: Path) -> None:
     model.save(tmp_path / "m.pt")
     again = verbs.load_network(tmp_path / "m.pt")
@@ -342,9 +407,9 @@ def test_another_bench_is_flagged(model: LearnedSolver) -> None:
     camera = bench()
     with pytest.raises(MitsimError, match="trained under the patterns uniform, and these are others"):
         reconstruct(camera.run("dots:2", picture(5), 5), camera.calibrated(1), method=model)
-    small = replace(camera, left=camera.left[:, :8], right=camera.right[:, :8])
-    with pytest.raises(MitsimError, match="makes images of 16 x 16 pixels, but calibration in memory has 8 x 8"):
-        reconstruct(small.run("uniform", picture(5, 8), 5), small.calibrated(1), method=model)
+    small = replace(camera.calibrated(1), right=camera.right[:, :8])
+    with pytest.raises(MitsimError, match="makes images of 16 x 16 pixels, but calibration in memory has 16 x 8"):
+        model.init(small, model.patterns)
     shots, factors = camera.run("uniform", picture(5), 5), camera.calibrated(1)
     named = {"camera": {"mask": "other"}}
     others = Capture(shots.manifest.model_copy(update=named), memory=shots._memory)

@@ -68,7 +68,8 @@ class Lab:
         own = {key: asked.pop(key) for key in ("pictures", "vary") if key in asked}
         request = Request.of(**{"patterns": "dots:2", "accuracy": 2e-3, "seed": 3, **asked})
         wanted = PairsRequest(capture=request, count=count, **own)
-        return make_pairs(self.bench(**scene or {}), wanted, Task(self.folder / name, resume))[0]
+        store, self.cost = make_pairs(self.bench(**scene or {}), wanted, Task(self.folder / name, resume))
+        return store
 
 
 def test_programs_make_the_same_pairs(lab: Lab) -> None:
@@ -238,9 +239,11 @@ def shift_of(moved: np.ndarray, still: np.ndarray) -> float:
 
 
 def test_an_interrupted_store_is_resumed_bit_equal(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    """(Planted: pictures numbered within their shard; a resumed store that begins anew.)"""
+    """And its cost is that of the missing pairs. (Planted: pictures numbered within their shard; a resumed store that
+    begins anew; the cost of all pairs.)"""
     monkeypatch.setattr(pairs_module, "SHARD", 2)
-    whole = lab.pairs(5, "whole")
+    whole, shadow = lab.pairs(5, "whole"), 40 * (64 + 64) * N  # of each shard
+    assert lab.cost.disk_bytes == 5 * 4 * N**2 + 3 * shadow
     draw = pairs_module.DrawnPictures.draw
 
     def fail(self: Any, number: int, n: int) -> Any:
@@ -257,6 +260,7 @@ def test_an_interrupted_store_is_resumed_bit_equal(lab: Lab, monkeypatch: pytest
         PairStore.open(folder)
     kept = (folder / "pairs_00000.h5").stat().st_mtime_ns
     again = lab.pairs(5, "cut", resume=True)
+    assert lab.cost.disk_bytes == 3 * 4 * N**2 + 2 * shadow
     assert (folder / "pairs_00000.h5").stat().st_mtime_ns == kept and len(again) == 5
     files = [{path.name: path.read_bytes() for path in each.iterdir()} for each in (whole.folder, folder)]
     assert files[0].keys() == files[1].keys() == {"pairs.json", *(f"pairs_0000{k}.h5" for k in range(3))}
@@ -360,6 +364,63 @@ def test_drawn_pictures_are_as_natural_ones_are() -> None:
     assert (abs(np.diff(pictures, axis=1)) > 1 / 3).mean() < 0.01
 
 
+class Draws:
+    """Random numbers that are written down: each is a part of its range."""
+
+    def __init__(self, *parts: float | list[float]) -> None:
+        self._parts = list(parts)
+
+    def uniform(self, low: float, high: float, size: int | None = None) -> Any:
+        return low + (high - low) * np.array(self._parts.pop(0))
+
+    def random(self, size: int | None = None) -> Any:
+        return np.array(self._parts.pop(0)) * np.ones(size or ())
+
+    def integers(self, low: int, high: int, size: int) -> Any:
+        return np.zeros(size, int)
+
+
+@pytest.mark.parametrize(("kind", "area", "spread"), [(0.5, np.pi, 1 / 4), (0.2, 4, 1 / 3)], ids=["ellipse", "box"])
+def test_a_leaf_is_a_turned_ellipse_or_box_with_a_slope(
+    kind: float, area: float, spread: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The largest leaf of half the width, turned by 60 degrees: its area, its second moments and its shade.
+    (Planted: another power; rows for columns; a shade of one slope.)"""
+    monkeypatch.setattr(pairs_module, "_COVERED", 0)  # one leaf, as wide as the largest
+    side, place, turn, shape = 300, np.array([0.45, 0.55]), 1 / 3, 0.5
+    across, half = side * 0.35, np.array([0.75, 0.25])
+
+    def drawn(*slopes: float) -> np.ndarray:
+        canvas = np.zeros((side, side))
+        parts = (0.5, 0.0, 0.0, 1.0, list(place), (shape - 0.4) / 0.6, turn, kind, 1.0, list(slopes), 0.0)
+        pairs_module._lay_leaves(canvas, np.zeros((side, side)), cast(Any, Draws(*parts)))
+        return canvas
+
+    even = drawn(0.5, 0.5)
+    assert even.sum() == pytest.approx(area * shape * across**2, rel=0.01) and even.max() == 1.0
+    points = np.stack(np.mgrid[:side, :side], axis=-1) - place * side
+    turned = np.array([[np.cos(np.pi * turn), -np.sin(np.pi * turn)], [np.sin(np.pi * turn), np.cos(np.pi * turn)]])
+    moments = np.einsum("ij,ijk,ijl->kl", even, points, points) / even.sum()
+    expected = turned @ np.diag([1, shape**2]) @ turned.T * spread * across**2
+    assert moments == pytest.approx(expected, abs=0.02 * spread * across**2)
+    shades = 2 * 0.25 * (half - 0.5) / (2 * across)  # grey a point
+    assert drawn(*half) == pytest.approx(even * (1 + points @ shades), abs=1e-9)
+
+
+def test_stripes_have_edges_of_one_point() -> None:
+    """Of 9 points at 45 degrees in the smallest box, 90 points across: 14 edges along a row, as much dark as bright,
+    and one point of each stripe between them. (Planted: waves in place of stripes; a larger box; turned the other way;
+    stripes of another width.)"""
+    canvas = np.full((450, 450), 0.5)
+    pairs_module._lay_stripes(canvas, cast(Any, Draws([0.5, 0.0], 0.0, 0.0, 0.0, 0.25, [0.8, 0.2])))
+    box = canvas[112:202, :90].copy()
+    canvas[112:202, :90] = 0.5
+    assert np.all(canvas == 0.5) and box[1:, :-1] == pytest.approx(box[:-1, 1:], abs=1e-9)
+    assert box.mean() == pytest.approx(0.5, abs=0.01) and (box.min(), box.max()) == (0.2, 0.8)
+    assert np.count_nonzero(np.diff(box[0] > 0.5)) == 14
+    assert ((box > 0.2 + 1e-9) & (box < 0.8 - 1e-9)).mean() == pytest.approx(1 / 9, abs=0.02)
+
+
 def test_the_amplitude_of_texture_falls_as_one_over_the_frequency() -> None:
     """The mean over 30 fields, to 5 % in its slope. (Planted: the power, not the amplitude.)"""
     fields = np.array([pink_noise(SIDE, stream(0, "field", number)) for number in range(30)])
@@ -395,6 +456,18 @@ def test_equal_files_are_one_photograph(tmp_path: Path) -> None:
     for name, level in (("a.png", 10), ("b.png", 20), ("c.png", 10)):
         Image.fromarray(np.full((16, 16), level, np.uint8)).save(tmp_path / name)
     assert FolderPictures(tmp_path, 0).photographs == (0, 1, 0) and DrawnPictures(0).photographs == ()
+
+
+def test_pairs_of_a_photograph_are_known_by_its_file(drawn: PairStore) -> None:
+    """Of numbers in the manifest, and of how many files there are where an earlier version made the store. (Planted:
+    every pair a photograph of its own.)"""
+    for change, shown in (
+        ({}, [0, 1, 2, 3]),
+        ({"photographs": (0, 1, 0)}, [0, 1, 0, 0]),
+        ({"pictures": "3 files of there, names and sizes 0"}, [0, 1, 2, 0]),
+    ):
+        store = PairStore(drawn.folder, drawn.manifest.model_copy(update=change))
+        assert store.photographs.tolist() == shown
 
 
 def test_pictures_of_any_kind_of_file_are_read(tmp_path: Path) -> None:

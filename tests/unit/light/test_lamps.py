@@ -7,6 +7,8 @@ The geometry is that of ``test_lamps``: a point lamp, a sheet at 400 mm, an open
 times what it sees of a lamp of intensity 1 over a sheet of reflectance 1; I / 470 nm is the lamp's spectral intensity.
 """
 
+import itertools
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ import pytest
 
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
-from mitsim.core.colour_files import RUN
+from mitsim.core.colour_files import MOST_LINES, RUN
 from mitsim.devices.projector import SPECTRA_NM
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
@@ -101,8 +103,13 @@ def traced(folder: str) -> list[dict[str, Any]]:
         accumulated = [
             simulation.accumulate("indirect", run.by_line(3)[2], labels, SAMPLES)["fine"] for run in traced_runs[:1]
         ]
+        other = open_bench(path, "llvm_ad_spectral", place / "number.toml", place / "lines.toml", albedo=SHEETS[sheet])
+        spectra = () if lamp != "coloured" else SpectralBench.of(other, RUN).lit_by_lamps({}, 0).whole.counted_lamps
         found.append(
             {
+                "spectra": [
+                    (each.wavelengths_nm.tolist(), each.weights.tolist()) for each in spectra and spectra.spectra
+                ],
                 "lines": np.array(lines).tolist(),
                 "together": [float(light.value.sum()) / SAMPLES for light in both],
                 "accumulated": np.asarray(accumulated[0].sum(axis=1)).tolist(),
@@ -145,3 +152,19 @@ def test_light_beyond_a_curve_is_known_to_be_missing(light: Mapping[Any, dict[st
         ends = min(CURVE), max(CURVE)
         inside, whole = counted(*case, *ends), counted(*case)
         assert light[case]["unknown"] == pytest.approx((whole - inside) / whole, abs=0.01)
+
+
+def test_a_bands_light_diffracts_like_its_lit_parts(light: Mapping[Any, dict[str, Any]]) -> None:
+    """Parts of equal width, at most 24 nm, each with its part of the band's photons; dark ones are left out, and a dark
+    band has all. To 3 % of a band, which is what the paths find. (Planted: parts weighed evenly; parts too fine.)"""
+    (spectra,) = [light[case]["spectra"] for case in CASES if case[0] == "coloured"]
+    bands = np.linspace(*SPECTRA_NM, len(spectra) + 1)
+    assert len(spectra) == MOST_LINES
+    for (begin, end), (wavelengths, weights) in zip(itertools.pairwise(bands), spectra, strict=True):
+        edges = np.linspace(begin, end, 1 + math.ceil((end - begin) / 24))
+        parts = np.array([counted("coloured", "coloured", False, *ends) for ends in itertools.pairwise(edges)])
+        lit = parts > 0 if parts.any() else parts == 0
+        assert wavelengths == pytest.approx(((edges[1:] + edges[:-1]) / 2)[lit])
+        assert weights == pytest.approx(
+            (parts[lit] if parts.any() else np.ones(len(parts))) / max(parts.sum(), 1), abs=0.03
+        )

@@ -155,6 +155,15 @@ def test_values_are_those_of_the_formula(settings: dict[str, Any]) -> None:
         assert np.allclose(pdf, f * cosine / total, rtol=1e-4, atol=1e-4 * f.max())
 
 
+def test_grooves_that_lie_upright_are_those_along_the_first_axis() -> None:
+    """A direction along the normal has no part in the plane. (Planted: the part that is none over its length.)"""
+    out, settings = np.array([[0.1, 0.3], [0.0, 0.05]]), {"grooves": "linear", "sigma": 0.1}
+    upright, first = (grating(direction=to, **settings) for to in ([0.0, 0.0, 2.0], [1.0, 0.0, 0.0]))
+    value, pdf = evaluate(upright, (0.0, 0.0), out)
+    known, density = evaluate(first, (0.0, 0.0), out)
+    assert value == pytest.approx(known) and pdf == pytest.approx(density) and value.min() > 0.1
+
+
 def test_nothing_from_behind_to_behind_or_for_another_kind_of_lobe() -> None:
     bsdf, context = grating(diffuse=0.3), mi.BSDFContext()
     si = interaction((0.0, 0.0))
@@ -258,6 +267,7 @@ HOSTILE = {
     "too few shares": ({"wavelengths": "500, 600", "shares": "1"}, "one number for each line"),
     "shares of nothing": ({"shares": "0, 0, 0"}, "not all 0"),
     "no direction": ({"direction": [0.0, 0.0, 0.0]}, "direction"),
+    "a direction out of bounds": ({"direction": [float("inf"), 0.0, 0.0]}, "direction"),
     "other grooves": ({"grooves": "spiral"}, "'circular' or 'linear'"),
 }
 
