@@ -551,7 +551,7 @@ SIZES = {
     "core": (16, 2976),
     "devices": (8, 1995),
     "exchange": (5, 1312),
-    "learn": (5, 1195),
+    "learn": (5, 1198),
     "light": (6, 1680),
     "metrics": (1, 79),
     "mitsim": (1, 26),

@@ -103,7 +103,8 @@ def test_black_level_and_warmth_add_to_every_datum() -> None:
 
 
 def test_an_ambient_frame_holds_the_lamps_as_they_were() -> None:
-    """Their change is after it, their flicker is in it: the mean of 16 shots. (Planted: the change in it.)"""
+    """Their change is after it, their flicker is in it: the mean of 16 shots. (Planted: the change in it; nothing taken
+    off where there are lamps.)"""
 
     class Lit(list[Frame]):
         has_ambient, projector_off = True, Frame(AMBIENT, 0.0, 0.0, 0.0)
@@ -116,6 +117,7 @@ def test_an_ambient_frame_holds_the_lamps_as_they_were() -> None:
         AmbientFrame.expose(flickering, lit, 16).digital.mean() - AmbientFrame.expose(exposer(), lit, 16).digital.mean()
     )
     electrons = exposer().electrons(Lit.projector_off).mean()
+    assert np.mean(known) == pytest.approx(electrons / SECONDS, rel=0.02)
     assert found == pytest.approx((flickering.ambient_levels.mean() - 1) * electrons * SENSOR.gain_dn_per_e, rel=0.2)
 
 

@@ -82,6 +82,7 @@ def test_lamps_are_in_every_frame_and_alone_in_the_dark_one(apart: bool) -> None
     (dark,) = MosaicFrames(given, passed)  # type: ignore[arg-type]
     (lit,) = frames
     assert frames.has_ambient and frames.projector_off.irradiance is lamps.irradiance
+    assert frames.projector_off.by_group.tolist() == [[0.0]]
     assert lit.irradiance == pytest.approx(dark.irradiance + lamps.irradiance)
     root = spread.sum() * np.sign(own) * np.sqrt(abs(own)) + np.sign(theirs) * np.sqrt(abs(theirs))
     assert lit.by_group == pytest.approx(dark.by_group + theirs if apart else root * abs(root))
@@ -126,13 +127,33 @@ def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans
 
 
 def test_a_session_behind_filters_repeats_its_frames_by_default(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four times, where no recipe is given. (Seen: TypeError, because the request is no dataclass.)"""
-    lines = SimpleNamespace(manifest=SimpleNamespace(wavelengths_nm=()), names=(), benches=(), whole=bench)
-    sessions: list[Any] = []
-    monkeypatch.setattr(calibrate, "SpectralBench", SimpleNamespace(of=lambda *_: lines))
-    monkeypatch.setattr(calibrate, "_run_sessions", lambda _, request, *__: sessions.append(request) or [])
-    assert calibrate.calibrate_lines(coloured(bench), SessionRequest(), Task(None, False, Job()), mosaic=True) == {}
-    assert sessions[0].recipe.repeats == 4
+    """Four times, where no recipe is given; each line's light passes by its filter, all of it without filters, and a
+    filter that passes nothing is refused. (Seen: TypeError, because the request is no dataclass.)"""
+    asked: list[Any] = []
+    monkeypatch.setattr(calibrate, "_run_sessions", lambda lines, request, *_: asked.append((lines, request)) or lines)
+    seen = coloured(bench)
+    bare, first = without_filters(seen), seen.sensor.mosaic_curves
+    assert first is not None
+    dark = first.model_copy(update={"B": first.B.model_copy(update={"efficiency": (0.0, 0.0)})})
+    sensor = seen.sensor.model_copy(update={"mosaic_curves": dark})
+    black = replace(bare, filters=sensor)
+    for whole, mosaic in ((bare, True), (bench, False), (black, True)):
+        lines = SimpleNamespace(
+            manifest=SimpleNamespace(wavelengths_nm=(500.0, 600.0)), names=("a", "b"), benches=(bare, bare), whole=whole
+        )
+        monkeypatch.setattr(calibrate, "SpectralBench", SimpleNamespace(of=lambda *_, lines=lines: lines))
+        own = seen if mosaic else bench
+        if whole is black:
+            with pytest.raises(MitsimError, match="its B filters pass nothing of a, so its calibration lacks pixels"):
+                calibrate.calibrate_lines(own, SessionRequest(), Task(None, False, Job()), mosaic)
+            continue
+        sessions = calibrate.calibrate_lines(own, SessionRequest(), Task(None, False, Job()), mosaic)
+        passed: list[Any] = [each.filters for each in sessions.values()]
+        if mosaic:
+            assert [each[:2, :2] for each in passed] == [pytest.approx(np.array([[0.5, 0.2], [0.2, 0.1]]))] * 2
+        else:
+            assert passed == [None, None]
+    assert asked[0][1].recipe.repeats == 4 and asked[1][1].recipe is None
 
 
 def test_only_a_camera_with_filters_has_a_mosaic(bench: Bench) -> None:
@@ -176,8 +197,8 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
         accumulated = simulation.accumulate("indirect", PathSamples.join([lamps, spot]), none[:1].repeat(n**2), 1)
         plan: Any = SimpleNamespace(settings=settings)
         zeros = np.zeros(n**2)
-        seen_by = nm / 1e3  # another reflectance in each line, under boards of the same light
-        truth = Truth(np.full((n, n), seen_by), np.zeros((n, n)), np.ones(n**2), 1)
+        # Reflectances of 0.6 and 0.5, of boards of light 1 and 3.
+        truth = Truth(np.full((n, n), nm / 1e3), np.zeros((n, n)), np.full(n**2, 13 - nm / 50), 1)
         light = SampledLight((accumulated,), simulation, plan, 0, none[:1].repeat(n**2), zeros, zeros, 1, 0.0, True)
         lights.append(replace(light, known_truth=truth))
     whole = MosaicLight.of(replace(seen, counted_lamps=counted_lamps), lights, [nm for nm, _ in units])
@@ -199,7 +220,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     weights = np.array(seen.counting.planes([nm for nm, _ in units])) * [nm for nm, _ in units]
     passed = behind(weights / seen.projector.effective_wavelength_nm, expected.shape)
     assert lit.irradiance - expected == pytest.approx(np.einsum("lij,lij->ij", passed, np.array(lines)), rel=1e-6)
-    counted = passed.mean(axis=(1, 2))
+    counted = passed.mean(axis=(1, 2)) * [1.0, 3.0]
     assert whole.apparent.board_flux == pytest.approx(counted.sum())
     assert whole.apparent.reflectance == pytest.approx(counted @ [0.6, 0.5] / counted.sum())
 

@@ -183,6 +183,7 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     squares = [float(np.mean(step**2)) for step in (*steps, *off.values())]
     for name, before, after in zip(fixed, squares, squares[1:], strict=False):
         assert found["capture", name]["squared_error"] == pytest.approx(after - before)
+        assert found["capture", name]["deviation"] == 0
     for name, before, after in zip((DEPTH, GLOSS), squares[3:], squares[4:], strict=False):
         assert found["scene", ERROR_SOURCES[name]]["squared_error"] == pytest.approx(before - after)
     sampled = Noise(light=3e-4, left_light=4e-4)
@@ -192,6 +193,7 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["solver", LAMBDA]["squared_error"] == pytest.approx(bias)
     rest = squares[5] - bias - exact.variance(scene, sampled) / N**2
     assert found["scene", REST]["squared_error"] == pytest.approx(rest)
+    assert found["scene", REST]["deviation"] == pytest.approx(scatter.deviation(sampled, off[DEPTH, GLOSS]) / N**2)
     explained = sum(row["squared_error"] for row in rows[:-1])
     assert last["squared_error"] == pytest.approx(0.01 - explained)
     assert last["deviation"] == pytest.approx(scatter.deviation(drawn, steps[2]) / N**2)
@@ -323,7 +325,11 @@ def test_what_is_not_explained_is_said_by_its_standard_errors() -> None:
 
 
 def test_the_page_has_every_loss_in_one_table() -> None:
-    """With its uncertainty, the largest first. (Planted: the order of the rows.)"""
+    """With its uncertainty, the largest first; the figure has those that are seen. (Planted: the order of the rows; small
+    or unknown losses drawn.)"""
+    (bars,) = STUDY.panels
+    drawn = cast(Any, bars).where["lost_db"]
+    assert [drawn(lost) for lost in (0.1, -0.1, 0.001, float("nan"), None)] == [True, True, False, False, False]
     lost = ("capture", "shot noise", 2.0, 0.1), ("scene", "all else", 3.0, 0.2), ("session", "read noise", 0.0, 0.0)
     columns = "of", "source", "lost_db", "error_db"
     table = _tables(Results([{"kind": "losses", **dict(zip(columns, row, strict=True))} for row in lost]))[0]

@@ -16,9 +16,13 @@ from mitsim.acquire.exposure import drift_mask, drift_projector
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import DRIFTS, Drift, load_recipe
+from mitsim.optics.shadow import SeparableTerms
+from mitsim.reconstruct.factors import Factors
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
-from mitsim.studies.drift_study import SESSION, DriftStand, loss_of
+from mitsim.sensor.chain import electrons_from_irradiance, specimen
+from mitsim.studies.causes import Noise
+from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, loss_of
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
 from mitsim.verbs import StudyOptions, scope_of, study
@@ -143,6 +147,52 @@ def test_a_mask_turned_over_a_region_shifts_that_part_of_its_shadow(stand: Drift
     np.testing.assert_allclose(found, whole[3:33, :, 20:50], rtol=0, atol=1e-9 * np.abs(whole).max())
 
 
+def test_a_mask_that_shakes_casts_its_mean_shadow(stand: DriftStand) -> None:
+    """The mean over normal motions along both axes, by seven nodes in place of three, over a region that lies otherwise
+    along the rows. (Planted: a node elsewhere; the rows' shadow for that of the columns.)"""
+    bench = stand.lit.bench
+    camera = bench.geometry.model_copy(update={"roi": (3, 20, 30, 30)})
+    part = replace(bench, devices=replace(bench.devices, camera=camera))
+    own = replace(stand, lit=cast(LitScene, SimpleNamespace(bench=part, light=stand.lit.light, board_flux=1.0)))
+
+    def light(terms: SeparableTerms) -> np.ndarray:
+        return np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in terms))
+
+    nodes, weights = np.polynomial.hermite_e.hermegauss(7)
+    shifted = [own._shift(0.01 * node) for node in nodes]
+    means = [
+        [
+            np.asarray(sum(w * pair[axis] for w, pair in zip(weights / weights.sum(), one, strict=True)))
+            for axis in (0, 1)
+        ]
+        for one in zip(*shifted, strict=True)
+    ]
+    still, found = light(own._terms(Drift())), light(own._terms(Drift(vibration_um=10.0)))
+    unit = electrons_from_irradiance(1.0, 1.0, part.sensor, part.projector.effective_wavelength_nm)
+    change = unit * (light(cast(SeparableTerms, means)) - light(own._shift(0.0)))
+    assert np.linalg.norm(found - still - change) < 0.01 * np.linalg.norm(change)
+
+
+def test_rows_and_columns_take_of_a_response_all_that_factors_see(stand: DriftStand) -> None:
+    """What is left over brings no light of the factors' to any row or column, by other factors on either side.
+    (Planted: weights of the other side.)"""
+    rng, shape = np.random.default_rng(3), (9, 9)
+    sensor = stand.lit.bench.sensor.model_copy(update={"prnu_pixel": 0.2, "prnu_row": 0.2, "prnu_column": 0.2})
+    bench = SimpleNamespace(sensor=sensor, geometry=SimpleNamespace(frame_shape=shape))
+    sides = [rng.random((size, 3)) ** 4 for size in shape]
+    factors = SimpleNamespace(left=sides[0], right=sides[1])
+    own = replace(stand, lit=cast(LitScene, SimpleNamespace(bench=bench)), factors=cast(Factors, factors))
+    off, left, right = own._response, *(np.square(side.sum(axis=1)) for side in sides)
+    whole = specimen(sensor, shape).response
+    assert off is not None and whole is not None
+    even = whole / (1 + off)
+    rows, columns = even[:, 0], even[0]
+    assert even == pytest.approx(np.outer(rows, columns) / rows[0])
+    scale = np.abs(off).mean()
+    assert np.abs((whole - even) @ (right * columns)).max() < 2e-3 * scale * (right * columns).sum()
+    assert np.abs((whole - even).T @ (left * rows)).max() < 2e-3 * scale * (left * rows).sum()
+
+
 def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
     """A quarter of a pixel down a smooth print, its pixels see what lies between two. (Planted: rows and columns
     swapped.)"""
@@ -172,9 +222,17 @@ def test_an_image_is_off_the_still_one_by_the_noise_that_is_predicted_of_its_cap
     """Of noisy frames and of expected ones, by one lambda: 256 pixels, whose mean square scatters by 9 %, three times
     that. (Planted: electrons for electrons a second; each datum counted twice.)"""
     capture = [noise for name, noise in stand.noises.items() if name != SESSION]
+    known = stand.factors.manifest.noise
+    assert known is not None and stand.noises[SESSION] == Noise(left=known.left**2, right=known.right**2)
     reported = sum(stand.linear.variance(stand.lit.truth, noise) for noise in capture) / stand.lit.truth.size
     still = stand.clear(stand.factors, stand.lit.light)
     assert np.mean(np.square(stand.before.image - still)) == pytest.approx(reported, rel=0.27)
+
+
+def test_an_ambient_frame_adds_its_noise(stand: DriftStand, lamp_stand: DriftStand) -> None:
+    """A sixteenth of a shot's, or less. (Planted: none.)"""
+    assert AMBIENT not in stand.noises
+    assert 0 < lamp_stand.noises[AMBIENT].ambient < sum(noise.datum for noise in lamp_stand.noises.values()) / 16
 
 
 def test_points_are_every_kind_alone() -> None:
