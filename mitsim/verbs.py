@@ -41,6 +41,7 @@ from mitsim.core.configuration import (
     WHAT,
     FilePath,
     Options,
+    Styled,
     load_model,
     locate,
     opening_words,
@@ -58,6 +59,7 @@ from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import Drift, load_recipe
 from mitsim.learn.requests import PairOptions, PairsRequest, Schedule, Training, check_torch
+from mitsim.reconstruct.request import TIKHONOV
 from mitsim.studies import OF_CAPTURES, OF_NO_SCENE, find_files
 
 if TYPE_CHECKING:
@@ -232,7 +234,11 @@ WHOLE = "1/1"
 """The only part of a study that is not shared."""
 
 
-class StudyOptions(Opening, Seeded):
+_KNOBS = {"lam": "asked_lambda", "lambda": "asked_lambda"}
+"""Names of a sweep's table for those of the command line and of Python."""
+
+
+class StudyOptions(Styled, Opening, Seeded):
     """How a study is made."""
 
     PANEL = WHAT
@@ -254,19 +260,25 @@ class StudyOptions(Opening, Seeded):
         kind=list[str],
     )
     measure: str = option("psnr", "only with sweep: results to plot, such as psnr, ssim, misfit", metavar="NAME,...")
+    method: str | Sequence[str] = option(TIKHONOV, "only with sweep: methods of its images", metavar="NAME,...", kind=str)
+    lam: str | float | Sequence[str | float] = option(
+        AUTO, "only with sweep: regularisations of its images, or auto", "--lambda", metavar="auto|VALUE,...", kind=str
+    )
+    seeds: int = option(
+        1, "only with sweep: seeds, from --seed on, to take means with 95 % intervals over", metavar="N", min=1, max=1000
+    )
 
     @property
     def varied(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Names and values that are varied."""
+        """Names and values that are varied, and those of method and lambda if they are given."""
         from mitsim.bench.apparatus import spelling
         from mitsim.studies.framework.experiment import values_of
 
-        if isinstance(self.over, Mapping):
-            each = {
-                name: values if isinstance(values, (list, tuple)) else [values] for name, values in self.over.items()
-            }
-            return tuple((name, tuple(spelling(value) for value in values)) for name, values in each.items())
-        return tuple(values_of(text) for text in self.over)
+        over = self.over.items() if isinstance(self.over, Mapping) else map(values_of, self.over)
+        each = [*over, *((name, values) for name, values in self.given.items() if name in ("method", "lam"))]
+        lists = [(name, values.split(",") if isinstance(values, str) else values) for name, values in each]
+        lists = [(name, values if isinstance(values, (list, tuple)) else [values]) for name, values in lists]
+        return tuple((_KNOBS.get(name, name), tuple(map(spelling, values))) for name, values in lists)
 
 
 @takes(StudyOptions)
@@ -354,7 +366,11 @@ def prepare_study(
         of_scenes = "patterns", "camera", "projector", "parameters", "allow_outside_files"
         asked.refuse(of_scenes, f"on the study {name}, which is of no scene")
         find_files(None if data is None else Path(data), name)
-    scope = Scope(setup, pictures, seeds=(asked.seed,), quick=asked.quick, recipe=recipe, data=data)
+    if name != "sweep":
+        asked.refuse(("method", "lam", "seeds"), f"on the study {name}, but on sweep")
+    seeds = tuple(range(asked.seed, asked.seed + asked.seeds))
+    Request(seed=seeds[-1])
+    scope = Scope(setup, pictures, seeds, asked.quick, recipe=recipe, data=data, style=asked.style)
     scope = scope_of(name, scope, patterns, asked.varied, asked.measure)
     if name not in ("accuracy", "calibration", "sweep", "drift"):
         asked.refuse(["patterns"], f"on the study {name}, which has its own")
@@ -375,7 +391,9 @@ def scope_of(
     from mitsim.studies.framework.experiment import MEASURES, check_sweep, number_of
 
     if name == "sweep":
-        check_sweep(tuple(varied), len(scope.pictures))
+        check_sweep(tuple(varied), len(scope.pictures) * len(scope.seeds))
+        if len(scope.seeds) > 1 and "seed" in dict(varied):
+            raise MitsimError("--seeds: seeds are varied by --over seed already; leave one of them out")
         measures = tuple(measure.split(","))
         if unknown := [each for each in measures if each not in MEASURES]:
             raise MitsimError(f"--measure {unknown[0]!r}: use {', '.join(MEASURES)}")

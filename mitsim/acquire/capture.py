@@ -24,7 +24,7 @@ from mitsim.bench.layout import obstacles
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, Request, Task, check_accuracy, check_samples
 from mitsim.core import colour_files, manifests
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import takes
+from mitsim.core.configuration import Drawn, takes
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, keep_scenes, load_variant, versions
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, write_frame
@@ -447,12 +447,12 @@ class Rendered:
         write_frame(path, channels, {"unit": "W/m^2", **facts, **versions()})
         return Path(path)
 
-    @check_arguments
-    def plot(self, ax: Axes | None = None) -> Axes:
+    @takes(Drawn)
+    def plot(self, ax: Axes | None = None, **figure: Any) -> Axes:
         """Draw the mean of the channels with a colour bar on ``ax`` or a new figure, and return the axes."""
         from mitsim.core.images import from_above
 
-        return from_above("report.plots", "draw_rendered")(self, ax)
+        return from_above("report.plots", "draw_rendered")(self, ax, **figure)
 
     def __repr__(self) -> str:
         rows, columns = self.mean.shape[:2]

@@ -11,6 +11,7 @@ import numpy as np
 
 from mitsim.bench.request import Exposure, Irradiance, check_ending, check_image
 from mitsim.core.arrays import FloatArray, npy_header
+from mitsim.core.configuration import Drawn, takes
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
@@ -69,10 +70,10 @@ class Sensed:
             "warnings": list(self.warnings),
         }
 
-    @check_arguments
-    def plot(self, ax: Axes | None = None) -> Axes:
+    @takes(Drawn)
+    def plot(self, ax: Axes | None = None, **figure: Any) -> Axes:
         """Draw the digital numbers with a colour bar on ``ax`` or a new figure, and return the axes."""
-        return from_above("report.plots", "draw_sensed")(self, ax)
+        return from_above("report.plots", "draw_sensed")(self, ax, **figure)
 
     def __repr__(self) -> str:
         rows, columns = self.digital.shape

@@ -335,6 +335,27 @@ class Options(BaseModel):
                 raise ArgumentError(name, f"has no effect {where}; leave it out")
 
 
+class Styled(Options):
+    """Style of figures."""
+
+    PANEL = OUTPUT
+
+    style: Literal["screen", "paper"] = option(
+        "screen",
+        "sizes of the figures: screen, or paper (89 or 183 mm wide, letters of 8 pt, thin lines)",
+        metavar="screen|paper",
+        complete=lambda: ("screen", "paper"),
+    )
+
+
+class Drawn(Styled):
+    """Options of a drawing."""
+
+    VERB = "plot"
+
+    output: FilePath | None = option(None, "files to write, without ending: a PNG, an SVG and a PDF of the figure")
+
+
 def limits_of(field: FieldInfo) -> str:
     names, marks, kinds = ("ge", "gt", "le", "lt"), [*field.metadata], [field.annotation]
     for kind in kinds:  # grows, because a number may be optional, or one of several

@@ -18,7 +18,7 @@ import numpy as np
 from mitsim.core import colour_files, manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import MosaicManifest
-from mitsim.core.configuration import validate
+from mitsim.core.configuration import Drawn, takes, validate
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder, remove_page
@@ -263,8 +263,10 @@ class Capture:
                 run.finish(self.manifest)
         return folder
 
-    @check_arguments
-    def plot(self, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None) -> Axes:
+    @takes(Drawn)
+    def plot(
+        self, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None, **figure: Any
+    ) -> Axes:
         """Draw a frame, or the truth, with a colour bar, and return the axes.
 
         Parameters
@@ -281,7 +283,7 @@ class Capture:
         MitsimError
             for a shot that does not exist, or a quantity that a real camera does not have.
         """
-        return from_above("report.plots", "draw_shot")(self, shot, quantity, ax)
+        return from_above("report.plots", "draw_shot")(self, shot, quantity, ax, **figure)
 
     def to_xarray(self) -> Dataset:
         """Return frames, expected electrons and truth, if known, as an ``xarray.Dataset`` with coordinates.

@@ -14,7 +14,7 @@ import pydantic
 
 from mitsim.bench.effects import EFFECTS
 from mitsim.bench.request import Request
-from mitsim.core.configuration import Configuration, refusal
+from mitsim.core.configuration import Configuration, Drawn, refusal, takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.files import MOST_BYTES, json_text, plain, read_json, write_text
 from mitsim.core.images import from_above, table
@@ -213,10 +213,10 @@ class Plan:
             **{f"predicted_{what}_bytes": count for what, count in cost.items()},
         }
 
-    @check_arguments
-    def plot(self, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
+    @takes(Drawn)
+    def plot(self, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None, **figure: Any) -> Axes:
         """Draw the error of omitting each effect, or the seconds of each stage, and return the axes."""
-        return from_above("report.plots", "draw_plan")(self, quantity, ax)
+        return from_above("report.plots", "draw_plan")(self, quantity, ax, **figure)
 
     def __repr__(self) -> str:
         states = ", ".join(f"{row.name} {row.state}" for row in self.effects if row.state != "off")

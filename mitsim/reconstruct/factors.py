@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, SeparableTerm, sum_of_squares
+from mitsim.core.configuration import Drawn, takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, cut
 from mitsim.core.exr import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder
@@ -540,10 +541,10 @@ class Factors:
         size = int(np.prod(shape)), rows * columns
         return LinearOperator(size, matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64))
 
-    @check_arguments
-    def plot(self, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
+    @takes(Drawn)
+    def plot(self, side: Literal["left", "right"] = "left", ax: Axes | None = None, **figure: Any) -> Axes:
         """Draw a factor (``left`` of rows, ``right`` of columns) with a colour bar, and return the axes."""
-        return from_above("report.plots", "draw_factor")(self, side, ax)
+        return from_above("report.plots", "draw_factor")(self, side, ax, **figure)
 
     def to_xarray(self) -> Dataset:
         """Return both factors as an ``xarray.Dataset`` with units and, where they are known, coordinates in mm."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import takes
+from mitsim.core.configuration import Drawn, takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields
 from mitsim.core.exr import verify_files, write_frame
 from mitsim.core.files import output_folder, plain, read_json, remove_page, write_bytes, write_json
@@ -262,13 +262,15 @@ class Reconstruction(Solution):
         write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), **stated})
         return folder
 
-    @check_arguments
-    def plot(self, quantity: Literal["image", "uncertainty", "depth"] = "image", ax: Axes | None = None) -> Axes:
+    @takes(Drawn)
+    def plot(
+        self, quantity: Literal["image", "uncertainty", "depth"] = "image", ax: Axes | None = None, **figure: Any
+    ) -> Axes:
         """Draw the image, its standard uncertainty or the depths with a colour bar, and return the axes.
 
         Raises MitsimError for an uncertainty or depths that are not known.
         """
-        return from_above("report.plots", "draw_image")(self, quantity, ax)
+        return from_above("report.plots", "draw_image")(self, quantity, ax, **figure)
 
     @check_arguments
     def to_xarray(self, factors: Factors | None = None) -> Dataset:

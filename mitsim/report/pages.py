@@ -226,6 +226,7 @@ def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[in
 
 Value = str | int | float | bool | None
 _SEEN = 0.05
+_CONFIDENCE = 0.95
 
 
 class Mean(NamedTuple):
@@ -244,6 +245,13 @@ class Mean(NamedTuple):
             return f"{self.value:{sign}.1f}"
         places = 1 if self.error >= _SEEN else 2
         return f"{self.value:{sign}.{places}f} \N{PLUS-MINUS SIGN} {self.error:.{places}f}"
+
+    @property
+    def reach(self) -> float:
+        """Half of the mean's 95 % confidence interval, by Student's t; NaN of a single value."""
+        from scipy.special import stdtrit
+
+        return float(stdtrit(self.of - 1, 1 - (1 - _CONFIDENCE) / 2)) * self.error if self.of > 1 else math.nan
 
     @classmethod
     def of_numbers(cls, numbers: Sequence[float], what: str) -> Mean:

@@ -1,24 +1,34 @@
 """Matplotlib figures with one message each, units on every axis, and colours for the colour-blind.
 
-The caller saves the figure, and no state of pyplot is touched.
+A figure is drawn for the screen. :func:`style_figure` gives it the sizes of a paper, and :func:`save_figure` writes it.
+No state of pyplot is touched.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.colors import FuncNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import Drawn
 from mitsim.core.errors import ArgumentError
+from mitsim.core.files import prepare_output, whole_file
 from mitsim.core.images import lightness, linear_light
 from mitsim.report.pages import Mean, scientific, typeset
 
@@ -210,9 +220,84 @@ def panels_of(
     return figure, places
 
 
+# -------- Styles and files of figures
+
+_MM = 1 / 25.4
+_PAPER_FONT, _PAPER_COLUMNS = 8.0, (89 * _MM, 183 * _MM)
+"""Letters [pt], and widths of one and two columns [inches], as common journals ask for them."""
+_THIN = 0.55
+"""Lines and marks of a paper relative to those of a screen: curves of 1 pt, axes of 0.45 pt."""
+_SHARP_DPI = {"screen": 150, "paper": 300}
+KINDS = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+"""Endings of figures, each with the metadata that are left out, because they differ from run to run."""
+
+
+def style_figure(figure: Figure, style: str, columns: int = 0) -> None:
+    """Give a finished figure the sizes of a ``style``: "screen", as it is drawn, or "paper".
+
+    A figure of a paper has the width of one or two ``columns``, by default the number that its letters need.
+    """
+    figure.set_dpi(_SHARP_DPI[style])
+    if style == "screen":
+        return
+    ratio, before = _PAPER_FONT / FONT, float(figure.get_figwidth())
+    columns = columns or 1 + (ratio * before > 1.02 * _PAPER_COLUMNS[0])
+    width = _PAPER_COLUMNS[columns - 1]
+    # Images keep their shape. Curves and bars keep the height of their letters.
+    stretch = width / before if any(axes.images for axes in figure.axes) else ratio
+    figure.set_size_inches(width, stretch * figure.get_figheight())
+    for text in figure.findobj(Text):
+        text.set_fontsize(min(ratio * text.get_fontsize(), _PAPER_FONT))
+    for part in figure.findobj(lambda each: isinstance(each, (Line2D, LineCollection, Patch))):
+        part.set_linewidth(_THIN * np.asarray(part.get_linewidth()))
+    for line in figure.findobj(Line2D):
+        line.set_markersize(_THIN * line.get_markersize())
+        line.set_markeredgewidth(_THIN * line.get_markeredgewidth())
+    for axes in figure.axes:  # ticks that later sizes of the axes add
+        axes.tick_params(labelsize=ratio * (FONT - 1), width=_THIN * 0.8, length=_THIN * 3.5)
+    figure.draw_without_rendering()  # places the axes, whose sizes their texts have to fit
+    for axes in figure.axes:
+        sides = width * axes.get_position().width, figure.get_figheight() * axes.get_position().height
+        for text, inches in ((axes.xaxis.label, sides[0]), (axes.title, sides[0]), (axes.yaxis.label, sides[1])):
+            most = int(1.1 * inches / (ratio * _LETTER))
+            if max(map(len, text.get_text().split("\n"))) > most:
+                text.set_text(fill(text.get_text(), max(most, 12)))
+
+
+def save_figure(figure: Figure, path: Path | str) -> None:
+    """Write a figure as PNG, SVG and PDF with fonts embedded, the same bytes for the same figure.
+
+    ``path`` may have one of the endings of :data:`KINDS`, or none.
+    """
+    place = prepare_output(path, overwrite=True, kind="file")
+    stem = place.stem if place.suffix in KINDS else place.name
+    for ending, left_out in KINDS.items():
+        with (
+            rc_context({"svg.hashsalt": "mitsim", "pdf.fonttype": 42}),
+            whole_file(place.with_name(stem + ending)) as part,
+        ):
+            figure.savefig(part, format=ending[1:], dpi=figure.get_dpi(), metadata=left_out)
+
+
+def _drawn(draw: Callable[..., Axes]) -> Callable[..., Axes]:
+    """Give a function that draws on axes the options :class:`mitsim.core.configuration.Drawn`."""
+
+    @wraps(draw)
+    def call(*arguments: Any, **options: Any) -> Axes:
+        asked, axes = Drawn(**options), draw(*arguments)
+        if options:
+            style_figure(axes.figure, asked.style, 1)
+        if asked.output is not None:
+            save_figure(axes.figure, asked.output)
+        return axes
+
+    return call
+
+
 # -------- Results on axes: frames, factors, images and plans, for the `plot` methods
 
 
+@_drawn
 def draw_shot(
     shots: Capture, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None
 ) -> Axes:
@@ -237,17 +322,20 @@ def draw_shot(
     return _draw(ax, channels[channel], f"{name}, shot {shot}: pattern ({taken.row}, {taken.column}){sign}", unit)
 
 
+@_drawn
 def draw_sensed(sensed: Sensed, ax: Axes | None = None) -> Axes:
     title = f"{sensed.sensor.name}, exposure {sensed.exposure_s:.3g} s"
     return _draw(ax, sensed.digital, title, "digital number [DN]")
 
 
+@_drawn
 def draw_rendered(rendered: Rendered, ax: Axes | None = None) -> Axes:
     channels = rendered.mean.shape[2]
     title = f"{rendered.facts['estimator']} estimator" + (f", mean of {channels} channels" if channels > 1 else "")
     return _draw(ax, rendered.mean.mean(axis=2), title, "irradiance [W/m$^2$]")
 
 
+@_drawn
 def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
     line = "row" if side == "left" else "column"
     title = f"{side.capitalize()} factor, of {line}s"
@@ -256,6 +344,7 @@ def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: A
     return axes
 
 
+@_drawn
 def draw_image(
     image: Reconstruction, quantity: Literal["image", "uncertainty", "depth"] = "image", ax: Axes | None = None
 ) -> Axes:
@@ -273,6 +362,7 @@ def draw_image(
     return _draw(ax, values, title, unit, pixel="projector ", cmap="viridis")
 
 
+@_drawn
 def draw_plan(plan: Plan, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
     """Draw the error of the frames without each effect, or the predicted seconds of each stage, as bars."""
     if quantity == "error":

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from mitsim.core.configuration import locate
+from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.studies.framework.claims import distinct
 from mitsim.studies.framework.experiment import (
+    ASKED,
     KNOBS,
     MEASURES,
     NO_SCENE,
@@ -28,10 +33,10 @@ if TYPE_CHECKING:
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    check_sweep(scope.sweep, len(scope.pictures))
+    check_sweep(scope.sweep, len(scope.pictures) * len(scope.seeds))
     knobs: dict[str, Any] = dict(scope.sweep)
     values = {"patterns": (scope.patterns,), "exposure": (EQUAL_PEAK,)}
-    values |= {name: knobs[name] for name in ("patterns", "exposure", "method") if name in knobs}
+    values |= {name: knobs[name] for name in ("patterns", "exposure", "method", ASKED) if name in knobs}
     scene = {name: each for name, each in knobs.items() if name not in NO_SCENE}
     own = replace(scope, seeds=tuple(int(each) for each in knobs.get("seed", scope.seeds)))
     points = []
@@ -47,18 +52,40 @@ def _knobs(results: Results) -> list[str]:
     return [name for name in knobs if len(distinct(results.frame, name)) > 1] or knobs[:1]
 
 
+def _bars(scope: Scope) -> str:
+    """Return the meaning of the bars; nothing if each mean is of one image."""
+    prints, seeds = len(scope.pictures), len(scope.seeds)
+    of = f"{prints} pictures" if prints > 1 else f"{seeds} seeds"
+    return f"95 % interval of {of}" if prints * seeds > 1 else ""
+
+
+def _axis(scope: Scope, knob: str) -> str:
+    """Return the name of an axis: the parameter, and its meaning and unit as the scene file's comment states them."""
+    if knob in NO_SCENE:
+        return MEASURES["lambda"][1] if knob == ASKED else f"{knob} [1]"
+    found = None
+    with suppress(OSError, MitsimError):  # parts may be merged where the scene is not
+        text = locate(scope.setup.scene, "scenes", "scene.xml").read_text("utf-8")
+        words = r"(?:(mm|degrees),? )?([^\n$]*?)(?: \[(.+?)\].*?| \(chosen.*?)?"
+        found = re.search(rf'<default name="{re.escape(knob)}"[^>]*>[ \t]*<!-- {words} -->', text)
+    unit = (found and (found[1] or found[3])) or "as in the scene file"
+    unit = re.sub(r"\^(-?\d+)", r"$^{\1}$", unit).replace(" ", "\N{NO-BREAK SPACE}")
+    return f"{knob}: {found[2]} [{unit}]" if found else f"{knob} [{unit}]"
+
+
 def _panels(results: Results) -> Mapping[str, Figure]:
     first, *others = knobs = _knobs(results)
-    names: dict[Any, str] = {(knob, each): f"{knob} {each}" for knob in knobs for each in distinct(results.frame, knob)}
-    panels: list[Panel] = [
-        Images(first, title=f"Images by {' and '.join(knobs)}", down=("picture", *others), names=names | {None: ""})
-    ]
+    values = [(knob, each) for knob in knobs for each in distinct(results.frame, knob)]
+    names: dict[Any, str] = {(knob, each): f"{knob.removeprefix('asked_')} {each}" for knob, each in values}
+    seeds, bars = results.scope.seeds, _bars(results.scope)
+    title = f"Images by {' and '.join(knobs)}{f', seed {seeds[0]}' if len(seeds) > 1 else ''}"
+    panels: list[Panel] = [Images(first, title=title, down=("picture", *others), names=names | {None: ""})]
     numeric = [knob for knob in knobs if all(map(is_number, distinct(results.frame, knob)))]
     for measure in results.scope.measures if numeric else ():
         (column, axis), x = MEASURES[measure], numeric[0]
         panels.append(
-            Lines(x, f"{x} [{'1' if x in NO_SCENE else 'as in the scene file'}]", file=measure, y=column, y_label=axis,
-                  names=names, facet="", colour=[knob for knob in knobs if knob != x])
+            Lines(x, _axis(results.scope, x), file=measure, y=column, y_label=axis, names=names, facet="",
+                  colour=[knob for knob in knobs if knob != x], interval=True, title=f"Mean and {bars}" if bars else "")
         )  # fmt: skip
     return {file: figure for panel in panels for file, figure in panel.draw(results).items()}
 
@@ -67,7 +94,9 @@ def _table(results: Results) -> Sequence[Part]:
     columns = {MEASURES[name][0]: f"{name.replace('_', '-')} {MEASURES[name][1].rpartition(' ')[2]}"
                for name in results.scope.measures}  # fmt: skip
     names = {(knob, each): str(each) for knob in _knobs(results) for each in distinct(results.frame, knob)}
-    table = Pivot(_knobs(results), columns=columns, title="Measures by setting", names=names)
+    bars = _bars(results.scope)
+    title = f"Measures by setting{f': mean +- {bars}' if bars else ''}"
+    table = Pivot(_knobs(results), columns=columns, title=title, names=names, interval=True)
     return [*table.draw(results).values()]
 
 
@@ -82,5 +111,6 @@ STUDY = Study(
     about="Rendered frames with the sensor's noise, exposed at equal peak unless the exposure varies (the brightest "
     "pixel fills the same part of the full well), and the images that mitsim reconstruct makes of them, with "
     "factors calibrated by a session of the same camera. Parameters have the names and units of the scene file, "
-    "where lengths are in mm.",
+    "where lengths are in mm. Each further seed draws noise, calibration and random patterns anew, in light that is "
+    "traced once. After +- and as bars: the 95 % confidence interval of the mean (Student's t).",
 )

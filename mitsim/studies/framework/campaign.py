@@ -90,12 +90,14 @@ class StudyResult:
         return card(f"Study in {self.output}", {}, self.lines()) + "".join(shown)
 
 
-def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figure]:
-    """Write the figures that show something, and return them."""
+def write_figures(folder: Path, figures: Mapping[str, Figure], style: str = "screen") -> dict[str, Figure]:
+    """Write the figures that show something as PNG, SVG and PDF, and return them by the names of their PNG files."""
+    from mitsim.report.plots import save_figure, style_figure
+
     drawn = {file: figure for file, figure in figures.items() if figure.axes}
     for file, figure in drawn.items():
-        with files.whole_file(folder / file) as part:
-            figure.savefig(part, dpi=150, format="png")  # 1290 pixels wide, a page of text on a common screen
+        style_figure(figure, style)
+        save_figure(figure, folder / file)
     return drawn
 
 
@@ -117,7 +119,7 @@ def study_folder(output: Path | str, name: str) -> AbstractContextManager[Path]:
 def _is_earlier(place: Path, name: str) -> bool:
     head = place / f"{name}.json"
     found = files.read_json(head) if head.is_file() else None
-    written = "*.png", "*.csv", "*.html", "camera.toml", POINTS, KEPT, *DEMO_FOLDERS, *PAPER
+    written = "*.png", "*.svg", "*.pdf", "*.csv", "*.html", "camera.toml", POINTS, KEPT, *DEMO_FOLDERS, *PAPER
     names = [item.name for item in place.iterdir()] if isinstance(found, dict) and found.get("kind") == name else [""]
     return all(any(fnmatch(each, known) for known in (head.name, ".*", *written)) for each in names)
 
@@ -311,6 +313,7 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
 
 def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Store], None]) -> StudyResult:
     """Fill a study's folder with points, and write table, claims, figures and page if no point is missing."""
+    from mitsim.studies.framework.claims import with_intervals
     from mitsim.studies.framework.panels import section_of, write_page
 
     experiment, started = find_experiment(study), time.perf_counter()
@@ -334,13 +337,19 @@ def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Stor
         found = {point.key: store.load(point) for point in points}
         rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
         arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
-        results = Results(rows, arrays, scope)
-        claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
+        results = with_intervals(Results(rows, arrays, scope))
+        claims = tuple(experiment.judge(results))
+        figures = write_figures(folder, experiment.draw(results), scope.style)
         files.write_text(folder / f"{name}.csv", results.frame.to_csv(index=False))
         section = section_of(experiment, study, claims, figures, results)
         write_page([section], folder / f"{name}.html", section.title)
         result = replace(
-            result, rows=rows, claims=claims, figures=tuple(figures), section=section, warnings=section.warnings
+            result,
+            rows=tuple(results.rows),
+            claims=claims,
+            figures=tuple(figures),
+            section=section,
+            warnings=section.warnings,
         )
         files.write_json(place, {**head, "status": "complete", **result.payload()})
     return result

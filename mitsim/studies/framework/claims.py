@@ -21,13 +21,12 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import FAMILIES
 from mitsim.report import IDEALISED, RENDERED, in_text
 from mitsim.report.pages import Mean, round_to_error
-from mitsim.studies.framework.experiment import Claim, Results
+from mitsim.studies.framework.experiment import MEASURES, Claim, Results
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
 CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"
-_CONFIDENCE = 0.95
 Holds = bool | None
 Where = Mapping[str, Any] | str
 """Values by column that choose rows: a value, a sequence of values, or a predicate; a text is the value of the column
@@ -96,6 +95,27 @@ def mean_of(
     return mean._replace(error=math.hypot(own, mean_of(rows, error_column).value))
 
 
+def with_intervals(results: Results) -> Results:
+    """Add the mean and half of its 95 % interval to each row of a sweep, for each shown measure.
+
+    Means are over all seeds and prints of one setting. A sweep of one seed on one print is returned as it is.
+    """
+    scope, table = results.scope, results.frame
+    if not scope.measures or len(scope.seeds) * len(scope.pictures) == 1:
+        return results
+    means: dict[tuple[Any, ...], dict[str, float]] = {}
+    for row in results.rows:
+        setting = {name: row.get(name) for name, _ in scope.sweep}
+        if (key := tuple(setting.values())) not in means:
+            same = choose_rows(table, setting)
+            columns = [name for name in (MEASURES[each][0] for each in scope.measures) if same[name].notna().any()]
+            found = {name: mean_of(same, name) for name in columns}
+            means[key] = {f"{name}_mean": mean.value for name, mean in found.items()}
+            means[key] |= {f"{name}_ci95": mean.reach for name, mean in found.items()}
+    rows = [{**row, **means[tuple(row.get(name) for name, _ in scope.sweep)]} for row in results.rows]
+    return replace(results, rows=rows)
+
+
 # -------- A mean and a range in, the verdict out
 
 
@@ -103,9 +123,7 @@ def within(quantity: Mean, low: float = -math.inf, high: float = math.inf) -> Ho
     """Return whether a quantity lies in a range, by Student's interval; a single value decides nothing."""
     if quantity.of < 2:
         return None
-    from scipy.special import stdtrit
-
-    reach = float(stdtrit(quantity.of - 1, 1 - (1 - _CONFIDENCE) / 2)) * quantity.error
+    reach = quantity.reach
     if low < quantity.value - reach and quantity.value + reach < high:
         return True
     return False if quantity.value + reach < low or quantity.value - reach > high else None

@@ -15,11 +15,11 @@ from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitsim.bench.request import Request
+from mitsim.bench.request import AUTO, Request
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import read_name
-from mitsim.reconstruct.request import METHODS
+from mitsim.reconstruct.request import METHODS, MODEL, TIKHONOV, ImageRequest
 from mitsim.report import CONVENTIONS
 from mitsim.studies import ALL, EXPERIMENTS, GONE, SHARED
 
@@ -113,6 +113,8 @@ class Scope:
         recipe of a calibration whose drift is studied; None: the shipped one.
     data
         folder of real captures.
+    style
+        style of the figures.
     """
 
     setup: Setup
@@ -124,6 +126,7 @@ class Scope:
     patterns: str = "dots:7"
     recipe: str | None = None
     data: str | None = None
+    style: str = "screen"
 
     @property
     def repeats(self) -> tuple[int, ...]:
@@ -362,7 +365,9 @@ MEASURES = {
     "lambda": ("lambda", "lambda, weight of the regularisation [(electrons/s)²]"),
     "seconds": ("seconds", "time of the solution [s]"),
 }
-NO_SCENE = ("patterns", "exposure", "seed", "accuracy", "method")
+ASKED = "asked_lambda"
+"""Knob and column of the requested lambda, beside the column of the lambda that was used."""
+NO_SCENE = ("patterns", "exposure", "seed", "accuracy", "method", ASKED)
 """Knobs of a sweep that are no parameters of the scene."""
 OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason", *(c for c, _ in MEASURES.values())}
 """Columns of every study's table that are no knob."""
@@ -393,7 +398,9 @@ def values_of(text: str) -> tuple[str, tuple[str, ...]]:
 
 def check_sweep(sweep: Sweep, pictures: int) -> None:
     """Raise MitsimError for a ``sweep`` that varies nothing, or an impossible knob."""
-    knobs, allowed = dict(sweep), {"exposure": CONVENTIONS, "method": METHODS}
+    knobs, allowed = dict(sweep), {"exposure": CONVENTIONS}
+    if len(knobs) < len(sweep):
+        raise MitsimError("study sweep: something is varied twice; give all its values at once")
     if not knobs:
         raise MitsimError(
             "study sweep: nothing is varied; give --over NAME=FIRST:LAST:COUNT, such as roughness=0.1:0.5:5"
@@ -411,6 +418,11 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
             read_name(text)
         elif name in ("seed", "accuracy"):
             Request.of(**{name: number_of(name, text, int if name == "seed" else float)})
+    for method, lam in product(knobs.get("method", (TIKHONOV,)), knobs.get(ASKED, (AUTO,))):
+        if method.endswith(MODEL):
+            raise MitsimError(f"--method {method}: a sweep has no networks; use {', '.join(METHODS)}")
+        number: Any = lam if lam == AUTO else number_of("lambda", lam)
+        ImageRequest(method=method, lam=number)
 
 
 def number_of(knob: str, text: str, kind: type[int] | type[float] = float) -> float:

@@ -64,6 +64,8 @@ class Panel:
         names of values in the legend, beside rows and above columns.
     errors
         columns of errors that all rows share, by the column of their numbers.
+    interval
+        True for means with their 95 % intervals, False for means with one standard error.
     """
 
     _: KW_ONLY
@@ -73,6 +75,7 @@ class Panel:
     each: str = ""
     names: Names = field(default_factory=dict)
     errors: Mapping[str, str] = field(default_factory=dict)
+    interval: bool = False
 
     def draw(self, results: Results) -> dict[str, Any]:
         """Return the figures, or the tables of a page, by file name."""
@@ -118,12 +121,16 @@ class Panel:
         """Return the means of a ``column`` by the combinations of two lists of columns."""
         return {
             name: {
-                inner: mean_of(line, shown, error_column=self.errors.get(shown, ""))
+                inner: self.mean(line, shown)
                 for inner, (line, third) in self.parts(own, second).items()
                 if (shown := third or other or column) in line and line[shown].notna().any()
             }
             for name, (own, other) in self.parts(rows, first).items()
         }
+
+    def mean(self, rows: DataFrame, column: str) -> Mean:
+        found = mean_of(rows, column, error_column=self.errors.get(column, ""))
+        return found._replace(error=found.reach) if self.interval else found
 
     def joined(self, values: Mapping[str, Any]) -> str:
         return ", ".join(filter(None, (self.name(*item) for item in values.items())))
@@ -139,7 +146,7 @@ def is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Lines(Panel):
-    """Means of a column over another with bars of one standard error.
+    """Means of a column over another with bars of their errors.
 
     Attributes
     ----------
@@ -176,8 +183,7 @@ class Lines(Panel):
                 column, line = third or other or self.y, own.loc[first.append(line.index)]
                 line = line[to_numeric(line[column], errors="coerce").notna()] if column in line else line[:0]
                 shown[facet][colour] = {
-                    float(x): mean_of(choose_rows(line, {self.x: x}), column, error_column=self.errors.get(column, ""))
-                    for x in distinct(line, self.x)
+                    float(x): self.mean(choose_rows(line, {self.x: x}), column) for x in distinct(line, self.x)
                 }
         return curves(shown, self.x_label, self.y_label, log=self.log, title=self.title)
 
@@ -388,6 +394,8 @@ def section_of(
         ("--measure", ",".join(scope.measures)),
         ("--patterns", scope.patterns if scope.patterns != type(scope).patterns else None),
         ("--recipe", scope.recipe), ("--data", scope.data), ("--seed", scope.seeds[0]),
+        ("--seeds", len(scope.seeds) if len(scope.seeds) > 1 else None),
+        ("--style", scope.style if scope.style != type(scope).style else None),
         ("--variant", setup.variant if setup.variant != Setup.variant else None),
     ]  # fmt: skip
     flags = {"--allow-outside-files": setup.outside, "--quick": scope.quick}

@@ -17,6 +17,7 @@ from skimage.transform import resize
 
 from mitsim.acquire.capture import expose
 from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.request import AUTO
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
@@ -31,7 +32,7 @@ from mitsim.reconstruct.solver import Status
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.pages import Value
-from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TEST_IMAGES, TRUTH, Found, Point, Setup
+from mitsim.studies.framework.experiment import ASKED, IMAGE, QUICK_IMAGES, TEST_IMAGES, TRUTH, Found, Point, Setup
 
 Kept = TypeVar("Kept")
 
@@ -172,6 +173,7 @@ class Studio:
         exposure: str = EQUAL_PEAK,
         focus: Literal["auto", "map"] | None = None,
         method: str = TIKHONOV,
+        lam: float | Literal["auto"] = "auto",
     ) -> Image:
         """Return the image of a scene; a rendered one is exposed and reconstructed as a user's own frames are.
 
@@ -183,7 +185,7 @@ class Studio:
             return Image.of(frames, frames.seconds(exposure))
         exposure_s = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
         shots = expose(frames.lit.light, patterns, seed=seed, exposure=exposure_s)
-        found = reconstruct(shots, self.factors(setup, seed), focus=focus, method=method)
+        found = reconstruct(shots, self.factors(setup, seed), lam=lam, focus=focus, method=method)
         misfit, uncertainty = found.misfit, found.uncertainty
         trust = {
             "misfit": misfit.unexplained if misfit else None,
@@ -261,7 +263,8 @@ def measure_image(studio: Studio, point: Point, shown: Collection[str] | None = 
     """Return the quality of the image at a point; images are kept of the patterns ``shown``, or of all."""
     values = dict(point.values)
     patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
-    method = str(values.get("method", TIKHONOV))
-    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure, method=method)
+    asked: dict[str, Any] = {"method": values.get("method", TIKHONOV)}
+    asked |= {"lam": float(str(values[ASKED]))} if values.get(ASKED, AUTO) != AUTO else {}
+    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure, **asked)
     measured = image.row() | ({"seconds": image.seconds} if "method" in values else {})
     return finding(studio, point, image.image if shown is None or patterns in shown else None, **measured)

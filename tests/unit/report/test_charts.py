@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 import mitsim as ms
@@ -296,15 +299,48 @@ def test_a_plan_is_drawn_as_errors_and_as_seconds() -> None:
     assert widths == kept.predicted and "[s]" in stages.get_xlabel()
 
 
+def test_a_drawing_for_a_paper_is_written_as_three_files(results: tuple[Any, Any, Any], tmp_path: Path) -> None:
+    """The PDF is 89 mm wide [252.28 pt] with its fonts embedded as TrueType, all letters have at most 8 pt, a long
+    label is broken and not cut off, and a second drawing has the same bytes. (Planted: files with the date; the width
+    of the screen; fonts of type 3.)"""
+    for name in ("one.pdf", "two"):
+        own = results[2].plot(ax=axes(), output=tmp_path / name, style="paper")
+    assert len([*tmp_path.iterdir()]) == 6
+    for ending in ("png", "svg", "pdf"):
+        assert (tmp_path / f"one.{ending}").read_bytes() == (tmp_path / f"two.{ending}").read_bytes(), ending
+    pdf = (tmp_path / "one.pdf").read_bytes()
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ", pdf)
+    assert box and float(box[1]) == pytest.approx(89 / 25.4 * 72, abs=1e-3)
+    assert b"/FontFile2" in pdf and b"/Type3" not in pdf and b"CreationDate" not in pdf
+    assert Image.open(tmp_path / "one.png").size[0] == round(89 / 25.4 * 300)
+    assert max(text.get_fontsize() for text in own.figure.findobj(Text)) <= 8
+    (bar,) = (other for other in own.figure.axes if other is not own)
+    assert bar.get_ylabel().replace("\n", " ") == "reflectance, 1 = board, shown by the sRGB curve"
+    assert bar.yaxis.label.get_window_extent().height <= own.figure.bbox.height
+
+
+def test_a_wide_figure_for_a_paper_has_two_columns() -> None:
+    """(Planted: one column for all.)"""
+    grid = image_grid({"": [(np.zeros((2, 2)), "")] * 5}, list("abcde"))
+    plots.style_figure(grid, "paper")
+    lines = curves({"": {"a": {"1": Mean(1.0, 0.1, 2), "2": Mean(1.0, 0.1, 2)}}}, "x [mm]")
+    plots.style_figure(lines, "paper")
+    assert [round(25.4 * each.get_figwidth(), 3) for each in (grid, lines)] == [183, 89]
+    assert lines.axes[0].containers[0].lines[0].get_linewidth() == pytest.approx(0.99)
+
+
 def test_what_is_not_known_is_not_drawn(results: tuple[Any, Any, Any]) -> None:
     shots, _, image = results
     for draw, line in (
         (lambda: shots.plot(shot=99), "shot 99: give 0 to 5"),
         (lambda: shots.plot(quantity="light"), "quantity 'light': give 'dn' or 'electrons' or 'truth'"),
         (lambda: image.plot("depth"), "quantity 'depth': is not known of this image"),
+        (lambda: image.plot(style="poster"), "style 'poster': give 'screen' or 'paper'"),
+        (lambda: image.plot(output="no such/x"), "the folder no such does not exist"),
+        (lambda: image.plot(outptu="x"), "outptu is no option of plot; did you mean output"),
         (lambda: image.plot(ax="here"), "ax 'here': give a Axes or None"),
     ):
-        with pytest.raises(ms.ArgumentError, match=line):
+        with pytest.raises(MitsimError, match=line):
             draw()
 
 

@@ -80,7 +80,11 @@ def begun(folder: Path) -> list[str]:
 
 def contents(folder: Path) -> dict[str, bytes]:
     """All that tells of results: time and place apart."""
-    kept = {file.name: file.read_bytes() for file in folder.iterdir() if file.suffix in (".csv", ".png", ".html")}
+    kept = {
+        file.name: file.read_bytes()
+        for file in folder.iterdir()
+        if file.suffix in (".csv", ".png", ".svg", ".pdf", ".html")
+    }
     reported = json.loads((folder / "toy.json").read_text())
     return kept | {"rows": json.dumps([reported["rows"], reported["claims"], reported["figures"]]).encode()}
 
@@ -90,7 +94,9 @@ def test_every_point_is_measured_once_and_put_together(run: Run, tmp_path: Path)
     assert begun(tmp_path) == sorted(ALL) and result.points == 12 and not result.missing
     assert [claim.verdict for claim in result.claims] == ["confirmed"]
     folder = tmp_path / "out"
-    assert {file.name for file in folder.iterdir()} == {"toy.json", "toy.csv", "toy.html", "squares.png", "points"}
+    assert {file.name for file in folder.iterdir()} == {
+        *("toy.json", "toy.csv", "toy.html", "squares.png", "squares.svg", "squares.pdf", "points")
+    }
     rows = list(csv.DictReader((folder / "toy.csv").open()))
     assert [row["place"] + row["number"] for row in rows] == sorted(ALL), "in the order of the points"
     reported = json.loads((folder / "toy.json").read_text())
@@ -288,7 +294,8 @@ def test_a_cluster_gives_the_same(run: Run, tmp_path: Path) -> None:
 def test_a_figure_without_axes_is_not_written(tmp_path: Path) -> None:
     """(Planted: it is.)"""
     figures = {"toy.png": plots.singular_values({"a": [2.0, 1.0]}), "none.png": Figure()}
-    assert [*campaign.write_figures(tmp_path, figures)] == ["toy.png"] == [path.name for path in tmp_path.iterdir()]
+    assert [*campaign.write_figures(tmp_path, figures)] == ["toy.png"]
+    assert {path.name for path in tmp_path.iterdir()} == {"toy.png", "toy.svg", "toy.pdf"}
 
 
 def test_findings_that_may_not_be_trusted_end_with_1(

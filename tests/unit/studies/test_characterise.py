@@ -107,11 +107,14 @@ def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.Mo
     assert any(line.startswith("gain_dn_per_e of the camera found: 0.2") for line in done.warnings)
 
 
+PLOTS = "pdf", "png", "svg"
+
+
 def test_page_plots_and_json_lie_in_the_folder(tmp_path: Path) -> None:
     done = characterise(camera("plain"), Procedure(pixels=32, steps=20, frames=2), tmp_path / "found")
     assert sorted(path.name for path in (tmp_path / "found").glob("[!.]*")) == [
-        "camera.toml", "characterise.html", "characterise.json", "dark_current.png", "linearity.png",
-        "photon_transfer.png",
+        "camera.toml", "characterise.html", "characterise.json",
+        *(f"{name}.{kind}" for name in ("dark_current", "linearity", "photon_transfer") for kind in PLOTS),
     ]  # fmt: skip
     page = (tmp_path / "found" / "characterise.html").read_text(encoding="utf-8")
     assert page.count('<img src="data:image/') == 3 and done.message in page and done.warnings == ()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import lightness
 from mitsim.reconstruct.solver import Status, Verdict
@@ -21,7 +22,17 @@ from mitsim.report.pages import Mean, Value
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.campaign import Where, batches, run_experiment
-from mitsim.studies.framework.claims import UNDECIDED, Gain, Judged, Level, choose_rows, distinct, mean_of, measured
+from mitsim.studies.framework.claims import (
+    UNDECIDED,
+    Gain,
+    Judged,
+    Level,
+    choose_rows,
+    distinct,
+    mean_of,
+    measured,
+    with_intervals,
+)
 from mitsim.studies.framework.experiment import IMAGE, TRUTH, Axes, Claim, Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.panels import Bars, Images, Lines, flag_warnings, section_of, write_page
 from mitsim.studies.framework.studio import flags_of
@@ -372,6 +383,59 @@ def test_what_a_sweep_varies_and_measures() -> None:
     assert scope_of("sweep", WHOLE, "dots:7", (("mask", ("a", "b")),), "psnr,misfit").measures == ("psnr", "misfit")
     with pytest.raises(MitsimError, match="--measure 'speed': use psnr, ssim"):
         scope_of("sweep", WHOLE, "dots:7", (("mask", ("a", "b")),), "psnr,speed")
+
+
+def test_method_and_lambda_of_a_sweep_are_axes_like_others() -> None:
+    """From the command line and from Python; lambda is asked for in a column of its own, because each row states the
+    lambda that was used. (Planted: a list that is one method.)"""
+    swept = StudyOptions(over=["mask=open"], method="tikhonov,tv", lam="auto,1e6").varied
+    assert swept == (("mask", ("open",)), ("method", ("tikhonov", "tv")), ("asked_lambda", ("auto", "1e6")))
+    over = {"mask": ["open"], "method": ["tikhonov", "tv"], "lambda": ["auto", "1e6"]}
+    assert swept == StudyOptions(over=over).varied
+    assert StudyOptions(over={"a": 1}, lam=[1, 2.5]).varied[1] == ("asked_lambda", ("1.0", "2.5"))
+    points = find_experiment("sweep").points(Scope(Setup(), (None,), (4, 5), sweep=swept))
+    assert [(point["method"], point["asked_lambda"], point["seed"]) for point in points[:5]] == [
+        ("tikhonov", "auto", 4), ("tikhonov", "1e6", 4), ("tv", "auto", 4), ("tv", "1e6", 4), ("tikhonov", "auto", 5)
+    ]  # fmt: skip
+    for options, line in (
+        ({"method": "tikhonov,x"}, "method 'x': use tikhonov"),
+        ({"method": "net.pt"}, "--method net.pt: a sweep has no networks"),
+        ({"lam": "-1"}, "lam -1.0: give a finite number of at least 0"),
+        ({"lam": "much"}, "--over lambda=much: give numbers"),
+        ({"over": ["method=tv"], "method": "tv"}, "something is varied twice"),
+        ({"over": ["seed=1,2"], "seeds": 2}, "--seeds: seeds are varied by --over seed already"),
+        ({"seeds": 0}, "seeds 0: give a number from 1 to 1000"),
+        ({"seeds": 1000, "over": ["roughness=0.1:0.5:50"]}, "50000 points; give at most"),
+    ):
+        with pytest.raises(MitsimError, match=line):
+            ms.study("sweep", "photograph", **{"over": ["roughness=0.1,0.2"], **options})
+    with pytest.raises(MitsimError, match="seeds has no effect on the study patterns, but on sweep"):
+        ms.study("patterns", seeds=3)
+
+
+def test_the_means_of_a_sweep_have_student_intervals() -> None:
+    """Of 30, 31 and 33 dB by hand: mean 94/3, standard error sqrt(7/9), and t(2) = 4.30265 for 95 %. The curve's bar
+    and the table's columns are equal, and the mean of another setting is not mixed in. (Planted: the normal
+    distribution's 1.96; the mean of all rows.)"""
+    scope = Scope(Setup(), (None,), (0, 1, 2), sweep=(("sheet_z", ("390", "400")),), measures=("psnr",))
+    experiment, psnr = find_experiment("sweep"), {"390": (20.0, 20.0, 20.0), "400": (30.0, 31.0, 33.0)}
+    rows = [
+        {"point": each.key, **each.row(psnr_db=psnr[dict(each.setup.parameters)["sheet_z"]][each["seed"]])}
+        for each in experiment.points(scope)
+    ]
+    results = with_intervals(Results(rows, scope=scope))
+    found = {(row["sheet_z"], row["psnr_db_mean"], row["psnr_db_ci95"]) for row in results.rows}
+    half = 4.302653 * math.sqrt(7 / 9)
+    assert len(results.rows) == 6 and sorted(found) == [
+        ("390", 20, 0), ("400", pytest.approx(94 / 3), pytest.approx(half, rel=1e-6))
+    ]  # fmt: skip
+    drawn = experiment.draw(results)["psnr.png"]
+    _, _, (bars,) = drawn.axes[0].containers[0].lines
+    assert np.ptp(bars.get_segments()[1][:, 1]) == pytest.approx(2 * half, rel=1e-6)
+    assert drawn.get_suptitle() == "Mean and 95 % interval of 3 seeds"
+    assert drawn.axes[0].get_xlabel() == "sheet_z: where the printed sheet stands [mm]"
+    alone = Results(rows[:2], scope=replace(scope, seeds=(0,)))
+    assert with_intervals(alone) is alone
 
 
 @pytest.mark.parametrize("text", ["", "roughness", "roughness=", "=1:2:3", "z=1:2:x", "z=1:2:1", "z=1:2:99999"])
