@@ -260,12 +260,18 @@ class StudyOptions(Styled, Opening, Seeded):
         kind=list[str],
     )
     measure: str = option("psnr", "only with sweep: results to plot, such as psnr, ssim, misfit", metavar="NAME,...")
-    method: str | Sequence[str] = option(TIKHONOV, "only with sweep: methods of its images", metavar="NAME,...", kind=str)
+    method: str | Sequence[str] = option(
+        TIKHONOV, "only with sweep: methods of its images", metavar="NAME,...", kind=str
+    )
     lam: str | float | Sequence[str | float] = option(
         AUTO, "only with sweep: regularisations of its images, or auto", "--lambda", metavar="auto|VALUE,...", kind=str
     )
     seeds: int = option(
-        1, "only with sweep: seeds, from --seed on, to take means with 95 % intervals over", metavar="N", min=1, max=1000
+        1,
+        "only with sweep: seeds, from --seed on, to take means and 95 % intervals of",
+        metavar="N",
+        min=1,
+        max=1000,
     )
 
     @property
