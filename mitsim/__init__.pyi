@@ -26,6 +26,7 @@ from mitsim.exchange.formats import export as export
 from mitsim.exchange.formats import import_file as import_file
 from mitsim.exchange.formats import import_frames as import_frames
 from mitsim.exchange.formats import pattern_pictures as pattern_pictures
+from mitsim.exchange.formats import patterns as patterns
 from mitsim.learn.pair_store import PairStore as PairStore
 from mitsim.light.plan import Plan as Plan
 from mitsim.metrics import psnr as psnr
@@ -37,8 +38,11 @@ from mitsim.reconstruct.known_pictures import calibrate_known as calibrate_known
 from mitsim.reconstruct.point_spread import reconstruct_psf as reconstruct_psf
 from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
 from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
+from mitsim.report.folder_page import report as report
 from mitsim.report.folder_page import report_folder as report_folder
 from mitsim.report.reconstruct_run import reconstruct_colours as reconstruct_colours
+from mitsim.sessions.folder_facts import FolderFacts as FolderFacts
+from mitsim.sessions.folder_facts import show as show
 from mitsim.sessions.run_session import run as run
 from mitsim.sessions.session_file import session_of as session_of
 from mitsim.verbs import characterise as characterise
@@ -46,6 +50,7 @@ from mitsim.verbs import demo as demo
 from mitsim.verbs import doctor as doctor
 from mitsim.verbs import load_network as load_network
 from mitsim.verbs import make_pairs as make_pairs
+from mitsim.verbs import pairs as pairs
 from mitsim.verbs import scenes as scenes
 from mitsim.verbs import sense as sense
 from mitsim.verbs import study as study

@@ -601,9 +601,12 @@ def make_pairs(
     check_output(output, overwrite=resume and (output / PAIRS).is_file())
     task = Task.of(output, resume, job)
     with task.importing():
-        from mitsim.learn import pairs
+        from mitsim.learn.pairs import make_pairs
 
-    return pairs.make_pairs(bench, asked, task)[0]
+    return make_pairs(bench, asked, task)[0]
+
+
+pairs = make_pairs
 
 
 @check_arguments

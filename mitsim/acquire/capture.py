@@ -29,6 +29,7 @@ from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, keep_sce
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, write_frame
 from mitsim.core.files import FRAMES, output_folder
+from mitsim.core.images import card, normalise, span
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
@@ -87,6 +88,14 @@ class Light(SampledLight):
         """
         write_light(Path(path), self)
         return Path(path)
+
+    def _repr_html_(self) -> str:
+        side = math.isqrt(len(self.flux))
+        caption = f"light on the sensor by projector pixel\n{span(self.flux, 'W/m^2')}"
+        error = f"{self.sampling_error:.1e}, accuracy {self.plan.accuracy:g}"
+        rows = {"bench": self.bench, "paths": f"{self.paths:.3g}", "Monte Carlo error": error, "seed": self.seed}
+        pictures = {caption: normalise(self.flux.reshape(side, side))}
+        return card("Light by projector pixel", pictures, (*self.warnings, "Frames: light.expose('dots:7')"), rows)
 
 
 def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None, seed: int | None = None) -> Light:

@@ -78,6 +78,11 @@ def open_bench(
 
 # ---- The bench and its verbs ----
 
+_LISTED = """view plan light transport capture capture_lines capture_mosaic choose_colour calibrate calibrate_lines
+calibrate_mosaic calibrate_depths write_session render with_board in_variant in_bands family geometry sensor projector n
+variant"""
+"""Names that ``dir(bench)`` lists."""
+
 
 class Bench(Apparatus):
     """Apparatus that is ready to plan, capture and calibrate.
@@ -89,6 +94,29 @@ class Bench(Apparatus):
         path, (rows, columns) = self.loaded.path, self.geometry.frame_shape
         devices = f"{self.sensor.name} with {rows} x {columns} pixels, {self.projector.name}"
         return f"Bench({path.parent.name}/{path.name}: {devices})"
+
+    def __dir__(self) -> list[str]:
+        """Return the names that a user needs; the other attributes serve the package."""
+        return sorted(_LISTED.split())
+
+    def _repr_html_(self) -> str:
+        import numpy as np
+
+        from mitsim.core.images import card, normalise
+
+        geometry, mask = self.geometry, self.geometry.build_mask()
+        (rows, columns), pitch = geometry.frame_shape, geometry.pixel_pitch * 1e3
+        facts = {
+            "scene": f"{self.loaded.path}, in {self.variant}",
+            "camera": f"{self.sensor.name}, {rows} x {columns} pixels of {pitch:.4g} um",
+            "mask": f"{geometry.mask_words}, {geometry.mask_distance:g} mm before the sensor",
+            "projector": f"{self.projector.name}, {self.n} x {self.n} pixels, set to {geometry.scene_distance:g} mm",
+        }
+        places = (np.arange(128) - 63.5) / 128 * min(mask.extent_mm, 64 * mask.feature_mm)
+        picture = {
+            "the 64 x 64 features in the middle of the mask": normalise(mask.transmission(places[:, None], places))
+        }
+        return card(str(self), picture, ("Drawing to scale: bench.view()",), facts)
 
     # ---- The plan, and light of the scene ----
 
@@ -132,6 +160,8 @@ class Bench(Apparatus):
         else:
             check_plan(patterns, SpectralBench(self), asked)
         return trace_request(self, patterns, job, asked.seed)
+
+    transport = light
 
     # ---- Captures ----
 
@@ -457,7 +487,7 @@ _LIT_MM = 120.0
 
 
 @check_arguments
-def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.0, **options: Any) -> Bench:
+def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.0, **parameters: Any) -> Bench:
     """Open the scene ``photograph`` with your own picture on its sheet.
 
     Parameters
@@ -471,8 +501,8 @@ def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.
         of 128 x 128 numbers has one for each of its pixels.
     distance_mm
         Distance from the camera to the sheet [mm]. The bench stays aligned to 400 mm, and so does its calibration.
-    **options
-        Other arguments of :func:`mitsim.open_bench`: ``camera``, ``projector``, ``variant``, parameters of the scene.
+    **parameters
+        ``camera``, ``projector``, ``variant`` and parameters of the scene, as for :func:`mitsim.open_bench`.
 
     Returns
     -------
@@ -485,12 +515,12 @@ def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.
         for a picture that cannot be read or whose numbers are no reflectances, and as :func:`mitsim.open_bench`.
     """
     path = picture if isinstance(picture, str | Path) else _write_array(picture)
-    return open_bench("photograph", picture=path, sheet_mm=size_mm, sheet_z=distance_mm, **options)
+    return open_bench("photograph", picture=path, sheet_mm=size_mm, sheet_z=distance_mm, **parameters)
 
 
 @check_arguments
 def shelf_scene(
-    mesh: Path | str, size_mm: float = 60.0, reflectance: float = 0.7, turn_deg: float = 0.0, **options: Any
+    mesh: Path | str, size_mm: float = 60.0, reflectance: float = 0.7, turn_deg: float = 0.0, **parameters: Any
 ) -> Bench:
     """Open the scene ``shelf`` with your own object.
 
@@ -504,8 +534,8 @@ def shelf_scene(
         Reflectance of the object's matt surface, on either side, 0 to 1.
     turn_deg
         Rotation about the upright axis [degrees].
-    **options
-        Other arguments of :func:`mitsim.open_bench`.
+    **parameters
+        ``camera``, ``projector``, ``variant`` and parameters of the scene, as for :func:`mitsim.open_bench`.
 
     Raises
     ------
@@ -513,7 +543,7 @@ def shelf_scene(
         for a mesh that cannot be read, has no faces, or normals that face into it, and as :func:`mitsim.open_bench`.
     """
     stated: dict[str, Any] = {"object_mm": size_mm, "object_albedo": reflectance, "object_turn": turn_deg}
-    return open_bench("shelf", object=mesh, **stated, **options)
+    return open_bench("shelf", object=mesh, **stated, **parameters)
 
 
 _ALLOWED = "give a file, or an array of real numbers 0 to 1 or of unsigned ones, (rows, columns) or (rows, columns, 3)"

@@ -417,7 +417,14 @@ def open_apparatus(
             own_um, stated_um = f"{own * 1e3:g} um", f"{scene} has {stated * 1e3:g} um"
             problem = f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {own_um}, but {stated_um}"
             raise MitsimError(f"{problem}; name the scene's own camera by --camera, or change {name}")
-    loaded = _at_own_distance(loaded, mask, sensor_path, defines)
+    if mask is not None and (own := mask.distance_mm) is not None:
+        stated = loaded.camera.geometry.mask_distance
+        if "mask_distance" in defines and not math.isclose(own, stated):
+            problem = f"camera {sensor_path}: its table [mask] has distance_mm {own:g}"
+            raise MitsimError(f"{problem}, and mask_distance was set to {stated:g}; give one of the two")
+        note = f"mask: {own:g} mm before the sensor, as its camera file says, in place of the scene's {stated:g} mm"
+        notes = [loaded.sensor_note, "" if math.isclose(own, stated) else note]
+        loaded = replace(loaded, sensor_note="; ".join(filter(None, notes)))
     _adapt(loaded, mask, sensor_path, light)
     devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
     # By their whole paths: who repeats this from another folder finds them.
@@ -439,25 +446,6 @@ def reopen(bench: Opened, variant: str) -> Opened:
     loaded = _load(variant, bench.loaded.path, bench.defines, outside=True, **given)
     _adapt(loaded, load_mask(camera), camera, bench.projector)
     return replace(bench, loaded=loaded, variant=variant)
-
-
-def _at_own_distance(
-    loaded: LoadedScene, mask: MaskProfile | None, camera: Path, defines: Mapping[str, str]
-) -> LoadedScene:
-    """Return the scene with a note if the camera file states another mask distance than the scene.
-
-    MitsimError if the user set the parameter ``mask_distance`` to another value.
-    """
-    if mask is None or mask.distance_mm is None:
-        return loaded
-    own, stated = mask.distance_mm, loaded.camera.geometry.mask_distance
-    if math.isclose(own, stated):
-        return loaded
-    if "mask_distance" in defines:
-        problem = f"camera {camera}: its table [mask] has distance_mm {own:g}, and mask_distance was set to {stated:g}"
-        raise MitsimError(f"{problem}; give one of the two, or the same value")
-    note = f"mask: {own:g} mm before the sensor, as its camera file says, in place of the scene's {stated:g} mm"
-    return replace(loaded, sensor_note="; ".join(filter(None, (loaded.sensor_note, note))))
 
 
 def _adapt(loaded: LoadedScene, mask: MaskProfile | None, camera: Path, projector: ProjectorModel) -> None:

@@ -195,6 +195,25 @@ def report(asked: Reporting) -> int:
     return asked.finish({**made, "output": str(asked.folder)}, [page_line(made)])
 
 
+class ShowingFolder(Common):
+    """Options of `mitsim show`."""
+
+    folder: Path = argument(..., "folder of any command", "FOLDER")
+
+
+@command
+def show(asked: ShowingFolder) -> int:
+    """Describe a folder: its kind, origin, main numbers and next steps.
+
+    Only its JSON files are read. The status is 1 if the folder is flagged, or its work was interrupted.
+
+    $ mitsim show run
+    $ mitsim show cal --json
+    """
+    found = mitsim.show(asked.folder)
+    return asked.finish(vars(found), found.lines(), found.warnings)
+
+
 # ---- A camera's sensor alone -----------------------------------------------------------------------------------------
 
 _CAMERA: dict[str, Any] = {"help": "camera: shipped name, or TOML file", "complete": lambda: shipped_names(CAMERA)}

@@ -152,11 +152,8 @@ def list_(asked: Listing) -> int:
 # ---- Files to begin with ---------------------------------------------------------------------------------------------
 
 _MASKS: dict[str, dict[str, Any]] = {
-    "separable": {"order": 9},
-    "flatcam": {"order": 9},
-    "open": {"order": 9},
-    "mura": {"features": 127},
-    "random": {"features": 127},
+    **{kind: {"order": 9} for kind in ("separable", "flatcam", "open")},
+    **{kind: {"features": 127} for kind in ("mura", "random")},
     "drawing": {"file": "mask.png"},
     "psf": {"file": "psf.png", "psf_distance_mm": 400.0, "aperture_mm2": 1.0},
 }

@@ -575,8 +575,12 @@ def normalise(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return (shown - low) / (high - low) if high > low else np.zeros_like(shown)
 
 
-def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]) -> str:
-    """Return an object's HTML for a notebook; ``pictures`` are values in 0..1 or linear sRGB by caption."""
+def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str], rows: Any = ()) -> str:
+    """Return an object's HTML for a notebook.
+
+    ``pictures`` are values in 0..1 or linear sRGB by caption, ``rows`` a mapping that becomes a small table, and
+    ``facts`` lines below it.
+    """
     sources = {caption: data_uri(png(values, _LARGEST_INLINE)) for caption, values in pictures.items()}
     figures = "".join(
         '<figure style="display:inline-block;vertical-align:top;margin:4px 12px 4px 0">'
@@ -584,24 +588,25 @@ def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]
         f'<figcaption style="font-size:85%;white-space:pre-line">{html.escape(caption)}</figcaption></figure>'
         for caption, source in sources.items()
     )
-    return _with_title(title, f"<div>{figures}</div>", facts)
+    small = "".join(_row((name, str(value)), "td") for name, value in dict(rows).items())
+    return _with_title(title, f"<div>{figures}</div><table>{small}</table>", facts)
 
 
 def table(
     title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], facts: Iterable[str] = (), numbers: int = 0
 ) -> str:
     """Return a table's HTML for a notebook; the last ``numbers`` columns are aligned as numbers."""
+    body = "".join(_row(row, "td", numbers) for row in rows)
+    return _with_title(title, f"<table>{_row(headings, 'th', numbers)}{body}</table>", facts)
 
-    def line(cells: Sequence[str], tag: str) -> str:
-        sides = ["left"] * (len(cells) - numbers) + ["right"] * numbers
-        style = "padding:2px 10px 2px 0;vertical-align:top"
-        whole = (";white-space:nowrap" if len(cell) < _SHORT_CELL else "" for cell in cells)
-        each = zip(cells, sides, whole, strict=True)
-        texts = (f'<{tag} style="{style};text-align:{side}{wrap}">{html.escape(cell)}' for cell, side, wrap in each)
-        return "".join(f"{text}</{tag}>" for text in texts)
 
-    body = "".join(f"<tr>{line(row, 'td')}</tr>" for row in rows)
-    return _with_title(title, f"<table><tr>{line(headings, 'th')}</tr>{body}</table>", facts)
+def _row(cells: Sequence[str], tag: str, numbers: int = 0) -> str:
+    sides = ["left"] * (len(cells) - numbers) + ["right"] * numbers
+    style = "padding:2px 10px 2px 0;vertical-align:top"
+    whole = (";white-space:nowrap" if len(cell) < _SHORT_CELL else "" for cell in cells)
+    each = zip(cells, sides, whole, strict=True)
+    texts = (f'<{tag} style="{style};text-align:{side}{wrap}">{html.escape(cell)}' for cell, side, wrap in each)
+    return f"<tr>{''.join(f'{text}</{tag}>' for text in texts)}</tr>"
 
 
 def _with_title(title: str, body: str, facts: Iterable[str]) -> str:

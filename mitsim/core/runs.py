@@ -302,9 +302,9 @@ class Capture:
             caption = f"shot {index}, pattern ({shot.row}, {shot.column})\n{span(frame, 'DN')}"
             pictures[caption] = normalise(frame)
         truth = {} if self.truth is None else {"truth\nreflectance 0 to 1": self.truth}
-        facts = f"{self._size}, exposure {self.exposure_s:.3g} s a shot; {self.folder or 'in memory'}"
         title = f"Capture: {self.manifest.patterns.family or 'patterns'}"
-        return card(title, {**pictures, **truth}, (facts, *self.warnings))
+        rows = {"frames": self._size, "exposure": f"{self.exposure_s:.3g} s each", "place": self.folder or "memory"}
+        return card(title, {**pictures, **truth}, self.warnings, rows)
 
     @property
     def _has_truth(self) -> bool:

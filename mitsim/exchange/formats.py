@@ -332,3 +332,6 @@ def pattern_pictures(patterns: str, output: Path | str, **options: Any) -> dict[
 
     drawn = draw_family(folder, patterns, pixels, str(asked.projector), seed, last)
     return {**drawn, "session": None}
+
+
+patterns = pattern_pictures

@@ -285,7 +285,7 @@ class Reconstruction(Solution):
         return f"Reconstruction({rows} x {columns}: {self.status.verdict.value}, residual {self.residual:.1e})"
 
     def _repr_html_(self) -> str:
-        facts = f"lambda {self.lam:.3g}, residual {self.residual:.1e} of the frames"
+        facts = {"lambda": f"{self.lam:.3g}", "residual of the frames": f"{self.residual:.1e}"}
         unit = "electrons/s" if POINT_SPREAD in self.inputs else "reflectance"
         pictures = {f"{unit} 0 to {self.white:.3g}": self.image / self.white}
         if self.uncertainty is not None:
@@ -293,8 +293,8 @@ class Reconstruction(Solution):
             pictures[caption] = normalise(self.uncertainty)
         if self.depths:
             pictures[f"depth of each pixel\n{span(self.depths.mm, 'mm')}"] = normalise(self.depths.mm)
-        lines = str(self.status), *self.trust, *self.limits, facts
-        return card(f"Reconstruction: {self.status.verdict.value}", pictures, lines)
+        lines = str(self.status), *self.trust, *self.limits
+        return card(f"Reconstruction: {self.status.verdict.value}", pictures, lines, facts)
 
 
 def _check_stored(more: object) -> None:

@@ -91,6 +91,9 @@ def report_folder(folder: Path | str) -> Path:
     return folder / PAGE
 
 
+report = report_folder
+
+
 def _write(folder: Path, shown: Shown) -> None:
     """Write pictures and pages, the folder's own page last, because it marks completion."""
     for name, part in shown["parts"].items():

@@ -26,7 +26,8 @@ from mitsim.core.colour_files import (
     open_lines,
     read_colours,
 )
-from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.configuration import takes
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, read_json, write_bytes
 from mitsim.core.images import png
@@ -133,7 +134,7 @@ def _origin(job: Job | None, run: Path | str, calibration: Path | str | None = N
 # -------- Images of several lines, and one in colour
 
 
-@check_arguments
+@takes(ImageRequest)
 def reconstruct_colours(
     run: Path | str,
     calibration: Path | str,
@@ -141,6 +142,7 @@ def reconstruct_colours(
     chart: ChartPlace | None = None,
     overwrite: bool = False,
     job: Job | None = None,
+    page: bool = True,
     **options: Any,
 ) -> ColourImage:
     """Recover the image of every line of a coloured run, and combine them to one image in colour.
@@ -160,9 +162,10 @@ def reconstruct_colours(
         Whether an earlier image of other inputs may be replaced.
     job
         Clock of the work.
+    page
+        False to leave out pictures and report.html, which :func:`mitsim.report` makes later.
     **options
-        Options of :func:`reconstruct`, for every line; of a run behind colour filters, ``lam`` alone. ``page=False``
-        leaves out pictures and report.html, which :func:`mitsim.report_folder` makes later.
+        Options of :func:`mitsim.reconstruct`, for every line; of a run behind colour filters, ``lam`` alone.
 
     Raises
     ------
@@ -170,7 +173,7 @@ def reconstruct_colours(
         For folders of different lines, and as :func:`reconstruct`.
     """
     run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
-    page, found = options.pop("page", True), open_lines(run, RUN, MOSAIC)
+    found = open_lines(run, RUN, MOSAIC)
     lines = found.filters or read_colours(run, RUN)
     check_lines(lines, str(run), calibration)
     boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
@@ -186,6 +189,8 @@ def reconstruct_colours(
         return image
 
     if found.filters:
+        for name in options.keys() - {"lam"}:
+            raise ArgumentError(name, "has no effect behind colour filters; leave it out")
         image = _solve_at_once(lines, run, calibration, output, board, overwrite, job, finish, **options)
     else:
         replaces = is_coloured(output) and (read_colours(output, IMAGE).names == lines.names or overwrite)

@@ -243,13 +243,15 @@ def test_objects_show_themselves(bench: ms.Bench, shots: ms.Capture, factors: ms
     assert page.count("<tr>") == 1 + len(plan.effects) and "error if off" in page
     assert all(f">{row.name}<" in page for row in plan.effects)
     for shown, pictures, words in (
+        (bench, 1, "separable, order 9, 2 mm before the sensor"),
+        (bench.light("uniform", accuracy=0.1), 1, "Monte Carlo error"),
         (shots, 4, "dots:3"),
         (factors, 2, "left: 64 sensor x 16 projector pixels"),
         (ms.reconstruct(shots, factors), 2, "standard uncertainty"),
     ):
         page = shown._repr_html_()
         assert page.count('src="data:image/png;base64,') == pictures, type(shown)
-        assert words in page and len(page) < 1e5
+        assert words in page and len(page) < 1e5 and page.count("<table>") == 1
 
 
 # ---- numbers and names -----------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from mitsim.reconstruct.reconstruct import Reconstruction, may_replace, reconstr
 from mitsim.reconstruct.request import ImageCost
 from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Tikhonov
+from mitsim.report import reconstruct_run
 from mitsim.report.reconstruct_run import reconstruct as reconstruct_folders
 from tests.ideal_sessions import Bench, bench, picture
 
@@ -229,9 +230,7 @@ def test_the_folders_are_refused_before_work(
     folders = shots.save(tmp_path / "run"), factors.save(tmp_path / "cal"), tmp_path / "image"
     reconstruct_folders(*folders, 1.0)
     reconstruct_folders(*folders, 1.0)
-    monkeypatch.setattr(
-        "mitsim.report.reconstruct_run.reconstruct_request", lambda *_: pytest.fail("work was done first")
-    )
+    monkeypatch.setattr(reconstruct_run, "reconstruct_request", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match=r"other inputs \(lambda differ\).*overwrite=True"):
         reconstruct_folders(*folders, 2.0)
     (tmp_path / "image" / "result.json").unlink()
