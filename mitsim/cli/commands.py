@@ -178,7 +178,7 @@ class Pictured(Common):
             drawn = Picture.of(path.name, path.name, values, unit=unit, ends=(None, None))
             return {
                 "file": str(drawn.write(path.parent)),
-                "shows": drawn.caption,
+                "shows": drawn.scale,
                 "seconds": time.perf_counter() - start,
             }
 

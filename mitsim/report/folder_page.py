@@ -26,7 +26,7 @@ from mitsim.core.exr import checksum, finite_channel, read_frame, verify_files, 
 from mitsim.core.files import PAGE, PICTURES, output_folder, read_json, remove_page, write_bytes, write_text
 from mitsim.core.images import card, data_uri, grey_png, lightness, png
 from mitsim.core.job import size_text
-from mitsim.core.manifests import MANIFEST, CalibrationManifest, read_manifest
+from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.runs import TRUTH, load_mosaic, load_run
 from mitsim.devices.framelist import ChartPlace
 from mitsim.light.plan import PlanRow
@@ -53,19 +53,28 @@ _ELSEWHERE = {
 }
 """Keys of a manifest or result outside the table of numbers."""
 _ABOVE_BLACK = "DN above the black level"
-_TRUTH = "what a perfect image shows: of each projector pixel what it lights, black where that is not seen"
+_TRUTH = "image that a perfect camera would recover; projector pixels whose light the camera cannot see are black"
 _MISFIT = 2.0
-"""Least chi-square that is white, so that chance fills no scale."""
+"""Least end of the scale of chi-square, so that chance does not fill the scale."""
 _SHOWN_PERCENT = 99.0
-"""Part of the errors within the scale of their picture."""
+"""Percentage of the errors that lie within the scale of their picture."""
 
 
 Shown = dict[str, Any]
 """Content of a folder's page: variables of its template, of which `parts` are pages of the folders in it."""
 
 
-def _shown(kind: str, verdict: str, **more: Any) -> Shown:
-    absent = {"detail": "", "command": None, "accuracy": None, "colours": None, "plan": (), "pictures": ()}
+def _shown(kind: str, subject: str, verdict: str, **more: Any) -> Shown:
+    absent = {
+        "title": f"{kind}: {subject}",
+        "subject": subject,
+        "detail": "",
+        "command": None,
+        "accuracy": None,
+        "colours": None,
+        "plan": (),
+        "pictures": (),
+    }
     tables: Shown = {"warnings": (), "seconds": {}, "kernels": {}, "tables": {}, "parts": {}, "facts": {}}
     return {"kind": kind, "verdict": verdict, **absent, **tables, **more}
 
@@ -148,6 +157,7 @@ def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> 
     first, *_, last = *parts.values(), *parts.values()
     return _shown(
         f"{first['kind']} by {axis}",
+        first["subject"],
         f"{len(parts)} {axis}{'s' if len(parts) > 1 else ''}: {', '.join(parts)}{unit}",
         warnings=[f"{name}: {text}" for name, part in parts.items() for text in part["warnings"]],
         command=first["command"],
@@ -155,6 +165,28 @@ def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> 
         tables={"Versions": first["tables"]["Versions"]},
         parts=parts,
     )
+
+
+def _subject(manifest: RunManifest | CalibrationManifest | None, file: Path) -> str:
+    """Return scene and camera of a ``manifest`` and the date of a ``file``, for the title of a page."""
+    if manifest is None:
+        return pages.subject("", "", file)
+    scene, camera = manifest.configuration.get("scene"), manifest.camera.get("sensor", manifest.camera)
+    camera = camera.get("name") if isinstance(camera, Mapping) else None
+    return pages.subject(pages.scene_name(Path(scene)) if isinstance(scene, str) else "", str(camera or ""), file)
+
+
+def _subject_of_image(made_of: Any, file: Path) -> str:
+    """Return :func:`_subject` of the run that an image was made of, or the run's folder if it is gone or damaged."""
+    stated = made_of.get("run") if isinstance(made_of, Mapping) else None
+    if not isinstance(stated, str):
+        return _subject(None, file)
+    run = Path(stated)
+    with suppress(MitsimError):
+        # A run of several spectral lines has a manifest for each line.
+        place = next((each.parent for each in sorted(run.glob(f"*/{MANIFEST}"))), run)
+        return _subject(read_manifest(run if (run / MANIFEST).is_file() else place, RunManifest), file)
+    return pages.subject(f"frames of {run.name}", "", file)
 
 
 # -------- Runs and calibrations
@@ -171,18 +203,23 @@ def _of_run(lines: SpectralFolder) -> Shown:
         return np.asarray(shots.read(name)[0]["DN"] - black)
 
     first = frame(taken.captures[0].file)
-    single = {"frame": (f"One of them, {taken.captures[0].file}", first, "")} if count > 1 else {}
-    titles = {"ambient": "Projector off: what is taken off", "closing": "Closing frame: no part of the image"}
-    single |= {kind: (titles[kind], frame(name), name) for kind, name in manifest.others.items()}
-    pictures = [pages.contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape)]
-    for name, (title, values, about) in single.items():
-        pictures.append(Picture.of(name, title, values, about, _ABOVE_BLACK, (0.0, None)))
+    titles = {
+        "ambient": "Ambient frame, with the projector off; subtracted from the frames",
+        "closing": "Closing frame; checks lamp and camera, and is not part of the image",
+    }
+    single = {"frame": ("First frame", first, f"file {taken.captures[0].file}")} if count > 1 else {}
+    single |= {kind: (titles[kind], frame(name), f"file {name}") for kind, name in manifest.others.items()}
+    pictures = [
+        Picture.of(name, title, values, about, _ABOVE_BLACK, (0.0, None))
+        for name, (title, values, about) in single.items()
+    ]
     if shots.truth is not None:
         pictures.append(Picture.of("truth", "The truth", shots.truth, _TRUTH))
     for name in lines.names if lines.filters else ():
         if (path := lines.folder / name / TRUTH).is_file():
             truth = finite_channel(read_frame(path)[0], "reflectance", path)
             pictures.append(Picture.of(f"truth_{name}", f"The truth at {name}", truth))
+    pictures.append(pages.contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape))
     effects = (manifest.plan or {}).get("effects")
     plan, row = list[PlanRow](), TypeAdapter(PlanRow)
     for each in effects if isinstance(effects, list) else ():
@@ -191,6 +228,7 @@ def _of_run(lines: SpectralFolder) -> Shown:
     asked = "" if error is None or accuracy is None else f"accuracy {accuracy:g} asked for, "
     return _shown(
         "Capture",
+        _subject(manifest, lines.folder / MANIFEST),
         f"{count} frame{'s' if count > 1 else ''}{'' if error is None else f', error at most {error:.1e}'}",
         detail=f"{first.shape[0]} x {first.shape[1]} pixels, patterns {taken.family or 'from elsewhere'}, {asked}"
         f"exposure {shots.exposure_s:.3g} s a frame",
@@ -215,11 +253,13 @@ def _of_calibration(folder: Path) -> Shown:
     pictures = []
     for name, side, axis in (("left", factors.left, "rows"), ("right", factors.right, "columns")):
         about = f"{side.shape[1]} projector {axis} (down) x {side.shape[0]} sensor {axis} (across)"
-        title, unit = f"The {name} factor, of {axis}", "sqrt(electrons/s)"
-        pictures.append(Picture.of(name, title, side.T, about, unit, (None, None), wide=True))
+        title, unit, most = f"{name.capitalize()} factor, for {axis}", "√(electrons/s)", float(np.abs(side).max())
+        ends, quantity = ((-most, most), "difference") if manifest.centre else ((None, None), "light")
+        pictures.append(Picture.of(name, title, side.T, about, unit, ends, wide=True, quantity=quantity))
     known = {key: value for key, value in result.items() if key not in _ELSEWHERE}
     return _shown(
         "Calibration",
+        _subject(manifest, folder / MANIFEST),
         verdict if error is None else f"{verdict}, factor error {error:.1e}",
         detail="" if manifest.estimate in manifest.warnings else manifest.estimate or "",
         warnings=manifest.warnings,
@@ -261,27 +301,38 @@ def _of_image(folder: Path) -> Shown:
     white, truth, size = result.get("white"), _truth_of(result), f"{image.shape[0]} x {image.shape[1]} projector pixels"
     by_spread = POINT_SPREAD in (inputs or {}) and isinstance(white, float)
     unit, most = ("electrons/s", white) if by_spread else (REFLECTANCE, 1.0)
-    pictures = [Picture.of("image", "The image", image, size, unit, (0.0, most))]
+    method, weight = (inputs or {}).get("method"), result.get("lambda")
+    how = [f"method {method}"] if isinstance(method, str) else []
+    how += [f"lambda {weight:.2g} (electrons/s)²"] if isinstance(weight, float) else []
+    about = ", ".join([*how, *(known if isinstance(quality, float) else ()), size])
+    pictures = [Picture.of("image", "The image", image, about, unit, (0.0, most))]
     if truth is not None and truth.shape == image.shape:
-        pictures.append(Picture.of("truth", "The truth", truth, _TRUTH))
-        pictures.append(_error_picture(np.abs(image - truth), REFLECTANCE, "|image \N{MINUS SIGN} truth|"))
-    trust = "standard uncertainty that the image states of each pixel"
+        pictures += [Picture.of("truth", "The truth", truth, _TRUTH), _difference("error", "Difference", image, truth)]
     for file, channel, title, about, unit, ends in (
-        (UNCERTAINTY_FILE, "uncertainty", "How far to trust it", trust, REFLECTANCE, (0.0, None)),
-        (DEPTH_FILE, "depth_mm", "Depth of each pixel", "", "mm", (None, None)),
-        (DEPTH_FILE, "confidence", "How sure the depth is", "", "(1: certain)", (0.0, 1.0)),
+        (
+            UNCERTAINTY_FILE,
+            "uncertainty",
+            "Standard uncertainty",
+            "estimated without the truth",
+            REFLECTANCE,
+            (0.0, None),
+        ),
+        (DEPTH_FILE, "depth_mm", "Depth", "distance from the sensor", "mm", (None, None)),
+        (DEPTH_FILE, "confidence", "Confidence of the depth", "", "1 = certain", (0.0, 1.0)),
     ):
         if (path := folder / file).is_file():
-            values = finite_channel(read_frame(path)[0], channel, path)
-            pictures.append(Picture.of(channel.removesuffix("_mm"), title, values, about, unit, ends))
+            values, name = finite_channel(read_frame(path)[0], channel, path), channel.removesuffix("_mm")
+            pictures.append(Picture.of(name, title, values, about, unit, ends, quantity=name))
     misfit = result.get("misfit")
     tiles = np.array(misfit.get("map", []) if isinstance(misfit, dict) else [], dtype=np.float64)
     if tiles.ndim == 2 and tiles.size > 1 and np.isfinite(tiles).all():
-        about = "chi-square a datum by place on the sensor, 1 where only noise is left"
+        about = "mean squared residual of each part of the sensor, relative to its noise; 1 where only noise is left"
         ends = 0.0, max(float(tiles.max()), _MISFIT)
-        pictures.append(Picture.of("misfit", "Where the frames do not fit", tiles, about, "a datum", ends))
+        chi = "chi-square per datum"
+        pictures.append(Picture.of("misfit", "Misfit of the frames", tiles, about, chi, ends, quantity="chi-square"))
     return _shown(
         "Image",
+        _subject_of_image(result.get(MADE_OF), folder / RESULT_FILE),
         ("Flagged. " if warnings else "") + ", ".join(known),
         detail="" if warnings else str(result.get("status", "")),
         warnings=[*map(str, warnings)],
@@ -296,9 +347,11 @@ def _of_image(folder: Path) -> Shown:
     )
 
 
-def _error_picture(error: FloatArray, unit: str, about: str, least: float = 0.0) -> Picture:
-    largest = max(float(np.percentile(error, _SHOWN_PERCENT)), least)
-    return Picture.of("error", "How they differ", error, about, unit, (0.0, largest))
+def _difference(name: str, title: str, image: FloatArray, truth: FloatArray) -> Picture:
+    error = image - truth
+    most = float(np.percentile(np.abs(error), _SHOWN_PERCENT)) or 1.0
+    about = "image \N{MINUS SIGN} truth"
+    return Picture.of(name, title, error, about, ends=(-most, most), quantity="difference")
 
 
 def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
@@ -364,21 +417,33 @@ def _of_colours(lines: SpectralFolder) -> Shown:
         levels = np.rint(255 * lightness(linear_srgb(both))).astype(np.uint8)
         swatches = [[f"#{bytes(each).hex()}" for each in pair] for pair in levels]
     size = f"in sRGB under D65, {images.shape[0]} x {images.shape[1]} projector pixels"
-    ideal, pictures = "what a perfect image of the same lines would show, by the same matrix", list[Picture]()
+    ideal, pictures = "image that a perfect camera would recover of the same lines, by the same matrix", list[Picture]()
     for name, xyz, about in (("image", image.xyz, size), ("truth", image.truth_xyz, ideal)):
         if xyz is not None:
-            caption = f"{about}; white is a perfect reflector, and what lies beyond the screen's colours is cut"
+            caption = f"{about}; white is a perfect reflector; colours beyond the screen's are clipped"
             pictures.append(Picture(name, f"The {name}", caption, png(linear_srgb(xyz), LARGEST, SMALLEST)))
     if image.delta_e is not None:
-        about = "1 is about the least difference that an eye sees side by side"
-        pictures.append(_error_picture(image.delta_e, "Delta E 2000", about, 1.0))
+        about, ends = "an eye sees a difference of 1 side by side", (0.0, max(np.percentile(image.delta_e, 99), 1.0))
+        pictures.append(
+            Picture.of(
+                "error",
+                "Colour difference of image and truth",
+                image.delta_e,
+                about,
+                "CIE Delta E 2000",
+                ends,
+                quantity="error",
+            )
+        )
     for number, line in enumerate(colours.channels):
-        title = f"{line.wavelength_nm:g} nm"
-        pictures.append(Picture.of(f"image_{line.name}", title, images[..., number]))
+        title, own, quality_of_line = f"{line.wavelength_nm:g} nm", images[..., number], image.qualities[line.name]
+        pictures.append(Picture.of(f"image_{line.name}", f"{title}, image", own, str(quality_of_line or "")))
         if truth is not None:
             pictures.append(Picture.of(f"truth_{line.name}", f"{title}, truth", truth[..., number]))
+            pictures.append(_difference(f"error_{line.name}", f"{title}, difference", own, truth[..., number]))
     return _shown(
         "Image in colour",
+        _subject_of_image(data.get(MADE_OF), folder / colour_files.COLOUR),
         verdict,
         detail=detail,
         warnings=data.get("warnings") or (),
@@ -611,8 +676,10 @@ class Trust:
         stated, actual = (f"rms {pages.reflectance(value)}" for value in (self.stated, self.actual))
         ends, title = (0.0, largest), "Actual: |image \N{MINUS SIGN} truth|"
         return (
-            Picture.of("stated", "Stated: standard uncertainty", self.uncertainty, stated, ends=ends),
-            Picture.of("actual", title, self.error, actual, ends=ends),
+            Picture.of(
+                "stated", "Stated: standard uncertainty", self.uncertainty, stated, ends=ends, quantity="uncertainty"
+            ),
+            Picture.of("actual", title, self.error, actual, ends=ends, quantity="error"),
         )
 
     def summary(self) -> dict[str, Any]:
@@ -710,6 +777,7 @@ def render_demo(report: Mapping[str, Any]) -> str:
         singular_values=page_figure(singular_values(curves))[0] if curves else "",
         frames=[Picture.of(name, name, dn, unit="DN", ends=(None, None)) for name, dn in shown.items()],
         errors=trust.pictures() if trust else (),
+        grey=pages.colour_map("light")[0],
         pattern_corner=_PATTERN_CORNER,
         picture_of=lambda image, name: data_uri(grey_png(lightness(finite(image, name)), smallest=_SMALLEST)),
         pattern_of=pattern_of,

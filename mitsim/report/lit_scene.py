@@ -51,7 +51,7 @@ from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, prepare
 from mitsim.report import EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
-from mitsim.report.pages import page_figure, render_page, typeset
+from mitsim.report.pages import page_figure, render_page, scene_name, subject, typeset
 from mitsim.report.plots import BLACK, BLUE, GREY, ORANGE, PALE
 from mitsim.sensor.chain import electrons_from_irradiance, response_variance
 
@@ -321,6 +321,8 @@ _NAMES = 3
 _BESIDE, _BEHIND = 0.3, 1.2
 """Part of the scene that is drawn beside and behind the light."""
 _LAMP, _DARK = "#f0c419", "#9a6b00"
+_TINTS = "#ffffff", "#9fd3f2", "#ffb27f", "#8fe0c0", "#f2a8d0", "#d9c2ff", "#e8e28a", "#c4c9cf"
+"""White of each surface of the model, so that the legend distinguishes the surfaces."""
 _SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 _CLOSED, _PYRAMID = [0, 1, 2, 3, 0], [1, 2, 3, 4, 1, 0, 2, 0, 3, 0, 4]
 """Points of a line around four corners, and of one along all edges of a pyramid, whose tip is point 0."""
@@ -455,8 +457,7 @@ class BenchView:
 
     @property
     def _name(self) -> str:
-        path = self.bench.loaded.path
-        return path.parent.name if path.name == "scene.xml" else path.stem
+        return scene_name(self.bench.loaded.path)
 
     @cached_property
     def _end(self) -> float:
@@ -509,9 +510,11 @@ class BenchView:
         axes.annotate(f"field stop, {geometry.fov:g}°", (z, -tan * z), color=BLUE, **below, **_SMALL_GAP)
         words = f"window\n{self._window_mm[1 - axis]:.4g} mm,\n{self.bench.n} pixels"
         axes.text(max(end, aligned) + 0.03 * length, window.mean(), words, color=_DARK, va="center")
-        axes.text(aligned, high + 0.03 * across, "calibrated plane", ha="center", va="bottom")
-        _measure(axes, (0, low - 0.07 * across), (aligned, low - 0.07 * across), f"{aligned:.4g} mm")
-        axes.set(xlim=(start - 0.32 * length, end + 0.24 * length), ylim=(low - 0.12 * across, high + 0.16 * across))
+        ground = {"fc": "white", "ec": "none", "pad": 1}
+        axes.text(aligned, high + 0.03 * across, "calibrated plane", ha="center", va="bottom", bbox=ground)
+        below_all = low - 0.2 * across  # below the label of the field stop
+        _measure(axes, (0, below_all), (aligned, below_all), f"{aligned:.4g} mm")
+        axes.set(xlim=(start - 0.4 * length, end + 0.24 * length), ylim=(low - 0.26 * across, high + 0.18 * across))
         axes.set_aspect("equal", adjustable="box")
         every = {surface.name: surface.points for surface in layout.surfaces}
         every |= {name: place[None] for name, place in layout.lamps.items()}
@@ -580,16 +583,25 @@ class BenchView:
         ]
         lamp = {"mode": "markers", "marker": {"color": _LAMP, "size": 5}}
         parts += [(name, place[None], lamp) for name, place in layout.lamps.items()]
-        for surface in layout.surfaces:
-            shown = lightness(surface.reflectance)
+        for number, surface in enumerate(layout.surfaces):
+            shown, tint = lightness(surface.reflectance), _TINTS[number % len(_TINTS)]
             color: dict[str, Any] = {"color": _LAMP}
+            legend = _LAMP if surface.is_lamp else tint
             if not surface.is_lamp and shown.shape[1] == 1:
-                grey = shown[:, 0].astype(np.float32)
-                color = {"intensity": grey, "colorscale": "gray", "cmin": 0, "cmax": 1, "showscale": False}
+                grey, scale = shown[:, 0].astype(np.float32), [[0, "black"], [1, tint]]
+                color = {"intensity": grey, "colorscale": scale, "cmin": 0, "cmax": 1, "showscale": False}
             elif not surface.is_lamp:
                 color = {"vertexcolor": np.rint(255 * shown).astype(int).tolist()}
+                legend = f"rgb{(*np.rint(255 * shown.mean(axis=0)).astype(int).tolist(),)}"
             faces = dict(zip("ijk", surface.triangles.astype(np.int32).T, strict=True))
-            parts.append((surface.name, surface.points, {**faces, **color}))
+            # Plotly's legend shows all meshes alike, so that a square without a place stands for each of them.
+            square = {
+                "mode": "markers",
+                "marker": {"color": legend, "symbol": "square", "size": 11, "line": {"width": 2}},
+            }
+            parts.append((surface.name, np.full((1, 3), np.nan), {**square, "legendgroup": str(number)}))
+            group = {"legendgroup": str(number), "showlegend": False}
+            parts.append((surface.name, surface.points, {**faces, **color, **group}))
         figure = graph_objects.Figure()
         for name, points, style in parts:
             # Plotly's x is the bench's z, and its z, which is up, is y. It reads names, which may be any text, as HTML.
@@ -597,11 +609,12 @@ class BenchView:
             if "i" in style:
                 light_on = {"ambient": 0.75, "diffuse": 0.35, "specular": 0.0}
                 hover = "%{x:.4g} mm from the sensor<br>x %{y:.4g} mm, y %{z:.4g} mm"
-                figure.add_mesh3d(**common, lighting=light_on, flatshading=True, showlegend=True, hovertemplate=hover)
+                figure.add_mesh3d(**common, lighting=light_on, flatshading=True, hovertemplate=hover)
             else:
                 figure.add_scatter3d(**{"mode": "lines", **common})
         # Plotly makes the sides' geometric mean 1. Therefore the eye moves back for a scene with one long side.
-        extents = np.ptp(np.concatenate([points for _, points, _ in parts]), axis=0)
+        every = np.concatenate([points for _, points, _ in parts])
+        extents = np.nanmax(every, axis=0) - np.nanmin(every, axis=0)
         back = max(1.0, float(extents.max() / np.cbrt(extents.prod())) / _IN_SIGHT)
         place = {"x": -2.1 * back, "y": -1.45 * back, "z": back}
         titles = {"xaxis": "z, from the sensor [mm]", "yaxis": "x, to the left [mm]", "zaxis": "y, up [mm]"}
@@ -634,13 +647,15 @@ class BenchView:
                 FigureCanvasAgg(figure)
                 draw(figure.subplots())
             pictures[name] = page_figure(figure)
+        model = self.model().update_layout(height=None)  # the page's style sets the height
         return render_page(
             "view.html",
-            title=self._name,
+            name=self._name,
+            title=subject(self._name, self.bench.sensor.name),
             scene=str(self.bench.loaded.path),
             facts=self.facts,
             warnings=self.warnings,
-            model=self.model().to_html(
+            model=model.to_html(
                 full_html=False, include_plotlyjs=True, config={"displayModeBar": False, "responsive": True}
             ),
             pictures=pictures,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +18,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import write_bytes
-from mitsim.core.images import data_uri, png
+from mitsim.core.images import data_uri, grey_png, lightness, png
 from mitsim.core.job import size_text
 from mitsim.core.parallel import in_threads
 
@@ -93,6 +94,16 @@ def reflectance(value: float) -> str:
     return f"{value:.4f}" if value >= 1e-3 else scientific(value)
 
 
+def scene_name(scene: Path) -> str:
+    return scene.parent.name if scene.name == "scene.xml" else scene.stem
+
+
+def subject(scene: str, camera: str, file: Path | None = None) -> str:
+    """Return scene, camera and date for the title of a page; the date is that of a ``file``, or the present one."""
+    moment = time.localtime(None if file is None else file.stat().st_mtime)
+    return ", ".join(filter(None, (scene, camera, time.strftime("%Y-%m-%d %H:%M", moment))))
+
+
 def sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
@@ -161,16 +172,49 @@ _MOST_READ = _MOST_FRAMES << 18
 _GAP = 2
 
 
-REFLECTANCE = "of the board's reflectance"
+REFLECTANCE = "reflectance (1 = white board)"
+_SEQUENTIAL = "#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"
+_DIVERGING = "#003c5e", "#0072b2", "#f5f5f5", "#d55e00", "#6e2f00"
+_GREY = tuple(f"#{3 * f'{round(255 * level):02x}'}" for level in lightness(np.linspace(0, 1, 9)).tolist())
+"""Equal steps of light, as :func:`mitsim.core.images.png` shows them."""
+_MAPS: dict[str, tuple[tuple[str, ...], float | None]] = {
+    "light": (_GREY, None),
+    **dict.fromkeys(("uncertainty", "error", "depth", "confidence"), (_SEQUENTIAL, None)),
+    "difference": (_DIVERGING, 0.0),
+    "chi-square": (_DIVERGING, 1.0),
+}
+
+
+def colour_map(quantity: str) -> tuple[tuple[str, ...], float | None]:
+    """Return the colours of a ``quantity`` from its lowest to its highest number, and the number in their middle.
+
+    Light and reflectance are grey. Quantities that begin at a lowest number have a sequential map. Quantities that may
+    lie on either side of an ideal number have a diverging map, in which that number is almost white.
+    """
+    return _MAPS[quantity]
 
 
 @dataclass(frozen=True)
 class Picture:
+    """A picture of numbers for a page.
+
+    Attributes
+    ----------
+    caption
+        What is shown, without the scale.
+    colours, ends, unit
+        Colours of equal steps and the numbers of the first, of the middle (if it has a meaning) and of the last;
+        empty for pictures in colour, whose caption states the scale.
+    """
+
     name: str
     title: str
     caption: str
     data: bytes
     wide: bool = False
+    colours: tuple[str, ...] = ()
+    ends: tuple[str, ...] = ()
+    unit: str = ""
 
     @classmethod
     def of(
@@ -182,17 +226,32 @@ class Picture:
         unit: str = REFLECTANCE,
         ends: tuple[float | None, float | None] = (0.0, 1.0),
         wide: bool = False,
+        quantity: str = "light",
     ) -> Picture:
-        """Draw ``values`` in a ``unit`` between black and white ``ends``; an end of None is that of the values."""
-        black, white = (
+        """Draw ``values`` in a ``unit`` between the ``ends`` of a scale; an end of None is that of the values.
+
+        ``quantity`` chooses the colours (:func:`colour_map`).
+        """
+        low, high = (
             float(known(values)) if end is None else end for end, known in zip(ends, (np.min, np.max), strict=True)
         )
-        beyond = float(np.mean((values < black) | (values > white)))
-        cut = f"; {beyond:.2g} of the pixels lie beyond" if beyond else ""
-        low, high = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (black, white))
-        caption = f"{about}{': ' if about else ''}black {low}, white {high} {unit}{cut}"
-        levels = (np.asarray(values, dtype=np.float64) - black) / (white - black if white > black else np.inf)
-        return cls(name, title, caption, png(levels, LARGEST, SMALLEST), wide)
+        high, (colours, centre) = high if high > low else low + 1.0, colour_map(quantity)
+        beyond = 100 * float(np.mean((values < low) | (values > high)))
+        cut = f"{beyond:.2g} % of the pixels lie outside the scale" if beyond else ""
+        numbers, steps = [low, *([] if centre is None else [centre]), high], np.linspace(0, 1, len(colours))
+        levels = np.interp(values, numbers, np.linspace(0, 1, len(numbers)))
+        if quantity == "light":
+            data = png(levels, LARGEST, SMALLEST)
+        else:
+            shades = np.array([[*bytes.fromhex(each[1:])] for each in colours]) / 255
+            painted = np.stack([np.interp(levels, steps, shade) for shade in shades.T], axis=-1)
+            data = grey_png(painted, LARGEST, SMALLEST)
+        stated = tuple(f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in numbers)
+        return cls(name, title, "; ".join(filter(None, (about, cut))), data, wide, colours, stated, unit)
+
+    @property
+    def scale(self) -> str:
+        return f"black {self.ends[0]}, white {self.ends[-1]} {self.unit}"
 
     @property
     def uri(self) -> str:
@@ -205,7 +264,7 @@ class Picture:
 
 
 def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[int, int]) -> Picture:
-    """Draw ``count`` frames of a ``shape`` side by side, or as many, evenly taken, as fit a page.
+    """Draw ``count`` frames of a ``shape`` side by side, or as many evenly spaced ones as fit a page.
 
     ``read`` returns frame i less the black level [DN].
     """
@@ -217,9 +276,9 @@ def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[in
     for place, frame in enumerate(frames):
         top, left = place // columns * (shape[0] + _GAP), place % columns * (shape[1] + _GAP)
         sheet[top : top + shape[0], left : left + shape[1]] = frame
-    which = f"all {count}" if len(chosen) == count else f"{len(chosen)} of {count}, evenly taken"
-    about, unit = f"{which}, row by row, {columns} a row", "DN above the black level"
-    return Picture.of("frames", "What the camera recorded", sheet, about, unit, (0.0, white), wide=True)
+    which = f"all {count} frames" if len(chosen) == count else f"{len(chosen)} of {count} frames, evenly spaced"
+    about = f"{which}, {columns} in each row, on one scale"
+    return Picture.of("frames", "Contact sheet", sheet, about, "DN above the black level", (0.0, white), wide=True)
 
 
 # -------- Means of the rows of a study

@@ -206,18 +206,20 @@ def run(
         remove_page(folder)
         done = SessionResult(tuple(results), str(folder), str(folder / PAGE) if asked.pictures else None)
         if asked.pictures:
-            from mitsim.report.pages import render_page
+            from mitsim.report.pages import render_page, scene_name, subject
 
+            opened = any(step.verb in OF_A_BENCH for step in read.steps)
+            about = (scene_name(steps.bench.loaded.path), steps.bench.sensor.name) if opened else ("", "")
             count, flagged = len(results), sum(bool(step.warnings) for step in results)
             verdict = f"{count} step{'s' * (count > 1)} done{f', {flagged} flagged' if flagged else ''}"
             page = render_page(
                 "session.html",
-                folder=folder.absolute(),
+                title=f"Session {folder.name}: {subject(*about)}",
                 verdict=verdict,
                 warnings=done.warnings,
                 command=job and job.command,
                 steps=results,
-                images=[step.output for step in results if (folder / step.output / "image.png").is_file()],
+                images=[step for step in results if (folder / step.output / "image.png").is_file()],
                 text=text,
                 file=SESSION_FILE,
             )

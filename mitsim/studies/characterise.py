@@ -441,12 +441,12 @@ class Characterisation:
 
         return (
             Part(
-                "Figures of EMVA 1288", "What the standard's procedure finds.",
+                "Results of EMVA 1288", "Numbers that the standard's procedure finds in the frames.",
                 *table(self.rows, figure="name", symbol="symbol", unit="unit", set="set", found="found"),
                 ("photon_transfer.png", "linearity.png", "dark_current.png"),
             ),
             Part(
-                "The camera that explains the frames", "The fields of camera.toml, which --camera takes.",
+                "Fitted camera", "Fields of camera.toml, which --camera reads.",
                 *table(self.fields, camera_found="name", unit="unit", set="set", found="found",
                        std_error="standard_error", off_by="deviations"),
                 notes=tuple(self.found.notes),
@@ -564,8 +564,9 @@ def _write(done: Characterisation, folder: Path | None) -> Characterisation:
     results = folder / "characterise.json"  # written last, so that a folder with it is complete
     results.unlink(missing_ok=True)
     pictures = {name: page_figure(figure) for name, figure in write_figures(folder, figures_of(done)).items()}
-    title = f"{done.camera} after EMVA 1288"
-    section = Section("characterise", title, done.message, done.where, pictures, done.parts, warnings=done.warnings)
+    title, light = "Camera after EMVA 1288", "real frames" if done.real else "simulated even light"
+    shown: dict[str, Any] = {"warnings": done.warnings, "scene": light, "camera": done.camera}
+    section = Section("characterise", title, done.message, done.where, pictures, done.parts, **shown)
     write_page([section], folder / "characterise.html", title)
     write_text(folder / CAMERA_FILE, done.found.toml())
     write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})

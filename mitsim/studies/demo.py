@@ -29,6 +29,7 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.report import CONVENTIONS, EQUAL_PEAK, label
 from mitsim.report.folder_page import FamilyResult, Recovery, Trust, render_demo, verdict
 from mitsim.report.lit_scene import LitScene, Unexposed
+from mitsim.report.pages import scene_name, subject
 from mitsim.studies.framework.campaign import DEMO_FOLDERS, DEMO_PAGE, study_folder
 
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
@@ -208,7 +209,7 @@ def _page(
     size = " x ".join(f"{pitch * 1e3:g}" for pitch in geometry.pitches[geometry.row_pitch is None :])
     mask = f"{geometry.mask_words}, {geometry.mask_feature * 1e3:g} um, {geometry.mask_distance:g} mm from the sensor"
     return {
-        "title": f"Coded-illumination lensless imaging: {bench.loaded.path.parent.name}",
+        "title": f"Comparison of patterns: {subject(scene_name(bench.loaded.path), bench.sensor.name)}",
         "verdict": headline,
         "verdict_detail": detail,
         "truth": light.truth,

@@ -21,7 +21,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.files import write_text
 from mitsim.report import label
-from mitsim.report.pages import DASH, Mean, page_figure, render_page
+from mitsim.report.pages import DASH, Mean, page_figure, render_page, scene_name, subject
 from mitsim.studies.framework.claims import (
     Where,
     choose_rows,
@@ -375,6 +375,8 @@ class Section:
     command: str = ""
     quick: bool = False
     prints: int = 0
+    scene: str = ""
+    camera: str = ""
 
 
 def section_of(
@@ -398,6 +400,7 @@ def section_of(
         ("--style", scope.style if scope.style != type(scope).style else None),
         ("--variant", setup.variant if setup.variant != Setup.variant else None),
     ]  # fmt: skip
+    scene = scene_name(Path(setup.scene))
     flags = {"--allow-outside-files": setup.outside, "--quick": scope.quick}
     options = [*(f"{option} {value}" for option, value in given if value), *(flag for flag, on in flags.items() if on)]
     return Section(
@@ -418,6 +421,8 @@ def section_of(
         command=" ".join(["mitsim study", name, *([] if any(scope.pictures) else [setup.scene]), *options]),
         quick=scope.quick,
         prints=len(prints),
+        scene=f"{len(prints)} test images on {scene}" if prints else scene,
+        camera=Path(setup.camera).stem if setup.camera else "the scene's camera",
     )
 
 
@@ -439,6 +444,15 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
 def write_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     """Write a page of one study, or of several with the verdicts of all first."""
     message = sections[0].message if len(sections) == 1 else tally([claim for one in sections for claim in one.claims])
-    page = render_page("study.html", title=title, message=message or title, sections=sections, versions=versions())
+    scenes, cameras = {one.scene for one in sections}, {one.camera for one in sections}
+    scene, camera = (names.pop() if len(names) == 1 else "" for names in (scenes, cameras))
+    images = any(file.startswith("images") for one in sections for file in one.pictures)
+    shown = {
+        "title": f"{title}: {subject(scene, camera)}",
+        "message": message or title,
+        "sections": sections,
+        "images": images,
+    }
+    page = render_page("study.html", **shown, versions=versions())
     write_text(path, page)
     return path

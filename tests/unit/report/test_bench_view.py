@@ -106,9 +106,14 @@ def test_words_state_what_the_numbers_do(seen: BenchView) -> None:
 
 
 def test_the_model_has_every_part_in_place(seen: BenchView) -> None:
-    """Plotly's x is z of the bench, its z is y; only lamps have the lamp's colour. (Planted: y for x; a line's corners
-    in another order.)"""
-    traces = {trace.name: trace for trace in seen.model().data}
+    """Plotly's x is z of the bench, its z is y; only lamps have the lamp's colour, and the legend shows each surface in
+    a colour of its own. (Planted: y for x; a line's corners in another order; one colour for all surfaces.)"""
+    model = seen.model().data
+    traces = {trace.name: trace for trace in model}
+    squares = {trace.name: trace for trace in model if trace.legendgroup and trace.type == "scatter3d"}
+    assert len({trace.marker.color for trace in squares.values()}) == len(seen.layout.surfaces)
+    for name, square in squares.items():
+        assert square.legendgroup == traces[name].legendgroup and not traces[name].showlegend
     places = {name: np.stack([trace.y, trace.z, trace.x], axis=1) for name, trace in traces.items()}
     for surface in seen.layout.surfaces:
         mesh = traces[surface.name]
@@ -151,7 +156,7 @@ def test_names_of_a_scene_are_no_html(seen: BenchView, tmp_path: Path) -> None:
     layout = replace(seen.layout, surfaces=shapes, lamps={bad: np.array([0.0, 9000, 300])}, obstacles=(bad,))
     view = replace(seen, layout=layout)
     named = [trace.name for trace in view.model().data if "evil" in trace.name]
-    assert len(named) == len(shapes) + 1 and {*named} == {html.escape(bad)}
+    assert len(named) == 2 * len(shapes) + 1 and {*named} == {html.escape(bad)}
     text = view.save(tmp_path / "bench.html").read_text()
     assert "<b style" not in text and "Plotly.newPlot(" in text
     assert not re.search(r'<(script|link|img)[^>]*\b(src|href)="https?:', text)

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shutil
+import time
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
@@ -201,7 +202,7 @@ def test_an_empty_report_has_no_empty_section() -> None:
 
 
 def test_best_of_each_exposure_convention_and_a_dash_where_there_is_none(page: str) -> None:
-    table = page.split("<h2>Exposure decides who wins</h2>")[1].split("</table>")[0]
+    table = page.split("<h2>PSNR under three rules of exposure</h2>")[1].split("</table>")[0]
     best = re.findall(r'class="n best">(.*?)<', table)
     assert best == ["31.8 dB", "24.0 dB", "23.0 dB"] and table.count("\N{EN DASH}") == 1
 
@@ -211,7 +212,7 @@ def test_trust_is_a_row_a_family_and_one_picture_of_the_main_one(page: str) -> N
 
     (Planted: the error held against one uncertainty instead of 1.96.)
     """
-    section = page.split("<h2>How far to trust the images</h2>")[1].split("<h2>")[0]
+    section = page.split("<h2>Stated uncertainty and actual error</h2>")[1].split("<h2>")[0]
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", row, flags=re.S) for row in section.split("<tr>")[2:]]
     assert [row[0] for row in rows] == ["Uniform", "16 dots", "25 dots", "49 dots", "64 Hadamard"]
     for row, decibel in zip(rows, (18.7, 27.9, 29.6, 31.8, 30.9), strict=True):
@@ -219,7 +220,7 @@ def test_trust_is_a_row_a_family_and_one_picture_of_the_main_one(page: str) -> N
         assert row[1] == f"{decibel} dB" and row[2] == f"{stated:.4f}" and row[5] == "1.020"
         assert float(row[3]) == pytest.approx(stated, rel=0.1)
         assert float(row[4].removesuffix(" %")) == pytest.approx(95, abs=2.1)
-    assert [re.sub(r"<.*?>", "", row[6]) for row in rows] == ["depth", "fits", "fits", "fits", "fits"]
+    assert [re.sub(r"<.*?>", "", row[6]) for row in rows] == ["depth", *4 * ["frames fit"]]
     assert section.count("<img ") == 2 and 'alt="Stated: standard uncertainty"' in section
 
 
@@ -363,7 +364,7 @@ def test_a_run_shows_its_frames_its_truth_and_how_it_was_made(folders: Made, tmp
         "6 frames, error at most 8.0\N{MULTIPLICATION SIGN}10⁻⁴",
         *("40 \N{MULTIPLICATION SIGN} 52 pixels", "accuracy 0.001 asked for", "exposure 0.0213 s a frame"),
         *("optics", "2.00 s", "all else", "0.50 s", "diffraction", "approximate", "digital.gain_dn_per_e 0.37"),
-        "1 left out, of no effect here: mirrors",
+        "1 effects are off, because they change nothing here: mirrors",
     ):
         assert wanted in text, wanted
     head = words((run / "report.html").read_text().partition("</header>")[0])
@@ -386,7 +387,8 @@ def test_a_contact_sheet_is_of_the_frames_on_one_scale(folders: Made, tmp_path: 
         top, left = (place * (side + 2) for place, side in zip(divmod(number, 3), (ROWS, COLUMNS), strict=True))
         shown = small[top : top + ROWS, left : left + COLUMNS]
         assert np.abs(shown - 255 * lightness(frame / light.max())).max() < 0.51
-    assert f"black 0, white {light.max():.0f} DN above the black level" in text
+    assert f"0 {light.max():.0f} DN above the black level Contact sheet." in text
+    assert text.index("First frame.") < text.index("Contact sheet."), "results are first"
 
 
 def test_many_frames_are_evenly_taken_and_large_ones_are_fewer_and_smaller() -> None:
@@ -399,10 +401,10 @@ def test_many_frames_are_evenly_taken_and_large_ones_are_fewer_and_smaller() -> 
         return np.full((8, 8), float(number))
 
     shown = contact_sheet(read, 640, (8, 8))
-    assert sorted(seen) == list(range(0, 640, 10)) and "64 of 640, evenly taken, row by row, 8 a row" in shown.caption
+    assert sorted(seen) == list(range(0, 640, 10)) and "64 of 640 frames, evenly spaced, 8 in each row" in shown.caption
     seen.clear()
     large = contact_sheet(lambda number: read(number).repeat(256, 0).repeat(256, 1), 9, (2048, 2048))
-    assert len(seen) == 4 and "4 of 9" in large.caption
+    assert len(seen) == 4 and "4 of 9 frames" in large.caption
     assert max(Image.open(BytesIO(large.data)).size) <= 1024
 
 
@@ -410,10 +412,54 @@ def test_a_picture_says_what_is_black_white_and_beyond() -> None:
     """(Planted: the part beyond not counted.)"""
     values = np.array([[-1.0, 0.0], [0.5, 3.0]])
     shown = Picture.of("name", "Title", values, "what it is", "units")
-    assert shown.caption == "what it is: black 0, white 1 units; 0.5 of the pixels lie beyond"
+    assert shown.caption == "what it is; 50 % of the pixels lie outside the scale"
+    assert shown.ends == ("0", "1") and shown.scale == "black 0, white 1 units"
     levels = np.asarray(Image.open(BytesIO(shown.data)))
     assert levels.shape == (512, 512) and [*levels[0, ::256], *levels[-1, ::256]] == [0, 0, 188, 255]
     assert not np.asarray(Image.open(BytesIO(Picture.of("a", "A", 0 * values, ends=(None, None)).data))).any()
+
+
+@pytest.mark.parametrize(
+    ("quantity", "numbers", "colours"),
+    [
+        ("uncertainty", (0.0, 4.0), ((68, 1, 84), (253, 231, 37))),
+        ("difference", (-2.0, 0.0, 2.0), ((0, 60, 94), (245, 245, 245), (110, 47, 0))),
+        ("chi-square", (0.0, 1.0, 4.0), ((0, 60, 94), (245, 245, 245), (110, 47, 0))),
+    ],
+)
+def test_a_quantity_chooses_its_colours(quantity: str, numbers: Any, colours: Any) -> None:
+    """A diverging map is white at the number that is expected, which is not the middle of the numbers. (Planted: the
+    middle of the scale in place of 1.)"""
+    shown = Picture.of("a", "A", np.array([numbers]), "", "1", (numbers[0], numbers[-1]), quantity=quantity)
+    assert shown.ends == tuple(f"{number:g}" for number in numbers)
+    pixels = np.asarray(Image.open(BytesIO(shown.data)))
+    assert [*map(tuple, pixels[0, :: pixels.shape[1] // len(numbers)][: len(numbers)].tolist())] == [*colours]
+
+
+def test_a_title_has_scene_camera_and_date_and_every_picture_a_scale(
+    folders: Made, image: Path, tmp_path: Path
+) -> None:
+    """The date is that of the files, so that a page that is made again has the same. (Planted: the present date; a
+    picture without a scale.)"""
+    made_at, camera = 1.7e9, {"name": "bench 3", "sensor": {"name": "Camera 4"}}
+    changes = {"camera": camera, "configuration": {"scene": "/scenes/shelf/scene.xml"}}
+    run = copy(folders.run, tmp_path / "run", **changes)
+    calibration = copy(folders.calibration, tmp_path / "cal", **changes)
+    solved = tmp_path / "image"
+    shutil.copytree(image, solved)
+    result = json.loads((solved / "result.json").read_text())
+    write_json(solved / "result.json", {**result, "made_of": {**result["made_of"], "run": str(run)}})
+    date = time.strftime("%Y-%m-%d %H:%M", time.localtime(made_at))
+    for kind, folder, file in (
+        ("Capture", run, MANIFEST),
+        ("Calibration", calibration, MANIFEST),
+        ("Image", solved, "result.json"),
+    ):
+        os.utime(folder / file, (made_at, made_at))
+        page = page_of(folder)
+        title = f"{kind}: shelf, Camera 4, {date}"
+        assert f"<title>{title}</title>" in page and f"<h1>{title}</h1>" in page
+        assert page.count('class="scale"') == page.count("<img ") > 0
 
 
 def test_an_image_shows_what_is_known_of_it(image: Path) -> None:
@@ -452,7 +498,7 @@ def test_a_calibration_shows_its_factors(folders: Made, tmp_path: Path) -> None:
     assert (
         picture(calibration, "left").shape == (10 * 13, 40 * 13) and picture(calibration, "right").shape[0] == 14 * 10
     )
-    assert "Made from Python" in text
+    assert "The command is not known" in text
 
 
 def test_a_flagged_calibration_says_so_at_the_head(folders: Made, tmp_path: Path) -> None:
