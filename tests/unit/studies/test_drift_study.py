@@ -22,7 +22,7 @@ from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
 from mitsim.sensor.chain import electrons_from_irradiance, specimen
 from mitsim.studies.causes import Noise
-from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, loss_of
+from mitsim.studies.drift_study import _HERMITE, AMBIENT, SESSION, DriftStand, loss_of
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
 from mitsim.verbs import StudyOptions, scope_of, study
@@ -148,8 +148,11 @@ def test_a_mask_turned_over_a_region_shifts_that_part_of_its_shadow(stand: Drift
 
 
 def test_a_mask_that_shakes_casts_its_mean_shadow(stand: DriftStand) -> None:
-    """The mean over normal motions along both axes, by seven nodes in place of three, over a region that lies otherwise
-    along the rows. (Planted: a node elsewhere; the rows' shadow for that of the columns.)"""
+    """The mean over normal motions along both axes: three nodes that have the moments of a normal motion, to 8 % by
+    seven, over a region that lies otherwise along the rows. (Planted: a node elsewhere; the rows' shadow for that of
+    the columns.)"""
+    places, parts = np.transpose(_HERMITE)
+    assert [parts @ places**power for power in range(6)] == pytest.approx([1, 0, 1, 0, 3, 0], abs=1e-12)
     bench = stand.lit.bench
     camera = bench.geometry.model_copy(update={"roi": (3, 20, 30, 30)})
     part = replace(bench, devices=replace(bench.devices, camera=camera))
@@ -170,7 +173,7 @@ def test_a_mask_that_shakes_casts_its_mean_shadow(stand: DriftStand) -> None:
     still, found = light(own._terms(Drift())), light(own._terms(Drift(vibration_um=10.0)))
     unit = electrons_from_irradiance(1.0, 1.0, part.sensor, part.projector.effective_wavelength_nm)
     change = unit * (light(cast(SeparableTerms, means)) - light(own._shift(0.0)))
-    assert np.linalg.norm(found - still - change) < 0.01 * np.linalg.norm(change)
+    assert np.linalg.norm(found - still - change) < 0.08 * np.linalg.norm(change)
 
 
 def test_rows_and_columns_take_of_a_response_all_that_factors_see(stand: DriftStand) -> None:
