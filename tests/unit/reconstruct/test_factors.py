@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.reconstruct.factors import Factors, estimate_factors, load_calibration
+from mitsim.reconstruct.factors import Factors, estimate_factors, load_calibration, rank_above_noise
 from mitsim.reconstruct.solver import Status, Verdict
 
 N, ROWS, COLUMNS = 12, 20, 17
@@ -97,3 +98,15 @@ def test_saved_and_loaded_they_are_the_same(tmp_path: Path) -> None:
     assert str(disk.status) == str(memory.status)
     for shown in (memory, disk):
         assert shown._repr_html_().count("data:image/png;base64,") == 2
+
+
+def test_a_rank_counts_directions_above_three_deviations_of_the_noise() -> None:
+    """Of a factor of 50 rows whose two small singular values lie 2 % above and below the limit, where an error of a
+    tenth has the energy e^2 |Phi|^2 / 150 (50 + 3 sqrt(100)) in a direction. (Planted: the noise of all numbers.)"""
+    part = 0.1**2 / 150 * (50 + 3 * np.sqrt(100))
+    limit = np.sqrt(part / (1 - 2 * part))
+    turned = np.linalg.qr(np.random.default_rng(1).standard_normal((50, 3)))[0]
+    assert rank_above_noise(turned * [1.0, 1.02 * limit, 0.98 * limit], 0.1) == 2
+    own = factors()
+    stated = own.manifest.model_copy(update={"result": {"rank": [7, 5]}})
+    assert replace(own, manifest=stated).stated_rank == (7, 5) and own.stated_rank is None

@@ -7,6 +7,7 @@ import html
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +25,7 @@ from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import request
 from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import Reconstruction, may_replace, reconstruct
+from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction, may_replace, reconstruct
 from mitsim.reconstruct.request import ImageCost
 from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Tikhonov
@@ -141,6 +142,7 @@ def test_what_an_image_takes_is_predicted_where_that_can_be_told(shots: Capture,
     """By the stages that it states; every shot is read, and held against the model. (Planted: half of the shots.)"""
     image = reconstruct(shots, factors)
     assert image.predicted == ImageCost.of(shots, factors)
+    assert image.white == 1.0 and replace(image, inputs={POINT_SPREAD: "x"}).white == image.image.max()
     assert image.predicted.seconds.keys() == image.seconds.keys()
     summary = image.summary()
     assert summary["predicted_seconds"] == sum(summary["predicted"].values()) > 0

@@ -34,6 +34,7 @@ def families(n):
         "random": (rng.random((n, 4)) < 0.6).astype(float),
         "grey": rng.random((n, 3)),
         "with a dark row": dots(n, 3) * (np.arange(n) != 4)[:, None],
+        "with a black pattern": np.pad(dots(n, 3), ((0, 0), (1, 1))),
     }
 
 
@@ -101,6 +102,24 @@ def test_block_structure_is_found_and_lit_columns_only_are_touched():
     assert len(solver.pattern_blocks(np.ones((9, 2)))) == 1
     # 0.1 and 0.3 are not exact: rows orthogonal only up to rounding are not taken apart.
     assert len(solver.pattern_blocks(np.array([[0.1, 0.3], [0.3, -0.1]]))) == 1
+    # Whole numbers are exact as long as their products are: 2^80 is 0 in 64 bits.
+    assert len(solver.pattern_blocks(np.array([[100.0, 100.0], [100.0, -100.0]]))) == 2
+    assert len(solver.pattern_blocks(np.array([[2.0**40, 0.0], [2.0**40, 1.0]]))) == 1
+
+
+@pytest.mark.parametrize(
+    ("patterns", "stated", "lost", "limit"),
+    [
+        (1, (8, 8), 0, "rounding"),
+        (1, (5, 8), 24, "the calibration's noise"),
+        (2, (5, 3), 16, "the calibration's noise"),
+    ],
+)
+def test_factors_of_less_rank_lose_directions_that_patterns_bring_back(patterns, stated, lost, limit):
+    """Each pattern measures as many directions as the factor has above its noise. (Planted: the larger of both.)"""
+    factor = np.random.default_rng(2).random((12, 8))
+    prepared = solver.prepare(factor, factor, dots(8, patterns), dots(8, patterns))
+    assert replace(prepared, stated=stated).lost == (lost, limit)
 
 
 def test_condition_covers_all_blocks_and_the_worse_side():
