@@ -173,7 +173,7 @@ STATUSES = ROOT / "docs" / "howto.md"
 _BLOCK = r"^    \$ mitsim ({verb} .*)\n((?:    (?!\$ ).*\n)*)"
 _MACHINE = re.compile(
     r"\b(?:in |0\.001: )[\d.]+ s\b|(?<=e[+-]\d\d) +\d+\.\d\d(?= )|(?<= [-0]) +\d+\.\d\d(?= )|"
-    r"\bSeconds:(?: \w+ [\d.e-]+,?)+|\bAt most [\d.]+ GiB|\b\d+ kernels compiled in .*? Dr\.Jit's cache keeps them"
+    r"\bSeconds:(?: \w+ [\d.e-]+,?)+|\bAt most [\d.]+ GiB|\b\d+ kernels were compiled .*? are kept"
 )
 """Parts of an output that depend on the machine and its caches, and not on the scene."""
 _NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[+-]?\d+)?")

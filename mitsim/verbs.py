@@ -342,13 +342,13 @@ def prepare_study(
         raise ArgumentError("scene", f"{wrong[0]!r}: give a path")
     if name == MERGE:
         others = (name for name in asked.given if name not in ("experiment", "variant"))
-        asked.refuse(others, "on parts, which say themselves what they are of")
+        asked.refuse(others, "with merge, because the parts state it")
         from mitsim.studies.framework.campaign import merge
 
         return partial(merge, [Path(part) for part in scenes], output, asked.experiment)
-    asked.refuse(["experiment"], "but with merge; give the module as the study's name")
+    asked.refuse(["experiment"], "except with merge (your own study's module is given as its name)")
     if name not in OF_CAPTURES:
-        asked.refuse(["data"], f"but on the studies {' and '.join(OF_CAPTURES)}")
+        asked.refuse(["data"], f"except on the studies {' and '.join(OF_CAPTURES)}")
     if asked.recipe is not None and name not in ("calibration", "drift"):
         raise MitsimError(f"study {name}: has no session of its own; a recipe is for calibration and drift")
     patterns = Request(patterns=asked.patterns or "dots:7", seed=asked.seed).patterns
@@ -368,9 +368,9 @@ def prepare_study(
         load_recipe(recipe)
     if name in OF_NO_SCENE or data is not None:
         if place is not None:
-            raise MitsimError(f"study {name} {place}: it is of no scene; leave the scene out")
+            raise MitsimError(f"study {name} {place}: this study uses no scene; leave the scene out")
         of_scenes = "patterns", "camera", "projector", "parameters", "allow_outside_files"
-        asked.refuse(of_scenes, f"on the study {name}, which is of no scene")
+        asked.refuse(of_scenes, f"on the study {name}, which uses no scene")
         find_files(None if data is None else Path(data), name)
     if name != "sweep":
         asked.refuse(("method", "lam", "seeds"), f"on the study {name}, but on sweep")
@@ -379,7 +379,7 @@ def prepare_study(
     scope = Scope(setup, pictures, seeds, asked.quick, recipe=recipe, data=data, style=asked.style)
     scope = scope_of(name, scope, patterns, asked.varied, asked.measure)
     if name not in ("accuracy", "calibration", "sweep", "drift"):
-        asked.refuse(["patterns"], f"on the study {name}, which has its own")
+        asked.refuse(["patterns"], f"on the study {name}, which has its own patterns")
     if asked.scheduler is not None:
         asked.refuse(["jobs"], "with a scheduler, whose machines have processes of their own")
     where = Where(shard_of(asked.shard), asked.jobs, asked.scheduler)
@@ -411,8 +411,8 @@ def scope_of(
                 still.alone(kind, number_of(kind, text))
     elif not (name in ("accuracy", "calibration") and measure == "psnr" and not varied):
         if varied or patterns != "dots:7" or measure != "psnr":
-            others = "measure is for sweep, over for drift and sweep, patterns for these, accuracy and calibration"
-            raise MitsimError(f"study {name}: has its own points and measures; {others}")
+            others = "measure is for sweep; over for drift, sweep; patterns for accuracy, calibration, drift, sweep"
+            raise MitsimError(f"study {name}: measures its own points; {others}")
         return scope
     read_name(patterns)
     return replace(scope, sweep=tuple(varied), patterns=patterns)
@@ -640,6 +640,7 @@ def train(
     calibration: Path | str | None = None,
     resume: bool = False,
     job: Job | None = None,
+    overwrite: bool = False,
     **options: Any,
 ) -> Trained:
     """Train a network on pairs, and write its file.
@@ -656,6 +657,8 @@ def train(
         True to continue an interrupted training of the same options.
     job
         Limits, and the receiver of progress.
+    overwrite
+        True to replace an existing file.
 
     Raises
     ------
@@ -669,7 +672,7 @@ def train(
         raise MitsimError(f"calibration: {pairs} holds none; give the folder of `mitsim calibrate`")
     check_apart(output, [pairs, place])
     check_torch()
-    with output_file(output) as file:
+    with output_file(output, overwrite) as file:
         from mitsim.learn.pair_store import PairStore
         from mitsim.reconstruct.factors import load_calibration
 

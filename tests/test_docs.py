@@ -314,7 +314,7 @@ def test_figures_are_compared_to_the_last_digit_printed() -> None:
         ("PSNR 50.81 dB, lambda 8.05e+06", ["8.03e+06 -> 8.05e+06"]),
     ):
         new = f"49 frames in 9.9 s: run\n{now}\nSeconds: write 1.07\nAt most 2 GiB"
-        new += "\n27 kernels compiled in 2.1 s of these; Dr.Jit's cache keeps them"
+        new += "\n27 kernels were compiled in 2.1 s of this time, and are kept"
         assert figures.differences(reported, new) == found
     assert len(figures.differences(reported, reported.replace("frames", "shots"))) == 1
 

@@ -56,7 +56,20 @@ ONE_CALL = ["show", "demo", "run", "study", "import", "patterns", "characterise"
 """Verbs that are one call with the same options."""
 ALIKE = {"scenes": "scene", "family": "patterns", "repeated": "folder", "stacks": "frames", "stack_size": "frames"}
 """Arguments that the command line calls otherwise."""
-OF_THE_COMMAND_LINE = {"as_json", "quiet", "verbose", "help", "variant", "no_pictures", "max_seconds", "max_memory"}
+OF_THE_COMMAND_LINE = {
+    *(
+        "as_json",
+        "quiet",
+        "verbose",
+        "help",
+        "variant",
+        "no_pictures",
+        "max_seconds",
+        "max_memory",
+        "overwrite",
+        "overwrite",
+    ),
+}
 """Options that say how it is reported and bounded, as a job does; the variant is a bench's."""
 ANYWAY = {("sense", "output")}
 """Of the verb and option, what a method of the result is for."""

@@ -345,17 +345,17 @@ def _warnings(
             + (f": {reason}" if reason else "")
         )
     if totals.removed > accuracy:
-        yield f"interpolation between anchors left {totals.removed:.1e} of a frame below zero; ask for more"
+        yield f"interpolation between anchors left {totals.removed:.1e} of a frame below zero; ask for a finer accuracy"
     if totals.heaviest > _FIREFLIES and totals.noise.value > _NEGLIGIBLE * accuracy:
         yield (
-            f"one of {GROUPS} groups of the light brings {totals.heaviest:.1%} of the Monte Carlo variance: a few "
-            "heavy paths (fireflies) make it, so mc_error may be far off; frames keep them unclipped, try another seed"
+            f"one of {GROUPS} groups of the light causes {totals.heaviest:.1%} of the Monte Carlo variance: few very "
+            "bright paths (fireflies) make mc_error unreliable; frames contain them unclipped; try another seed"
         )
     if shooting.ambient is not None and shooting.ambient.saturated:
-        yield "saturation: the ambient frame has pixels at the full well or the ADC's end; expose for less"
+        yield "saturation: the ambient frame has pixels at the full well or the ADC's end; use a shorter exposure"
     yield from exposure.camera_warnings(light.bench.sensor, shooting.always.shape)
     if shooting.saturated:
-        yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"
+        yield (f"saturation: {shooting.saturated} frames reach the full well or the ADC's end; use a shorter exposure")
     if not shooting.always.any():
         return
 
@@ -363,11 +363,11 @@ def _warnings(
     part, of_projector = f"{shooting.ambient_part:.1%} of the frames' light is ambient", total.bound * shooting.dilution
     if of_projector > _DILUTED * accuracy:
         yield (
-            f"{part}, and the accuracy {accuracy:g} is relative to all of it: relative to the projector's light alone "
+            f"{part}, and the accuracy {accuracy:g} is relative to all light; relative to the projector's light alone, "
             f"the error is up to {of_projector:.1e}; ask for a finer accuracy, or darken the room"
         )
     if shooting.ambient is None and not shooting.family.signed:
-        yield f"{part} and is not taken off (ambient_frame is no): an image of them shows it, and is wrong"
+        yield (f"{part} and is not subtracted (ambient_frame is no), so images are wrong; set ambient_frame to auto")
     if shooting.noise_to_signal > _DROWNED:
         yield (
             f"{part}: noise is {shooting.noise_to_signal:.2g} times the projector's light in the frames, so little of "
@@ -377,9 +377,9 @@ def _warnings(
     if counted_lamps is not None and counted_lamps.unknown * shooting.ambient_part > accuracy:
         first, last = counted_lamps.range_nm
         yield (
-            f"up to {counted_lamps.unknown:.1%} of the lamps' light is in no frame: what would be counted beyond "
-            f"{first:g} to {last:g} nm if the quantum efficiency went on as its curve ends; let it end at 0, as a "
-            "filter's does"
+            f"up to {counted_lamps.unknown:.1%} of the lamps' light is missing in the frames, because the quantum "
+            f"efficiency is not known beyond {first:g} to {last:g} nm; extend its curve until it is 0, for example "
+            "with a filter's"
         )
 
 
@@ -390,8 +390,8 @@ def _foreign(light: SampledLight, totals: exposure.Totals, request: Request) -> 
         return ""
     if totals.noise.value > _NOISIER * light.sampling_error:
         return (
-            f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
-            f"{request.patterns} {totals.noise.value:.1e}, and their image as much noisier; trace it for "
+            f"the light was traced for {traced}, whose frames have an error of {light.sampling_error:.1e}; frames of "
+            f"{request.patterns} have {totals.noise.value:.1e}, and their image is noisier; trace the light for "
             f"{request.patterns}"
         )
     own = light.bench.family(request.patterns, request.seed).lighting.lit
@@ -399,8 +399,9 @@ def _foreign(light: SampledLight, totals: exposure.Totals, request: Request) -> 
     if own >= _AS_DENSE * planned:
         return ""
     return (
-        f"its shots light {own:.2g} of the pixels, those of {traced}, which the light was planned for, {planned:.2g}: "
-        f"what the plan left out shows more in them, by how much it does not tell; trace it for {request.patterns}"
+        f"its shots light {own:.2g} of the pixels, but the light was planned for {traced}, whose shots light "
+        f"{planned:.2g}; effects that the plan left out may cause a larger error, which is not known; trace the light "
+        f"for {request.patterns}"
     )
 
 
@@ -503,8 +504,8 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
             while cause.__cause__ is not None:  # what Dr.Jit raises says only that something below it failed
                 cause = cause.__cause__
             raise MitsimError(
-                f"{loaded.path}: Mitsuba cannot render this scene in {mi.variant()}: {one_line(cause)}; change what it "
-                "names, or try another --variant"
+                f"{loaded.path}: Mitsuba cannot render this scene in {mi.variant()}: {one_line(cause)}; change the "
+                "part that it names, or try another --variant"
             ) from None
         finally:
             loaded.camera.stratify(None)
@@ -603,7 +604,7 @@ def render(
     }
     rendered = Rendered(mean, error, facts, warnings)
     if mean.any() and not rendered.mc_error < _UNKNOWN:
-        rule = "too few paths met any light to tell how much there is; give more samples (--spp), or more light"
+        rule = "too few paths met light to estimate the irradiance; give more samples (--spp), or more light"
         return replace(rendered, warnings=(*warnings, f"relative noise {rendered.mc_error:.1e}: {rule}"))
     return rendered
 

@@ -103,23 +103,23 @@ def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str
     if sensor.hot_pixels or sensor.dead_pixels:
         own = chain.specimen(sensor, (shape[0], shape[1]))
         yield (
-            f"defect pixels: {own.hot} are hot and {own.dead} dead, and frames have them as they are read; an image "
-            "takes what they read for light; leave them out of the camera's file, or look at its misfit"
+            f"defect pixels: {own.hot} are hot and {own.dead} dead, and frames are not corrected, so that an image "
+            "treats their readings as light; remove them from the camera's file, or look at the image's misfit"
         )
     if sensor.prnu_pixel:
         yield (
-            f"response nonuniformity: pixels differ by {sensor.response_parts[0]:.2%} of their light, which is no "
-            "product of a row's and a column's; factors hold none of it, and an image takes it for light"
+            f"response nonuniformity: pixels differ by {sensor.response_parts[0]:.2%} of their light; separable "
+            "factors cannot describe this, so that an image treats it as light"
         )
     if sensor.row_noise_e:
         yield (
-            f"row noise: {sensor.superpixel_row_noise_e:g} electrons are shared by a row's pixels, and an image's "
-            "uncertainty takes all noise for independent; it is larger than stated"
+            f"row noise: {sensor.superpixel_row_noise_e:g} electrons are common to all pixels of a row, but the "
+            "uncertainty of an image assumes independent noise; the true uncertainty is larger"
         )
     if sensor.linearity:
         yield (
-            f"linearity: a full well reads {sum(sensor.linearity):+.1%} off what a linear camera reads, and an image "
-            "takes the frames for linear"
+            f"linearity: at the full well, readings differ by {sum(sensor.linearity):+.1%} from those of a linear "
+            "camera, but an image assumes linear frames"
         )
 
 
@@ -322,21 +322,19 @@ def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
     moved, fault = camera.model_copy(update=changed), ""
     if kinds and camera.is_correlated(camera.diffracts):
         fault = (
-            f"{kinds} would be formed of separable terms, and {camera.mask_words} has none; turn or tilt that mask in "
-            "the camera file's [mask]"
+            f"{kinds} can be simulated only for separable masks, not for {camera.mask_words}; rotate or tilt that mask "
+            "in the camera file's [mask]"
         )
     elif kinds and bench.loaded.mirrors:
-        fault = (
-            f"{kinds} would be formed of light in cells, and mirrors bring light in none; take a scene without mirrors"
-        )
+        fault = f"{kinds} cannot be simulated for light over mirrors; use a scene without mirrors"
     elif drift.tilt_mrad and camera.mask_thickness:
         thick = f"{kinds} would tilt a mask of {camera.mask_thickness:g} mm"
-        fault = f"{thick}, and only thin ones are formed tilted; set mask_thickness to 0"
+        fault = f"{thick}, but only thin masks can be tilted; set mask_thickness to 0"
     elif not camera.mask_distance + axis > 0:
         fault = f"mask_axis_um moves the mask {-axis:g} mm, to the sensor; it is {camera.mask_distance:g} mm off"
     elif drift.tilt_mrad and moved.tilt_left_out(moved.diffracts):
-        tilted = f"{kinds} would tilt the mask until its shadow takes more terms than are formed"
-        fault = f"{tilted}; give less, or one of the two alone"
+        tilted = f"{kinds} would tilt the mask until its shadow needs more terms than are computed"
+        fault = f"{tilted}; give a smaller tilt, or a tilt about one axis"
     if fault:
         raise MitsimError(f"drift: {fault}")
     return replace(bench, devices=replace(bench.devices, camera=moved))

@@ -54,7 +54,7 @@ class Sensed:
     def warnings(self) -> tuple[str, ...]:
         if not self.saturated:
             return ()
-        return (f"saturation: {self.saturated} pixels are at the full well or the ADC's end; expose for less",)
+        return (f"saturation: {self.saturated} pixels are at the full well or the ADC's end; use a shorter exposure",)
 
     def summary(self) -> dict[str, Any]:
         return {
@@ -139,8 +139,8 @@ def sense(
     Irradiance(wavelength=wavelength_nm)
     if sensor.mosaic is not None:
         raise MitsimError(
-            f"sensor {sensor.name!r}: has a mosaic {sensor.mosaic} of colour filters, which an image of one channel "
-            "does not tell apart; use a monochrome camera, or capture a scene with --colour mosaic"
+            f"sensor {sensor.name!r}: has a mosaic {sensor.mosaic} of colour filters, but the image has one channel; "
+            "use a monochrome camera, or capture a scene with --colour mosaic"
         )
     light = np.asarray(irradiance, dtype=np.float64)
     if light.ndim != 2 or not light.size or not (light.min() >= 0 and light.max() < np.inf):
@@ -189,7 +189,7 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
     channels = {name: values for name, values in read_frame(path)[0].items() if not name.startswith("error.")}
     if channel is None and {*_LUMINANCE} <= {*channels}:
         light = sum(weight * finite_channel(channels, name, path) for name, weight in _LUMINANCE.items())
-        return np.asarray(light), ("channels R, G and B: taken as one, their luminance (ITU-R BT.709)",)
+        return np.asarray(light), ("channels R, G and B are combined to their luminance (ITU-R BT.709)",)
     name = channel or ("Y" if "Y" in channels else next(iter(channels)) if len(channels) == 1 else None)
     if name is None or name not in channels:
         asked = "several channels" if name is None else f"no channel {name!r}"

@@ -218,7 +218,7 @@ def choose_colour(bench: Apparatus, request: Request) -> Coloured:
     looked = time.perf_counter() - started - plan.predicted["plan"]
     ways = [{"name": colour_files.MONO, "error": error}, {"name": colour_files.LINES, "error": 0.0}]
     choice = {"chosen": colour_files.MONO if is_mono else colour_files.LINES, "candidates": ways}
-    note = f"colour: {choice['chosen']}, because mono leaves {error:.1e} of direct light in frames"
+    note = f"colour: {choice['chosen']}, because grey light causes a relative error of {error:.1e} in direct light"
     plan = replace(plan.taking(plan=plan.predicted["plan"] + looked), request=request, colour=choice)
     return Coloured(replace(plan, notes=(*plan.notes, note)), own, is_mono)
 

@@ -179,7 +179,7 @@ _TABLE = (
     Effect(
         "interreflection",
         {"interreflection": False},
-        what="light that goes over several surfaces",
+        what="light that several surfaces reflect",
         # Lamps' light bounces as well, and only paths that were never followed tell how much of it.
         retraced=lambda physics: frozenset({FOLLOWED} if physics.lamps else ()),
         kind="indirect",
@@ -189,7 +189,7 @@ _TABLE = (
     Effect(
         "mirrors",
         {"mirrors": False},
-        what="light over mirrors and through glass, in single directions, and of a projector in view",
+        what="light over mirrors and through glass, and of a projector in view",
         absent="no surface reflects or transmits light in single directions",
         retraced=lambda physics: frozenset({FOLLOWED}),
         first_pilot_run=True,
@@ -209,8 +209,8 @@ _TABLE = (
     Effect(
         "diffraction",
         {"spectrum": None},
-        what="the mask's shadow by wave optics, where it is geometric without",
-        absent="the mask's shadow is geometric, or a picture that has it",
+        what="diffraction at the mask; without this effect its shadow is geometric",
+        absent="the mask's shadow is geometric, or a picture that includes diffraction",
         note=_diffraction,
         first_pilot_run=True,
         in_shadow=True,
@@ -218,15 +218,15 @@ _TABLE = (
     Effect(
         "mask-thickness",
         {"geometry.mask_thickness": 0.0},
-        what="walls of the mask's openings, which take slanting light",
+        what="walls of the mask's openings, which block oblique light",
         absent="the mask is thin",
         in_reference=True,
     ),
     Effect(
         "pixel-response",
         {"geometry.pixel_fill_factor": 1.0, "geometry.angular_exponent": 0.0},
-        what="pixels that see less at their edges, and of slanting light",
-        absent="pixels are fully sensitive, whatever the angle",
+        what="lower sensitivity of pixels at their edges and to oblique light",
+        absent="pixels are fully sensitive at all angles",
         retraced=lambda physics: frozenset({DIRECT, FOLLOWED}),
         in_reference=True,
         in_truth=True,
@@ -234,7 +234,7 @@ _TABLE = (
     Effect(
         "aperture",
         {"projector.aperture": 0.0},
-        what="the projector's lens, which is sharp at one distance alone",
+        what="defocus of the projector's lens, which is sharp at one distance",
         absent="the projector is a pinhole: sharp at all distances",
         note=_lens,
         retraced=lambda physics: frozenset({DIRECT, FOLLOWED}),
@@ -244,7 +244,7 @@ _TABLE = (
     Effect(
         "blur",
         {"projector.blur": 0.0},
-        what="projector pixels that run into their neighbours",
+        what="blur of projector pixels into their neighbours",
         absent="the projector's pixels are sharp",
         retraced=lambda physics: frozenset({DIRECT, FOLLOWED}),
         first_pilot_run=True,
@@ -271,8 +271,8 @@ EFFECTS: Mapping[str, Effect] = MappingProxyType({effect.name: effect for effect
 """All effects in the order of a plan's rows."""
 
 DISCRETISED: Mapping[str, str] = MappingProxyType({
-    "anchors": "points of the sensor that light is traced to, for what changes over it",
-    "layers": "depths, each with a shadow of its own",
+    "anchors": "sensor points to which light is traced, because it varies over the sensor",
+    "layers": "depths, each with its own shadow of the mask",
 })  # fmt: skip
 """Quantities that a plan counts instead of switching; off means one."""
 SWITCHES = (*DISCRETISED, *EFFECTS)

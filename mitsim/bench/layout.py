@@ -507,15 +507,15 @@ def mask_fault(bench: Apparatus) -> Fault | None:
         return None
     own = 0.0 if isinstance(mask, Mask) else min(mask.residuals)
     if own > residual / 2:
-        problem = f"the mask ({geometry.mask_words}) has no two factors: frames can be captured, but the best separable"
+        problem = f"the mask ({geometry.mask_words}) is not separable: frames can be captured, but the best separable"
         remedy = "use a mask of the kind separable, flatcam or mura"
-        return Fault(f"{problem} mask leaves {own:.0%} of it, which images lack", remedy, residual)
+        return Fault(f"{problem} mask misses {own:.0%} of its shadow, and so do images", remedy, residual)
     needed = 2 * max(float(np.abs(each).max()) for each in crossings)
     if mask.flaws.turn_deg:
-        turned = f"the mask ({geometry.mask_words}) has no two factors as it is mounted, because the best separable"
-        return Fault(f"{turned} one leaves {residual:.0%} of it", "mount it straight", residual)
+        turned = f"the mask ({geometry.mask_words}) is not separable as it is mounted, because the best separable"
+        return Fault(f"{turned} mask misses {residual:.0%} of its shadow", "mount it straight", residual)
     covers = f"covers {mask.extent_mm:.2g} mm of the {needed:.2g} mm that the sensor sees through it"
-    reason = f"the mask {covers}, and its edge leaves {residual:.0%} of what is seen without factors"
+    reason = f"the mask {covers}, so that its edge makes {residual:.0%} of the responses not separable"
     least, feature = math.ceil(needed / mask.feature_mm), f"{mask.feature_mm * 1e3:g} um"
     return Fault(reason, f"use at least {least} features of {feature}, or larger ones", residual)
 
@@ -558,7 +558,7 @@ def shortage(bench: Apparatus, family: PatternFamily) -> Fault | None:
         f"{patterns[0]} x {patterns[1]} patterns ({family.name}) on {lit[0]} x {lit[1]} sensor pixels that the mask "
         f"lights give {patterns[0] * lit[0]} x {patterns[1] * lit[1]} numbers for {n} x {n} unknowns"
         f"{f' of each of {lines} lines' if lines > 1 else ''}, so that "
-        + ("noise cannot be told from the image" if data <= rank else "the image is not determined"),
+        + ("noise cannot be distinguished from the image" if data <= rank else "the image is not determined"),
         f"use at least {least} patterns, or more sensor pixels",
         1.0 if data <= rank else 1 - math.prod(ranks) / math.prod(needed),
     )

@@ -206,8 +206,8 @@ def modelled_factors(
         lost = best_term([camera.factors(fitted.placement), *turned]).residual
         if lost > SEPARABLE_RESIDUAL:
             warnings.append(
-                f"the mask is turned by {1e3 * angle:.2f} mrad (+-{1e3 * error:.2g}): no separable factors have that, "
-                f"and {lost:.1%} of the shadow is lacking ({decibels(lost):.1f} dB); straighten the mask"
+                f"the mask is rotated by {1e3 * angle:.2f} mrad (+-{1e3 * error:.2g}), which separable factors cannot "
+                f"describe: they miss {lost:.1%} of the shadow ({decibels(lost):.1f} dB); straighten the mask"
             )
     numbers = {
         name: FittedNumber(value=getattr(fitted.placement, name), standard_error=fitted.errors.get(name), unit=unit)
@@ -404,7 +404,7 @@ def _inverse(jacobian: FloatArray, free: Sequence[str]) -> FloatArray:
     first, second = map(int, np.unravel_index(int(np.argmax(alike)), alike.shape))
     if alike[first, second] > _ALIKE:
         raise MitsimError(
-            f"{free[first]} and {free[second]} cannot be told apart by these responses (correlation "
+            f"{free[first]} and {free[second]} cannot be distinguished with these responses (correlation "
             f"{alike[first, second]:.5f}); leave one of them out of the fit"
         )
     return np.asarray(covariance / np.outer(lengths, lengths))
@@ -432,6 +432,6 @@ def _first_guess(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) ->
     place = tuple(found.values())
     gain = float(products[place] / norms[place] ** 2)
     if not gain > 0:
-        raise MitsimError("the response to uniform light has nothing of the camera's shadow; check mask and geometry")
+        raise MitsimError("the response to uniform light does not contain the mask's shadow; check mask and geometry")
     moves = {name: float(shifts[index]) for name, index in found.items() if name in free}
     return camera.built.move({**moves, "gain": gain - camera.built.gain})

@@ -31,6 +31,8 @@ from mitsim.cli.commands import (
     LimitedPictured,
     OfScene,
     Overwritten,
+    Replaced,
+    Replacing,
     Resumed,
     argument,
     command,
@@ -57,7 +59,7 @@ if TYPE_CHECKING:
 # ---- demo, run, view, study and doctor -------------------------------------------------------------------------------
 
 
-class Showing(DemoRequest, Common):
+class Showing(DemoRequest, Replacing, Common):
     """Options of `mitsim demo`."""
 
     FIRST = "scene output patterns"
@@ -78,10 +80,11 @@ def demo(asked: Showing) -> int:
     return asked.call(mitsim.demo, asked.scene, asked.output, **asked.given_of(DemoRequest))
 
 
-class Running(RunOptions, Variant, LimitedPictured):
+class Running(RunOptions, Replaced, Variant, LimitedPictured):
     """Options of `mitsim run`."""
 
     PANEL = WHAT
+    MARKS = ("session",)
 
     session: str | None = argument(None, "session file, or the name of a shipped session", "SESSION.toml")
     output: Path | None = to_make(
@@ -91,6 +94,10 @@ class Running(RunOptions, Variant, LimitedPictured):
         None, "set a field of the session file; repeatable", "-D", metavar="TABLE.FIELD=VALUE", kind=list[str]
     )
     repeated: Path | None = option(None, "write the session file that repeats this folder", "--from", metavar="FOLDER")
+
+    @property
+    def places(self) -> list[Path]:
+        return [self.output or Path("session-output")]
 
 
 @command
@@ -110,7 +117,7 @@ def run_(asked: Running) -> int:
         others = "values", "resume", "no_pictures", "variant", "max_seconds", "max_memory"
         asked.refuse(others, "with --from, which runs nothing")
         if asked.output is not None:
-            check_output(asked.output, kind="file")
+            check_output(asked.output, asked.overwrite, "file")
         found = mitsim.session_of(folder)
         written = None if asked.output is None else str(found.save(asked.output))
         payload = {"session": found.text, "output": written, "warnings": found.warnings}
@@ -134,7 +141,7 @@ def run_(asked: Running) -> int:
     return asked.call(mitsim.run, asked.session, asked.output or "session-output", values, **options)
 
 
-class Viewing(OfScene, Opening, Common):
+class Viewing(OfScene, Opening, Replacing, Common):
     """Options of `mitsim view`."""
 
     output: Path = to_make(Path("view.png"), "picture or interactive page; replaces an old file", "FILE.png|FILE.html")
@@ -161,7 +168,7 @@ def view(asked: Viewing) -> int:
     return asked.finish(payload, [*seen.lines(), f"Drawn: {payload['output']}"], seen.warnings)
 
 
-class Studying(StudyOptions, Common):
+class Studying(StudyOptions, Replacing, Common):
     """Options of `mitsim study`."""
 
     CHANGES = shown(patterns={"default": "dots:7"})
@@ -207,7 +214,7 @@ def doctor(asked: Checking) -> int:
     bad = [f"{check.name}: {check.detail}" for check in checks if not check.ok]
     lines = [f"{sum(check.ok for check in checks)} of {len(checks)} checks pass"]
     for check in checks:
-        remedy = f"\n     mend with: {check.remedy}" if check.remedy and not check.ok else ""
+        remedy = f"\n     correct it with: {check.remedy}" if check.remedy and not check.ok else ""
         lines.append(f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.detail}{remedy}")
     if not (bad or asked.verbose):
         lines = [f"All {len(checks)} checks pass (--verbose lists them)"]
@@ -286,12 +293,12 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
         f"Plan at accuracy {plan.accuracy:g}: {plan.predicted_seconds:.3g} s, error up to {most:.1e}",
         *table("on", "how", [row for row in rows if row.state != "off"]),
         *table("left out", "why", left_out),
-        *([f"{silent} more that nothing calls for (--all)"] if silent else []),
+        *([f"{silent} more effects that this scene does not need (--all lists them)"] if silent else []),
         f"Seconds: {stages}",
         *plan.notes,
     ]
     if plan.asked_seconds is not None:
-        lines.append(f"Accuracy {plan.accuracy:g} is what {plan.asked_seconds:g} s buy")
+        lines.append(f"Accuracy {plan.accuracy:g} is the best that is reachable within {plan.asked_seconds:g} s")
     if plan.cost:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
         lines.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
@@ -301,7 +308,7 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
 # ---- capture ---------------------------------------------------------------------------------------------------------
 
 
-class Capturing(OfScene, Request, KnownPlan, Resumed, AnyColour, Opening, LimitedPictured):
+class Capturing(OfScene, Request, KnownPlan, Resumed, Replaced, AnyColour, Opening, LimitedPictured):
     """Options of `mitsim capture`."""
 
     FIRST = "scene patterns exposure exposure_fraction ambient_frame"
@@ -386,7 +393,7 @@ def memory_line(payload: Mapping[str, Any]) -> str:
 def _kernel_lines(kernels: Mapping[str, float]) -> list[str]:
     if not kernels["number"]:
         return []
-    return [f"{kernels['number']} kernels compiled in {kernels['seconds']:.1f} s of these; Dr.Jit's cache keeps them"]
+    return [(f"{kernels['number']} kernels were compiled in {kernels['seconds']:.1f} s of this time, and are kept")]
 
 
 def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
@@ -419,7 +426,7 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
     lines += _kernel_lines(payload["kernels"])
     if ambient := payload.get("ambient_frame"):
         lines.append(
-            f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
+            f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be subtracted; "
             f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's, "
             f"total error up to {payload['total_error_of_projector']:.1e} of it"
         )
@@ -429,7 +436,7 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
 # ---- render, transport and pairs -------------------------------------------------------------------------------------
 
 
-class Rendering(OfScene, Planned, LitScene, LimitedPictured):
+class Rendering(OfScene, Planned, LitScene, Replacing, LimitedPictured):
     """Options of `mitsim render`."""
 
     FIRST, HIDDEN = "scene output estimator spp", "patterns seconds"
@@ -520,10 +527,10 @@ def transport(asked: Tracing) -> int:
     return asked.finish(payload, lines, payload["warnings"])
 
 
-class Pairing(OfScene, PairOptions, Request, Resumed, Opening, Limited):
+class Pairing(OfScene, PairOptions, Request, Resumed, Replaced, Opening, Limited):
     """Options of `mitsim pairs`."""
 
-    FIRST, HIDDEN = "scene output count", "seconds"
+    FIRST, HIDDEN, MARKS = "scene output count", "seconds", (PAIRS,)
     CHANGES = shown(exposure={"help": "exposure time of each frame [s]; auto: chosen for each pair"})
 
     output: Path = to_make(..., "folder to make for the pairs", "DIR")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.request import NO, Coloured, Exposure, Opening, Request, SessionRequest, Task, check_psnr
 from mitsim.cli.bench_verbs import check_work, memory_line, payload_of_lines
-from mitsim.cli.commands import LimitedPictured, Resumed, command, option_name, scene_named, to_make
+from mitsim.cli.commands import LimitedPictured, Replaced, Resumed, command, option_name, scene_named, to_make
 from mitsim.core.colour_files import CALIBRATION, is_coloured
 from mitsim.core.configuration import OUTPUT, WHAT, option
 from mitsim.core.errors import MitsimError
@@ -28,10 +28,11 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
 
-class Calibrating(SessionRequest, Coloured, Opening, LimitedPictured, Resumed):
+class Calibrating(SessionRequest, Coloured, Opening, LimitedPictured, Resumed, Replaced):
     """Options of `mitsim calibrate`."""
 
     PANEL = WHAT
+    MARKS = "calibration", CALIBRATION
 
     scene: str | None = scene_named(None, "scene XML file, or the name of a shipped scene")
     output: Path | None = to_make(None, "folder to make; with --plan-session, recipe file to write", "CAL")
@@ -70,9 +71,9 @@ def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memo
             f"{result['output']}",
             f"Factor error {error:.1e}, separability residual {residual:.2%} ({clean:.1e} without noise)"
             if simulated
-            else f"Factor error {predicted:.1e} by its noise, separability residual {residual:.2%}",
+            else f"Factor error {predicted:.1e} predicted from noise, separability residual {residual:.2%}",
             *asked.details(f"Condition {condition:.2e}", memory_line(result)),
-            *([] if divisor == 1 else [f"Numbers are divided by {divisor}, which all have"]),
+            *([] if divisor == 1 else [f"Numbers are divided by {divisor}, their common factor"]),
             *(f"Not known: {text}" for text in result.get("not_known", ())),
         ]
     warnings: Any = [text for each in found.values() for text in each.warnings]
@@ -160,14 +161,14 @@ def _plan(asked: Calibrating, _: Path) -> int:
     recipe, output = asked.recipe or load_recipe(), asked.output
     recipe.of_one_depth()
     if output is not None:
-        prepare_output(output, kind="file")
+        prepare_output(output, asked.overwrite, "file")
     patterns, psnr = Request(patterns=asked.patterns or "dots:7").patterns, check_psnr(asked.psnr)
     asked.check(asked.scene, patterns, Exposure(None, recipe.exposure_fraction))
     with asked.job() as job:
         bench = open_as(asked.scene, asked, job)
         from mitsim.calibrate.session_plan import plan_calibration
 
-        with nullcontext() if output is None else output_file(output):
+        with nullcontext() if output is None else output_file(output, asked.overwrite):
             found = plan_calibration(bench, psnr, patterns, recipe, seed=asked.seed, accuracy=asked.accuracy, job=job)
             lines = found.lines()
             if output is not None:
@@ -246,7 +247,9 @@ def calibrate(asked: Calibrating) -> int:
     allowed = {*words.split()}
     if mode == "model" and asked.frames:
         allowed -= {"recipe", "seed", "accuracy"}
-    if others := sorted({*asked.given} - allowed - {"output", "as_json", "quiet", "verbose", "no_pictures"}):
+    if others := sorted(
+        {*asked.given} - allowed - {"output", "overwrite", "as_json", "quiet", "verbose", "no_pictures"}
+    ):
         kind = mode if mode == "scene" else option_name(mode)
         raise MitsimError(f"{option_name(others[0])}: has no effect on a calibration by {kind}; leave it out")
     if asked.output is None and mode != "planning":

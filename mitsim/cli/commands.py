@@ -21,7 +21,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -42,10 +42,11 @@ from typing import (
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from mitsim.core.colour_files import MOSAIC, RUN
 from mitsim.core.configuration import LIMITS, OUTPUT, PANELS, WHAT, Options, option, shipped_files, validated_by
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
 from mitsim.core.errors import ArgumentError, MitsimError, printable
-from mitsim.core.files import PICTURES, plain
+from mitsim.core.files import PICTURES, plain, replaced
 from mitsim.core.job import Job, Limits, progress, running_seconds
 
 if TYPE_CHECKING:
@@ -227,6 +228,37 @@ class Overwritten(Options):
     overwrite: bool = option(False, "replace an existing file")
 
 
+class Replacing(Options):
+    """Options of verbs that replace an earlier result unasked."""
+
+    overwrite: bool = option(False, "accepted, because other verbs need it", hidden=True)
+
+
+class Replaced(Options):
+    """Whether earlier results of the same kind are replaced as a whole; they are kept if the command is refused."""
+
+    PANEL = OUTPUT
+    MARKS: ClassVar[Sequence[str]] = ("capture", RUN, MOSAIC)
+    """Kinds of the folders that the verb makes, or files in them."""
+
+    overwrite: bool = option(False, "replace an earlier result, which is kept if this command is refused")
+
+    @property
+    def places(self) -> Iterable[Path | None]:
+        """Return the files and folders that the verb makes."""
+        return (getattr(self, name, None) for name in ("output", "calibration_output", "write_frames"))
+
+    @contextmanager
+    def replacing(self) -> Iterator[None]:
+        """Move earlier results aside, if they are to be replaced, until new ones are begun."""
+        if self.overwrite and getattr(self, "resume", False):
+            raise ArgumentError("overwrite", "replaces the work that --resume continues; give one of both")
+        with ExitStack() as stack:
+            for place in filter(None, self.places if self.overwrite else ()):
+                stack.enter_context(replaced(place, self.MARKS))
+            yield
+
+
 class KnownPlan(Options):
     """A plan that is made already."""
 
@@ -317,7 +349,9 @@ def command(function: Callable[[M], int]) -> Callable[..., int]:
     def call(context: typer.Context, **values: Any) -> int:
         sources = {name: context.get_parameter_source(name) for name in values}
         given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
-        return function(model(**{name: readers[name](values[name]) for name in given}))  # type: ignore[arg-type]
+        asked: Any = model(**{name: readers[name](values[name]) for name in given})
+        with asked.replacing() if isinstance(asked, Replaced) else nullcontext():
+            return function(asked)
 
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     call.__annotations__ = {each.name: each.annotation for each in parameters}

@@ -11,6 +11,8 @@ from mitsim.cli.commands import (
     Common,
     Limited,
     Pictured,
+    Replaced,
+    Replacing,
     Resumed,
     argument,
     command,
@@ -20,7 +22,7 @@ from mitsim.cli.commands import (
     shown,
     to_make,
 )
-from mitsim.core.colour_files import MOSAIC, RUN, SpectralFolder, is_coloured, open_lines
+from mitsim.core.colour_files import CALIBRATION, MOSAIC, RUN, SpectralFolder, is_coloured, open_lines
 from mitsim.core.configuration import CAMERA, DEVICES, OUTPUT, WHAT, locate, option, shipped_names
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_apart, check_output, output_file
@@ -219,7 +221,7 @@ def show(asked: ShowingFolder) -> int:
 _CAMERA: dict[str, Any] = {"help": "camera: shipped name, or TOML file", "complete": lambda: shipped_names(CAMERA)}
 
 
-class Characterising(Procedure, Common):
+class Characterising(Procedure, Replacing, Common):
     """Options of `mitsim characterise`."""
 
     camera: str | None = argument(None, metavar="[CAMERA]", show_default=False, **_CAMERA)
@@ -254,7 +256,7 @@ def characterise(asked: Characterising) -> int:
     return asked.call(mitsim.characterise, asked.camera, asked.output, frames, **asked.given_of(Procedure))
 
 
-class Sensing(Irradiance, Pictured):
+class Sensing(Irradiance, Replacing, Pictured):
     """Options of `mitsim sense`."""
 
     FIRST = "image output camera exposure exposure_fraction"
@@ -306,17 +308,18 @@ def export(asked: Exporting) -> int:
     $ mitsim export run --format mat -o run.mat --calibration cal
     """
     if asked.format == "png":
-        asked.refuse(["overwrite"], "on a folder of pictures, which takes the place of none")
+        asked.refuse(["overwrite"], "with png, which never replaces a folder")
     payload = mitsim.export(asked.run, **asked.given_of(Exported))
     with_it = f" with {payload['calibration']}" if payload["calibration"] else ""
     lines = [f"{payload['frames']} frames{with_it} as {asked.format}: {payload['output']}", *payload["notes"]]
     return asked.finish(payload, lines)
 
 
-class Importing(FrameFacts, Pictured):
+class Importing(FrameFacts, Replaced, Pictured):
     """Options of `mitsim import`."""
 
     FIRST = "source list"
+    MARKS = (*Replaced.MARKS, "calibration", CALIBRATION)
     CHANGES = shown(seed={"default": 0}, byte_order={"default": "little"})
 
     source: Path = argument(..., "folder of frames, or one frame; or an exported file", "SOURCE")
@@ -348,12 +351,10 @@ def import_(asked: Importing) -> int:
     if output is None and calibration is None:
         raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
     if source.suffix.lower() in READERS:
-        asked.refuse(
-            [name for name in facts if name != "channel"], f"on {source}, which says itself what its frames are"
-        )
+        asked.refuse([name for name in facts if name != "channel"], f"on {source}, which states these facts itself")
         payload = mitsim.import_file(source, output, calibration, asked.channel)
     elif output is None or calibration is not None:
-        raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
+        raise MitsimError(f"{source}: frames contain no calibration; give -o RUN, and leave out --calibration-output")
     else:
         with asked.job() as job:
             payload = mitsim.import_frames(source, output, job, **facts)
@@ -363,7 +364,7 @@ def import_(asked: Importing) -> int:
     if payload["calibration_output"]:
         lines.append(f"calibration: {payload['calibration_output']}")
     elif "calibration" in payload["holds"]:
-        lines.append("The file holds a calibration too; give --calibration-output to have it")
+        lines.append("The file also contains a calibration; write it with --calibration-output CAL")
     lines += payload.get("notes", ())
     if payload["left_out"]:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
@@ -372,10 +373,11 @@ def import_(asked: Importing) -> int:
     return asked.finish({**payload, "report": None}, lines, payload["warnings"])
 
 
-class Drawing(Pictures, Common):
+class Drawing(Pictures, Replaced, Common):
     """Options of `mitsim patterns`."""
 
     CHANGES = shown(seed={"default": 0}, signed_capture={"default": "pair"})
+    MARKS = ("patterns.json",)
 
     family: str = argument(..., f"{pattern_names()}; or stripes, for a calibration session", "PATTERNS|stripes")
     output: Path = to_make(..., "folder to make for the pictures", "DIR")
@@ -393,8 +395,8 @@ def patterns(asked: Drawing) -> int:
     payload = mitsim.pattern_pictures(asked.family, asked.output, **asked.given_of(Pictures))
     last = f" --closing-frame {asked.closing_frame}" if asked.closing_frame else ""
     after = (
-        f"Their frames are read by: mitsim import FRAMES --patterns {asked.output / 'patterns.json'} --camera NAME "
-        f"--exposure SECONDS --calibration CAL -o RUN{last}"
+        "Import the frames that the camera records with: mitsim import FRAMES --patterns "
+        f"{asked.output / 'patterns.json'} --camera NAME --exposure SECONDS --calibration CAL -o RUN{last}"
     )
     if session := payload["session"]:
         after = f"Copy {session} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
@@ -412,7 +414,7 @@ def patterns(asked: Drawing) -> int:
 # ---- Learning --------------------------------------------------------------------------------------------------------
 
 
-class Learning(Schedule, Resumed, Limited):
+class Learning(Schedule, Resumed, Replaced, Limited):
     """Options of `mitsim train`."""
 
     FIRST = "method pairs output calibration"
@@ -440,7 +442,8 @@ def train(asked: Learning) -> int:
     Training(method=asked.method, **schedule)  # refused before anything is imported for it
     advise(RESUME)
     with asked.job() as job:
-        made = train_model(asked.method, asked.pairs, output, asked.calibration, asked.resume, job, **schedule)
+        where = asked.pairs, output, asked.calibration, asked.resume, job, asked.overwrite
+        made = train_model(asked.method, *where, **schedule)
         payload = {**made.summary(), "seconds": job.clock.seconds()}
     lines = [
         f"{payload['model']}: {payload['weights']} weights, {made.curve[-1][0]} of {asked.steps} steps in "

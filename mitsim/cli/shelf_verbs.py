@@ -17,7 +17,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 
 from mitsim.bench.effects import DISCRETISED, EFFECTS
-from mitsim.cli.commands import Common, argument, command, to_make
+from mitsim.cli.commands import Common, Replaced, argument, command, to_make
 from mitsim.core.configuration import (
     CAMERA,
     DEFAULT_CAMERA,
@@ -230,8 +230,10 @@ def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
         yield Path(found.origin).read_text(encoding="utf-8").replace('"starter"', f'"{name}"').rstrip()
 
 
-class Beginning(Common):
+class Beginning(Replaced, Common):
     """Options of `mitsim new`."""
+
+    MARKS = ("scene.xml",)
 
     kind: str = argument(..., ", ".join(_STARTERS), "KIND", complete=lambda: _STARTERS)
     name: str = argument(..., "name of letters, digits, - and _ that begins with a letter", "NAME")
@@ -246,6 +248,10 @@ class Beginning(Common):
             name for kind, each in _STARTERS.items() if each.like for name in [*_shipped(kind), *_MASKS]
         ),
     )
+
+    @property
+    def places(self) -> list[Path]:
+        return [self.output or Path(self.name)]
 
 
 @command
@@ -290,7 +296,7 @@ def new(asked: Beginning) -> int:
         head = [f"# {kind.capitalize()} {name}, for: {use}", *places, *([] if kind == "session" else _MORE)]
         lines = _lines(kind, name, source, like if like is not None and like in masks else "separable")
         text = "\n".join([*(head if ending == ".toml" else []), *lines]) + "\n"
-        with output_file(output) as place:
+        with output_file(output, asked.overwrite) as place:
             write_text(place, text)
     payload = {"kind": kind, "name": name, "output": str(output), "use": use}
     return asked.finish(payload, [f"{kind.capitalize()} {name}: {output}", f"Try: {use}"])

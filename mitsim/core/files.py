@@ -119,11 +119,11 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
         except OSError as error:
             raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
         if occupied and not overwrite:
-            remedy = "choose a new one or empty it"
+            remedy = "choose a new folder, or empty this one"
             with suppress(MitsimError, ValueError, RecursionError, AttributeError):  # a killed work left its manifest
                 manifest = path / (PAIRS if (path / PAIRS).is_file() else "manifest.json")
                 if json.loads(read_text(manifest, _LONGEST_HEAD)).get("status") == "incomplete":
-                    remedy = "go on with resume=True"
+                    remedy = "continue with resume=True"
             raise MitsimError(f"output {path}: the folder holds files already; {remedy}")
     # Permission bits do not show everything (root, read-only mounts, quotas): only a file that was really written does.
     try:
@@ -193,6 +193,39 @@ def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
         same = place == resolve(each) or (place.exists() and each.exists() and place.samefile(each))
         if same or (each.is_dir() and place.exists() and place.is_relative_to(resolve(each))):
             raise MitsimError(f"output {path}: would replace {each}, which is read; choose another name")
+
+
+@contextmanager
+def replaced(path: Path, marks: Iterable[str]) -> Iterator[None]:
+    """Move a folder with an earlier result aside while a new one is made, and back if none is begun.
+
+    A result has a file or a ``kind`` of ``marks``. Other folders, files, and the working folder stay where they are, so
+    that they are refused as an output. MitsimError if another process writes there.
+    """
+    place = resolve(path)
+    aside = _beside(place, ".replaced")
+    if not _is_result(place, marks) or Path.cwd().is_relative_to(place):
+        yield
+        return
+    if os.path.lexists(aside):  # a killed process left it
+        shutil.rmtree(aside)
+    with _lock(path, place / LOCK):
+        os.replace(place, aside)
+    try:
+        yield
+    finally:
+        if os.path.lexists(place):
+            shutil.rmtree(aside)
+        else:
+            os.replace(aside, place)
+
+
+def _is_result(folder: Path, marks: Iterable[str]) -> bool:
+    found = {name for name in marks if (folder / name).is_file()}
+    for name in ("manifest.json", "colour.json", "session.json"):
+        with suppress(MitsimError, AttributeError):  # missing, damaged, or no object
+            found.add(read_json(folder / name).get("kind"))
+    return not found.isdisjoint(marks)
 
 
 @contextmanager

@@ -154,7 +154,7 @@ def _png(path: Path, wanted: Wanted) -> _Reader:
 
 def _check_upright(path: Path, stated: Any, wanted: Wanted) -> None:
     if stated != _UPRIGHT:
-        problem = f"has the orientation {stated}: it is to be shown turned or mirrored; save it as it is to be read"
+        problem = f"has the orientation {stated}: viewers rotate or mirror it; save it without this entry"
         raise wanted.refusal(path, problem + ("" if wanted.colour else ", and turn frames by --orientation 2 to 8"))
 
 
@@ -486,7 +486,7 @@ def read_reflectance(path: Path) -> FloatArray:
     grey = np.asarray(values, dtype=np.float64) / (own_end(values) or 1.0)
     if grey.ndim == 3:
         if (grey[..., 3:] < 1).any():
-            raise MitsimError(f"picture {path}: has transparent pixels; lay it on a ground, and save it without")
+            raise MitsimError(f"picture {path}: has transparent pixels; save it with an opaque background")
         grey = grey[..., :3].mean(axis=2)
     if not (np.isfinite(grey).all() and grey.min() >= 0 and grey.max() <= 1):
         raise MitsimError(f"picture {path}: its numbers reach from {grey.min():g} to {grey.max():g}; give 0 to 1")

@@ -21,7 +21,7 @@ from typing import NoReturn
 
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status after Control-C, as in a shell."""
-RESUME = "finished work is kept, go on with --resume"
+RESUME = "finished work is kept; continue with --resume"
 _STOPS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name))
 _CRASHES = ("SIGABRT", "SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGTRAP")
 _SPACE_BYTES = 0.7e9

@@ -139,12 +139,12 @@ def check_format(
     if format not in FORMATS:
         raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
     if projector is not None and format != PNG:
-        raise ArgumentError("projector", f"{projector}: {format} draws no pictures for one; leave it out")
+        raise ArgumentError("projector", f"{projector}: is only for png; leave it out with {format}")
     if calibration is not None and format == PNG:
-        raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
+        raise ArgumentError("calibration", (f"{calibration}: {format} cannot contain one; leave it out"))
     ending, own = Path(output).suffix.lower(), {HDF5: (".h5", ".hdf5"), "mat": (".mat",)}.get(format, ())
     if ending in READERS and ending not in own:
-        raise MitsimError(f"output {output}: {ending} is not of {format}; rename it")
+        raise MitsimError(f"output {output}: files of {format} do not end in {ending}; choose another name")
 
 
 # ---- Import ----
@@ -196,7 +196,7 @@ def import_file(
         }
         for kind, (argument, place, held) in wanted.items():
             if place is not None and held is None:
-                raise ArgumentError(argument, f"{place}: {source} holds no {kind}; leave this out")
+                raise ArgumentError(argument, f"{place}: {source} contains no {kind}; leave this option out")
         with ExitStack() as stack:
             folders = [(stack.enter_context(whole_folder(place)), held) for _, place, held in wanted.values() if place]
             for folder, held in folders:
@@ -317,17 +317,17 @@ def pattern_pictures(patterns: str, output: Path | str, **options: Any) -> dict[
         asked.refuse(["closing_frame"], "on stripes, whose pairs check the lamp")
         if asked.camera is None or asked.exposure is None:
             missing = "camera" if asked.camera is None else "exposure"
-            raise ArgumentError(missing, "is not given, and the list of a calibration's frames needs it; give it")
+            raise ArgumentError(missing, "is missing; stripes need it for the session file of their frames")
         from mitsim.exchange.other_programs import SESSION, draw_stripes
 
         mode = asked.signed_capture or "pair"
         drawn = draw_stripes(folder, pixels, str(asked.projector), str(asked.camera), asked.exposure, mode)
         return {**drawn, "session": str(folder / SESSION)}
     read_name(patterns, pixels)  # refused before numpy is imported
-    asked.refuse(["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
+    asked.refuse(["signed_capture"], "on patterns, but only on stripes")
     for name in ("camera", "exposure"):
         if (value := getattr(asked, name)) is not None:
-            raise ArgumentError(name, f"{value}: goes with stripes; give it to `mitsim import`")
+            raise ArgumentError(name, f"{value}: is only for stripes; for patterns give it to `mitsim import`")
     from mitsim.exchange.other_programs import draw_family
 
     drawn = draw_family(folder, patterns, pixels, str(asked.projector), seed, last)

@@ -484,7 +484,7 @@ def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[st
             again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {ambient.shots}"
         if closing is not None:
             again += f" --closing-frame {closing.kind} --closing-exposure {closing.exposure_s!r}"
-    note = f"Read again by: mitsim import {folder / 'frames'} {again} --camera NAME --calibration CAL -o RUN"
+    note = f"Import again by: mitsim import {folder / 'frames'} {again} --camera NAME --calibration CAL -o RUN"
     return note, f"Patterns in cells of {describe_cells(where)}"
 
 

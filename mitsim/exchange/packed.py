@@ -432,10 +432,11 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     pages = {path: image_pages(path, known.wanted) for path in files}
     if (held := sum(number for number, _ in pages.values())) != count + bool(closing):
         last = " and a closing frame" if closing else ""
-        hint = " (is the last a closing frame? say so)" if held == count + 1 else ""
+        hint = "; if the last one is a closing frame, give --closing-frame" if held == count + 1 else ""
         raise MitsimError(
-            f"{source}: holds {held} frames, but patterns {known.patterns!r} take {count}{last}, in the order "
-            f"(row, column), of signed ones + before -; give all of them and no others, each page a frame{hint}"
+            f"{source}: holds {held} frames, but patterns {known.patterns!r} need {count}{last}, in the order (row, "
+            "column), and + before - for signed patterns; give exactly these frames (a page of a file is a "
+            f"frame){hint}"
         )
     pixels = sum(number * math.prod(size) for number, size in pages.values())
     cost = Cost(seconds=pixels * _SECONDS_PER_PIXEL, disk_bytes=pixels * np.dtype(np.uint32).itemsize)
@@ -459,8 +460,8 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
             notes.append(f"numbers are divided by {factor}, because all are multiples of it")
         elif common.factor > 1:
             warnings.append(
-                f"all numbers are multiples of {common.factor}, and are taken as they are: if the camera's numbers "
-                f"were shifted or scaled, give --divide {common.factor}, else --divide 1"
+                f"all numbers are multiples of {common.factor}, and are used unchanged: if the camera's numbers were "
+                f"shifted or scaled, give --divide {common.factor}, else --divide 1"
             )
     elif common.factor % factor:
         raise ArgumentError("divide_by", f"{factor}: the numbers' common factor is {common.factor}; give that, or 1")
@@ -477,8 +478,8 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
             )
     if prepare.turn_deg:
         notes.append(
-            f"turned by {prepare.turn_deg:g} degrees: noise of neighbouring pixels is no more independent, so an "
-            "image's stated uncertainty is rough"
+            f"turned by {prepare.turn_deg:g} degrees: noise of neighbouring pixels is not independent any more, so "
+            "that the stated uncertainty of an image is approximate"
         )
     content = Content(runs, colours, "" if colours is None else json.dumps(colours.model_dump(mode="json")))
     with whole_folder(output) as place:
@@ -508,13 +509,13 @@ def _check_range(path: Path, frame: Numbers, camera: Electronics, factor: int, m
     if high / factor > largest or (low < 0 and not mean):
         raise MitsimError(
             f"{path}: has the number {(low if low < 0 else high) / factor:g}, but {counts} 0 to {largest}: they were "
-            "scaled, hold more than light (as a text in the picture), or the camera is another; save them as they are, "
+            "scaled, contain more than light (for example a text), or come from another camera; save them unchanged, "
             "or give the right camera file"
         )
     if not mean and kind.kind != "f" and np.iinfo(kind).max < largest:
         raise MitsimError(
-            f"{path}: holds numbers of {8 * kind.itemsize} bits, but {counts} to {largest}: they were made "
-            "smaller; save them as they are, or give a camera file of these numbers"
+            f"{path}: holds numbers of {8 * kind.itemsize} bits, but {counts} to {largest}: they were reduced; save "
+            "them unchanged, or give a camera file of these numbers"
         )
 
 

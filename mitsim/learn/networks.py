@@ -306,20 +306,21 @@ class LearnedSolver(Solver):
             (own_rows, own_columns), (rows, columns) = self.network.shape, shape
             raise MitsimError(
                 f"model {self.name}: makes images of {own_rows} x {own_columns} pixels, but calibration {camera.name} "
-                f"has {rows} x {columns}; train one for it"
+                f"has {rows} x {columns}; train a network for this calibration"
             )
         if not all(np.array_equal(own, other) for own, other in zip(self.patterns, patterns, strict=True)):
             raise MitsimError(
-                f"model {self.name}: was trained under the patterns {cut(self.manifest.patterns)}, and these are "
-                "others; capture those, or train one for these"
+                f"model {self.name}: was trained for the patterns {cut(self.manifest.patterns)}, but this run has "
+                "others; capture those patterns, or train a network for these"
             )
         doubts, (ours, theirs) = list[str](), (self.manifest.camera, camera.manifest.camera)
         if names := [cut(name) for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]:
             other = f"{', '.join(names)} differ"
             if self.network.holds_camera:
                 raise MitsimError(
-                    f"model {self.name}: was trained for another camera ({other}), and its weights stand for that one; "
-                    f"train one for calibration {camera.name}, or {UNROLLED} or {REFINED}, which serve others, flagged"
+                    f"model {self.name}: was trained for another camera ({other}), and its weights contain that "
+                    f"camera; train a network for calibration {camera.name}, or use {UNROLLED} or {REFINED}, which "
+                    "accept other cameras and flag their images"
                 )
             doubts.append(f"The network was trained for another camera: {other}.")
         else:
@@ -355,19 +356,19 @@ class LearnedSolver(Solver):
         relative, (low, high) = relative_noise(problem), self.manifest.noise
         if not low / _OTHER_NOISE <= relative <= high * _OTHER_NOISE:
             flags.append(
-                f"The network was trained with noise of {low:.1e} to {high:.1e} of the light, and here it is "
+                f"The network was trained with noise of {low:.1e} to {high:.1e} of the light, but these frames have "
                 f"{relative:.1e}."
             )
         if beyond > UNEXPLAINED:
-            flags.append(f"The image does not give the frames: {beyond:.1e} of them, beyond noise, are others.")
+            flags.append(f"The image does not explain the frames: {beyond:.1e} of them, beyond noise, differ.")
         return Solution(
             image=image,
             lam=variance * float(torch.exp(self.network.log_start.detach())),
             residual=float(np.sqrt((missed + outside) / problem.energy)),
             status=Status(
                 Verdict.SOLVED,
-                f"Found by a trained network, {self.name}: what it adds to the frames is likely, not measured, and its "
-                "uncertainty is not known",
+                f"Computed by a trained network, {self.name}: details that the frames do not determine are guesses, "
+                "and their uncertainty is not known",
                 figures=f"{prepared.extent}.",
                 flags=tuple(flags),
             ),
@@ -543,7 +544,7 @@ class Trainer:
                 return
             for number in range(self.taken, min(self.taken + max(steps // _LOOKS, 1), steps)):
                 if not math.isfinite(self.step(number)):
-                    raise MitsimError(f"training: its numbers ran away at step {number}; give a smaller rate")
+                    raise MitsimError(f"training: the loss diverged at step {number}; give a smaller rate")
                 self.taken = number + 1
                 job.progress("train", self.taken / steps)
 
@@ -560,8 +561,8 @@ class Trainer:
             raise MitsimError(f"{path}: cannot be read ({cut(reason_of(error), 200)}); remove it") from error
         if own != digest:
             raise MitsimError(
-                f"{path}: is of a training of other pairs, factors or options, or of numbers of other precision "
-                "on another processor; give those, or remove it"
+                f"{path}: belongs to a training with other pairs, factors or options, or on another processor; "
+                "continue with the same ones, or remove the file"
             )
         self.network.load_state_dict(held["network"])
         self.optimiser.load_state_dict(held["optimiser"])

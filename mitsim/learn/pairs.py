@@ -390,9 +390,9 @@ def make_pairs(bench: Bench, asked: PairsRequest, task: Task) -> tuple[PairStore
         exposure_s = float(np.median(np.concatenate([exposures for exposures, _, _ in facts])))
         found = [text for _, _, texts in facts for text in texts]
         if saturated := sum(count for _, count, _ in facts):
-            found.append(f"saturation: {saturated} pairs are expected to fill the full well; expose for less")
+            found.append(f"saturation: {saturated} pairs are expected to fill the full well; use a shorter exposure")
         if bench.loaded.lamps and capture.ambient_frame == "no" and not family.signed:
-            found.append("light of lamps is not taken off (ambient_frame is no): frames have it, and truths have not")
+            found.append("light of lamps is not subtracted (ambient_frame is no): frames contain it, but truths do not")
         found += camera_warnings(bench.sensor, begun.m)
         new = {"status": "complete", "exposure_s": exposure_s, "digital": digital_of(bench.sensor, exposure_s)}
         manifest = begun.model_copy(update={**new, "warnings": tuple(dict.fromkeys(found))})

@@ -237,8 +237,9 @@ class SampledLight:
             return self.plan.warnings
         return (
             *self.plan.warnings,
-            f"{self.lost:.1e} of the light comes from beyond the directions that the plan holds, and is in no frame: "
-            "surfaces nearer than its pilot saw, at the edge of the view; widen the projector's window or move them",
+            f"{self.lost:.1e} of the light is missing in the frames, because it comes from directions outside the "
+            "plan: at the edge of the view, surfaces are nearer than the pilot measured; widen the projector's "
+            "window, or move these surfaces",
         )
 
     @property

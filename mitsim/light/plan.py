@@ -198,11 +198,11 @@ class Plan:
                     for value in (planned, found)
                 )
                 alike = what == "scene" or one == other  # checksums, or what is cut before it differs
-                differs_by = f"the content of {place.strip()} differs" if alike else f"{place}{one} there, {other} here"
+                differs_by = f"the content of {place.strip()} differs" if alike else (f"{place}{one} then, {other} now")
                 raise ArgumentError(
                     "plan",
-                    f"was made of another {what}: {differs_by}; give what it was made of, or make it anew "
-                    "(seed, exposure, sensor noise and output may differ)",
+                    f"was made for another {what}: {differs_by}; use the same {what}, or plan again (only seed, "
+                    "exposure, sensor noise and output may differ)",
                 )
 
     def payload(self) -> dict[str, Any]:
@@ -235,7 +235,7 @@ class Plan:
         ]
         facts = (
             "Error if off: relative rms change of the frames without the effect.",
-            f"Predicted: {self.predicted_seconds:.2f} s. What is left out or made coarse adds up to "
+            f"Predicted: {self.predicted_seconds:.2f} s. Omitted and approximated effects add an error of "
             f"{self.systematic_error:.1e}, at most {self.systematic_bound:.1e}.",
         )
         headings = ("effect", "state", "reason", "error if off", "time [s]")

@@ -102,7 +102,7 @@ class PilotRuns:
             if times > 1 and hits * sample.direct < _FEWEST_IN_RUN:
                 n, side = bench.n, math.sqrt(hits)
                 raise MitsimError(
-                    "what the camera sees is too small for the projector's light: all that it lights fills "
+                    "the lit surfaces in the camera's view are too small for the projector: together they fill "
                     f"{hits:.1e} of one of {n} x {n} projector pixels ({side:.1e} a side); give the projector a "
                     "narrower fov, or a larger target"
                 )
@@ -174,8 +174,8 @@ class PilotRuns:
             if not self.switched.light:
                 feature = bench.geometry.build_mask().feature_mm
                 raise MitsimError(
-                    "no light of the projector passes the mask: what lies between the scene and the sensor is closed; "
-                    f"give a mask that opens there (its features are {feature:g} mm wide)"
+                    "no light of the projector passes the mask: the part of the mask between scene and sensor is "
+                    f"closed; use a mask that is open there (its features are {feature:g} mm wide)"
                 )
         elif run == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0

@@ -145,8 +145,8 @@ def _look(
         whole = candidates.choice(accuracy).work
         if spent > _OF_RUN * whole:
             note = (
-                f"{part.name.replace('_', ' ')} and all that hangs on them are chosen safely: to look closer would "
-                f"take {spent:.1f} s, more than a fifth of the {whole:.1f} s of light and frames"
+                f"{part.name.replace('_', ' ')} and all settings that depend on them have safe values, because "
+                f"measuring them would take {spent:.1f} s, more than a fifth of the {whole:.1f} s for light and frames"
             )
             notes = (note,)
             break
@@ -294,7 +294,7 @@ def _rows(
         on, error = name in settings.effects, result.effects.get(name)
         state = "exact" if on else "off"
         if error is None:
-            yield PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
+            yield PlanRow(name, state, effect.absent or "no part of the scene needs it", 0.0, 0.0)
             continue
         parts = [facts.notes.get(name, ""), "switched by the user" if name in switches else ""]
         if error.bound >= _VAGUE * error.value and error.bound:
@@ -368,9 +368,9 @@ class SceneFacts:
         elif loaded.coloured:
             may = f"{len(loaded.coloured)} of the scene's tags may have colours"
             first = f"the first {loaded.coloured[0].path.name}:{loaded.coloured[0].line}"
-            reason = f"one panchromatic reflectance; {may}, {first}; --colour lines tells them apart"
+            reason = f"one panchromatic reflectance; {may}, {first}; --colour lines simulates them"
         elif curve is not None:
-            reason = f"{_GREY}, but the camera does; --colour lines tells them apart"
+            reason = f"{_GREY}, but the camera does; --colour lines simulates this"
         spectrum = PlanRow("spectrum", state, reason, 0.0 if reason == _GREY else None, 0.0)
         return cls(notes, loaded.pixels.keystone, warnings, spectrum)
 
@@ -380,7 +380,7 @@ def _limits(bench: Apparatus, off: Collection[str]) -> Iterator[str]:
     if bench.projector.glare and bench.loaded.mirrors and not {"glare", "mirrors"} & set(off):
         yield (
             f"{bench.projector.glare:.2g} of the light over mirrors alone is to be scattered in the projector's lens "
-            "(ansi_contrast), and stays in its own pixels; --effects=-glare says that no scattering is meant"
+            "(ansi_contrast), but stays in its own pixels; if no scattering is intended, use --effects=-glare"
         )
     lens = bench.projector.aperture_radius_mm
     if lens and bench.loaded.in_view and not {"aperture", "mirrors"} & set(off):
@@ -404,7 +404,7 @@ def _limits(bench: Apparatus, off: Collection[str]) -> Iterator[str]:
     if not geometry.diffracts and not of_light and waves:
         yield (
             "diffraction is left out: behind blurred edges it is worked out for masks of one separable term, and this "
-            f"one ({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is meant"
+            f"one ({geometry.mask_words}) has more; if a geometric shadow is intended, use --effects=-diffraction"
         )
     left_out = geometry.tilt_left_out(geometry.diffracts and waves)
     if left_out or (any(geometry.mask_tilt) and bench.loaded.mirrors):
@@ -446,16 +446,17 @@ def unseen_lamps(loaded: LoadedScene, paths: float, estimator: str) -> Iterator[
     for lamp, tag in loaded.small_lamps:
         if shines_in(loaded.scene, loaded.camera, lamp):
             rule = (
-                f"it shines on the sensor itself, and {estimator} has no light of a lamp but over surfaces, so that is "
-                "missing; keep it out of the view, or use a light that has a surface (area)"
+                f"it shines directly on the sensor, and {estimator} simulates light of such lamps only by way of "
+                "surfaces, so that this light is missing; keep it out of the view, or use a light that has a surface "
+                "(area)"
             )
             yield str(tag.refusal("light", repr(tag.attributes.get("type", "")), rule))
     for tag, shape in zip(loaded.shapes, loaded.scene.shapes(), strict=True) if loaded.shapes else ():
         part = part_of_view(loaded.scene, loaded.camera, shape) if shape.is_emitter() else 0.0
         if 0 < part * paths < _FEWEST:
             rule = (
-                f"{estimator} meets what shines on the sensor itself by chance, and {paths:.2g} paths meet this "
-                f"{part * paths:.1g} times, so its light may be missing; keep it out of the view, or take a lamp that "
-                f"is {(_FEWEST / (part * paths)) ** 0.5:.2g} times as wide and as much dimmer"
+                f"{estimator} finds light that shines directly on the sensor only by chance: {paths:.2g} paths meet "
+                f"this lamp {part * paths:.1g} times, so that its light may be missing; keep it out of the view, or "
+                f"take a lamp that is {(_FEWEST / (part * paths)) ** 0.5:.2g} times as wide and correspondingly dimmer"
             )
             yield str(tag.refusal("lamp", f"{part:.1e} of the field of view", rule))

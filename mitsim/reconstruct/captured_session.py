@@ -118,7 +118,7 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
         rate, variance, _ = readings.response(side, index)
         if readings.saturated:
             words = f"{min(readings.saturated)} has pixels at the full well or the ADC's end"
-            raise MitsimError(f"frames {session.folder}: {words}; expose for less")
+            raise MitsimError(f"frames {session.folder}: {words}; use a shorter exposure")
         yield rate, float(np.sqrt(variance))
 
 
@@ -136,17 +136,23 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...]) -> Fac
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
-            f"ADC's end, first {min(readings.saturated)}, so responses are not linear; expose for less",
+            f"ADC's end, first {min(readings.saturated)}, so responses are not linear; use a shorter exposure",
         )
-    exact = "nobody has exact factors of a real camera; predicted_phi_error is by noise"
+    exact = "exact factors of a real camera are not known; predicted_phi_error is the part that noise causes"
     end = "frames count as saturated at the largest number of their file, if at all"
     not_known = (
         (True, f"phi_error, noise_free_residual: {exact}"),
-        (noise is None, "digital.read_noise_e: noise and what no separable camera explains are not told apart"),
+        (noise is None, "digital.read_noise_e: noise cannot be distinguished from responses that are not separable"),
         (listed.digital.saturation_dn is None, f"digital.saturation_dn: {end}"),
-        (listed.board_reflectance is None, "board_reflectance: 1 in an image is this board, whatever it reflects"),
-        (listed.parallax is None, "parallax: `reconstruct --focus` has no other depth than the board's"),
-        (not session.pairs, "motion, ambient light, proportion to light: without pairs hardly seen; take pairs"),
+        (
+            listed.board_reflectance is None,
+            ("board_reflectance: 1 in an image is the board's, which is unknown"),
+        ),
+        (listed.parallax is None, "parallax: `reconstruct --focus` can use only the depth of the board"),
+        (
+            not session.pairs,
+            ("motion, ambient light, nonlinearity: hardly found without pairs; take pairs"),
+        ),
         (bool(session.dark) and session.pairs, "dark: pairs have no dark signal, and dark frames are not used"),
     )
     result = {
@@ -210,7 +216,7 @@ def _checked(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
             common.add(read_image(session.folder / name, session.wanted))
         factor = common.choose(end)
         if factor == 1 < common.factor:
-            are = f"are multiples of {common.factor}, and are taken as they are"
+            are = f"are multiples of {common.factor}, and are used unchanged"
             remedy = f"state prepare.divide_by = {common.factor} if they were shifted or scaled, else 1"
             return session.with_preparer(), (f"frames: all numbers of {session.files[0]} {are}; {remedy}",)
         if factor > 1:

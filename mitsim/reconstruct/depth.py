@@ -306,10 +306,10 @@ class DepthMap:
 
     def __str__(self) -> str:
         if self.doubt:
-            return "focus: no depths are told; the image is that of the calibrated one"
+            return "focus: no depth could be estimated; the image uses the calibrated depth"
         message = self.summary()
         depths = f"{message['least_mm']:.4g} to {message['most_mm']:.4g} mm, median {message['median_mm']:.4g}"
-        return f"focus: depths of {depths}, told for {message['told_part']:.0%} of pixels"
+        return f"focus: depths of {depths}, estimated for {message['told_part']:.0%} of pixels"
 
     @property
     def reliable(self) -> npt.NDArray[np.bool_]:
@@ -503,19 +503,18 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
     doubt, at_end = "", min(abs(end - shift) for end in (first, last, *tried)) < 2 * _RESOLUTION * pixel
     if at_end or not first < shift < last:
         doubt = (
-            f"End of range: {mm:.1f} mm explains most, and depths from {range_mm[0]:.0f} to {range_mm[1]:.0f} mm "
-            "were asked for, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
-            "NEAR:FAR or depth_range, or calibrate nearer to it."
+            f"End of range: the best depth, {mm:.1f} mm, is at an end of the range from {range_mm[0]:.0f} to "
+            f"{range_mm[1]:.0f} mm, so that the scene may lie outside; give a wider range with --depth-range NEAR:FAR "
+            "or depth_range, or calibrate nearer to the scene."
         )
     elif not (error < pixel and rise > max(indifferent(rise), 2e-5 * basis.energy)):
-        doubt = "These patterns hardly tell depth: use shifting dots."
+        doubt = "These patterns hardly determine depth: use shifting dots."
     elif alternatives:
         others_mm = (f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in alternatives)
         named = " and ".join(others_mm)
         doubt = (
-            f"Depth may be another by whole periods of the dots: {mm:.1f} mm explains the measurements no better "
-            f"than {named}, within chance and what no depth explains; use dots of a longer period, or give the "
-            "range of depths."
+            f"Depth may be wrong by whole periods of the dots: {mm:.1f} mm explains the measurements no better than "
+            f"{named}, within the noise and the misfit; use dots of a longer period, or give the range of depths."
         )
     local = float(np.hypot(error, _RESOLUTION * pixel)) * mm**2
     error_mm = float(np.hypot(local, max((abs(other.mm - mm) for other in alternatives), default=0.0)))
@@ -570,7 +569,7 @@ def depth_map(
     less = found.left_over - pixels.solve(np.zeros(shift.shape)).left_over
     # Of a sheet at the calibrated depth either may leave more.
     if not reliable.any() or less > chance_difference(less, variance, unknowns):
-        doubt = "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
+        doubt = "Depths by pixel explain the measurements no better than the calibrated depth, which the image uses."
     else:
         span = float(np.ptp(np.percentile(shift[reliable], (1, 99))))
         away = (np.abs(arrivals.most(*rival)[0] - shift)[reliable] > width / 2 for rival in rivals)
@@ -652,7 +651,7 @@ class PixelDepths:
         self._lit = [[np.flatnonzero(column) for column in patterns.T] for patterns in basis.patterns]
         most = max(len(row) for row in self._lit[0]) * max(len(column) for column in self._lit[1])
         if most > _MOST_LIT:
-            words = f"{most} pixels are lit at a time, and {_MOST_LIT} can be told"
+            words = f"{most} pixels are lit at a time, and at most {_MOST_LIT} can be separated"
             raise MitsimError(f"focus map: {words}; use dots further apart")
         middle = len(self._shifts) // 2
         left, right = (float(np.square(table[:, middle]).sum(axis=1).mean()) for table in self._tables)
@@ -713,7 +712,7 @@ class Arrivals:
 
     def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
         if not all(map(_are_dots, shots.patterns)):
-            raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
+            raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement depends on depth")
         moves, span = _moves(factors), ends[1] - ends[0]
         self._open = [bool(move * span > 0.5) for move in moves]
         if not any(self._open):

@@ -151,7 +151,7 @@ class Side:
 
 # ---- The fit ---------------------------------------------------------------------------------------------------------
 
-_NO_LIGHT = "known pictures: have no light, or an even one, and tell nothing of the camera; give others"
+_NO_LIGHT = "known pictures: are dark or uniform, and do not determine the camera; give others"
 _VAGUE, _SMALLEST, _LARGEST = 1e-3, 1e-9, 1e6
 
 
@@ -203,7 +203,7 @@ def fit_codes(exposures: Sequence[Exposure], shape: Shape, start: FloatArray | N
     gains = dict.fromkeys((each.plane for each in exposures), 1.0)
     energies = np.array([np.mean(np.square(each.frame)) for each in exposures])
     if not (energies > 0).all():
-        raise MitsimError("known pictures: a frame is even, and tells nothing of the camera; leave it out")
+        raise MitsimError("known pictures: a frame is uniform, and does not determine the camera; leave it out")
 
     def factors_of(axis: int) -> dict[float, FloatArray]:
         return {place: sides[axis].factor(codes[axis], place) for place in {each.offset[axis] for each in exposures}}
@@ -465,7 +465,7 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
         )
     if read.saturated:
         first = f"{len(read.saturated)} runs have readings at the full well or the ADC's end, first {read.saturated[0]}"
-        doubts.append(f"saturation: {first}, so their frames are not linear; expose for less")
+        doubts.append(f"saturation: {first}, so their frames are not linear; use a shorter exposure")
     found = {}
     for line, manifest in captures.manifests.items():
         left, right = codes.factors(read.places.get(line, (0.0, 0.0)), line)
@@ -479,7 +479,7 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
         rank = [rank_above_noise(side, error) for side, error in zip(sides, whole, strict=True)]
         error = float(np.hypot(seen[0], seen[1]))
         figures = (
-            f"Frames tell {codes.told[0]:.0f} and {codes.told[1]:.0f} numbers of the codes, rank {rank[0]} of "
+            f"Frames determine {codes.told[0]:.0f} and {codes.told[1]:.0f} numbers of the codes, rank {rank[0]} of "
             f"{codes.sides[0].scene} and {rank[1]} of {codes.sides[1].scene}; in frames of such pictures the factors "
             f"have an error of {error:.1e}."
         )
@@ -491,14 +491,14 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
             verdict = Verdict.NOT_SEPARABLE
             left_over = f"{unexplained:.1%} of them is left over"
             sentence = f"Frames hold more than codes seen through shifts explain: {left_over}"
-            remedy = "check that each run is of its picture, that pictures are as light as what was shown (gamma)"
+            remedy = "check that each run shows its picture, that pictures are as bright as they were shown (gamma)"
             remedy += ", and that the frames stand straight"
             if not stated:
                 remedy = f"state digital.read_noise_e, as noise is guessed from neighbouring pixels; {remedy}"
         else:
             verdict, remedy = Verdict.CALIBRATED, ""
             code = "one code a side explains" if terms == 1 else f"{terms} codes that change over the scene explain"
-            sentence = f"Calibrated by known pictures: {code} {explained:.1%} of what frames have beside even light"
+            sentence = f"Calibrated by known pictures: {code} {explained:.1%} of the frames beside uniform light"
         status = Status(verdict, sentence, remedy, figures)
         # Without its figures, which differ by plane.
         warnings = (*doubts, *(() if status.ok else (f"{sentence}; {remedy}.",)))

@@ -596,7 +596,7 @@ def reconstruct_psf_request(
     status = fit.judge(solution.status)
     flags = [f"The capture was flagged: {' '.join(warning.split()).rstrip('.')}." for warning in shots.warnings]
     if saturated:
-        flags.append(f"{saturated} readings are at the full well or the ADC's end: expose for less.")
+        flags.append(f"{saturated} readings are at the full well or the ADC's end: use a shorter exposure.")
     return Reconstruction(
         **{**vars(solution), "status": replace(status, flags=(*status.flags, *flags))},
         fit=fit,

@@ -137,11 +137,11 @@ _DARK, _LIT = (0.02, 0.3), 0.1
 _NAMED = 12
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
 _LAMP = "the lamp's power changes; use a steadier one"
-_BENT = "numbers are not in proportion to light; switch gamma and other processing off, expose for less"
+_BENT = "numbers are not in proportion to light; switch gamma and other processing off, or use a shorter exposure"
 _POWER = "frames are of different power; use a steadier lamp, or pairs"
 _OFFSET = "the uniform frame does not fit those of patterns; keep lamp and ambient light steady, or take pairs"
 _REPLACED = "a frame of a pair is wrong; take it again"
-_UNEQUAL = "the two do not add up to what others do"
+_UNEQUAL = "the two do not have the sum that other pairs have"
 
 
 def frame_words(half: Half) -> str:
@@ -364,9 +364,9 @@ class _Check:
         if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
             moved = np.ptp(np.where(self.good, places, 0.0), axis=1).max()
             raise MitsimError(
-                f"all frames: the two frames of {bad.sum():.0f} of {2 * self.count} patterns do not add up to what "
-                f"others do; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds light of "
-                f"the one before ({lag:.1%}), and that numbers are in proportion to light"
+                f"all frames: the two frames of {bad.sum():.0f} of {2 * self.count} patterns do not have the sum that "
+                f"other pairs have; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds "
+                f"light of the one before ({lag:.1%}), and that numbers are in proportion to light"
             )
         for axis in np.flatnonzero(bad[:, 0]).tolist():  # all others hang on it
             self._refuse(self.sides[axis], 0, _UNEQUAL)

@@ -409,7 +409,7 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) 
 def noise_variance(problem: DiagonalProblem) -> float:
     spare = problem.data_count - np.count_nonzero(problem.sigma)
     if spare <= 0:
-        raise MitsimError("there are no more data than unknowns, so noise cannot be told; give lambda as a number")
+        raise MitsimError("too few data to estimate the noise; give lambda as a number")
     inside = np.square(problem.projected[problem.sigma > 0]).sum()
     return max(problem.energy - float(inside), 0.0) / spare
 

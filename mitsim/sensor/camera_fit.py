@@ -387,7 +387,7 @@ class Pixels:
         if self.uneven > _MOST_UNEVEN:
             raise MitsimError(
                 f"light differs by {100 * self.uneven:.0f} % over the frame; at most {100 * _MOST_UNEVEN:.0f} % is "
-                "possible; move the lamp away, or cut frames to what it lights evenly"
+                "possible; move the lamp away, or crop the frames to the evenly lit part"
             )
         wide = math.sqrt(max(*self.responses[0], 0.0))
         if wide > _MOST_RESPONSE:
@@ -423,7 +423,7 @@ class Pixels:
                 )
         end = transfer.saturation_dn if transfer.saturates else top
         if transfer.saturation_dn is None:
-            what = "is taken as what the ADC's end needs" if top else "is taken as infinite"
+            what = "is set to the electrons that reach the ADC's end" if top else "is set to infinity"
             self.notes.append(f"full well: no frame is saturated, so it {what}; take brighter frames")
         elif not transfer.saturates:
             self.notes.append("full well: the ADC's end is reached first, so it may be larger")
@@ -477,13 +477,13 @@ class Pixels:
         mean, error = transfer["dark"], transfer.error("dark")
         names = "dark_current_e_per_s", "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s"
         if self.excess is None:
-            self.notes.append("dark current is not told by dark frames of one exposure, and taken as 0; take two")
+            self.notes.append("dark current needs dark frames of two exposures, and is set to 0; take them")
             return dict.fromkeys(names, (0.0, 0.0))
         gain, both = transfer["gain"], (self.taken[self.long], self.taken[self.least])
         unit, count, (m, n) = gain * (both[0].exposure_s - both[1].exposure_s), self.size, self.shape
         if not error:
             error = 0.5 / unit
-            self.notes.append(f"dark current is hidden by rounding, and taken as 0; it is below {error:.2g} e-/s")
+            self.notes.append(f"dark current is hidden by rounding, and set to 0; it is below {error:.2g} e-/s")
         beyond = max(self.beyond, 0.0) / unit
         rows = sum(max(each.rows, 0.0) / each.count for each in both) * (1 - 1 / m)
         noise = self._noise(self.long, self.least) - rows
@@ -515,7 +515,7 @@ class Pixels:
             found[f"dsnu_{name}_e"] = kept, math.hypot(kept_error, kept * gain_error / gain)
         if hidden:
             self.notes.append(
-                "dsnu_*_e are hidden by rounding or by the ADC's end, and taken as 0; dsnu_pixel_e is below "
+                "dsnu_*_e are hidden by rounding or by the ADC's end, and set to 0; dsnu_pixel_e is below "
                 f"{found['dsnu_pixel_e'][1]:.2g} e-"
             )
         return found

@@ -172,7 +172,7 @@ def alike(
         difference, last = off - last, off
     count, (m, n) = len(means), first.shape
     if count < 2:
-        raise ValueError(f"alike: {count} frames tell no temporal noise; give 2 or more")
+        raise ValueError(f"alike: {count} frames cannot show temporal noise; give 2 or more")
     own = (squares - np.square(total) / count) / (count - 1)
     variance = float(own.sum()) / (m * n - 1)
     shared = (float(np.var(lines, axis=0, ddof=1).sum()) / (m - 1) - variance / n) * n / (n - 1)

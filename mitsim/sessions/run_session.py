@@ -162,7 +162,7 @@ def run(
     read, place = read_session(session, values), Path(output)
     again, earlier = (place / SUMMARY).is_file(), _Earlier(kind=KIND)
     if again and not asked.resume:
-        raise MitsimError(f"output {place}: holds a session already; go on with resume=True, or choose another folder")
+        raise MitsimError(f"output {place}: holds a session already; use resume=True, or choose another folder")
     with output_folder(place, overwrite=again) as folder:
         if again:
             earlier = validate(_Earlier, read_json(folder / SUMMARY), f"resume=True: {folder / SUMMARY}")

@@ -371,7 +371,10 @@ def _check_steps(session: Session, found: _Mistakes) -> None:
                 if name in values:
                     found.say((*place, name), "is the transport's; give it in [transport]")
             if colour != NO:
-                found.say((*place, "colour"), "stands beside [transport], which tells no light apart; leave one out")
+                found.say(
+                    (*place, "colour"),
+                    ("cannot go with [transport], which sums all light; leave one out"),
+                )
         elif step.verb == "calibrate" and capture and colour != (other := capture.values.get("colour", NO)):
             found.say((*place, "colour"), f"{colour}, but the capture's is {other}; give both the same")
         elif step.verb == "reconstruct":
@@ -394,7 +397,7 @@ def _check_steps(session: Session, found: _Mistakes) -> None:
         if step.verb in OF_A_BENCH and not session.scene:
             found.say(place, 'is of a scene, and there is none; add a table [scene] with scene = "NAME"')
     if not session.steps:
-        found.texts.append(f"asks for nothing; add a table, such as [capture]: {', '.join(TABLES)}")
+        found.texts.append(f"has no step; add a table, such as [capture]: {', '.join(TABLES)}")
 
 
 def calibration_for(session: Session, step: Step) -> str | None:
@@ -526,11 +529,11 @@ class _Found:
 
         conf, where = manifest.configuration, f"{folder}/{MANIFEST}"
         if "scene" not in conf or "defines" not in conf:
-            raise MitsimError(f"{folder}: is not of a simulated scene, so no session file makes it anew")
+            raise MitsimError(f"{folder}: is not of a simulated scene, so that no session file can repeat it")
         if "board" in conf:
-            raise MitsimError(f"{folder}: is of a bench before a board, which only Python makes")
+            raise MitsimError(f"{folder}: is of a bench with a board, which only Python can make")
         if manifest.opened is None:
-            self.warn(f"{folder} does not tell its devices' files: the usual ones are taken")
+            self.warn(f"{folder} does not state the files of its devices: the default devices are used")
         files, scene = validate(_Opened, dict(manifest.opened or {}), where), validate(_Traced, dict(conf), where)
         if own := scene.defines.keys() & fields_of("scene").keys():
             raise MitsimError(f"{where}: defines.{min(own)} is no parameter of a scene; remove it")
@@ -561,11 +564,11 @@ class _Found:
             return
         shown = {**light.model_dump(mode="json", exclude={"contrast_ratio"}), "black_level": light.black_level}
         if plain(sensor.identity) != conf.get("sensor"):
-            self.warn(f"camera {camera} is not the one that the manifest tells")
+            self.warn(f"camera {camera} differs from that in the manifest")
         if plain(shown) != conf.get("projector_model") and not coloured:
-            self.warn(f"projector {projector} is not the one that the manifest tells")
+            self.warn(f"projector {projector} differs from that in the manifest")
         if (made := conf.get("versions")) != deciding_versions():
-            self.warn(f"it was made by {made}, and here is {deciding_versions()}")
+            self.warn(f"it was made by {made}, but this is {deciding_versions()}")
 
     def add_run(self, folder: Path) -> None:
         """Add the request of the frames in a ``folder``."""
@@ -574,10 +577,10 @@ class _Found:
         self.add_scene(manifest, folder, is_coloured(folder))
         request = {name: conf[name] for name in Request.model_fields if name in conf}
         if gone := [name for name in ("noise_fraction", "closing_frame", "ambient_shots") if conf.get(name)]:
-            self.warn(f"it was made with {' and '.join(gone)}, which are no more")
+            self.warn(f"it was made with {' and '.join(gone)}, which this version does not have any more")
         if request.pop("seconds", None) is not None:
             request["accuracy"] = (manifest.plan or {}).get("accuracy")
-            self.warn("it was planned by seconds: the accuracy is what they bought then")
+            self.warn("it was planned for a given time: the accuracy is that which was reached then")
         always = "patterns", "accuracy", "seed"
         asked = {
             name: value
@@ -585,7 +588,7 @@ class _Found:
             if name in always or value != Request.model_fields[name].default
         }
         if "plan_seed" in conf:
-            raise MitsimError(f"{folder}: was captured by a stored plan, which no session file holds")
+            raise MitsimError(f"{folder}: was captured with a stored plan, which a session file cannot contain")
         if "light" in conf:
             above = {name: asked[name] for name in (*always, "effects") if name in asked}  # on which light depends
             self.tables["transport"] = {**above, **conf["light"]}
@@ -612,7 +615,7 @@ class _Found:
         conf = manifest.configuration
         simulated = {"accuracy", "seed", "recipe"} <= conf.keys() and not {"aged", "depth_mm"} & conf.keys()
         if manifest.modelled or not simulated:
-            raise MitsimError(f"{folder}: is not of one simulated session, so no session file makes it anew")
+            raise MitsimError(f"{folder}: is not of one simulated session, so that no session file can repeat it")
         self.add_scene(manifest, folder, is_coloured(folder))
         own = load_recipe().model_dump(exclude_defaults=True, exclude={"depths"})
         recipe = {} if conf["recipe"] == plain(own) else {"recipe": conf["recipe"]}
@@ -628,13 +631,13 @@ class _Found:
 
         made_of, first = _made_of(folder), _first(folder)
         if "calibration" not in made_of:
-            raise MitsimError(f"{folder}: does not tell the calibration that it is made of")
+            raise MitsimError(f"{folder}: does not state which calibration it was made with")
         stated = read_result(first).get("inputs") if (first / RESULT_FILE).is_file() else {}
         stated = stated if isinstance(stated, dict) else {}
         inputs = {name: value for name, value in stated.items() if name not in made_of}
         if inputs.get("method", METHODS[0]) not in METHODS:
             method = cut(str(inputs["method"]))
-            raise MitsimError(f"{folder}: was solved by {method}, a trained network, whose file it does not tell")
+            raise MitsimError(f"{folder}: was solved by {method}, a trained network, whose file is not recorded")
         if isinstance(ends := inputs.get("bounds"), list):
             infinite = -math.inf, math.inf
             inputs["bounds"] = [infinite[place % 2] if end is None else end for place, end in enumerate(ends)]
@@ -643,7 +646,7 @@ class _Found:
                 continue
             try:
                 if verb in self.taken:
-                    raise MitsimError(f"{made_of[name]}: is another than that of the first image")
+                    raise MitsimError(f"{made_of[name]}: differs from that of the first image")
                 add(Path(made_of[name]))
             except MitsimError as error:
                 self.warn(f"{error}; it is read where it is")

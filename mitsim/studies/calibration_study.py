@@ -122,7 +122,7 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[Row]:
 def judge_rest(squared_error: float, deviation: float) -> tuple[str, bool]:
     """Return a sentence on the squared error that no source explains, and True if chance may have caused it."""
     errors = abs(squared_error) / deviation if deviation else 0.0
-    size = f"what is not explained is {errors:.1f} of its standard errors"
+    size = f"the unexplained part is {errors:.1f} of its standard errors"
     if abs(squared_error) > SURE * deviation:
         return f"{size}: the sources do not make the image's error, and a cause is missing", False
     return size, True

@@ -258,9 +258,9 @@ def remarks(flats: FlatFrames, found: FoundCamera) -> tuple[str, ...]:
     cut, zero = max(said.cut[0] for *_, said in darks), scipy.special.ndtr((0.5 - transfer["black"]) / noise)
     dead, lamp, hot = found.sensor.dead_pixels, 100 * transfer.lamp, round(pixels.filled * math.prod(pixels.shape))
     light = {
-        "undecided": "means bend with exposure, and variances do not tell whether the camera bends or the lamp drifts",
+        "undecided": ("means bend with exposure, and variances do not show whether by the camera or by the lamp"),
         "drifts": f"means bend with exposure and variances do not, so the lamp drifts by {lamp:.2g} %",
-    }.get(transfer.light, f"light scatters by {lamp:.2g} % about what exposures say")
+    }.get(transfer.light, f"light scatters by {lamp:.2g} % about the values that exposures predict")
     table = [
         *((seen, text) for seen, _, text in _altered(flats, pixels.taken, [said for *_, said in used])),
         (bent > _STRAIGHT, f"variances do not rise with means as those of counted electrons: {curved} is off by "

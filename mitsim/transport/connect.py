@@ -75,8 +75,8 @@ class ProjectorOptics:
             return (self,)
         if self.lines is None:
             raise MitsimError(
-                f"variant {mi.variant()}: its paths carry drawn wavelengths, which glass of the scene sends different "
-                "ways; trace the projector's lines (colour lines), or choose a mono variant"
+                f"variant {mi.variant()}: its paths carry random wavelengths, which the scene's glass refracts "
+                "differently; trace the projector's lines (colour lines), or choose a mono variant"
             )
         return tuple(replace(self, lines=line) for line in self.lines.apart) if self.lines.several else (self,)
 

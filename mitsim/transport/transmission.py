@@ -389,7 +389,7 @@ def contacts(scene: mi.Scene) -> tuple[tuple[int, str, str] | None, tuple[int, s
         at = np.argsort(gaps / sizes)[_FEWEST - 1]
         for which, (limit, name) in enumerate(((_OWN, "the factored estimator"), (_MITSUBA, "the reference"))):
             if found[which] is None and gaps[at] < limit * sizes[at]:
-                least = f"{name} sees what stands at least {limit * sizes[at]:.2g} mm from a surface that lets light"
-                rule = f"{least} through; leave a gap of air, or take one surface with the material of both"
+                least = f"{name} needs {limit * sizes[at]:.2g} mm between a surface that transmits light and others"
+                rule = f"{least}; leave a gap of air, or take one surface with the material of both"
                 found[which] = index, f"another surface at a distance of {gaps[at]:.2g} mm", rule
     return found[0], found[1]

@@ -75,7 +75,7 @@ def test_a_card_that_few_rays_meet(
 
 
 def test_a_card_that_no_look_can_count_on_is_refused(small_scene: Callable[..., Path], variant: str) -> None:
-    with pytest.raises(MitsimError, match="too small for the projector's light: all that it lights fills"):
+    with pytest.raises(MitsimError, match="too small for the projector: together they fill"):
         off(*scene(small_scene, card(0.2, 0.2, 1, 1)), 0)
 
 

@@ -17,7 +17,7 @@ from mitsim.core.exr import read_frame
 PATTERNS = "hadamard:16"  # 512 frames: long enough to be hit in the middle
 
 
-RESUME = "; finished work is kept, go on with --resume\n"
+RESUME = "; finished work is kept; continue with --resume\n"
 
 
 def started(command: Sequence[str], session: bool) -> subprocess.Popen[str]:

@@ -281,7 +281,7 @@ def test_an_under_determined_image_is_flagged(call: Call, lab: Any, tmp_path: Pa
     # 12 sensor rows cannot tell 16 scene rows apart under one pattern.
     scene = lab.write_scene("few", pixels=12)
     captured = call("capture", scene, *lab.electronics, "-o", tmp_path / "run", "--patterns", "uniform")
-    assert captured.code == 1 and "noise cannot be told from the image" in captured.err
+    assert captured.code == 1 and "noise cannot be distinguished from the image" in captured.err
     assert call("calibrate", scene, *lab.electronics, "-o", tmp_path / "cal").code in (0, 1)
     outcome = call("reconstruct", tmp_path / "run", "--calibration", tmp_path / "cal", "--json", "--lambda", "1")
     assert outcome.code == 1

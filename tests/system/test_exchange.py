@@ -108,5 +108,5 @@ def test_patterns_are_drawn(call: Call, tmp_path: Path) -> None:
 
 def test_patterns_that_cannot_be_drawn(refused: Refused) -> None:
     mentions(refused("patterns", "stripes", "-o", "new"), "--camera is not given")
-    mentions(refused("patterns", "dots:2", "-o", "new", "--exposure", 1), "--exposure 1.0", "goes with stripes")
+    mentions(refused("patterns", "dots:2", "-o", "new", "--exposure", 1), "--exposure 1.0", "only for stripes")
     mentions(refused("patterns", "dots:2", "-o", "new", "--projector-pixels", 0), "--projector-pixels")

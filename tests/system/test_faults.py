@@ -199,7 +199,7 @@ def test_a_killed_run_is_no_run(refused: Refused, lab: Any, interrupted: Path) -
     assert "run: the capture is incomplete" in line and "--resume" in line
     line = refused("capture", *lab.arguments, "-o", "run", "--patterns", PATTERNS)
     assert "run: the folder holds files already" in line
-    assert "go on with --resume" in line and "empty" not in line, "emptying it would throw the frames away"
+    assert "continue with --resume" in line and "empty" not in line, "emptying it would throw the frames away"
 
 
 def test_resume_finishes_it(call: Call, lab: Any, interrupted: Path, whole: Path) -> None:

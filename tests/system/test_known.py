@@ -79,9 +79,9 @@ def test_a_plan_is_written_and_captured(
         mentions(refused("transport", *devices, "--plan", file, *options, "-o", tmp_path / "new.h5"), *fragments)
     other = lab.write_scene("laboratory_moved", sheet_z=390)
     line = refused("transport", other, *devices[1:], "--plan", file, "-o", tmp_path / "new.h5")
-    mentions(line, "--plan was made of another scene: the content of its XML differs")
+    mentions(line, "--plan was made for another scene: the content of its XML differs")
     line = refused("capture", other, *devices[1:], "--plan", file, "-o", tmp_path / "new")
-    mentions(line, "--plan was made of another scene: the content of its XML differs")
+    mentions(line, "--plan was made for another scene: the content of its XML differs")
 
 
 def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
@@ -102,7 +102,7 @@ def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
         mentions(line, f"output {path}: would replace", "which is read")
     np.save(tmp_path / "bars.npy", np.outer([1.0, 0, 1, 1], [0, 1.0, 1, 1]))  # of the same name
     line = refused("capture", *own, "--plan", file, "-o", tmp_path / "run")
-    mentions(line, "--plan was made of another camera: the content of mask_plate differs")
+    mentions(line, "--plan was made for another camera: the content of mask_plate differs")
 
 
 def test_what_python_warns_of_is_a_line_of_the_command_line(
@@ -169,8 +169,8 @@ def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
     for other in {"no", "bands:1", "lines", "mosaic"} - {colour}:
         devices = filters if other == "mosaic" else ()
         line = shell("capture", *sheet, "--plan", file, "--colour", other, *devices, "-o", tmp_path / "none").refusal
-        mentions(line, "--plan was made of another colour: ")
+        mentions(line, "--plan was made for another colour: ")
     for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
         line = shell("transport", *sheet, "--plan", file, "--variant", variant, "-o", tmp_path / "none").refusal
-        mentions(line, "--plan was made of another colour: ")
+        mentions(line, "--plan was made for another colour: ")
     assert not (tmp_path / "none").exists()

@@ -55,7 +55,11 @@ def test_what_was_changed_since_is_told(call: Call, lab: Any, tmp_path: Path) ->
     manifest["configuration"]["sensor"]["bits"] = 10
     (run / "manifest.json").write_text(json.dumps(manifest))
     told = call("run", "--from", run, "-o", tmp_path / "again.toml")
-    assert told.code == 1 and f"{lab.scene} was changed since" in told.err and "is not the one that" in told.err
+    assert (
+        told.code == 1
+        and f"{lab.scene} was changed since" in told.err
+        and "differs from that in the manifest" in told.err
+    )
     assert "# " + f"{lab.scene} was changed since" in (tmp_path / "again.toml").read_text()
 
 

@@ -198,7 +198,7 @@ class GlassModel(_Model):
         model = validate(cls, values, GLASS)
         given = [name for name in ("glass", "sellmeier", "index") if getattr(model, name) is not None]
         if len(given) > 1:
-            raise MitsimError(f"{GLASS}: {given[1]}: the index is told by {given[0]} already; give one of the two")
+            raise MitsimError(f"{GLASS}: {given[1]}: {given[0]} states the index already; give one of the two")
         if (model.index is None) != (model.abbe is None):
             lacking = "abbe" if model.abbe is None else "index"
             raise MitsimError(f"{GLASS}: {lacking}: is not given; index and abbe belong together")

@@ -94,7 +94,7 @@ def test_the_error_is_stated_relative_to_the_projectors_light(
     assert manifest.total_error_of_projector == pytest.approx(manifest.total_error_bound * diluted, rel=1e-4)
     monkeypatch.setattr("mitsim.acquire.capture._DILUTED", 1e-6)
     (warning,) = light.expose("dots:2").warnings
-    assert "relative to the projector's light alone the error is up to" in warning
+    assert "relative to the projector's light alone, the error is up to" in warning
 
 
 def test_it_holds_the_lamps_light_alone(captured: Capture, light: SampledLight) -> None:
@@ -179,7 +179,7 @@ def test_it_is_taken_where_it_helps(light: SampledLight) -> None:
 def test_without_it_the_run_is_flagged(light: SampledLight) -> None:
     """The image would be wrong, in silence; `no` is for those who take it off by themselves."""
     (warning,) = light.expose("dots:2", ambient_frame="no").warnings
-    assert "ambient" in warning and "not taken off" in warning
+    assert "ambient" in warning and "not subtracted" in warning
     assert not light.expose("hadamard:2", ambient_frame="no").warnings
 
 

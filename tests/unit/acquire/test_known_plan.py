@@ -114,7 +114,7 @@ def test_a_scene_that_changed_by_a_number_is_another(
     moved = open_bench(path, variant, albedo=0.4)
     assert np.array_equal(moved.capture(plan).dn, captured.dn)
     path.write_text(path.read_text().replace('value="0.01"', 'value="0.011"'))
-    with pytest.raises(ArgumentError, match=r"^plan was made of another scene: the content of its XML differs"):
+    with pytest.raises(ArgumentError, match=r"^plan was made for another scene: the content of its XML differs"):
         open_bench(path, variant, albedo=0.4).capture(plan)
     write_small_scene(tmp_path, "known_plan", extra=LAMP, canvas=np.full((16, 32), 255) * (np.arange(32) > 15) * 254)
     with pytest.raises(ArgumentError, match=r"the content of known_plan_projector\.png differs"):
@@ -130,24 +130,24 @@ def test_other_devices_are_refused_where_they_matter(bench: Bench, file: Path, v
     bench.capture(plan)
     replace(bench, devices=replace(devices, sensor=noisier)).capture(plan)
     others = {
-        r"parameter: albedo 0\.4 there, 0\.5 here": replace(bench, defines={"albedo": "0.5"}),
-        "projector: blur_pixels 0.0 there, 0.5 here": replace(
+        r"parameter: albedo 0\.4 then, 0\.5 now": replace(bench, defines={"albedo": "0.5"}),
+        "projector: blur_pixels 0.0 then, 0.5 now": replace(
             bench, devices=replace(devices, projector=devices.projector.model_copy(update={"blur_pixels": 0.5}))
         ),
-        "camera: mask_distance 2.0 there, 1.5 here": replace(
+        "camera: mask_distance 2.0 then, 1.5 now": replace(
             bench, devices=replace(devices, camera=devices.camera.model_copy(update={"mask_distance": 1.5}))
         ),
         "board: none there": bench.with_board(0.9),
         "variant: llvm_ad_mono there": replace(bench, variant="llvm_ad_rgb"),
         "colour: none there": replace(bench, lines=Lines((445.0, 638.0), (0.5, 0.5))),
-        "camera: mosaic none there, RGGB here": replace(
+        "camera: mosaic none then, RGGB now": replace(
             bench, filters=devices.sensor.model_copy(update={"mosaic": "RGGB"})
         ),
     }
     for sentence, other in others.items():
-        with pytest.raises(ArgumentError, match=f"^plan was made of another {sentence}"):
+        with pytest.raises(ArgumentError, match=f"^plan was made for another {sentence}"):
             other.capture(plan)
-        with pytest.raises(ArgumentError, match=f"^plan was made of another {sentence}"):
+        with pytest.raises(ArgumentError, match=f"^plan was made for another {sentence}"):
             other.light(plan)
 
 
@@ -165,7 +165,7 @@ def test_frames_that_are_noisier_than_the_lights_own_say_so(light: Light) -> Non
     rough = replace(light, sampling_error=1e-7, plan=replace(light.plan, accuracy=1e-6, warnings=()))
     for patterns, said in (("dots:2", True), ("dots:3", False)):
         (warning,) = [each for each in rough.expose(patterns).warnings if "accuracy 1e-06 was not reached" in each]
-        assert ("trace it for dots:2" in warning and "as much noisier" in warning) is said
+        assert ("trace the light for dots:2" in warning and "is noisier" in warning) is said
     assert rough.expose("dots:3", seed=9).manifest.configuration["light"] == {"patterns": "dots:3", "seed": SEED}
     with pytest.raises(ArgumentError, match=r"^accuracy 0\.001"):
         light.expose("dots:2", accuracy=1e-3)

@@ -95,7 +95,7 @@ def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
         sense(IMAGE, sensor(quantum_efficiency=None))
     with pytest.raises(MitsimError, match="wavelength"):
         sense(IMAGE, CAMERA, wavelength_nm=0.0)
-    with pytest.raises(MitsimError, match="mosaic BGGR of colour filters, which an image of one channel"):
+    with pytest.raises(MitsimError, match="mosaic BGGR of colour filters, but the image has one channel"):
         sense(IMAGE, load_sensor(shipped_path("calibration", "ov5647.toml")))
 
 

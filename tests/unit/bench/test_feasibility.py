@@ -100,7 +100,7 @@ def test_plan_and_capture_say_what_their_own_patterns_lack(small_scene: Callable
     plan's warnings kept.)"""
     bench = open_bench(small_scene(pixels=16))
     (said,) = obstacles(bench, bench.family("uniform"))
-    assert "noise cannot be told" in said and said in bench.plan("uniform", accuracy=0.1).warnings
+    assert "noise cannot be distinguished" in said and said in bench.plan("uniform", accuracy=0.1).warnings
     light = bench.light("uniform", accuracy=0.1)
     assert said in light.expose("uniform").warnings
     assert not any("unknowns" in text for text in light.expose("dots:4").warnings)

@@ -115,7 +115,7 @@ def test_a_small_lamp_flags_the_plan(small_scene: Callable[..., Path], variant: 
     assert bool(reported) is seen and not list(known_losses(loaded, {"ambient": False}))
     if seen:
         line = 1 + path.read_text(encoding="utf-8").split('<emitter type="point"')[0].count("\n")
-        place = f"{path}:{line}: light: got 'point' in <emitter type='point'>; it shines on the sensor"
+        place = f"{path}:{line}: light: got 'point' in <emitter type='point'>; it shines directly on the sensor"
         assert reported[0].startswith(place)
 
 

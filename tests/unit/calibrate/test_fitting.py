@@ -107,7 +107,7 @@ def test_numbers_that_act_alike_are_refused() -> None:
     model = camera(None, depth=400.0)
     data = shown(model, model.built, 0.01, patterns(2), 0)
     with pytest.raises(
-        MitsimError, match=r"mask_distance and magnification cannot be told apart .* leave one of them out"
+        MitsimError, match=r"mask_distance and magnification cannot be distinguished .* leave one of them out"
     ):
         fit_placement(model, data, FITTED)
     fitted = fit_placement(model, data, [name for name in FITTED if name != "magnification"])

@@ -136,18 +136,18 @@ def test_a_plan_says_first_what_it_comes_to(monkeypatch: pytest.MonkeyPatch) -> 
     assert "3x3 in cells of 4x4 pixels leave 1.9e-04" in text
     assert text.endswith("start 1.1 At most 2.5 GiB of memory, 95.4 MiB of disk")
     assert "left out error if off seconds why spectrum - 0.50 one panchromatic" in text
-    assert "2 more that nothing calls for (--all)" in text
+    assert "2 more effects that this scene does not need (--all lists them)" in text
 
 
 def test_what_is_left_out_is_named_within_two_decades_of_the_accuracy() -> None:
     """(Planted: one decade, and three.)"""
     text = "\n".join(plan_lines(plan_of(("glare", "off", "small", 1.1e-5), ("speckle", "off", "less", 0.9e-5))))
-    assert "\nglare " in text and "speckle" not in text and "3 more that nothing calls for" in text
+    assert "\nglare " in text and "speckle" not in text and "3 more effects that this scene does not need" in text
 
 
 def test_all_of_a_plan_has_every_row() -> None:
     text = " ".join(" ".join(plan_lines(plan_of(), everything=True)).split())
-    assert all(f"{name} " in text and reason in text for name, _, reason, _ in ROWS) and "nothing calls" not in text
+    assert all(f"{name} " in text and reason in text for name, _, reason, _ in ROWS) and "does not need" not in text
 
 
 def test_lines_are_as_wide_as_the_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

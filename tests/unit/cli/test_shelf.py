@@ -182,6 +182,23 @@ def test_what_cannot_be_begun_is_refused(
     assert sorted(tmp_path.rglob("*")) == before and (tmp_path / "there.toml").read_text() == "mine"
 
 
+def test_what_a_verb_made_is_replaced_if_asked(shell_of: Callable[..., str], tmp_path: Path) -> None:
+    """A folder of pictures, a scene and a file; not a folder of another kind. (Planted: overwrite passed over.)"""
+    from mitsim.core.errors import MitsimError
+
+    made = {"patterns": ("uniform", "--projector-pixels", 4), "new": ("scene", "mine")}
+    for verb, words in made.items():
+        shell_of(verb, *words, "-o", tmp_path / verb)
+        (tmp_path / verb / "stray").touch()
+        shell_of(verb, *words, "-o", tmp_path / verb, "--overwrite")
+        assert not (tmp_path / verb / "stray").exists()
+    for like in ("imx249", "imx477"):
+        shell_of("new", "camera", "mine", "-o", tmp_path / "c.toml", "--like", like, "--overwrite")
+    assert load_sensor(tmp_path / "c.toml").bits == load_sensor(shipped_path("calibration", "imx477.toml")).bits
+    with pytest.raises(MitsimError, match="holds files already"):
+        shell_of("patterns", "uniform", "-o", tmp_path / "new", "--overwrite")
+
+
 # ---- completion ------------------------------------------------------------------------------------------------------
 
 

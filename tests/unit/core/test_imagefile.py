@@ -253,7 +253,7 @@ def test_a_picture_to_be_shown_turned_is_refused(tmp_path: Path, name: str, numb
     An orientation of 1 says nothing. (Planted: no look at the orientation.)"""
     saved(NUMBERS, exif=turned(number))(tmp_path / name)
     for wanted in (Wanted(), Wanted("mask drawing"), Wanted("point spread function", colour=True)):
-        with pytest.raises(MitsimError, match=f"has the orientation {number}: it is to be shown turned"):
+        with pytest.raises(MitsimError, match=f"has the orientation {number}: viewers rotate or mirror it"):
             read_image(tmp_path / name, wanted)
     saved(NUMBERS, exif=turned(1))(tmp_path / name)
     assert np.array_equal(read_image(tmp_path / name), NUMBERS)

@@ -112,12 +112,41 @@ def test_an_unfinished_calibration_is_not_to_be_emptied(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text('{"kind": "calibration", "status": "incomplete"}')
     (tmp_path / "left.exr").touch()
     (tmp_path / "responses.part.npz").touch()
-    with pytest.raises(MitsimError, match="holds files already; go on with resume=True"):
+    with pytest.raises(MitsimError, match="holds files already; continue with resume=True"):
         files.prepare_output(tmp_path)
     for text in ("{", "[" * 100_000, "[1]", '{"status": "complete"}'):
         (tmp_path / "manifest.json").write_text(text)
-        with pytest.raises(MitsimError, match="holds files already; choose a new one or empty it"):
+        with pytest.raises(MitsimError, match="holds files already; choose a new folder, or empty this one"):
             files.prepare_output(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("marks", "begun", "left"),
+    [(("capture",), True, "new"), (("capture",), False, "old"), (("calibration", "pairs.json"), False, "old")],
+)
+def test_an_earlier_result_is_replaced_once_a_new_one_is_begun(
+    tmp_path: Path, marks: tuple[str, ...], begun: bool, left: str
+) -> None:
+    """It comes back after a refusal, and a result of another kind is in the way as before. (Planted: the old result
+    deleted at once; folders of all kinds moved.)"""
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "manifest.json").write_text('{"kind": "capture"}')
+    (run / "old").touch()
+    refused = pytest.raises(MitsimError, match=r"refused|holds files already")
+    with refused, files.replaced(run, marks), output_folder(run) as folder:
+        if begun:
+            (folder / "new").touch()
+        raise MitsimError("refused")
+    assert {"old", "new"} & {item.name for item in run.iterdir()} == {left} and [*tmp_path.iterdir()] == [run]
+
+
+def test_the_working_folder_is_not_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of relative names would be written beside it. (Planted: moved.)"""
+    (tmp_path / "manifest.json").write_text('{"kind": "capture"}')
+    monkeypatch.chdir(tmp_path)
+    with files.replaced(Path(), ["capture"]):
+        assert (tmp_path / "manifest.json").is_file()
 
 
 def test_no_device_pipe_or_socket_is_replaced(tmp_path: Path) -> None:

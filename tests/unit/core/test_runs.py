@@ -122,7 +122,7 @@ def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
     with claim_run(run, RunHead.of(CONFIGURATION), resume=True) as again:
         again.begin()
     with (
-        pytest.raises(MitsimError, match="holds files already; go on with resume=True"),
+        pytest.raises(MitsimError, match="holds files already; continue with resume=True"),
         claim_run(run, RunHead.of(CONFIGURATION), resume=False),
     ):
         pass

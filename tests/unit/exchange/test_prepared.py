@@ -198,7 +198,7 @@ def test_numbers_in_the_high_bits_are_found_and_named(tmp_path: Path) -> None:
     odd = dn * 16
     odd[:, 0, :2] = 24123, 36053
     written(tmp_path / "stamped", "png", odd)
-    refused("they were scaled, hold more than light", tmp_path, tmp_path / "stamped", about)
+    refused("they were scaled, contain more than light", tmp_path, tmp_path / "stamped", about)
     for frames in (slice(-1, None), slice(None)):
         odd = dn * 16
         odd[frames, 1] += 1
@@ -218,7 +218,7 @@ def test_a_factor_within_the_cameras_range_is_doubted_unless_it_is_stated(tmp_pa
     dn = ms.load_run(bench.run).dn // 4
     written(tmp_path / "a", "png", dn * 4)
     result = import_capture(tmp_path / "a", tmp_path / "run a", known(bench))
-    assert "multiples of 4, and are taken as they are" in result["warnings"][0] and result["divided_by"] == 1
+    assert "multiples of 4, and are used unchanged" in result["warnings"][0] and result["divided_by"] == 1
     for factor, kept in ((4, dn), (2, 2 * dn), (1, 4 * dn)):
         about = known(bench, prepare=Preparation(divide_by=factor))
         result = import_capture(tmp_path / "a", tmp_path / f"by {factor}", about)

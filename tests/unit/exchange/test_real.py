@@ -365,7 +365,7 @@ def test_what_does_not_fit_a_closing_frame_is_refused_in_a_line(tmp_path: Path) 
     np.save(tmp_path / "dark.npy", frames[0])
     refused = {
         "holds 6 frames, but patterns 'dots:2x3' take 6 and a closing frame": (frames, {"closing_frame": "first"}),
-        r"holds 7 frames.*\(is the last a closing frame\? say so\)": ([*frames, frames[0]], {}),
+        r"holds 7 frames.*if the last one is a closing frame, give --closing-frame": ([*frames, frames[0]], {}),
         "closing_exposure_s is of a closing frame; give closing_frame too": (frames, {"closing_exposure": 0.5}),
         "beside dark frames": (frames, {"closing_frame": "first", "closing_exposure": 0.5,
                                         "dark_frame": tmp_path / "dark.npy"}),

@@ -364,18 +364,18 @@ def test_what_is_said_again_is_taken_and_what_needs_another_plan_is_not() -> Non
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"version": {**deciding_versions(), "drjit": "0.1"}}, r"another version: drjit \S+ there, 0.1 here"),
-        ({"colour": {"filters": False, "wavelengths_nm": [440.0]}}, "another colour: none there, {"),
-        ({"variant": "llvm_ad_rgb"}, "another variant: llvm_ad_mono there, llvm_ad_rgb here"),
+        ({"version": {**deciding_versions(), "drjit": "0.1"}}, r"another version: drjit \S+ then, 0.1 now"),
+        ({"colour": {"filters": False, "wavelengths_nm": [440.0]}}, "another colour: none then, {"),
+        ({"variant": "llvm_ad_rgb"}, "another variant: llvm_ad_mono then, llvm_ad_rgb now"),
         ({"scene": {**MADE_OF["scene"], "its XML": "c" * 64}}, "another scene: the content of its XML differs"),  # type: ignore[dict-item]
         ({"scene": {"its XML": "a" * 64}}, "another scene: the content of print.png differs"),
-        ({"camera": {"mask_distance": 1.5}}, "another camera: mask_distance 2.0 there, 1.5 here"),
+        ({"camera": {"mask_distance": 1.5}}, "another camera: mask_distance 2.0 then, 1.5 now"),
     ],
 )
 def test_a_plan_of_another_bench_is_refused_by_what_differs(changes: dict[str, Any], sentence: str) -> None:
     plan = planned()
     plan.check_made_of(MADE_OF)
-    with pytest.raises(ArgumentError, match=f"^plan was made of {sentence}"):
+    with pytest.raises(ArgumentError, match=f"^plan was made for {sentence}"):
         plan.check_made_of({**MADE_OF, **changes})
     with pytest.raises(ArgumentError, match="decided without a bench"):
         replace(plan, made_of=None).check_made_of(MADE_OF)

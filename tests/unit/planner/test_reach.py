@@ -93,7 +93,7 @@ def test_light_beyond_the_cells_flags_the_result(scene: Callable[..., Bench], tm
     bench = scene("both")
     kept, lost = light(bench, reach=True), light(bench, reach=False)
     assert kept.lost == 0 and not kept.warnings
-    assert lost.lost > 2e-3 and "in no frame" in lost.warnings[0]
+    assert lost.lost > 2e-3 and "missing in the frames" in lost.warnings[0]
     # The frames lack what is said to be lost.
     frames = [next(iter(each.frames(Lighting.uniform(N), 0))) for each in (kept, lost)]
     whole, part = (float(frame.irradiance.sum()) for frame in frames)

@@ -160,7 +160,7 @@ def test_parallax_beyond_the_period_is_told_and_the_image_is_as_before(near: flo
     image, before = reconstruct(run, factors, focus="map"), reconstruct(run, factors)
     assert "off by a whole period" in str(image.status) and "Use dots of a period of" in str(image.status)
     assert not image.ok and image.depths is None and np.array_equal(image.image, before.image)
-    assert image.summary()["depths"] is None and "no depths are told" in str(image.focus)
+    assert image.summary()["depths"] is None and "no depth could be estimated" in str(image.focus)
 
 
 def flat(depth: float, patterns: str, peak: float = PEAK, dark: int = 0) -> Capture:

@@ -153,7 +153,7 @@ def test_a_plane_off_the_calibrated_distance_comes_into_focus(depth: float) -> N
 def test_a_depth_that_is_not_told_is_flagged(fine: Factors) -> None:
     """Uniform light takes a moved image for an image; and of a sheet nearer than all that is tried the end is found."""
     uniform = reconstruct(beside(480.0, "uniform"), fine, 1e-3, focus="auto")
-    assert not uniform.ok and "hardly tell depth" in str(uniform.status)
+    assert not uniform.ok and "hardly determine depth" in str(uniform.status)
     near = reconstruct(shots(290.0), calibrated(), focus="auto")
     assert not near.ok and "End of range" in str(near.status) and "320 to 533 mm" in str(near.status)
 
@@ -207,7 +207,7 @@ def test_a_depth_beyond_the_range_is_not_taken_for_one_within(fine: Factors, dep
     """A period of the dots from 308 mm is a depth within the range, and from 556 an end of it. (Planted: nothing beyond
     an end is tried.)"""
     found = best_depth(beside(depth, "dots:4"), fine)
-    assert "may lie beyond" in found.doubt and "--depth-range" in found.doubt and not found.at_end
+    assert "may lie outside" in found.doubt and "--depth-range" in found.doubt and not found.at_end
     assert abs(found.mm - depth) < 2 * found.error_mm < 0.6
 
 
@@ -217,7 +217,7 @@ def test_faulty_frames_are_named_at_the_end_of_a_range(fine: Factors, depth_rang
     run = with_frames(beside(556.0, "dots:4"), lambda frames: [*frames[:5], dark(frames[5]), *frames[6:]])
     image = reconstruct(run, fine, focus="auto", depth_range=depth_range)
     assert image.misfit and image.misfit.cause is Cause.FRAMES
-    assert "frame 5" in str(image.status) and "may lie beyond" in str(image.status)
+    assert "frame 5" in str(image.status) and "may lie outside" in str(image.status)
 
 
 @pytest.mark.parametrize("patterns", ["hadamard:4", "random:6"])

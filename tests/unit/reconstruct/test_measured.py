@@ -122,7 +122,9 @@ def test_saturated_frames_flag_the_result(tmp_path: Path) -> None:
     assert not factors.ok and factors.manifest.result["saturated_frames"] == 1
     assert "saturation: 1 of 16 frames" in factors.warnings[-1] and "f_0.png" in factors.warnings[-1]
     write_list(folder, digital={**DIGITAL, "saturation_dn": None})
-    with pytest.raises(MitsimError, match=r"f_0\.png .*f_1\.png .*: the two do not add up"):  # no longer saturated
+    with pytest.raises(
+        MitsimError, match=r"f_0\.png .*f_1\.png .*: the two do not have the sum"
+    ):  # no longer saturated
         calibrate_frames(folder)
     full[3, 5] = 65535
     write_image(folder / "f_0.png", full)
@@ -285,7 +287,7 @@ def test_a_wrong_repeat_or_exposure_is_named(tmp_path: Path) -> None:
         assert good.ok, good.warnings
         bad = tmp_path / f"bad_{name}"
         if name == "rung":
-            with pytest.raises(MitsimError, match=r"f_10\.png and 1 more .* the two do not add up"):
+            with pytest.raises(MitsimError, match=r"f_10\.png and 1 more .* the two do not have the sum"):
                 repeated(bad, listed, shots, (5, 1))
         else:
             (words,) = (found := repeated(bad, listed, shots, (5, 1))).warnings

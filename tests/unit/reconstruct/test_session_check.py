@@ -137,7 +137,7 @@ def test_the_other_frame_replaces_a_wrong_one(change: Callable[[np.ndarray], np.
     assert (fault.side, fault.index, fault.sign, fault.kind) == (*half, "replaced")
     assert error(found)[0] < 1.2 * CLEAN and holds(found, 0.01)
     (named,) = found.warnings
-    assert named.startswith(f"frames: {frame_words(half)}: the two do not add up")
+    assert named.startswith(f"frames: {frame_words(half)}: the two do not have the sum")
     assert fault.frames == [frame_words(half)]
 
 
@@ -171,7 +171,7 @@ def test_the_power_of_a_uniform_frame_is_divided_out_and_its_ambient_light_count
 def test_a_uniform_frame_that_shows_something_else_is_refused_and_named() -> None:
     shown = frames()
     lost = np.where(np.arange(PIXELS[1]) < 50, shown["vertical", 0, 1], 0.0)
-    with pytest.raises(MitsimError, match="the two do not add up") as refusal:
+    with pytest.raises(MitsimError, match="the two do not have the sum") as refusal:
         checked({**shown, ("vertical", 0, 1): lost})
     assert shown_frames(str(refusal.value)) == {("vertical", 0)}
 

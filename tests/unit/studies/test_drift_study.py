@@ -263,7 +263,7 @@ def test_options_of_the_study(tmp_path: Path) -> None:
     for varied, found in (([("power", ("0.1", "0.2"))], (("power", ("0.1", "0.2")),)), (ripple, tuple(ripple))):
         assert scope_of("drift", scope, "dots:7", varied, "psnr").sweep == found
     assert scope_of("drift", scope, "hadamard:8", (), "psnr").patterns == "hadamard:8"
-    with pytest.raises(MitsimError, match="over for drift and sweep, patterns for these"):
+    with pytest.raises(MitsimError, match="over for drift, sweep; patterns for"):
         scope_of("patterns", scope, "dots:7", [("power", ("0.1",))], "psnr")
     with pytest.raises(MitsimError, match="a recipe is for calibration and drift"):
         study("sweep", recipe=Path("any.toml"))

@@ -103,7 +103,7 @@ LAMPS: dict[str, tuple[Light, int, str]] = {
     "step": (lambda photons, number, frame: photons * (1.05 if number >= 8 else 1.0), 96, "light scatters by"),
     "scattering": (lambda photons, number, frame: photons * (1 + 0.03 * np.sin(5.0 * number)), 96, "light scatters by"),
     "weakly linear": (lambda photons, number, frame: photons * (1 + 0.02 * number / 16), 96,
-                      "variances do not tell whether the camera bends or the lamp drifts"),
+                      "variances do not show whether by the camera or by the lamp"),
     "weakly linear, more pixels": (lambda photons, number, frame: photons * (1 + 0.02 * number / 16), 192,
                                    "so the lamp drifts"),
 }  # fmt: skip
@@ -322,6 +322,6 @@ def test_one_exposure_tells_gain_and_noise_and_says_what_it_does_not(tmp_path: P
     off = off_by(done, "plain")
     assert all(abs(off[field]) < 5 for field in ("gain_dn_per_e", "read_noise_e", "quantum_efficiency")), off
     said = " ".join(done.found.notes)
-    assert "dark current is not told" in said and "full well" in said
+    assert "dark current needs dark frames of two exposures" in said and "full well" in said
     names = {row.name for row in done.rows}
     assert "system_gain" in names and not names & {"linearity_min", "dark_current", "full_well", "saturation_capacity"}

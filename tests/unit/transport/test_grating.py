@@ -361,7 +361,7 @@ def test_a_scene_has_the_wavelength_of_its_light_but_where_it_says_its_own() -> 
     ("values", "reported"),
     [
         ({"glass": "n-bk8"}, "glass: got 'n-bk8'; give n-bk7, n-sf11"),
-        ({"glass": "water", "index": 1.5, "abbe": 50.0}, "index: the index is told by glass already"),
+        ({"glass": "water", "index": 1.5, "abbe": 50.0}, "index: glass states the index already"),
         ({"index": 1.5}, "abbe: is not given"),
         ({"abbe": 50.0}, "index: is not given"),
         ({"sellmeier": "1.0, 0.01, 0.2"}, "sellmeier: got 3 numbers"),
