@@ -206,9 +206,7 @@ def test_a_gap_that_mitsuba_skips_is_the_references_refusal(loaded: Scene) -> No
     for z, refused in ((398 - 0.02, True), (398 - 0.06, False)):
         unfit = loaded(slab(z, 4)).unfit
         assert unfit.factored is None and (unfit.reference is not None) == refused
-    assert "the reference needs 0.039 mm between" in str(
-        loaded(slab(398 - 0.02, 4)).unfit.reference
-    )
+    assert "the reference needs 0.039 mm between" in str(loaded(slab(398 - 0.02, 4)).unfit.reference)
 
 
 def test_what_touches_along_a_line_or_in_a_point_is_no_contact(loaded: Scene) -> None:
