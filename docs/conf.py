@@ -8,6 +8,7 @@ import ast
 import base64
 import inspect
 import json
+import re
 from pathlib import Path
 
 from docutils import nodes
@@ -167,6 +168,8 @@ def add_formula(writer: HTML5Translator, node: nodes.math | nodes.math_block) ->
     """A formula as MathML: no script is needed to show it."""
     alone = isinstance(node, nodes.math_block)
     formula = convert(node.astext(), display="block" if alone else "inline")
+    # A prime is raised by its font; as a superscript it would be raised and made smaller twice.
+    formula = re.sub(r"<mi>(&#x0203[2-4];)</mi>", r'<mi class="prime">\1</mi>', formula)
     writer.body.append(f'<div class="formula">{formula}</div>' if alone else formula)
     raise nodes.SkipNode
 

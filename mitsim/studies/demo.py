@@ -198,12 +198,12 @@ def _page(
     unexplained = session["unexplained_residual"]  # JSON has no infinity: None
     beyond = "" if not unexplained else f" Beyond the sensor's noise, {unexplained:.1e} of the responses is left."
     budget = (
-        ("Monte Carlo", shots.manifest.mc_error, "rendering noise of the expected frames, from its groups"),
-        ("Discretisation", plan.systematic_error, "anchors, cells and layers, predicted by the plan"),
-        ("Sensor noise", shots.manifest.sensor_noise, "shot and read noise of the frames, closed form"),
-        ("Calibration", session["phi_error"], "error of the factors from noise in the calibration frames"),
+        ("Monte Carlo", shots.manifest.mc_error, "rendering noise of the expected frames, from groups of samples"),
+        ("Discretisation", plan.systematic_error, "finite number of anchors, cells and layers, from the plan"),
+        ("Sensor noise", shots.manifest.sensor_noise, "shot noise and read noise of the frames, in closed form"),
+        ("Calibration", session["phi_error"], "error of the factors, because calibration frames are noisy"),
         ("Separable model", session["noise_free_residual"],
-         "what no product of a left and a right factor explains of noise-free frames of the board"),
+         "part of noise-free frames of the board that a product of two factors cannot describe"),
     )  # fmt: skip
     (rows, columns), full = geometry.frame_shape, 100 * Exposure().fraction
     size = " x ".join(f"{pitch * 1e3:g}" for pitch in geometry.pitches[geometry.row_pitch is None :])
@@ -236,10 +236,10 @@ def _page(
         "seeds": {"root": light.seed},
         "versions": versions(),
         "notes": (
-            "PSNR has peak 1 and no gain or offset fit; truth is apparent reflectance relative to the board, with a "
-            f"standard error of {light.apparent.error:.1e} from sampling of its own.",
-            "Idealised: the paper's model with its own exact factors and the same sensor noise.",
-            "lambda is chosen by an unbiased risk estimate; no result has seen the truth.",
+            "PSNR has peak 1, without a fit of gain or offset. The truth is the apparent reflectance relative to the "
+            f"board. It is sampled separately and has a standard error of {light.apparent.error:.1e}.",
+            "The idealised images have the same sensor noise as the rendered ones.",
+            "Lambda is chosen by an unbiased estimate of the risk, without the truth.",
         ),
     }
 

@@ -4,6 +4,7 @@ goes on."""
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,10 @@ def test_a_session_file_repeats_a_figure_bit_by_bit(call: Call, lab: Any, imaged
     times = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.exr")}
     told = call("run", tmp_path / "out" / "session.toml", "-o", tmp_path / "out", "--resume", "--json")
     assert all(each["left_alone"] for each in told.payload["steps"])
-    assert (tmp_path / "out" / "report.html").is_file() and (tmp_path / "out" / "run" / "report.html").is_file()
+    assert (tmp_path / "out" / "run" / "report.html").is_file()
+    assert re.search(
+        r"<title>Session out: \w+, [^<]+, \d{4}-\d\d-\d\d ", (tmp_path / "out" / "report.html").read_text()
+    )
     other = call("run", tmp_path / "again.toml", "-o", tmp_path / "out", "--resume", "-D", "capture.seed=1")
     assert "holds a run of another configuration (seed differ)" in other.refusal
     assert "seed = 1" not in (tmp_path / "out" / "session.toml").read_text()

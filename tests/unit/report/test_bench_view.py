@@ -159,4 +159,5 @@ def test_names_of_a_scene_are_no_html(seen: BenchView, tmp_path: Path) -> None:
     assert len(named) == 2 * len(shapes) + 1 and {*named} == {html.escape(bad)}
     text = view.save(tmp_path / "bench.html").read_text()
     assert "<b style" not in text and "Plotly.newPlot(" in text
+    assert re.search(r"<title>Bench: seen, Sony IMX249, [^<]*\d{4}-\d\d-\d\d \d\d:\d\d</title>", text)
     assert not re.search(r'<(script|link|img)[^>]*\b(src|href)="https?:', text)

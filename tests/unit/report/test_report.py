@@ -268,13 +268,14 @@ def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left(tmp_path: 
     part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
     assert part.numeric == (False, True, True, False)
     pictures = {"a.png": page_figure(Figure(figsize=(3.0, 2.0)))}
-    section = Section("toy", "A study", "7 dB", "Scene toy", pictures, (part,))
+    section = Section("toy", "A study", "7 dB", "Scene toy", pictures, (part,), scene="toy", camera="Camera 4")
     page = write_page([section], tmp_path / "page.html", "A study").read_text(encoding="utf-8")
     assert (
         '<p class="verdict">7 dB</p>' in page
         and page.count('<th class="n">') == 2
         and page.count('<td class="n">') == 4
     )
+    assert re.search(r"<title>A study: toy, Camera 4, \d{4}-\d\d-\d\d \d\d:\d\d</title>", page)
     assert "512 \u00d7 512 pixels" in page and "2.8\u00d710\u00b9\u00b2" in page and "wide small" in page
 
 

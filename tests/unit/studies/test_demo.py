@@ -1,5 +1,6 @@
 """The demo on a bench of one's own, and the line that a report shows for a scene."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -87,7 +88,8 @@ def test_the_scene_is_traced_once_and_a_speckled_projector_shows_in_every_family
     job = Job()
     result = demo(bench, tmp_path / "demo", Request.of(patterns="dots:2", accuracy=2e-2, seed=3), job)
     assert len(traced) == 1
-    assert "<b>\N{EN DASH}</b>" in (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
+    assert "<b>\N{EN DASH}</b>" in page and re.search(r"<title>Comparison of patterns: \w+, [^<]+, \d{4}-\d\d-", page)
     assert tuple(result.psnr) == ("uniform", "dots:4", "dots:5", "dots:2", "hadamard:8")
     assert result.gain_db == result.psnr["dots:2"] - result.psnr["uniform"]
     shots = load_run(tmp_path / "demo" / "run")
