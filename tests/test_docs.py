@@ -26,6 +26,7 @@ import mitsim
 from mitsim.studies import EXPERIMENTS
 from tests.conftest import write_small_scene
 from tests.exchanged import made
+from tests.known_camera import KnownCamera
 from tests.robustness import Recorder, Row, page_of
 from tests.test_architecture import FLOORS
 from tests.test_verbs import verbs
@@ -252,6 +253,25 @@ def test_the_python_of_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytes
     names = GIVEN.get(page, dict)()
     for block in blocks(page, "python"):
         exec(compile(block, page, "exec"), names)
+
+
+@pytest.mark.slow
+def test_the_slow_examples_of_the_python_page_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str
+) -> None:
+    """After the quick ones, whose names they use."""
+    monkeypatch.chdir(tmp_path)
+    names = made_folders()
+    KnownCamera(1).write_session(tmp_path / "known", 3)
+    for block in [*blocks("docs/api.md", "python"), *blocks("docs/api.md", "python slow")]:
+        exec(compile(block, "docs/api.md", "exec"), names)
+
+
+def test_every_public_name_has_an_example_that_runs() -> None:
+    """In a block of Python that a test runs. (Planted: a name without one.)"""
+    pages = [page for page in EXAMPLES if page not in ELSEWHERE_RUN]
+    code = "\n".join(block for page in pages for kind in ("python", "python slow") for block in blocks(page, kind))
+    assert not {name for name in mitsim.__all__ if not re.search(rf"\b(?:ms|mitsim)\.{name}\b", code)}
 
 
 @pytest.mark.parametrize("page", [page for page in EXAMPLES if blocks(page, "json")])

@@ -417,13 +417,13 @@ def open_apparatus(
             own_um, stated_um = f"{own * 1e3:g} um", f"{scene} has {stated * 1e3:g} um"
             problem = f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {own_um}, but {stated_um}"
             raise MitsimError(f"{problem}; name the scene's own camera by --camera, or change {name}")
-    if mask is not None and (own := mask.distance_mm) is not None:
+    if mask is not None and (distance := mask.distance_mm) is not None:
         stated = loaded.camera.geometry.mask_distance
-        if "mask_distance" in defines and not math.isclose(own, stated):
-            problem = f"camera {sensor_path}: its table [mask] has distance_mm {own:g}"
+        if "mask_distance" in defines and not math.isclose(distance, stated):
+            problem = f"camera {sensor_path}: its table [mask] has distance_mm {distance:g}"
             raise MitsimError(f"{problem}, and mask_distance was set to {stated:g}; give one of the two")
-        note = f"mask: {own:g} mm before the sensor, as its camera file says, in place of the scene's {stated:g} mm"
-        notes = [loaded.sensor_note, "" if math.isclose(own, stated) else note]
+        note = f"mask: {distance:g} mm before the sensor, as its camera file says, in place of the scene's {stated:g}"
+        notes = [loaded.sensor_note, "" if math.isclose(distance, stated) else note]
         loaded = replace(loaded, sensor_note="; ".join(filter(None, notes)))
     _adapt(loaded, mask, sensor_path, light)
     devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))

@@ -67,8 +67,9 @@ class FolderFacts:
     def lines(self) -> list[str]:
         """Return the lines of `mitsim show`, of which the first one is a summary."""
         state = f"{self.kind}, {'' if self.finished else 'not '}finished{', flagged' if self.warnings else ''}"
-        found = {"made by": self.command or "Python, or not stated", "version": self.version, "date": self.date}
-        found |= {_UNITS.get(name, name.replace("_", " ")): value for name, value in self.numbers.items()}
+        known = {_UNITS.get(name, name.replace("_", " ")): value for name, value in self.numbers.items()}
+        by = self.command or "Python, or not stated"
+        found: dict[str, Any] = {"made by": by, "version": self.version, "date": self.date, **known}
         texts = [
             f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}" for name, value in found.items()
         ]
@@ -123,7 +124,9 @@ def show(folder: Path | str) -> FolderFacts:
     if not finished:
         warnings.append("the work was interrupted; give its command again, with --resume if it has that option")
     nexts = [f"open {folder / PAGE}"] * (folder / PAGE).is_file()
-    nexts += [each.format(folder) for each in _NEXT.get(name.split()[-1], ()) if finished]
+    repeats = kind == "image" or "scene" in numbers  # no session file repeats frames of a real camera
+    own = (each for each in _NEXT.get(name.split()[-1], ()) if finished and (repeats or "--from" not in each))
+    nexts += [each.format(folder) for each in own]
     date = f"{datetime.fromtimestamp(path.stat().st_mtime):%Y-%m-%d %H:%M}"
     return FolderFacts(str(folder), name, finished, command, version, date, numbers, tuple(warnings), tuple(nexts))
 
