@@ -561,7 +561,7 @@ SIZES = {
     "report": (6, 2001),
     "scene": (5, 1359),
     "sensor": (4, 1118),
-    "sessions": (4, 908),
+    "sessions": (4, 911),
     "studies": (22, 5133),
     "transport": (15, 3992),
     "verbs": (1, 378),
