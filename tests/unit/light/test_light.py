@@ -16,8 +16,8 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import light as module
-from mitsim.light.light import SampledLight, Sampling, trace_light
-from mitsim.light.passes import Simulation, TracedPass
+from mitsim.light.light import Group, SampledLight, Sampling, trace_light
+from mitsim.light.passes import PASSES, Simulation, TracedPass
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import ExpectedFrames, bound_of
@@ -202,12 +202,13 @@ def test_sampling_is_checked_without_what_black_pixels_leak(bench: Bench, plan: 
 
 
 def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
-    """One group of eight has a path of 100 standard deviations in shot 5; shots 0, 7, 14 are checked. (Planted: 1, 1.)
+    """One group of eight has a path of 100 standard deviations in shot 5; shots 0, 7, 14 are checked. Light that all
+    groups share is no error. (Planted: 1, 1; shared light counted as error.)
 
     The other shots have a variance of about 1, so that of all is 1 + 100^2 (1/8 - 1/64) / 16, and one group has it all.
     """
     rng, lighting = np.random.default_rng(1), Lighting(np.arange(16), np.eye(16))
-    totals = rng.normal(size=(8, 17))
+    totals = 1000 + rng.normal(size=(8, 17))
     heavy = totals.copy()
     heavy[3, 5] += 100
 
@@ -220,6 +221,33 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
     assert error == pytest.approx(np.sqrt((1 + 100**2 * (1 / 8 - 1 / 64) / 16) / module._BY_CHANCE), rel=0.3)
     assert bound > 1.2 * error, "one group alone makes it, so it could be larger by chance"
     assert max(ratios(heavy, [0, 5, 14])) == 1.0, "what is checked is in the error already"
+
+
+def test_a_group_adds_what_was_summed_on_the_device_and_weights_its_rounds() -> None:
+    """Each sample brings 1, and each round 100 from the device: after 5 samples the mean is 105 / 5, after 10 it is
+    210 / 10. (Planted: sums of the device left there.)"""
+    each = SimpleNamespace(
+        row=PASSES["indirect"],
+        tracer=SimpleNamespace(paths_per_sample=2),
+        trace=lambda seed, first, count, sums: SimpleNamespace(by_line=lambda lines: [float(count)]),
+    )
+    simulation: Any = SimpleNamespace(
+        paths_at_once=4,
+        passes={"indirect": each},
+        accumulator=lambda *_: SimpleNamespace(fetch=lambda: [100.0]),
+        accumulate=lambda name, found, labels, samples: found / samples,
+    )
+    at_once: Any = SimpleNamespace(give=lambda calls: [call() for call in calls], wait=lambda: None)
+    group = Group(simulation, np.zeros(1, dtype=np.int64), 0)
+    for samples in (5, 10):
+        group.trace({"indirect": samples}, at_once)
+        assert group.light() == pytest.approx(21.0) and group.paths == 2 * samples
+
+
+def test_lost_light_is_a_part_of_all_that_was_received() -> None:
+    groups = [SimpleNamespace(outside=outside, received=received) for outside, received in ((1.0, 30.0), (3.0, 10.0))]
+    light: Any = SimpleNamespace(groups=groups)
+    assert SampledLight.lost.fget(light) == 0.1  # type: ignore[attr-defined]
 
 
 def test_the_pace_is_that_of_the_pass_that_takes_longest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

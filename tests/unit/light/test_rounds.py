@@ -18,6 +18,9 @@ import numpy as np
 import pytest
 
 import mitsim
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import MOST_TERMS
+from mitsim.devices.patterns import Lighting
 from mitsim.light import cost_model
 from mitsim.light.cost_model import (
     Numbers,
@@ -30,9 +33,9 @@ from mitsim.light.cost_model import (
 )
 from mitsim.light.light import SampledPass, cheapest_samples, next_samples
 from mitsim.light.passes import EVEN, GRIDS, PASSES, even, table_of
-from mitsim.light.settings import GROUPS, Forming, Settings
-from mitsim.optics.frames import PROBES
-from tests.unit.planner.test_choice import PILOT_RESULT, plan
+from mitsim.light.settings import GROUPS, Forming, SampleCost, Settings
+from mitsim.optics.frames import PROBES, formed_frames
+from tests.unit.planner.test_choice import PILOT_RESULT, plan, with_sample_costs
 
 LIGHTS = (
     SampledPass("direct", 24, 0.165, 3.0),
@@ -79,6 +82,12 @@ def test_a_heavy_path_makes_its_own_light_grow() -> None:
     found = cheapest_samples(lights, 1 / 6)
     grown = math.ceil(57 * 0.95 / (1 / 6 - 0.0501))
     assert found == {"direct": 32, "indirect": grown, "penumbra": 6, "from_camera": 9, "indirect_residual": 9}
+
+
+def test_a_variance_that_no_round_reaches_takes_the_largest_round() -> None:
+    """(Planted: only light that is doubled.)"""
+    largest = {"direct": 8 * 24, "anchor_residual": 8, "indirect": 8 * 59, "indirect_residual": 8 * 3}
+    assert cheapest_samples(LIGHTS, 1e-9) == largest
 
 
 def simulated(**tracers: tuple[Any, float]) -> Any:
@@ -154,6 +163,79 @@ def test_forming_a_frame_is_as_many_products_as_its_matrices_have(
     """
     count(monkeypatch)
     assert formed(FORMING, replace(ONE, **change), 7.0) == pytest.approx(7 * multiplications)
+
+
+def test_the_shorter_side_of_occluded_light_is_multiplied_out_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hidden pixels light 2 of 10 rows and 5 of 10 columns of cells, from 4 x 4 anchors. (Planted: the longer side.)"""
+    count(monkeypatch)
+    hidden = replace(ONE, occluded=90.0, occluded_anchors=4.0)
+    for occluded, (rows, columns) in (((0.4, 1.0), (8, 20)), ((1.0, 0.4), (20, 8))):
+        seen = 50 * rows * columns + 50 * 50 * 8 + GROUPS * (PROBES + 1) * (columns + 50) * rows
+        found = formed(replace(FORMING, occluded=occluded), hidden)
+        assert found == pytest.approx(products(5, 3) + 3 * seen)
+
+
+@pytest.mark.parametrize(
+    ("change", "rows"),
+    [
+        ({}, 1.0),
+        ({"layers": 3.0}, 3.0),
+        ({"anchors": 2.0, "cells": 8.0}, 8 + 2),
+        ({"indirect": 1.0, "cells": 8.0, "coarse_layers": 1.0}, 8 + 2),
+        ({"followed_anchors": 3.0, "cells": 8.0, "coarse_layers": 1.0}, 8 + 2 / 4),
+    ],
+)
+def test_shadows_and_checks_take_the_time_of_their_entries(
+    change: dict[str, float], rows: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shadow has an entry for each pixel, for each row of cells and for each term, and two axes. Followed light has
+    a row of cells for every fourth pixel. The last check of all classes forms the frames, so that half a round is left,
+    or a round more for followed light. (Planted: rows of followed light by the wrong power; the last check twice.)"""
+    count(monkeypatch, _ENTRY_S=1.0)
+    numbers = replace(ONE, **change)
+    frames = float(forming_seconds(FORMING, numbers, formed_frames(4, 4, 50)))
+    assert float(optics_seconds(FORMING, numbers)) - frames == pytest.approx(2 * 50 * 10 * 3 * rows)
+    again = float(forming_seconds(FORMING, numbers, 4 * cost_model._CHECK * (0.5 + numbers.indirect)))
+    assert float(checking_seconds(FORMING, numbers)) == pytest.approx(again)
+
+
+def test_light_is_accumulated_in_all_cells_of_its_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Indirect light of 4 classes in 10 x 10 pixels of 2 x 2 cells passes 1600 places of each group. A place takes
+    0.4 of an entry. (Planted: more cells are fewer places.)"""
+    count(monkeypatch, _ACCUMULATED_S=1.0)
+    numbers = replace(ONE, indirect=1.0, cells=8.0, coarse_layers=1.0)
+    assert float(accumulation_seconds(FORMING, numbers, 7.0)) == pytest.approx(GROUPS * (7 + 0.4 * 4 * 20**2))
+
+
+def test_the_truth_takes_rays_for_a_sixth_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four estimates begin with 16 + 8 rays for each pixel. Then errors that fall as N^(-0.8) need 6^(1/0.8) times the
+    rays of the frames, and half of them is allotted. (Planted: fewer rays for more pixels.)"""
+    count(monkeypatch, _RAY_S=1.0)
+    few = with_sample_costs(PILOT_RESULT, direct=SampleCost(2e-3, 16, 100, 0.8))
+    settings = replace(plan().settings, anchors=1, samples={"direct": 64.0})
+    expected = 4 * 100 * 24 + 0.5 * GROUPS * 100 * 64 * 6 ** (1 / 0.8)
+    assert truth_seconds(few, settings) == pytest.approx(expected)
+
+
+def test_memory_and_disk_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each pixel takes 8 bytes, each row 16 and each file 2000; the truth is one file more. A mask of two terms keeps
+    none of them, and a mask on a raster keeps the raster and its largest terms. (Planted: a byte that is there already;
+    the raster left out; two terms kept.)"""
+    lighting = Lighting(np.arange(16), np.eye(5, 16))
+    monkeypatch.setattr(cost_model, "Simulation", lambda *_: SimpleNamespace(paths_at_once=1000))
+    camera = CameraGeometry(pixels=64, columns=32)
+    bench: Any = SimpleNamespace(n=4, geometry=camera, waves=None)
+    settings = replace(plan().settings, layers=(), anchors=1, subdivision=2)
+    files = 5 * (8 * 64 * 32 + 16 * 64 + 2000) + 8 * 16 + 16 * 4 + 2000
+    assert cost_model.frames_cost(bench, settings, lighting).disk_bytes == files
+    assert cost_model.frames_cost(bench, settings, lighting, on_disk=100.0, lines=3).disk_bytes == 3 * files - 100
+    held = cost_model.light_bytes(bench, 5, settings)
+    two: Any = SimpleNamespace(n=4, geometry=camera.model_copy(update={"mask": "flatcam"}), waves=None)
+    assert two.geometry.mask_terms == 2 and cost_model.light_bytes(two, 5, settings) == held
+    monkeypatch.setattr(cost_model, "cells_a_side", lambda geometry, waves: 1000 * geometry.mask_cells)
+    largest = 2 * 8 * MOST_TERMS * (4 * 2) * (64 + 32)
+    drawn = cost_model.light_bytes(bench, 5, replace(settings, raster=True, raster_cells=3))
+    assert drawn - held == pytest.approx(8 * 24 * 3000**2 + 1.2e8 + largest)
 
 
 def test_lines_share_paths_and_form_and_file_each_its_own() -> None:

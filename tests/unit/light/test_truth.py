@@ -4,6 +4,7 @@ Scenes of 16 x 16 projector pixels, seeds stated; 3.182 is the 97.5 % quantile o
 freedom of four groups.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
+from mitsim.core.arrays import mean_of_neighbours
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light import light as module
 from mitsim.light.cost_model import TRUTH_SAMPLES
@@ -175,3 +177,38 @@ def test_pixels_without_light_have_no_truth_and_no_error(bench: Bench, small_sce
     assert 0 < dark.sum() < N**2 / 2
     assert not found.reflectance[dark].any() and not found.standard_error[dark].any()
     assert found.reflectance[4:12, 4:12] == pytest.approx(0.5 / 0.99, rel=5e-3)
+
+
+class KnownFlux(module._Flux):
+    """Flux whose variances (n^2,) are known and fall as the square of the samples."""
+
+    def __init__(self, variances: np.ndarray) -> None:
+        self._samples, self._first = np.full(len(variances), 16), 16
+        self._shape, self.variances = (math.isqrt(len(variances)),) * 2, variances
+
+    @property
+    def left(self) -> np.ndarray:
+        return np.asarray(self.variances * (self._samples / 16.0) ** -2)
+
+    @property
+    def standard_error(self) -> np.ndarray:
+        return np.sqrt(self.left)[None]
+
+    def _sample(self, wanted: np.ndarray) -> None:
+        self._samples = wanted
+
+
+def test_rays_of_the_truth_go_where_they_lower_its_error_most() -> None:
+    """Variances of 1024 pixels differ by factors of thousands, the errors are to be a fifth. Doubling the samples of a
+    pixel lowers its variance by three quarters. The reached variance is within 4 % of the wanted one, and no rays are
+    wasted: what one more doubling brings for its rays is alike in all pixels to the factor 8 of a whole doubling.
+    (Planted: variances that fall faster; a part above one.)"""
+    variances = np.exp(3 * np.random.default_rng(2).normal(size=1024))
+    likely = variances + mean_of_neighbours(variances.reshape(32, 32)).ravel()
+    known = KnownFlux(likely + 0.01 * likely.mean())
+    wanted = np.sqrt(known.left.mean()) / 5
+    known.refine(np.ones(1024), np.array([wanted]), variances)
+    assert 0.92 < known.left.mean() / wanted**2 <= 1
+    worth = known.left / known._samples
+    grown = known._samples > 16
+    assert grown.sum() > 30 and worth.max() <= 8 * worth[grown].min() * (1 + 1e-9)

@@ -20,6 +20,40 @@ def test_a_pair_s_variance_is_free_of_what_is_fixed_and_of_drift() -> None:
     assert pair.mean == pytest.approx((first.mean() + second.mean()) / 2)
 
 
+def test_statistics_of_frames_are_numpys_of_their_stack() -> None:
+    """Five small frames whose light drifts and whose rows share noise, as one array: means over pixels, rows and frames
+    by numpy. The scatter of the light is that of means beyond what noise of pixels and rows leaves in them. The error
+    of the variance has the spread between pixels, and rows' noise, which moves all pixels of a row together.
+    Neighbours are correlated in the last difference without its rows and columns. (Planted: each term left out, added
+    in place of subtracted, or with another degree of freedom.)"""
+    count, m, n = 5, 7, 9
+    rng = stream(5, "stack")
+    light = 40 + 6 * np.arange(count)[:, None, None] + rng.normal(0, 3, (count, m, 1))
+    frames = np.clip(np.rint(light + rng.normal(0, 5, (count, m, n))), 0, 63)
+    frames[0, 0, 0], frames[1, :2, 0] = 0, 63
+    found, means = alike(frames, 63), frames.mean(axis=(1, 2))
+    off = frames - means[:, None, None]
+    variance = off.var(axis=0, ddof=1).sum() / (m * n - 1)
+    rows = (off.mean(axis=2).var(axis=0, ddof=1).sum() / (m - 1) - variance / n) * n / (n - 1)
+    own = variance - rows
+    flicker = math.sqrt(means.var(ddof=1) - own / (m * n) - rows / m)
+    square = off.var(axis=0, ddof=1).var() + (4 * own * rows + 2 * rows**2 * n) / (count - 1)
+    last = off[-1] - off[-2]
+    last -= last.mean(axis=1, keepdims=True)
+    last -= last.mean(axis=0)
+    pairs = (last[:, 1:], last[:, :-1]), (last[1:], last[:-1])
+    beside, below = ((one * other).mean() / np.square(last).mean() for one, other in pairs)
+    assert rows > 1 and own > 1 and flicker > 5
+    expected = {
+        "mean": frames.mean(), "variance": variance, "rows": rows, "flicker": flicker,
+        "variance_error": math.sqrt(square / (m * n)), "mean_error": math.sqrt((own / (m * n) + rows / m) / count),
+    }  # fmt: skip
+    for name, value in expected.items():
+        assert getattr(found, name) == pytest.approx(value, rel=1e-9), name
+    assert found.neighbours == pytest.approx((beside, below), rel=1e-9)
+    assert found.cut == pytest.approx((np.mean(frames <= 0), np.mean(frames >= 63))) and min(found.cut) > 0
+
+
 def test_noise_that_rows_share_is_told_from_the_pixels_own() -> None:
     rng = stream(2, "rows")
     frames = [rng.normal(0, 3, (400, 1)) + rng.normal(0, 2, (400, 100)) for _ in range(2)]
