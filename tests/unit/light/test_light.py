@@ -17,13 +17,11 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import light as module
 from mitsim.light.light import Group, SampledLight, Sampling, trace_light
-from mitsim.light.passes import PASSES, Simulation, TracedPass
+from mitsim.light.passes import PASSES, Simulation
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, Settings
+from mitsim.light.settings import GROUPS
 from mitsim.optics.frames import ExpectedFrames, bound_of
-from mitsim.planner import planner
 from mitsim.planner.planner import make_plan
-from tests.unit.planner.test_choice import PILOT_RESULT
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N = 16
@@ -248,22 +246,3 @@ def test_lost_light_is_a_part_of_all_that_was_received() -> None:
     groups = [SimpleNamespace(outside=outside, received=received) for outside, received in ((1.0, 30.0), (3.0, 10.0))]
     light: Any = SimpleNamespace(groups=groups)
     assert SampledLight.lost.fget(light) == 0.1  # type: ignore[attr-defined]
-
-
-def test_the_pace_is_that_of_the_pass_that_takes_longest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each launch takes twice its fixed seconds, but the first, which compiles. (Planted: the first launch counts;
-    seconds of a sample, not of a path.)"""
-    simulation, labels = Simulation(bench, Settings(depth=400.0, anchors=2)), np.arange(bench.n**2)
-    clock, seen = [0.0], list[int]()
-
-    def traced(self: TracedPass, seed: int, first: int, samples: int, accumulator: object = None) -> object:
-        seen.append(samples)
-        fixed = samples * self.tracer.paths_per_sample * self.row.unit_cost * float(self.row.connections(settings))
-        clock[0] += 2 * fixed if len(seen) > 1 else 9.0
-        return self.tracer.trace(seed, first, samples)
-
-    settings = simulation.settings
-    monkeypatch.setattr(TracedPass, "trace", traced)
-    monkeypatch.setattr(simulation, "accumulator", lambda *_: None)
-    monkeypatch.setattr(planner.time, "perf_counter", lambda: clock[0])
-    assert planner._measure_pace(PILOT_RESULT, simulation, labels, 0) == pytest.approx(2.0) and len(seen) == 2

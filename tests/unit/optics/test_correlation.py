@@ -122,6 +122,36 @@ def test_the_largest_terms_of_a_raster_form_the_correlations_frames(
     np.testing.assert_allclose(seen, frames[0], rtol=1e-9)
 
 
+def test_few_terms_are_summed_where_they_take_less_time_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light in 6 rows and 4 columns of cells, a frame of 30 x 50 pixels: T terms take T x 4 x (6 + 30) multiplications
+    for each column of the result, and 8 x T x (4 + 6) x 50 bytes. (Planted: the longer side first; fewer bytes; sums
+    that take as long as a correlation.)"""
+    lit = SimpleNamespace(rows=np.arange(6), columns=np.arange(4))
+    raster = SimpleNamespace(shadow=(BARE, ROWS, COLUMNS, 300.0, None), weights=(np.zeros((30, 1)), np.zeros((50, 1))))
+    whole = rasters.cells_per_pixel(BARE) ** 2 * 12 * 12
+    take_less = image_formation._Raster._sums_take_less
+
+    def found(terms: int, products: float, most_bytes: float, vectors: np.ndarray | None) -> bool:
+        monkeypatch.setattr(image_formation, "CORRELATION_PRODUCTS", products / whole)
+        monkeypatch.setattr(image_formation, "SUMMED_BYTES", most_bytes)
+        return take_less(raster, SimpleNamespace(terms=[0] * terms), lit, vectors)  # type: ignore[arg-type]
+
+    for vectors, columns in ((None, 50), (np.zeros((50, 7)), 7)):
+        sums = 3 * 4 * (6 + 30) * columns
+        assert found(3, sums * 1.001, 12_000, vectors) and not found(3, sums * 0.999, 12_000, vectors)
+        assert not found(3, sums * 1.001, 11_999, vectors) and not found(0, 1.0, 12_000, vectors)
+
+
+def test_cells_are_sorted_by_their_place_in_a_pixel_and_few_terms_are_counted() -> None:
+    """(Planted: rows for columns; terms of a raster that leaves too much.)"""
+    cells = np.arange(4 * 9).reshape(4, 9)
+    found = rasters._by_phase(cells, (2, 3))
+    assert all(np.array_equal(found[row, column], cells[row::2, column::3]) for row, column in np.ndindex(2, 3))
+    for left_out, count in ((RASTER_LEFT_OUT, 7), (2 * RASTER_LEFT_OUT, np.inf)):
+        drawn = SimpleNamespace(largest=SimpleNamespace(count=7, left_out=left_out))
+        assert image_formation.number_of_terms(drawn) == count  # type: ignore[arg-type]
+
+
 def test_an_even_drawings_waves_are_those_of_its_part(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a zone plate an eighth is worked out, of one that is mirrored along its rows alone a half, and of one whose
     rows are its columns what is not below its diagonal. (Planted: columns' half for rows'; the mirrored

@@ -528,22 +528,28 @@ def test_seconds_of_a_look_are_its_stages_and_sharp_lobes_get_paths() -> None:
         assert look.seconds(1e-2) == pytest.approx(seconds(taken, result))
 
 
-def test_the_pace_is_measured_in_the_longest_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    """(Planted: the pass whose name is last.)"""
-    monkeypatch.setattr(planner.cost_model, "tracing_seconds", lambda *_: {"direct": 5.0, "indirect": 2.0})
-    traced: list[str] = []
-    passes = {
-        name: SimpleNamespace(
-            tracer=SimpleNamespace(paths_per_sample=64),
-            whole=100,
-            trace=lambda *_, name=name: traced.append(name),
-        )
-        for name in ("indirect", "direct", "from_camera")
-    }
+def test_the_pace_is_that_of_the_pass_that_takes_longest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each launch takes twice its fixed seconds, but the first, which compiles. (Planted: the pass whose name is last;
+    the first launch counts; seconds of a sample, not of a path.)"""
+    settings, clock, traced = plan().settings, [0.0], list[str]()
+
+    def trace(name: str, samples: int) -> None:
+        traced.append(name)
+        row = PASSES[name]
+        clock[0] += 2 * samples * 64 * row.unit_cost * float(row.connections(settings)) if len(traced) > 1 else 9.0
+
+    def each(name: str) -> Any:
+        tracer = SimpleNamespace(paths_per_sample=64)
+        return SimpleNamespace(tracer=tracer, whole=100, trace=lambda seed, first, samples, _: trace(name, samples))
+
+    passes = {name: each(name) for name in ("indirect", "direct", "from_camera")}
     simulation: Any = SimpleNamespace(
-        settings=plan().settings, passes=passes, accumulator=lambda *_: None, accumulate=lambda *_: None
+        settings=settings, passes=passes, accumulator=lambda *_: None, accumulate=lambda *_: None
     )
-    assert planner._measure_pace(FOLLOWS, simulation, np.zeros(4, int), 0) > 0 and traced == ["direct"] * 2
+    monkeypatch.setattr(planner.cost_model, "tracing_seconds", lambda *_: {"direct": 5.0, "indirect": 2.0})
+    monkeypatch.setattr(planner.time, "perf_counter", lambda: clock[0])
+    assert planner._measure_pace(FOLLOWS, simulation, np.zeros(4, int), 0) == pytest.approx(2.0)
+    assert traced == ["direct"] * 2
 
 
 def test_effects_that_are_off_take_no_seconds_and_switches_are_named() -> None:
