@@ -41,13 +41,13 @@ class Calibrating(SessionRequest, Coloured, Opening, LimitedPictured, Resumed, R
     write_frames: Path | None = option(
         None, "also write the simulated frames to this folder, which --frames reads", metavar="DIR", panel=OUTPUT
     )
-    planning: bool = option(False, "only find the light that an image of --psnr needs", "--plan-session", "--plan")
+    planning: bool = option(False, "calibrate nothing; find the light that --psnr needs", "--plan-session", "--plan")
     psnr: float | None = option(None, "with --plan-session: PSNR that the image is to reach [dB]", metavar="DB")
     patterns: str | None = option(None, "patterns for --plan-session", show_default="dots:7", metavar="PATTERNS")
     model: str | None = option(
         None, "compute the factors from a device model that is fitted to a few frames", metavar="geometric|wave"
     )
-    frames_used: int | None = option(None, "with --model: most frames to fit", show_default="16", metavar="K")
+    frames_used: int | None = option(None, "with --model: limit of the frames to fit", show_default="16", metavar="K")
     fit: str | None = option(
         None, "with --model: quantities to fit", show_default="mask, magnification, gain", metavar="NAME,..."
     )

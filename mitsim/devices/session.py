@@ -352,7 +352,7 @@ class Modelling:
                 raise ArgumentError("fit", f"{name!r}: use names of {', '.join(UNITS)}")
         for axis in ("row", "column"):
             if {f"mask_shift_{axis}", f"projector_{axis}"} <= {*self.fitted}:
-                problem = f"mask_shift_{axis},projector_{axis}: both move the shadow alike, and cannot be told apart"
+                problem = f"mask_shift_{axis},projector_{axis}: both move the shadow alike, and cannot be distinguished"
                 raise ArgumentError("fit", f"{problem} but by how its brightness falls off; fit one of them")
 
     @property

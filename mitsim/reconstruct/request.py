@@ -89,7 +89,7 @@ class ImageRequest(Options):
         read=_two("bounds", "give the least and the largest number, such as 0:1 or 0:", -math.inf, math.inf),
     )
     iterations: int | None = option(
-        None, "with nonnegative or tv: most iterations; by default 5000, or 300 with --psf", min=1, metavar="N"
+        None, "with nonnegative or tv: limit of the iterations; by default 5000, or 300 with --psf", min=1, metavar="N"
     )
 
     def model_post_init(self, context: object) -> None:
