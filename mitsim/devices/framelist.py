@@ -135,9 +135,7 @@ class FrameList(Configuration):
     @model_validator(mode="after")
     def _saturation_is_known(self) -> FrameList:
         if len(self.exposure_ladder) > 1 and self.digital.saturation_dn is None:
-            raise ValueError(
-                ("digital.saturation_dn: is missing; an exposure_ladder needs it to detect saturated pixels")
-            )
+            raise ValueError("digital.saturation_dn: is not given; an exposure_ladder needs it to find saturation")
         return self
 
 
@@ -365,9 +363,7 @@ def load_flats(folder: Path | str) -> FlatFrames:
         for number, each in enumerate(sets):
             if len(each.files) < 2:
                 held = each.files[0] if each.files else "no frame"
-                problem = (
-                    f"{kind}.{number} holds {held} alone, of {each.exposure_s:g} s, and one frame cannot show noise"
-                )
+                problem = f"{kind}.{number} holds {held} alone, of {each.exposure_s:g} s; one frame cannot show noise"
                 raise _refusal(folder, f"{problem}; add its partner, taken alike")
     _check_files(folder, (name for each in flats.sets for name in each.files))
     exposures = {each.exposure_s for each in flats.listed.dark}

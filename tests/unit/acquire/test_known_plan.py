@@ -137,9 +137,9 @@ def test_other_devices_are_refused_where_they_matter(bench: Bench, file: Path, v
         "camera: mask_distance 2.0 then, 1.5 now": replace(
             bench, devices=replace(devices, camera=devices.camera.model_copy(update={"mask_distance": 1.5}))
         ),
-        "board: none there": bench.with_board(0.9),
-        "variant: llvm_ad_mono there": replace(bench, variant="llvm_ad_rgb"),
-        "colour: none there": replace(bench, lines=Lines((445.0, 638.0), (0.5, 0.5))),
+        "board: none then": bench.with_board(0.9),
+        "variant: llvm_ad_mono then": replace(bench, variant="llvm_ad_rgb"),
+        "colour: none then": replace(bench, lines=Lines((445.0, 638.0), (0.5, 0.5))),
         "camera: mosaic none then, RGGB now": replace(
             bench, filters=devices.sensor.model_copy(update={"mosaic": "RGGB"})
         ),

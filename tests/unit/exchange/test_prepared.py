@@ -302,7 +302,8 @@ def test_a_session_of_a_mosaic_is_calibrated_plane_by_plane(tmp_path: Path) -> N
 
 
 LISTS = {
-    "a camera's file": ("imx249", "is a camera's file; give it to --camera"),
+    "a camera's name": ("imx249", "no shipped list has that name; shipped lists are diffusercam, flatcam"),
+    "a camera's file": ("full_well_e = 1e4\n", "is a camera's file; give it to --camera"),
     "a session's list": ('signed_capture = "pair"\n', "is the list of a calibration's frames"),
     "a mistyped field": ('pattern = "dots:2"\n', "pattern: got 'dots:2', no such field; did you mean patterns"),
     "a mistyped field of prepare": ("[prepare]\nturn = 1.0\n", "list.toml: prepare.turn: .* did you mean turn_deg"),
@@ -327,7 +328,7 @@ def test_a_lists_mistake_is_told_with_its_cause(name: str, tmp_path: Path) -> No
     path = tmp_path / "list.toml"
     path.write_text(text)
     with pytest.raises(MitsimError, match=words):
-        load_capture_list(text if name == "a camera's file" else path)
+        load_capture_list(text if name == "a camera's name" else path)
 
 
 def test_a_sessions_list_says_what_is_wrong(tmp_path: Path) -> None:
