@@ -168,7 +168,7 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> N
     dn = ms.load_run(bench.run).dn
     source = tmp_path / "frames"
     written(source, "png", dn)
-    refused("holds 6 frames, but patterns 'dots:2' take 4", tmp_path, source, known(bench, "dots:2"))
+    refused("holds 6 frames, but patterns 'dots:2' need 4", tmp_path, source, known(bench, "dots:2"))
     refused("dots:99", tmp_path, source, known(bench, "dots:99"))
     refused("projector-pixels", tmp_path, source, replace(known(bench), calibration=None))
     refused("the calibration has 10 x 14", tmp_path, source, known(bench, n=12))
@@ -364,7 +364,7 @@ def test_what_does_not_fit_a_closing_frame_is_refused_in_a_line(tmp_path: Path) 
     frames = [*ms.load_run(bench.run).dn]
     np.save(tmp_path / "dark.npy", frames[0])
     refused = {
-        "holds 6 frames, but patterns 'dots:2x3' take 6 and a closing frame": (frames, {"closing_frame": "first"}),
+        "holds 6 frames, but patterns 'dots:2x3' need 6 and a closing frame": (frames, {"closing_frame": "first"}),
         r"holds 7 frames.*if the last one is a closing frame, give --closing-frame": ([*frames, frames[0]], {}),
         "closing_exposure_s is of a closing frame; give closing_frame too": (frames, {"closing_exposure": 0.5}),
         "beside dark frames": (frames, {"closing_frame": "first", "closing_exposure": 0.5,
