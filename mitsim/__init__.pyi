@@ -46,6 +46,7 @@ from mitsim.sessions.folder_facts import show as show
 from mitsim.sessions.run_session import run as run
 from mitsim.sessions.session_file import session_of as session_of
 from mitsim.verbs import characterise as characterise
+from mitsim.verbs import compare as compare
 from mitsim.verbs import demo as demo
 from mitsim.verbs import doctor as doctor
 from mitsim.verbs import load_network as load_network

@@ -51,7 +51,7 @@ from mitsim.core.configuration import (
     validated_by,
 )
 from mitsim.core.environment import DEFAULT_VARIANT, Check
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, is_path, short_text
 from mitsim.core.files import PAIRS, check_apart, check_output, check_plain, output_file
 from mitsim.core.job import Job
 from mitsim.devices.framelist import capacity_of, load_flats
@@ -73,6 +73,7 @@ if TYPE_CHECKING:
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
     from mitsim.studies.characterise import Characterisation
+    from mitsim.studies.compare import Comparison
     from mitsim.studies.demo import DemoResult
     from mitsim.studies.framework.campaign import StudyResult
     from mitsim.studies.framework.experiment import Scope
@@ -437,6 +438,50 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     from mitsim.devices.projector import ProjectorModel  # last: it imports numpy
 
     load_model(projector, ProjectorModel)
+
+
+class CompareOptions(Styled):
+    """How a comparison is written."""
+
+    VERB = "compare"
+
+    overwrite: bool = option(False, "replace an earlier comparison in the folder", panel=OUTPUT)
+
+
+@takes(CompareOptions)
+def compare(
+    images: Sequence[Path | str], output: Path | str = "compare-output", job: Job | None = None, **options: Any
+) -> Comparison:
+    """Compare images side by side: on one scale, with difference maps to the first, PSNR and SSIM.
+
+    Parameters
+    ----------
+    images
+        Two or more folders of ``mitsim reconstruct`` or ``mitsim run``, or pictures (OpenEXR, PNG, TIFF, NPY), of one
+        size. The others are compared with the first, and all with the truth if the folders' runs have it.
+    output
+        Folder of page, figures and compare.json.
+    job
+        Not used: comparing takes a second.
+
+    Raises
+    ------
+    MitsimError
+        for images of different sizes, in colour, or with values that are not finite, for files that cannot be read, and
+        for a folder that holds something else, or an earlier comparison without ``overwrite``.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> ms.compare(["run", "smooth", "mine.npy"], "beside", style="paper").payload()["images"]  # doctest: +SKIP
+    """
+    asked = CompareOptions(**options)
+    each = [images] if isinstance(images, (str, Path)) else [*images]
+    if wrong := [one for one in each if not isinstance(one, (str, Path)) or not is_path(str(one))]:
+        raise ArgumentError("images", f"{short_text(wrong[0])}: give paths")
+    from mitsim.studies.compare import compare as run_compare  # only now: it takes seconds to import
+
+    return run_compare([Path(one) for one in each], output, asked.overwrite, asked.style)
 
 
 # ---- sessions --------------------------------------------------------------------------------------------------------

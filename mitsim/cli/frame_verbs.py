@@ -36,7 +36,7 @@ from mitsim.exchange.capture_list import FrameFacts
 from mitsim.exchange.formats import READERS, Exported, Pictures
 from mitsim.learn.requests import METHODS, Schedule, Training
 from mitsim.reconstruct.request import MODEL, ImageRequest, check_joint, check_parallax, holds_image
-from mitsim.verbs import load_network
+from mitsim.verbs import CompareOptions, load_network
 from mitsim.verbs import train as train_model
 
 if TYPE_CHECKING:
@@ -176,6 +176,28 @@ def _colours_lines(found: ColourImage, common: Pictured) -> list[str]:
         *(f"{text[0].upper()}{text[1:]}" for text in found.sentences),
         *common.details(*found.described),
     ]
+
+
+class Comparing(CompareOptions, Common):
+    """Options of `mitsim compare`."""
+
+    images: list[str] = argument(
+        ..., "two or more folders of reconstruct or run, or pictures (EXR, PNG, TIFF, NPY); the first is compared with",
+        "RUN|IMAGE...", kind=list[str],
+    )  # fmt: skip
+    output: Path = to_make(..., "folder to make for page, figures and compare.json", "DIR")
+
+
+@command
+def compare(asked: Comparing) -> int:
+    """Compare images side by side, with difference maps, PSNR and SSIM.
+
+    On one scale, with the truth if the folders' runs have it.
+
+    $ mitsim compare run smooth -o beside
+    $ mitsim compare run other.npy -o figures --style paper
+    """
+    return asked.call(mitsim.compare, asked.images, asked.output, **asked.given_of(CompareOptions))
 
 
 class Reporting(Common):

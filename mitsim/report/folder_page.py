@@ -298,7 +298,7 @@ def _of_image(folder: Path) -> Shown:
     known = [f"PSNR {quality:.1f} dB"] if isinstance(quality, float) else ["An image, and no truth to judge it by"]
     known += [f"SSIM {similar:.3f}"] if isinstance(similar, float) else []
     inputs = result.get("inputs") if isinstance(result.get("inputs"), dict) else {}
-    white, truth, size = result.get("white"), _truth_of(result), f"{image.shape[0]} x {image.shape[1]} projector pixels"
+    white, truth, size = result.get("white"), truth_of(result), f"{image.shape[0]} x {image.shape[1]} projector pixels"
     by_spread = POINT_SPREAD in (inputs or {}) and isinstance(white, float)
     unit, most = ("electrons/s", white) if by_spread else (REFLECTANCE, 1.0)
     method, weight = (inputs or {}).get("method"), result.get("lambda")
@@ -354,7 +354,7 @@ def _difference(name: str, title: str, image: FloatArray, truth: FloatArray) -> 
     return Picture.of(name, title, error, about, ends=(-most, most), quantity="difference")
 
 
-def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
+def truth_of(result: Mapping[str, Any]) -> FloatArray | None:
     """Return the truth of an image; None where run or calibration are gone, or have changed."""
     made_of, inputs = result.get(MADE_OF), result.get("inputs")
     if not isinstance(made_of, dict) or not isinstance(inputs, dict):
@@ -384,11 +384,11 @@ def _of_colours(lines: SpectralFolder) -> Shown:
     files = [folder / name / IMAGE_FILE for name in names]
     images = np.stack([finite_channel(read_frame(file)[0], "reflectance", file) for file in files], axis=-1)
     if parts:
-        truths = [_truth_of(read_json(folder / name / RESULT_FILE)) for name in parts]
+        truths = [truth_of(read_json(folder / name / RESULT_FILE)) for name in parts]
         known = [each for each in truths if each is not None and each.shape == images.shape[:2]]
         truth = np.stack(known, axis=-1) if len(known) == len(names) else None
     else:
-        truth = _truth_of(data)
+        truth = truth_of(data)
         truth = truth if truth is not None and truth.shape == images.shape else None
     place = data.get("chart")
     image = ColourImage(

@@ -122,7 +122,13 @@ def spans_decades(values: Iterable[float]) -> bool:
     return bool(found.size and found.min() > 0 and found.max() >= LOGARITHMIC * found.min())
 
 
-def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
+def image_grid(
+    rows: Mapping[str, Sequence[tuple[FloatArray, str]]],
+    columns: Sequence[str],
+    title: str = "",
+    scale: tuple[Mapping[str, Any], str] | None = None,
+) -> Figure:
+    """Draw images with captions in rows; with a ``scale``, arguments of imshow and a label, they share a colour bar."""
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
     inches = (size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL
     figure, cells = panels_of(len(rows), len(columns), *inches, layout="compressed")
@@ -133,7 +139,8 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
     for index, (name, images) in enumerate(rows.items()):
         line = cells[index]
         for axes, (image, caption), column in zip(line, images, columns, strict=True):
-            axes.imshow(lightness(image), cmap="gray", vmin=0, vmax=1, interpolation="none")
+            style = scale[0] if scale else {"cmap": "gray", "vmin": 0, "vmax": 1}
+            drawn = axes.imshow(image if scale else lightness(image), interpolation="none", **style)
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_visible(True)
             axes.set_xlabel(wrap(caption), fontsize=FONT - 2)
@@ -141,6 +148,10 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
                 axes.set_title(wrap(column), fontsize=FONT - 1)
         fits = len(name) * _LETTER <= size + _CAPTION
         line[0].set_ylabel(name if fits else name.replace(", ", ",\n"), fontsize=FONT - 1)
+    if scale:
+        bar = figure.colorbar(drawn, ax=cells, extend="both")
+        bar.set_label(fill(scale[1], 20), fontsize=FONT - 2)
+        bar.set_ticks([tick for tick in bar.get_ticks() if drawn.norm.vmin <= tick <= drawn.norm.vmax])
     if title:
         figure.suptitle(fill(title, int(figure.get_figwidth() / _LETTER)), fontsize=FONT)
     return figure
@@ -384,6 +395,11 @@ def draw_plan(plan: Plan, quantity: Literal["error", "seconds"] = "error", ax: A
     return axes
 
 
+def reflectance_norm(white: float) -> FuncNorm:
+    """Return the scale from 0 to ``white`` by the sRGB curve, as screens show light."""
+    return FuncNorm((lambda part: lightness(part / white), lambda shade: white * linear_light(shade)), 0.0, white)
+
+
 def _axes(ax: Axes | None, height: float = 0.5 * WIDTH, width: float = 0.7 * WIDTH) -> Axes:
     if ax is not None:
         return ax
@@ -406,8 +422,7 @@ def _draw(
     style: dict[str, Any] = {"cmap": cmap, "interpolation": "none"}
     extend, scale = "neither", "linear"
     if white is not None:
-        curve = (lambda part: lightness(part / white), lambda shade: white * linear_light(shade))
-        style["norm"], scale = FuncNorm(curve, 0.0, white), "shown by the sRGB curve"
+        style["norm"], scale = reflectance_norm(white), "shown by the sRGB curve"
         extend = "both" if shown.min() < 0 or shown.max() > white else "neither"
     drawn = axes.imshow(shown, **style)
     axes.set_title(title, fontsize=FONT)

@@ -108,15 +108,15 @@ DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
 
 
 def check_study_folder(output: Path | str, name: str) -> None:
-    files.check_output(output, overwrite=_is_earlier(Path(output), name))
+    files.check_output(output, overwrite=is_earlier(Path(output), name))
 
 
 def study_folder(output: Path | str, name: str) -> AbstractContextManager[Path]:
     """Hold the new, empty or earlier folder ``output`` of the study ``name``; MitsimError if it holds anything else."""
-    return files.output_folder(output, overwrite=_is_earlier(Path(output), name))
+    return files.output_folder(output, overwrite=is_earlier(Path(output), name))
 
 
-def _is_earlier(place: Path, name: str) -> bool:
+def is_earlier(place: Path, name: str) -> bool:
     head = place / f"{name}.json"
     found = files.read_json(head) if head.is_file() else None
     written = "*.png", "*.svg", "*.pdf", "*.csv", "*.html", "camera.toml", POINTS, KEPT, *DEMO_FOLDERS, *PAPER
