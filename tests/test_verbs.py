@@ -53,7 +53,19 @@ CALLS = {
 """Python calls that do what a verb does, by its name."""
 UNLIKE = {"import", "list", "new"}
 """Verbs without a call of their name: a word of Python's own, names of what is shipped, and files to edit."""
-ONE_CALL = ["show", "demo", "run", "study", "compare", "import", "patterns", "characterise", "sense", "doctor", "export"]
+ONE_CALL = [
+    "show",
+    "demo",
+    "run",
+    "study",
+    "compare",
+    "import",
+    "patterns",
+    "characterise",
+    "sense",
+    "doctor",
+    "export",
+]
 """Verbs that are one call with the same options."""
 ALIKE = {"scenes": "scene", "family": "patterns", "repeated": "folder", "stacks": "frames", "stack_size": "frames"}
 """Arguments that the command line calls otherwise."""

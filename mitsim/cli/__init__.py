@@ -18,7 +18,18 @@ import mitsim
 from mitsim.cli.bench_verbs import capture, demo, doctor, pairs, plan, render, run_, study, transport, view
 from mitsim.cli.calibrate_verb import calibrate
 from mitsim.cli.commands import Program, Verb, help_of, message_of
-from mitsim.cli.frame_verbs import characterise, compare, export, import_, patterns, reconstruct, report, sense, show, train
+from mitsim.cli.frame_verbs import (
+    characterise,
+    compare,
+    export,
+    import_,
+    patterns,
+    reconstruct,
+    report,
+    sense,
+    show,
+    train,
+)
 from mitsim.cli.shelf_verbs import list_, new
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.worker import INTERRUPTED, end_stopped, end_uncaught, is_stopped, say_note
