@@ -12,7 +12,6 @@ import pytest
 from mitsim.acquire import spectral
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.request import Request
 from mitsim.core.colour_files import spectral_of
 from mitsim.core.errors import ArgumentError
 
@@ -44,48 +43,24 @@ def test_greys_are_mono_without_a_look(small_scene: Callable[..., Path], variant
             wrong.choose_colour("uniform", **options)
 
 
-def test_a_grey_sheet_differs_in_colours_by_the_camera(small_scene: Callable[..., Path], variant: str) -> None:
-    """Electrons are q lambda of the mean wavelength in mono light, and the mean of q lambda over the lines: a closed
-    form for a camera that sees red twice as well as blue. (Planted: photons over the efficiency.)"""
-    bench = open_bench(small_scene(mask="open"), variant)
-    curve = {"wavelengths_nm": (400.0, 700.0), "efficiency": (0.3, 0.6)}
-    sensor = bench.sensor.model_validate(
-        {**bench.sensor.model_dump(), "quantum_efficiency": None, "quantum_efficiency_curve": curve}
-    )
-    projector = bench.projector
-    found = replace(bench, devices=replace(bench.devices, sensor=sensor)).choose_colour("uniform", accuracy=0.3)
-    lines = np.array(projector.traced_lines.wavelengths_nm)
-    counted = np.average(np.interp(lines, *curve.values()) * lines, weights=projector.traced_lines.shares)
-    nm = projector.effective_wavelength_nm
-    expected = abs(np.interp(nm, *curve.values()) * nm / counted - 1)
-    assert found.plan.colour["candidates"][0]["error"] == pytest.approx(expected, rel=0.06) and expected > 0.005
-
-
-def line(nm: float) -> Any:
-    return SimpleNamespace(projector=SimpleNamespace(effective_wavelength_nm=nm))
-
-
 def test_a_plan_of_lines_is_that_of_the_roughest_one(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """The line whose light differs most from pixel to pixel: beside a tenth of lamps' light it counts for less, of
     equal ones the longest counts, and a dark one never. (Planted: the mean of the lamps' light; a dark line rough.)"""
     slope, lamps = np.repeat([1.0, 1.1, 1.2, 1.3], bench.n**2 // 4), np.full(4, 0.025)
 
-    def roughest(*dilution: float) -> float:
+    def roughest(*lit: float) -> float:
         """Wavelength of the chosen one of two lines of equal slope, of so much lamps' light each, and a dark one."""
-        places, sources = np.arange(bench.n**2), (slope, slope, 0 * slope)
-        direct = [SimpleNamespace(pixel=places, value=value) for value in sources]
-        ambient = [SimpleNamespace(value=slope.sum() * part * lamps) for part in dilution]
-        traced = SimpleNamespace(by_line=lambda count: direct[:count]), SimpleNamespace(by_line=lambda count: ambient)
-
-        def trace(light: Any, stream: int, first: int, rays: int) -> Any:
-            assert (stream > 100, first, rays) == (True, 0, spectral._RAYS)
-            return light
-
-        tracers = [SimpleNamespace(trace=lambda *asked, light=light: trace(light, *asked)) for light in traced]
+        direct = [SimpleNamespace(pixel=np.arange(bench.n**2), value=value) for value in (slope, slope, 0 * slope)]
+        ambient = [SimpleNamespace(value=slope.sum() * part * lamps) for part in lit]
+        tracers = [
+            SimpleNamespace(trace=lambda seed, *_, light=light: SimpleNamespace(by_line=lambda _: seed and light))
+            for light in (direct, ambient)
+        ]
         made = SimpleNamespace(direct=tracers[0], from_camera=tracers[1])
         monkeypatch.setattr(spectral, "Simulation", lambda *_: made)
         whole = SpectralBench(replace(bench, counted_lamps=cast(Any, "lamps")))
-        whole.__dict__["benches"] = (line(450.0), line(550.0), line(650.0))
+        projectors = [SimpleNamespace(effective_wavelength_nm=nm) for nm in (450.0, 550.0, 650.0)]
+        whole.__dict__["benches"] = [SimpleNamespace(projector=each) for each in projectors]
         return whole.roughest(1, 1.0).projector.effective_wavelength_nm
 
     assert roughest(0.0, 0.0, 0.0) == 550.0 and roughest(0.0, 1.0, 0.0) == 450.0 and roughest(1.0, 0.0, 0.0) == 550.0
@@ -96,27 +71,17 @@ def test_lamps_that_one_line_does_not_need_are_planned_for_the_others(
 ) -> None:
     """A plan of all lines has lamps where there are any; without lines it is the bench's own. (Planted: planned anew
     without lamps; the plan of lines for a bench that has none.)"""
-    planned: list[tuple[Any, Request]] = []
-
-    def plan_request(of: Any, request: Request, lines: int = 1) -> Any:
-        planned.append((of, request))
-        return replace(plan, request=request)
-
-    plan = bench.plan("uniform", accuracy=0.1)
-    assert plan.request is not None and "ambient" not in plan.settings.effects
-    request = plan.request
-    monkeypatch.setattr(spectral, "plan_request", plan_request)
-    assert SpectralBench(bench).plan(request) is not None and planned.pop() == (bench, request) and not planned
-    for lamps in (None, "lamps"):
+    plan, asked = bench.plan("uniform", accuracy=0.1), list[Any]()
+    monkeypatch.setattr(spectral, "plan_request", lambda *given: asked.append(given) or plan)
+    assert plan.request is not None and SpectralBench(bench).plan(plan.request) is plan
+    assert asked == [(bench, plan.request)]
+    for lamps, ambient in ((None, [None]), ("lamps", [None, True])):
+        whole: Any = SimpleNamespace(manifest=1, whole=bench, benches=(), check=lambda _: None)
         rough = SimpleNamespace(counted_lamps=lamps)
-        whole = SpectralBench(bench, cast(Any, "lines"))
-        monkeypatch.setattr(SpectralBench, "check", lambda *_: None)
-        monkeypatch.setattr(SpectralBench, "lit_by_lamps", lambda own, *_: own)
-        monkeypatch.setattr(SpectralBench, "roughest", lambda *_, rough=rough: rough)
-        found = whole.plan(request)
-        asked = [each.effects.get("ambient") for _, each in planned]
-        assert asked == ([None, True] if lamps else [None]) and found.request is request
-        planned.clear()
+        whole.lit_by_lamps = lambda *_, rough=rough: SimpleNamespace(roughest=lambda *_: rough)
+        asked.clear()
+        assert SpectralBench.plan(whole, plan.request).request is plan.request
+        assert [request.effects.get("ambient") for _, request, _ in asked] == ambient
 
 
 @pytest.fixture(scope="module")

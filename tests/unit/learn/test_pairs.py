@@ -461,11 +461,8 @@ def test_equal_files_are_one_photograph(tmp_path: Path) -> None:
 def test_pairs_of_a_photograph_are_known_by_its_file(drawn: PairStore) -> None:
     """Of numbers in the manifest, and of how many files there are where an earlier version made the store. (Planted:
     every pair a photograph of its own.)"""
-    for change, shown in (
-        ({}, [0, 1, 2, 3]),
-        ({"photographs": (0, 1, 0)}, [0, 1, 0, 0]),
-        ({"pictures": "3 files of there, names and sizes 0"}, [0, 1, 2, 0]),
-    ):
+    known, before = {"photographs": (0, 1, 0)}, {"pictures": "3 files of there"}
+    for change, shown in (({}, [0, 1, 2, 3]), (known, [0, 1, 0, 0]), (before, [0, 1, 2, 0])):
         store = PairStore(drawn.folder, drawn.manifest.model_copy(update=change))
         assert store.photographs.tolist() == shown
 

@@ -25,7 +25,7 @@ from mitsim.reconstruct import accumulation as acc
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import Cause, weigh
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.residuals import Residuals
+from mitsim.reconstruct.residuals import NoiseTest, Residuals
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
 from tests.ideal_sessions import PITCH, PIXELS, Bench, N, bench, picture, shadow
@@ -177,6 +177,33 @@ def test_measured_noise(gain: float) -> None:
         test = oblong_residuals([frame], [np.ones((16, 24))]).noise_test
         ratios.append(test.ratio)
     assert np.mean(ratios) == pytest.approx(gain, rel=0.14)
+
+
+def test_measured_noise_scatters_as_it_says() -> None:
+    """200 draws of 400 tiles whose variance is 0.9 of what is stated, 4 + light: ratio and slope lie about it by their
+    standard errors, which 200 draws know to 5 %; four times that. (Planted: the error of one tile; the variance of
+    shots for that of light.)"""
+    rng, pixels = np.random.default_rng(2), 256
+    freedom = pixels / (70 / 36) ** 2
+    noise = SimpleNamespace(stated=True, shots=1, of=lambda light, shots: shots * (4.0 + np.asarray(light)))
+    tests = []
+    for _ in range(200):
+        light = rng.uniform(5, 50, 400)
+        found = 0.9 * (4.0 + light) * rng.chisquare(freedom, 400) / freedom
+        own = SimpleNamespace(_noises=[np.stack([found, light])], _tile_pixels=pixels, noise=noise)
+        tests.append(Residuals.noise_test.func(own))  # type: ignore[attr-defined]
+    for value, error in (("ratio", "error"), ("gain", "gain_error")):
+        values, errors = (np.array([getattr(test, name) for test in tests]) for name in (value, error))
+        assert values.mean() == pytest.approx(0.9, abs=5 * errors.mean() / np.sqrt(200) + 5e-3)
+        assert values.std() == pytest.approx(errors.mean(), rel=0.2)
+
+
+def test_noise_is_off_where_energy_and_differences_agree() -> None:
+    """Half of the energy is too little noise if differences lie below 0.85, or within three errors of it, and twice as
+    much is too much above 1.15 and three errors. (Planted: three over the error.)"""
+    noise = SimpleNamespace(stated=True, light=np.ones(100), chance=lambda size: 0.0)
+    for ratio, whole, off in ((0.87, 0.5, True), (0.89, 0.5, False), (1.45, 2.0, True), (1.17, 1.7, False)):
+        assert NoiseTest(ratio, 0.01, 1.0, 0.01).off(noise, whole, 1.0, 0.0) == off  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("above", "flagged"), [(0.9, False), (1.1, True)])

@@ -19,9 +19,10 @@ LEFT, RIGHT, OTHER, FURTHER = (RNG.standard_normal((PIXELS, N)) + 1 for _ in ran
 SCENE, FRAME = RNG.random((N, N)), RNG.random((PIXELS, PIXELS))
 RESPONSE = 0.1 * RNG.standard_normal((PIXELS, PIXELS))
 GAIN = 1 + 0.1 * RNG.random((2, 2, 2))
-"""Of two shots of each pattern."""
+GAIN[1, 0, 0] = GAIN[0, 0, 0]
+"""Of two shots of each pattern, the same for the first."""
 LEAK = 0.1
-FAMILIES = ("dots:2", "uniform", "random:2", "hadamard:2")
+FAMILIES = ("dots:2", "dots:1x2", "uniform", "random:2", "hadamard:2")
 
 
 def family(name: str) -> PatternFamily:
