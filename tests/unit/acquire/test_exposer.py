@@ -181,8 +181,7 @@ def test_noise_is_stated_relative_to_the_light_without_lamps() -> None:
     shooting.shoot(FRAMES, Job())
     electrons = np.array([channels["electrons"] for channels, _ in recorder.files.values()], dtype=np.float64)
     noise, ambient = (electrons + 9).sum(), 25 * (lamps + 9).sum() / 4
-    expected = (noise + ambient) / np.square(electrons - lamps).sum()
-    assert shooting.noise_to_signal**2 == pytest.approx(expected, rel=1e-5)
+    assert shooting.noise_to_signal**2 * np.square(electrons - lamps).sum() == pytest.approx(noise + ambient, rel=1e-5)
 
 
 def test_a_file_that_cannot_be_written_ends_the_shooting(monkeypatch: pytest.MonkeyPatch) -> None:

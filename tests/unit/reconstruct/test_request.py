@@ -22,7 +22,6 @@ TAKEN = [
     *((lam, "tikhonov", None) for lam in (0.0, 1e-300, 5)),
     *(("auto", "tikhonov", focus) for focus in ("auto", "map", 1e-3, 400)),
     *(("auto", method, 400.0) for method in SOLVERS),
-    ("auto", "tikhonov", "map", (300.0, 400.0)),
 ]
 REFUSED = [
     *((("auto", method, None), "method", "use tikhonov, markov") for method in ("gram", "")),

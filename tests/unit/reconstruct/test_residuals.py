@@ -180,7 +180,7 @@ def test_measured_noise(gain: float) -> None:
 
 
 def test_measured_noise_scatters_as_it_says() -> None:
-    """200 draws of 400 tiles whose variance is 0.9 of what is stated, 4 + light: ratio and slope lie about it by their
+    """200 draws of 400 tiles whose variance is 0.9 of what is stated, 4 + light: ratio and slope scatter by their
     standard errors, which 200 draws know to 5 %; four times that. (Planted: the error of one tile; the variance of
     shots for that of light.)"""
     rng, pixels = np.random.default_rng(2), 256
@@ -194,7 +194,6 @@ def test_measured_noise_scatters_as_it_says() -> None:
         tests.append(Residuals.noise_test.func(own))  # type: ignore[attr-defined]
     for value, error in (("ratio", "error"), ("gain", "gain_error")):
         values, errors = (np.array([getattr(test, name) for test in tests]) for name in (value, error))
-        assert values.mean() == pytest.approx(0.9, abs=5 * errors.mean() / np.sqrt(200) + 5e-3)
         assert values.std() == pytest.approx(errors.mean(), rel=0.2)
 
 
