@@ -65,18 +65,10 @@ Shown = dict[str, Any]
 
 
 def _shown(kind: str, subject: str, verdict: str, **more: Any) -> Shown:
-    absent = {
-        "title": f"{kind}: {subject}",
-        "subject": subject,
-        "detail": "",
-        "command": None,
-        "accuracy": None,
-        "colours": None,
-        "plan": (),
-        "pictures": (),
-    }
+    absent = {"detail": "", "command": None, "accuracy": None, "colours": None, "plan": (), "pictures": ()}
     tables: Shown = {"warnings": (), "seconds": {}, "kernels": {}, "tables": {}, "parts": {}, "facts": {}}
-    return {"kind": kind, "verdict": verdict, **absent, **tables, **more}
+    head = {"kind": kind, "subject": subject, "title": f"{kind}: {subject}", "verdict": verdict}
+    return {**head, **absent, **tables, **more}
 
 
 @check_arguments
@@ -167,25 +159,22 @@ def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> 
     )
 
 
-def _subject(manifest: RunManifest | CalibrationManifest | None, file: Path) -> str:
+def _subject(manifest: RunManifest | CalibrationManifest, file: Path) -> str:
     """Return scene and camera of a ``manifest`` and the date of a ``file``, for the title of a page."""
-    if manifest is None:
-        return pages.subject("", "", file)
     scene, camera = manifest.configuration.get("scene"), manifest.camera.get("sensor", manifest.camera)
-    camera = camera.get("name") if isinstance(camera, Mapping) else None
-    return pages.subject(pages.scene_name(Path(scene)) if isinstance(scene, str) else "", str(camera or ""), file)
+    named = str(camera.get("name") or "") if isinstance(camera, Mapping) else ""
+    return pages.subject(pages.scene_name(Path(scene)) if isinstance(scene, str) else "", named, file)
 
 
 def _subject_of_image(made_of: Any, file: Path) -> str:
     """Return :func:`_subject` of the run that an image was made of, or the run's folder if it is gone or damaged."""
-    stated = made_of.get("run") if isinstance(made_of, Mapping) else None
-    if not isinstance(stated, str):
-        return _subject(None, file)
-    run = Path(stated)
+    if not (isinstance(made_of, Mapping) and made_of.get("run")):
+        return pages.subject("", "", file)
+    run = Path(str(made_of["run"]))
     with suppress(MitsimError):
         # A run of several spectral lines has a manifest for each line.
-        place = next((each.parent for each in sorted(run.glob(f"*/{MANIFEST}"))), run)
-        return _subject(read_manifest(run if (run / MANIFEST).is_file() else place, RunManifest), file)
+        found = [run / MANIFEST] if (run / MANIFEST).is_file() else sorted(run.glob(f"*/{MANIFEST}"))
+        return _subject(read_manifest(found[0].parent if found else run, RunManifest), file)
     return pages.subject(f"frames of {run.name}", "", file)
 
 
@@ -203,16 +192,10 @@ def _of_run(lines: SpectralFolder) -> Shown:
         return np.asarray(shots.read(name)[0]["DN"] - black)
 
     first = frame(taken.captures[0].file)
-    titles = {
-        "ambient": "Ambient frame, with the projector off; subtracted from the frames",
-        "closing": "Closing frame; checks lamp and camera, and is not part of the image",
-    }
+    titles = {"ambient": "Subtracted frame with the projector off", "closing": "Closing frame, which checks the others"}
     single = {"frame": ("First frame", first, f"file {taken.captures[0].file}")} if count > 1 else {}
     single |= {kind: (titles[kind], frame(name), f"file {name}") for kind, name in manifest.others.items()}
-    pictures = [
-        Picture.of(name, title, values, about, _ABOVE_BLACK, (0.0, None))
-        for name, (title, values, about) in single.items()
-    ]
+    pictures = [Picture.of(kind, *shown, _ABOVE_BLACK, (0.0, None)) for kind, shown in single.items()]
     if shots.truth is not None:
         pictures.append(Picture.of("truth", "The truth", shots.truth, _TRUTH))
     for name in lines.names if lines.filters else ():
@@ -309,14 +292,7 @@ def _of_image(folder: Path) -> Shown:
     if truth is not None and truth.shape == image.shape:
         pictures += [Picture.of("truth", "The truth", truth, _TRUTH), _difference("error", "Difference", image, truth)]
     for file, channel, title, about, unit, ends in (
-        (
-            UNCERTAINTY_FILE,
-            "uncertainty",
-            "Standard uncertainty",
-            "estimated without the truth",
-            REFLECTANCE,
-            (0.0, None),
-        ),
+        (UNCERTAINTY_FILE, "uncertainty", "Standard uncertainty", "without the truth", REFLECTANCE, (0.0, None)),
         (DEPTH_FILE, "depth_mm", "Depth", "distance from the sensor", "mm", (None, None)),
         (DEPTH_FILE, "confidence", "Confidence of the depth", "", "1 = certain", (0.0, 1.0)),
     ):
@@ -423,18 +399,12 @@ def _of_colours(lines: SpectralFolder) -> Shown:
             caption = f"{about}; white is a perfect reflector; colours beyond the screen's are clipped"
             pictures.append(Picture(name, f"The {name}", caption, png(linear_srgb(xyz), LARGEST, SMALLEST)))
     if image.delta_e is not None:
-        about, ends = "an eye sees a difference of 1 side by side", (0.0, max(np.percentile(image.delta_e, 99), 1.0))
-        pictures.append(
-            Picture.of(
-                "error",
-                "Colour difference of image and truth",
-                image.delta_e,
-                about,
-                "CIE Delta E 2000",
-                ends,
-                quantity="error",
-            )
+        about, ends = (
+            "an eye sees a difference of 1 side by side",
+            (0.0, max(float(np.percentile(image.delta_e, 99)), 1.0)),
         )
+        title, unit = "Colour difference of image and truth", "CIE Delta E 2000"
+        pictures.append(Picture.of("error", title, image.delta_e, about, unit, ends, quantity="error"))
     for number, line in enumerate(colours.channels):
         title, own, quality_of_line = f"{line.wavelength_nm:g} nm", images[..., number], image.qualities[line.name]
         pictures.append(Picture.of(f"image_{line.name}", f"{title}, image", own, str(quality_of_line or "")))
@@ -674,12 +644,10 @@ class Trust:
     def pictures(self) -> tuple[Picture, Picture]:
         largest = max(float(self.uncertainty.max()), float(np.percentile(self.error, _SHOWN_PERCENT)))
         stated, actual = (f"rms {pages.reflectance(value)}" for value in (self.stated, self.actual))
-        ends, title = (0.0, largest), "Actual: |image \N{MINUS SIGN} truth|"
+        style: dict[str, Any] = {"ends": (0.0, largest), "quantity": "uncertainty"}
         return (
-            Picture.of(
-                "stated", "Stated: standard uncertainty", self.uncertainty, stated, ends=ends, quantity="uncertainty"
-            ),
-            Picture.of("actual", title, self.error, actual, ends=ends, quantity="error"),
+            Picture.of("stated", "Stated: standard uncertainty", self.uncertainty, stated, **style),
+            Picture.of("actual", "Actual: |image \N{MINUS SIGN} truth|", self.error, actual, **style),
         )
 
     def summary(self) -> dict[str, Any]:

@@ -595,13 +595,10 @@ class BenchView:
                 legend = f"rgb{(*np.rint(255 * shown.mean(axis=0)).astype(int).tolist(),)}"
             faces = dict(zip("ijk", surface.triangles.astype(np.int32).T, strict=True))
             # Plotly's legend shows all meshes alike, so that a square without a place stands for each of them.
-            square = {
-                "mode": "markers",
-                "marker": {"color": legend, "symbol": "square", "size": 11, "line": {"width": 2}},
-            }
-            parts.append((surface.name, np.full((1, 3), np.nan), {**square, "legendgroup": str(number)}))
-            group = {"legendgroup": str(number), "showlegend": False}
-            parts.append((surface.name, surface.points, {**faces, **color, **group}))
+            square, group = {"color": legend, "symbol": "square", "size": 11}, {"legendgroup": str(number)}
+            nowhere = {"mode": "markers", "marker": {**square, "line": {"width": 2}}, **group}
+            parts.append((surface.name, np.full((1, 3), np.nan), nowhere))
+            parts.append((surface.name, surface.points, {**faces, **color, **group, "showlegend": False}))
         figure = graph_objects.Figure()
         for name, points, style in parts:
             # Plotly's x is the bench's z, and its z, which is up, is y. It reads names, which may be any text, as HTML.

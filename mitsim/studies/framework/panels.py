@@ -447,12 +447,7 @@ def write_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     scenes, cameras = {one.scene for one in sections}, {one.camera for one in sections}
     scene, camera = (names.pop() if len(names) == 1 else "" for names in (scenes, cameras))
     images = any(file.startswith("images") for one in sections for file in one.pictures)
-    shown = {
-        "title": f"{title}: {subject(scene, camera)}",
-        "message": message or title,
-        "sections": sections,
-        "images": images,
-    }
-    page = render_page("study.html", **shown, versions=versions())
+    shown: dict[str, Any] = {"message": message or title, "sections": sections, "images": images}
+    page = render_page("study.html", title=f"{title}: {subject(scene, camera)}", **shown, versions=versions())
     write_text(path, page)
     return path

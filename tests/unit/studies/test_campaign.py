@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import re
 import shutil
 import sys
 import tempfile
@@ -81,7 +82,7 @@ def begun(folder: Path) -> list[str]:
 def contents(folder: Path) -> dict[str, bytes]:
     """All that tells of results: time and place apart."""
     kept = {
-        file.name: file.read_bytes()
+        file.name: re.sub(rb"\d{4}-\d\d-\d\d \d\d:\d\d", b"", file.read_bytes())  # of the page's title
         for file in folder.iterdir()
         if file.suffix in (".csv", ".png", ".svg", ".pdf", ".html")
     }
