@@ -9,6 +9,7 @@ import base64
 import inspect
 import json
 import re
+import struct
 from pathlib import Path
 
 from docutils import nodes
@@ -20,8 +21,8 @@ import mitsim
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = "docs/_build/notebooks"
-TUTORIALS = "first_capture", "own_camera_and_picture", "ambient_light", "gloss_and_depth", "calibrate_and_drift"
-TUTORIALS += "real_captures", "teach_a_network"
+TUTORIALS = "shifting_dots", "own_camera_and_picture", "calibration", "noise", "diffraction", "ambient_light", "gloss"
+TUTORIALS += "interreflection", "depth", "real_captures", "networks"
 """Notebooks in the order to learn by."""
 
 project = "mitsim"
@@ -131,21 +132,25 @@ def face() -> str:
 
 
 def notebooks() -> str:
-    """Markdown that shows every notebook by its title, its first words and the last picture stored in it."""
-    blocks = []
+    """Markdown that shows of every notebook the picture that fits a tile best, with its title."""
+    tiles = []
     for number, name in enumerate(TUTORIALS, 1):
         cells = json.loads((ROOT / f"docs/notebooks/{name}.ipynb").read_text(encoding="utf-8"))["cells"]
-        title, _, words = "".join(cells[0]["source"]).lstrip("# ").partition("\n")
-        blocks.append(f"## [{number}. {title}]({name}.ipynb)\n\n{words.strip()}")
+        title = cells[0]["source"][0].lstrip("# ").strip()
         outputs = [output.get("data", {}) for cell in cells for output in cell.get("outputs", ())]
+        pictures = [base64.b64decode("".join(data["image/png"])) for data in outputs if "image/png" in data]
         picture = ROOT / PICTURES / f"{name}.png"
         picture.parent.mkdir(parents=True, exist_ok=True)
-        picture.write_bytes(
-            base64.b64decode("".join([data["image/png"] for data in outputs if "image/png" in data][-1]))
-        )
-        blocks.append(f"![{title}](/{PICTURES}/{name}.png)")
-    blocks.append("```{toctree}\n:hidden:\n\n" + "\n".join(TUTORIALS) + "\n```")
-    return "\n\n".join(blocks)
+        picture.write_bytes(min(pictures, key=misfit))
+        tiles.append(f"<div>\n\n![{title}](/{PICTURES}/{name}.png)\n\n[{number}. {title}]({name}.ipynb)\n\n</div>")
+    contents = "```{toctree}\n:hidden:\n\n" + "\n".join(TUTORIALS) + "\n```"
+    return "\n".join(["", '<div class="tiles figures">', *tiles, "</div>", "", contents])
+
+
+def misfit(png: bytes) -> float:
+    """Return how far a picture's width over height is from a tile's, as a ratio."""
+    width, height = struct.unpack(">2I", png[16:24])
+    return max(3 * width / (4 * height), 4 * height / (3 * width))
 
 
 def plugins() -> str:
@@ -155,13 +160,15 @@ def plugins() -> str:
     return "\n\n".join(f"```text\n{manual}\n```" for manual in manuals)
 
 
-myst_substitutions = {"face": face(), "notebooks": notebooks(), "plugins": plugins()}
+myst_substitutions = {"face": face(), "plugins": plugins()}
 
 
 def add_contents(_: Sphinx, page: str, source: list[str]) -> None:
-    """What lists the other pages at a page's side belongs to the site alone."""
+    """Add the list of pages, and the tiles of tutorials, which the site alone has."""
     if page == root_doc:
         source[0] += CONTENTS
+    if page == "docs/notebooks/index":
+        source[0] += notebooks()
 
 
 def add_formula(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
@@ -175,7 +182,11 @@ def add_formula(writer: HTML5Translator, node: nodes.math | nodes.math_block) ->
 
 
 def add_front(app: Sphinx, _: Exception | None) -> None:
-    """An index.html that leads to the first page, for browsers that are given the folder."""
+    """Write an index.html that leads to the first page, and mark the gallery's options, so that none is broken."""
+    gallery = Path(app.outdir, "docs/gallery.html")
+    if gallery.exists():
+        marked = re.sub(r"(?<= )--[\w-]+", r'<span class="option">\g<0></span>', gallery.read_text(encoding="utf-8"))
+        gallery.write_text(marked, encoding="utf-8")
     page = f'<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url={root_doc}.html">'
     Path(app.outdir, "index.html").write_text(page, encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""The drawings of docs/physics.md and docs/architecture.md: the shipped devices' numbers in, seven PNG files out.
+"""The drawings of docs/physics.md, architecture.md and validation.md: devices' numbers and tables in, PNG files out.
 
     python docs/images/drawings.py [FOLDER]
 
@@ -8,6 +8,7 @@ which is left for one who looks along +z.
 
 from __future__ import annotations
 
+import re
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -391,6 +392,48 @@ def way() -> Figure:
     return figure
 
 
+def predicted() -> Figure:
+    """Draw predictions against measurements, by the tables of docs/studies.md and docs/growth.md."""
+    figure = Figure(figsize=(10, 3.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    drift, light, seconds = figure.subplots(1, 3)
+    rows = [
+        [number.split(" +- ") for number in row[-3:-1]] for row in _table("studies.md", "| kind | what | amount | meas")
+    ]
+    measured, foretold = (np.array([[float(part) for part in row[side]] for row in rows]) for side in (0, 1))
+    drift.errorbar(foretold[:, 0], measured[:, 0], measured[:, 1], foretold[:, 1], fmt="o", ms=4, lw=0.8, color=BLUE)
+    drift.set(title="Loss by a drift", xlabel="predicted [dB]", ylabel="measured [dB]", xscale="log", yscale="log")
+    rows = [row for row in _table("studies.md", "| scene, patterns | asked") if row[-1] != "-"]
+    mean, error = np.array([[float(part) for part in row[-2].split(" +- ")] for row in rows]).T
+    light.errorbar([float(row[-3]) for row in rows], mean, error, fmt="o", ms=4, lw=0.8, color=ORANGE)
+    light.set(title="Image by a planned calibration", xlabel="predicted [dB]", ylabel="measured [dB]")
+    for heading, name, color in (
+        ("| case | plan [s] | transport [s] | truth", "captures", BLUE),
+        ("| case | plan [s] | transport [s] | optics", "calibrations", ORANGE),
+        ("| case | accumulate", "images", GREEN),
+    ):
+        pairs = [[float(part) for part in row[_TOTAL[name]].split(" / ")] for row in _table("growth.md", heading)]
+        seconds.plot(*np.transpose(pairs), "o", ms=4, color=color, label=name)
+    seconds.set(title="Time of the work", xlabel="predicted [s]", ylabel="measured [s]", xscale="log", yscale="log")
+    seconds.legend(frameon=False, fontsize=8)
+    for panel in (drift, light, seconds):
+        ends = panel.get_xlim()
+        panel.plot(ends, ends, color=GREY, lw=0.8, zorder=0)
+    return figure
+
+
+_TOTAL = {"captures": 7, "calibrations": 5, "images": 4}
+"""Columns of the tables in docs/growth.md that have the total."""
+
+
+def _table(page: str, heading: str) -> list[list[str]]:
+    """Return the cells of each row of the table on a page of docs whose first line begins with the heading."""
+    text = (Path(__file__).parents[1] / page).read_text(encoding="utf-8")
+    block = re.search(rf"^{re.escape(heading)}.*\n.*\n((?:\|.*\n)+)", text, flags=re.M)
+    assert block, f"docs/{page} has no table {heading!r}"
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in block[1].splitlines()]
+
+
 def _between(start: str, end: str) -> dict[str, tuple[float, float]]:
     """The ends of an arrow from one box to another: between the sides that face each other."""
     (column, row, _), (last_column, last_row, _) = BOXES[start], BOXES[end]
@@ -440,7 +483,7 @@ def _measure(
         )
 
 
-DRAWINGS = (devices, axes, shadow, anchors, parallax, passes, way)
+DRAWINGS = (devices, axes, shadow, anchors, parallax, passes, way, predicted)
 
 
 def main() -> None:

@@ -53,6 +53,13 @@ TILES = {
     "diffuser": "seen/pictures/image.png",
 }
 """What a tile of docs/gallery.md shows of what its commands wrote."""
+PARTS = {
+    "view": (0.768, 0.722, 0.94, 0.97),
+    "patterns": (0.4375, 0.375, 0.5625, 0.625),
+    "sweep": (0, 0.34, 1, 1),
+    "network": (0, 0, 0.508, 1),
+}
+"""Left, upper, right and lower end of the part that a tile shows, in pictures, because the whole is not legible."""
 WIDEST = 560
 """Pixels of a tile's picture: two for each of a tile's on the page, nearly."""
 LARGEST = 60_000
@@ -139,7 +146,7 @@ def gallery(work: Path) -> None:
     """Small pictures of what the commands of docs/gallery.md write; what is there already is used."""
     if not (work / "captures").exists():
         (work / "captures").symlink_to(ROOT / "captures")
-    shrink(ROOT / "docs/images/learned.png", ROOT / "docs/images/gallery/network.png")  # of a training of an hour
+    shrink(ROOT / "docs/images/learned.png", "network")  # of a training of an hour
     for name, commands in tiles().items():
         for command in map(shlex.split, commands):
             if "-o" not in command or not (work / command[command.index("-o") + 1]).exists():
@@ -147,13 +154,23 @@ def gallery(work: Path) -> None:
         if name == "view":
             shutil.copyfile(work / TILES[name], ROOT / "docs/images/view.png")  # the tour shows it whole
         if name in TILES:
-            shrink(work / TILES[name], ROOT / f"docs/images/gallery/{name}.png")
+            shrink(work / TILES[name], name)
 
 
-def shrink(path: Path, smaller: Path) -> None:
-    """The picture at ``path``, of a long one its left square, with as many greys or colours as ``LARGEST`` allows."""
-    shown = Image.open(path).convert("RGB")
-    if shown.width > 3 * shown.height:
+def shrink(path: Path, name: str) -> None:
+    """Write the tile ``name`` of the picture at ``path``, with as many greys or colours as ``LARGEST`` allows.
+
+    A tile shows one of ``PARTS``, or the left square of a long picture.
+    """
+    smaller, shown = ROOT / f"docs/images/gallery/{name}.png", Image.open(path).convert("RGB")
+    if name in PARTS:
+        left, upper, right, lower = PARTS[name]
+        shown = shown.crop(
+            tuple(round(end * side) for end, side in zip((left, upper, right, lower), shown.size * 2, strict=True))
+        )
+        if shown.width < WIDEST / 2:
+            shown = shown.resize((2 * shown.width, 2 * shown.height), Image.Resampling.LANCZOS)
+    elif shown.width > 3 * shown.height:
         shown = shown.crop((0, 0, shown.height, shown.height)).resize((WIDEST, WIDEST), Image.Resampling.NEAREST)
     shown.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
     for colours in (256, 128, 64, 32, 16):

@@ -138,7 +138,7 @@ class ProjectorModel(Configuration):
 
     Without an upper end: inf is a black that is black."""
     ansi_contrast: float | None = Field(default=None, gt=1)
-    """Light of the white fields of a chessboard of 4 x 4 over that of the black ones; none: the lens scatters nothing.
+    """Light in the white fields of a 4 x 4 chessboard over that in the black ones; none: the lens scatters nothing.
 
     IEC 61947-1; projectors have 100 to 1000."""
     glare_spread: float = Field(default=0.25, ge=0.1, le=2)

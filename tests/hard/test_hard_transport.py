@@ -68,7 +68,7 @@ def test_a_lobe_that_would_be_missed_flags_the_plan(
     if not seen:
         # Of all light: 95 %. Ten of 2^20 rays fall on this sensor, and a connection may meet the lobe by chance.
         missed = int(reported[0].partition("%")[0]) / 100
-        measured(missed, at_least=0.6, at_most=1, what="of the light is told as missed")
+        measured(missed, at_least=0.6, at_most=1, what="of the light is reported as missed")
 
 
 def test_a_perfect_mirror_is_exact(measured: Recorder, small_scene: Callable[..., Path]) -> None:
@@ -112,7 +112,7 @@ def test_a_heavy_path_shows_and_is_kept(weight: float, seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_capture_tells_of_fireflies(
+def test_a_capture_flags_fireflies(
     measured: Recorder, small_scene: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Roughness 1e-3 without the look for sharp lobes: of 32 768 connections a few meet the lobe, or none.

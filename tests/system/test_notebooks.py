@@ -16,9 +16,10 @@ DOCS = ROOT / "docs" / "notebooks"
 NOTEBOOKS = sorted(DOCS.glob("*.ipynb"))
 LARGEST = 600_000
 """Bytes of a notebook with its outputs."""
+MOST_CELLS = 10
 FIT = {("stream", "stdout"), ("display_data", ""), ("execute_result", "")}
 """Outputs that may come: neither warnings on stderr nor errors."""
-NETWORK = "teach_a_network"
+NETWORK = "networks"
 """The one that needs torch."""
 every = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -52,15 +53,26 @@ def words(cell: dict[str, Any]) -> str:
 
 
 def test_every_notebook_is_in_the_order_to_learn_by_and_leads_to_the_next() -> None:
-    """The site's list names each file, and each but the last ends with a link to the next.
+    """The site's list and the page of tutorials name each file, and each but the last ends with a link to the next.
 
     (Planted: a name missing from the list, a link to the notebook after the next.)"""
     site = (ROOT / "docs" / "conf.py").read_text(encoding="utf-8")
     order = ast.literal_eval(re.sub(r"\nTUTORIALS \+=", ",", re.findall(r"^TUTORIALS = (.*\n.*)", site, flags=re.M)[0]))
     assert sorted(order) == [path.stem for path in NOTEBOOKS]
+    assert re.findall(r"\((\w+)\.ipynb\)", (DOCS / "index.md").read_text(encoding="utf-8")) == [*order]
     for name, following in itertools.pairwise(order):
         last = "".join(read(DOCS / f"{name}.ipynb")["cells"][-1]["source"])
         assert "## Try next\n" in last and f"]({following}.ipynb)" in last
+
+
+@every
+def test_a_notebook_asks_one_question_answers_it_and_is_short(path: Path) -> None:
+    """(Planted: an answer removed, an eleventh cell.)"""
+    cells = read(path)["cells"]
+    first, last = ("".join(cells[number]["source"]) for number in (0, -1))
+    assert len(cells) <= MOST_CELLS
+    assert first.startswith("# ") and "\n**Question.** " in first and "\n**Expectation.** " in first
+    assert last.startswith("**Answer.** ")
 
 
 @every
