@@ -199,14 +199,18 @@ def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
 def replaced(path: Path, marks: Iterable[str]) -> Iterator[None]:
     """Move a folder with an earlier result aside while a new one is made, and back if none is begun.
 
-    A result has a file or a ``kind`` of ``marks``. Other folders, files, and the working folder stay where they are, so
-    that they are refused as an output. MitsimError if another process writes there.
+    A result has a file or a ``kind`` of ``marks``. Files and the working folder stay where they are, so that they are
+    refused as an output. MitsimError for a folder with other content, and if another process writes there.
     """
     place = resolve(path)
     aside = _beside(place, ".replaced")
-    if not _is_result(place, marks) or Path.cwd().is_relative_to(place):
+    free = not place.is_dir() or all(item.name == LOCK for item in place.iterdir())
+    if free or (place / _UNFINISHED).is_file() or Path.cwd().is_relative_to(place):
         yield
         return
+    if not _is_result(place, marks):
+        words = "holds files already, but no earlier result of this command, which alone is replaced"
+        raise MitsimError(f"output {path}: the folder {words}; choose another folder")
     if os.path.lexists(aside):  # a killed process left it
         shutil.rmtree(aside)
     with _lock(path, place / LOCK):
