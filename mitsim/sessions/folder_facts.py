@@ -20,7 +20,7 @@ _IMAGE, _MORE = "mitsim reconstruct {} --calibration {}", ("mitsim report {0}", 
 _NEXT: Mapping[str, tuple[str, ...]] = {
     "run": (_IMAGE.format("{0}", "CAL"), *_MORE),
     "calibration": (_IMAGE.format("RUN", "{0}"), *_MORE),
-    "image": _MORE,
+    "image": ("mitsim compare {0} OTHER -o compared", *_MORE),
     "pairs": ("mitsim train unrolled {0} -o model.pt",),
     "session": ("mitsim run {0}/session.toml -o again",),
 }
