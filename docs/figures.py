@@ -233,7 +233,7 @@ def tour_figures() -> dict[str, float]:
         "ssim": r"SSIM ([\d.]+),",
         "truth_db": r"truth good to ([\d.]+) dB",
         "mc_error": r"Monte Carlo error ([\d.e+-]+),",
-        "factor_error": r"Factor error ([\d.e+-]+),",
+        "factor_error": r"factor error ([\d.e+-]+)",
         "uncertainty": r"Standard uncertainty ([\d.e+-]+) rms",
     }
     return {name: float(re.findall(pattern, text)[0]) for name, pattern in patterns.items()}

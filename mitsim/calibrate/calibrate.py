@@ -56,12 +56,15 @@ from mitsim.reconstruct.factors import (
     stripe_sums,
 )
 from mitsim.reconstruct.session_check import CheckedSession, check_session
+from mitsim.reconstruct.solver import Verdict
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses from which factors are estimated."""
 _SAVED_EVERY, _SAVED_AFTER_S = 8, 0.5
 """Responses and seconds between two checkpoints."""
 _REPEATS_BEHIND_FILTERS = 4
+_AS_STATED = 1.2
+"""Ratio of measured to stated residual up to which the stated camera explains it."""
 """Default repeats behind filters, because most pixels see a tenth of a line that fills others."""
 
 
@@ -286,8 +289,11 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
     physics, lacks = lit.light.simulation.physics, None
     if physics.geometry.few_wave_terms:
         lacks = lacking(session.shadow(physics.geometry, physics.spectrum), clean.left, clean.right)
-    warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
-    warnings += faults.warnings
+    # The warnings of the session name the residual that the stated mask and sensor explain.
+    stated = _AS_STATED * np.hypot(clean.separability_residual, bench.sensor.response_parts[0])
+    named = session.warnings and noisy.status.verdict is Verdict.NOT_SEPARABLE and noisy.unexplained < stated
+    reasons = () if named else noisy.status.reasons
+    warnings = (*lit.light.warnings, *session.warnings, *reasons, *faults.warnings)
     if saturated:
         warnings += (
             f"saturation: {saturated} of {session.shots} frames have pixels at the full well or the ADC's end, "
@@ -354,11 +360,16 @@ def estimates(
     # A stated drift of the lamp is not divided out, so that the user sees its effect.
     unsteady = bool(drift.session_ramp or drift.session_flicker)
     with job.clock.stage("estimate"):
-        judged = [CheckedSession(sums) for sums in found.values()]
+        judged, clean = [CheckedSession(sums) for sums in found.values()], found.get(NOISE_FREE)
         if kinds[0] == NOISY:
             try:
                 judged[0] = check_session(
-                    found[NOISY], session.signs, session.order, saturated=bool(saturated), unsteady=unsteady
+                    found[NOISY],
+                    session.signs,
+                    session.order,
+                    saturated=bool(saturated),
+                    unsteady=unsteady,
+                    stated=clean,
                 )
             except MitsimError as error:
                 # A real session would be refused. A simulated one is flagged, because the bench asks for it, and

@@ -199,7 +199,7 @@ def modelled_factors(
             f"({decibels(unexplained):.1f} dB)",
             f"{other}, or measure the factors with all patterns",
         )
-        warnings.append(str(status))
+        warnings += status.reasons
     angle, error = fitted.placement.mask_rotation, fitted.errors.get("mask_rotation")
     if error is not None and abs(angle) >= _SIGNIFICANT * error:
         turned = [(angle * one, other) for one, other in camera.rotation_terms(fitted.placement)]

@@ -45,6 +45,7 @@ from mitsim.core.colour_files import MONO, RUN, read_colours
 from mitsim.core.configuration import OUTPUT, QUALITY, WHAT, option
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PAIRS, check_apart, check_output, output_file
+from mitsim.core.headline import each_once, frames_headline
 from mitsim.core.job import compiled_kernels, memory_from_here, memory_since, running_seconds
 from mitsim.core.manifests import MANIFEST, resumable
 from mitsim.core.worker import RESUME, advise
@@ -349,6 +350,7 @@ def capture(asked: Capturing) -> int:
             payload = payload_of_lines(RUN, {name: run.summary() for name, run in found.items()}, output)
         else:
             payload = found.summary()
+    payload["headline"] = frames_headline(payload.get("channels", [payload]), payload["warnings"])
     payload["memory_bytes"] = memory_since(held)
     return asked.finish_folder(output, payload, _capture_lines(payload, asked), payload["warnings"])
 
@@ -378,7 +380,7 @@ def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output
         "kind": colours.kind,
         "channels": [{**line.model_dump(), **results[line.name]} for line in colours.channels],
         **{name: results[colours.names[-1]].get(name) for name in ("seconds", "kernels")},
-        "warnings": tuple(f"{name}: {text}" for name, result in results.items() for text in result["warnings"]),
+        "warnings": each_once({name: result["warnings"] for name, result in results.items()}),
         "output": str(output),
     }
 
@@ -398,27 +400,22 @@ def _kernel_lines(kernels: Mapping[str, float]) -> list[str]:
 
 def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
     """Return the lines of a capture for the terminal, by its ``payload``."""
-
-    def frames(part: Mapping[str, Any]) -> str:
-        return f"{part['frames']} frames of {part['shape'][0]}x{part['shape'][1]}"
-
     taken = payload["seconds"]
+    lines = [f"Run: {payload['output']} (in {taken['total']:.1f} s)"]
     if payload.get("kind") == RUN:
-        lines = [f"{len(payload['channels'])} lines in {taken['total']:.1f} s: {payload['output']}"]
         for part in payload["channels"]:
             lines.append(
-                f"{part['name']}: {frames(part)}, Monte Carlo error {part['mc_error']:.1e}, total error up to "
+                f"{part['name']}: Monte Carlo error {part['mc_error']:.1e}, total error up to "
                 f"{part['total_error_bound']:.1e}, exposure {part['exposure_s']:.3g} s a frame"
             )
     else:
         stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in taken.items() if name != "total")
-        behind = f" behind {payload['mosaic']} filters" if "mosaic" in payload else ""
-        lines = [
-            f"{frames(payload)}{behind} in {taken['total']:.1f} s: {payload['output']}",
+        lines += [
+            *([f"Frames are behind {payload['mosaic']} filters"] if "mosaic" in payload else []),
             f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
             f"exposure {payload['exposure_s']:.3g} s a frame",
             *common.details(
-                f"Total error up to {payload['total_error_bound']:.1e}, accuracy {payload['accuracy']:g}",
+                f"Accuracy {payload['accuracy']:g}",
                 f"Seconds: {stages}",
                 memory_line(payload),
             ),

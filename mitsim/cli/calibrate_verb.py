@@ -18,6 +18,7 @@ from mitsim.core.colour_files import CALIBRATION, is_coloured
 from mitsim.core.configuration import OUTPUT, WHAT, option
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_output, output_file, prepare_output, write_text
+from mitsim.core.headline import calibration_headline, each_once
 from mitsim.core.job import memory_from_here, memory_since
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.framelist import load_frames, load_known
@@ -59,29 +60,28 @@ def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memo
         name: {**each.manifest.result, "memory_bytes": memory, "warnings": each.warnings, "output": str(folder / name)}
         for name, each in found.items()
     }
-    lines = []
-    for result in results.values():
+    lines = list[str]()
+    for name, result in results.items():
         # JSON has null for infinite numbers.
         names = "separability_residual", "noise_free_residual", "phi_error", "predicted_phi_error", "condition"
         numbers = (result.get(name) for name in names)
         residual, clean, error, predicted, condition = (math.inf if each is None else each for each in numbers)
         simulated, divisor = "shadow_residual" in result, result.get("divided_by", 1)
         lines += [
-            f"{result['frames']} frames of {result['n']} stripes in {result['seconds']['total']:.1f} s: "
-            f"{result['output']}",
-            f"Factor error {error:.1e}, separability residual {residual:.2%} ({clean:.1e} without noise)"
-            if simulated
-            else f"Factor error {predicted:.1e} predicted from noise, separability residual {residual:.2%}",
+            f"Calibration: {result['output']} ({result['frames']} frames in {result['seconds']['total']:.1f} s)",
+            *([f"Factor error {error if simulated else predicted:.1e}"] if name else []),
+            f"Separability residual {residual:.2%}"
+            + (f" ({clean:.1e} without noise)" if simulated else "; the factor error is predicted from the noise"),
             *asked.details(f"Condition {condition:.2e}", memory_line(result)),
             *([] if divisor == 1 else [f"Numbers are divided by {divisor}, their common factor"]),
             *(f"Not known: {text}" for text in result.get("not_known", ())),
         ]
-    warnings: Any = [text for each in found.values() for text in each.warnings]
+    warnings = each_once({name: each.warnings for name, each in found.items()})
     payload = results[""] if [*results] == [""] else {"depths": [*results.values()], "output": str(folder)}
     if is_coloured(folder):
         payload = {**payload_of_lines(CALIBRATION, results, folder), "memory_bytes": memory}
-        warnings = payload["warnings"]
-    return asked.finish_folder(folder, {**payload, "warnings": warnings}, lines, warnings)
+    payload = {**payload, "headline": calibration_headline([*results.values()], warnings), "warnings": warnings}
+    return asked.finish_folder(folder, payload, lines, warnings)
 
 
 def _simulated(asked: Calibrating, folder: Path) -> int:
@@ -135,14 +135,16 @@ def _known(asked: Calibrating, folder: Path) -> int:
         name: {**each.manifest.result, "warnings": each.warnings, "output": str(folder / name)}
         for name, each in found.items()
     }
-    warnings = list(dict.fromkeys(text for each in results.values() for text in each["warnings"]))
+    warnings = each_once({name: each["warnings"] for name, each in results.items()})
     first = next(iter(results.values()))
-    payload = {**first, "memory_bytes": memory_since(held), "warnings": warnings, "output": str(folder)}
+    payload = {"headline": calibration_headline([*results.values()], warnings), **first, "output": str(folder)}
+    payload |= {"memory_bytes": memory_since(held), "warnings": warnings}
     if captures.lines is not None:
         payload["planes"] = results
     rows, columns = first["scale"]
     lines = [
-        f"{first['frames']} frames of {first['pictures']} pictures in {first['seconds']['total']:.1f} s: {folder}",
+        f"Calibration: {folder} ({first['frames']} frames of {first['pictures']} pictures in "
+        f"{first['seconds']['total']:.1f} s)",
         f"Pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
         "columns of pixels",
     ]
@@ -200,8 +202,10 @@ def _fit(asked: Calibrating, folder: Path) -> int:
         for name, number in result["parameters"].items()
         if number["standard_error"] is not None
     ]
+    result["headline"] = calibration_headline([result], factors.warnings)
     lines = [
-        f"{result['model']} model fitted to {result['frames']} frames in {result['seconds']['total']:.1f} s: {folder}",
+        f"Calibration: {folder} ({result['model']} model fitted to {result['frames']} frames in "
+        f"{result['seconds']['total']:.1f} s)",
         *numbers,
         f"Unexplained {result['unexplained_residual']:.2%}, chi-square {result['chi_square']:.3g} a datum, condition "
         f"{result['condition']:.2e}",

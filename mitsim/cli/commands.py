@@ -155,10 +155,14 @@ class Pictured(Common):
     def finish_folder(
         self, folder: Path, payload: Mapping[str, Any], lines: Sequence[str], warnings: Sequence[str]
     ) -> int:
-        """Make the pictures and the page of a finished ``folder``, which JSON names as ``report``; print the result."""
+        """Make the pictures and the page of a finished ``folder``, which JSON names as ``report``; print the result.
+
+        The ``headline`` of the ``payload`` is printed before the ``lines``.
+        """
         made, failed = self._attempt(lambda: page_of(folder), f"`mitsim report {folder}` makes them later")
         said = [] if made is None else [page_line(made)]
-        return self.finish({**payload, "report": made}, [*lines, *said], [*warnings, *failed])
+        lines = [payload["headline"], *lines, *said]
+        return self.finish({**payload, "report": made}, lines, [*warnings, *failed])
 
     def finish_frame(
         self,
@@ -462,23 +466,29 @@ def wrap_text(text: str, indent: str = "") -> list[str]:
 def print_result(as_json: bool, payload: Any, lines: Iterable[str], warnings: Sequence[str]) -> int:
     """Print a result as one JSON object, the ``payload``, or as ``lines`` of text.
 
-    Return exit status 1 if there are ``warnings``, which go to stderr in either case. If nobody reads standard output
-    any more, end the program quietly as SIGPIPE does; raise MitsimError if it cannot be written for another reason,
-    such as a full disk.
+    Return exit status 1 if there are ``warnings``, which go to stderr in either case, after the first line. If nobody
+    reads standard output any more, end the program quietly as SIGPIPE does; raise MitsimError if it cannot be written
+    for another reason, such as a full disk.
     """
-    try:
-        if as_json:
-            print(json.dumps(plain(payload), allow_nan=False))
-        for line in () if as_json else lines:
-            for part in printable(line).split("\n"):
-                # Columns of a table stay one below the other.
-                print(*([part] if "  " in part.strip() else wrap_text(part)), sep="\n")
-        sys.stdout.flush()
-    except OSError as error:
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - what the exit writes has to go somewhere
-        if isinstance(error, BrokenPipeError):
-            sys.exit(128 + signal.SIGPIPE)
-        raise MitsimError(f"standard output: cannot be written ({error.strerror}); give it another place") from None
+
+    def write(texts: Iterable[str]) -> None:
+        try:
+            for text in texts:
+                print(text)
+            sys.stdout.flush()
+        except OSError as error:
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - what the exit writes has to go somewhere
+            if isinstance(error, BrokenPipeError):
+                sys.exit(128 + signal.SIGPIPE)
+            raise MitsimError(f"standard output: cannot be written ({error.strerror}); give it another place") from None
+
+    def wrapped(line: str) -> Iterable[str]:
+        for part in printable(line).split("\n"):  # columns of a table stay one below the other
+            yield from [part] if "  " in part.strip() else wrap_text(part)
+
+    first, *rest = [[json.dumps(plain(payload), allow_nan=False)]] if as_json else [*map(wrapped, lines)] or [[]]
+    write(first)
     for warning in warnings:
         print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
+    write(line for each in rest for line in each)
     return 1 if warnings else 0

@@ -143,22 +143,20 @@ def reconstruct(asked: Reconstructing) -> int:
 def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> list[str]:
     """Return the lines of an image for the terminal, by its ``payload``."""
     image, rank = result.reconstruction, payload["rank"]
-    inherits = image.status.verdict.good and not image.ok
-    if result.quality is not None:
-        verdict = f"{'Flagged' if inherits else image.status.verdict.value.capitalize()}: {result.quality}"
-    else:
-        verdict = f"Flagged: {image.status.flags[0]}" if inherits else f"{image.status.sentence}."
     rank_words = "" if rank is None else f", rank {rank}, condition {payload['condition_whole']:.3g}"
+    quality = str(result.quality or "").partition(", ")[2]  # its PSNR is in the headline
     trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit, image.fit) if known)
+    partly = image.ok and image.status.remedy
     return [
-        verdict,
         f"Image: {payload['output']}",
+        *([f"{image.status.sentence}; {image.status.remedy}"] if partly else []),
         *([] if payload["white"] == 1 else [f"image.png shows {payload['white']:.3g} electrons/s as white"]),
         *([] if image.focus is None else [str(image.focus)]),
+        *([quality] if quality else []),
         *([trust.capitalize()] if trust else []),
         *image.limits,
         *common.details(
-            *([str(image.status)] if image.ok else []),  # a warning has it otherwise
+            *([image.status.figures] if image.status.figures else []),
             f"lambda {payload['lambda']:.3g}, residual {payload['residual']:.1e}{rank_words}",
             *image.trust,
         ),
@@ -167,13 +165,10 @@ def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> l
 
 def _colours_lines(found: ColourImage, common: Pictured) -> list[str]:
     """Return the lines of an image in colour for the terminal."""
-    verdict = "Solved" if found.ok else "Flagged"
-    quality = f"PSNR {found.psnr_db:.2f} dB over all lines" if found.psnr_db is not None else "an image of every line"
     return [
-        f"{verdict}: {quality}",
         f"Image: {found.output}",
         *(f"{name}: {row}" for name, row in found.table.items()),
-        *(f"{text[0].upper()}{text[1:]}" for text in found.sentences),
+        *found.sentences,
         *common.details(*found.described),
     ]
 
@@ -380,11 +375,9 @@ def import_(asked: Importing) -> int:
     else:
         with asked.job() as job:
             payload = mitsim.import_frames(source, output, job, **facts)
-    lines = []
-    if payload["output"]:
-        lines.append(f"{payload['frames']} frame{'s' if payload['frames'] != 1 else ''}: {payload['output']}")
+    lines = [f"Run: {payload['output']}"] if payload["output"] else []
     if payload["calibration_output"]:
-        lines.append(f"calibration: {payload['calibration_output']}")
+        lines.append(f"Calibration: {payload['calibration_output']}")
     elif "calibration" in payload["holds"]:
         lines.append("The file also contains a calibration; write it with --calibration-output CAL")
     lines += payload.get("notes", ())
@@ -392,7 +385,7 @@ def import_(asked: Importing) -> int:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
     if payload["output"]:
         return asked.finish_folder(Path(payload["output"]), payload, lines, payload["warnings"])
-    return asked.finish({**payload, "report": None}, lines, payload["warnings"])
+    return asked.finish({**payload, "report": None}, [payload["headline"], *lines], payload["warnings"])
 
 
 class Drawing(Pictures, Replaced, Common):

@@ -15,6 +15,7 @@ from mitsim.core import colour_files, configuration, manifests, picture_files
 from mitsim.core.configuration import FilePath, Options, option, takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
+from mitsim.core.headline import calibration_headline, each_once, frames_headline
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest
 from mitsim.core.seeds import check_root
 from mitsim.devices.patterns import read_name, takes_seed
@@ -189,6 +190,8 @@ def import_file(
     check_plain(source)  # refused before numpy is imported
     if channel is not None:
         picture_files.check_channel(channel)
+    from mitsim.core.runs import load_run
+
     with _function(READERS[source.suffix.lower()])(source, channel) as (run, calibration):
         wanted = {
             "run": ("output", output, run),
@@ -204,8 +207,12 @@ def import_file(
     parts = {} if calibration is None or calibration_output is None else calibration.parts
     angles = sorted({part.manifest.configuration.get(TURNED, 0) for part in parts.values()})
     turned = [f"Its frames are turned by {each:g} degrees: import them with --turn {each:g}" for each in angles if each]
-    flags = [f"{line}: {text}" if line else text for line, part in parts.items() for text in part.manifest.warnings]
+    taken = {} if run is None or output is None else {name: load_run(Path(output) / name) for name in run.parts}
+    flags = [*each_once({line: part.warnings for line, part in taken.items()})]
+    shown = frames_headline([part.summary() for part in taken.values()], flags) if taken else ""
+    flags += each_once({line: part.manifest.warnings for line, part in parts.items()})
     return {
+        "headline": shown or calibration_headline([part.manifest.result for part in parts.values()], flags),
         "frames": None if run is None else _frames_of(run),
         "output": None if output is None else str(output),
         "calibration_output": None if calibration_output is None else str(calibration_output),

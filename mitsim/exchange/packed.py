@@ -35,6 +35,7 @@ from mitsim.core.files import (
     whole_folder,
     write_text,
 )
+from mitsim.core.headline import each_once, frames_headline
 from mitsim.core.images import LEAST_RESPONSE, CommonFactor, Numbers, Preparer, image_pages, read_images
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import (
@@ -484,7 +485,10 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     content = Content(runs, colours, "" if colours is None else json.dumps(colours.model_dump(mode="json")))
     with whole_folder(output) as place:
         content.fill(place)
+    imported = {"frames": count, "shape": shape, "total_error_bound": None}
+    warnings = [*each_once({"": warnings})]
     return {
+        "headline": frames_headline([imported] * len(runs), warnings),
         "frames": count * len(runs),
         "shape": [*shape],
         "output": str(output),

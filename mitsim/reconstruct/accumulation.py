@@ -41,6 +41,8 @@ PRINT = (1 + EDGES) / 2
 CHANCE = 6.0
 """Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
 TINY = 1e-300
+OFF = 7e-3
+"""Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +149,8 @@ class FrameNoise:
 
     Variances [(electrons/s)^2] of the ``ambient`` frame are by sensor row (m,) and column (m',); those of patterns (K,
     K'), ``rows`` (K, K', m) and ``columns`` (K, K', m') do not include it. ``light_error`` is the relative error of
-    single projector pixels' light in simulated frames.
+    single projector pixels' light in simulated frames. Such an error is one of the image, so that its energy
+    ``explained`` leaves no residual.
     """
 
     def __init__(self, manifest: RunManifest, ambient: Pair | None = None) -> None:
@@ -163,6 +166,7 @@ class FrameNoise:
         self.rows: FloatArray = np.zeros((*counts, 0))
         self.columns: FloatArray = np.zeros((*counts, 0))
         self.power, self.shots, self.saturated, self.readings = 0.0, 1, 0, 0
+        self.explained = 0.0
         self.light: FloatArray = np.zeros((0, 0))
 
     @property
@@ -171,11 +175,18 @@ class FrameNoise:
 
     @property
     def rendering(self) -> float:
-        return float((self._sampling**2 + self._systematic**2) * self.power)
+        """Energy of rendering errors that no image explains."""
+        return max(self._sampling**2 * self.power - self.explained, 0.0) + self._systematic**2 * self.power
 
     @property
     def discretisation(self) -> float:
         return float(self._systematic**2 * self.power) if self.light_error else self.rendering
+
+    @property
+    def coarse(self) -> float:
+        """Relative error that a simulation states of its frames; 0 if it is no more than that of a camera."""
+        error = float(np.sqrt(self.discretisation / max(self.power, TINY)))
+        return error if error > OFF else 0.0
 
     def of(self, light: FloatArray | float, shots: int) -> FloatArray:
         # The difference of a pair has no ambient frame.
@@ -329,6 +340,7 @@ def accumulate(shots: Capture, factors: Factors, solver: Solver = SOLVERS[TIKHON
         if few:
             kept.append(measurement)
             coefficients[measurement.row, measurement.column] = own
+    noise.explained = noise.light_error**2 * float(np.square(prepared.sigma).sum())
     model = Model(prepared, factors.sides, shots.patterns)
     return Accumulation(shots, factors, solver, model, frames, noise, tuple(kept), coefficients, iterative)
 

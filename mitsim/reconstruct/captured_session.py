@@ -131,8 +131,7 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...]) -> Fac
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         estimate = found.estimate(signs, noise)
-    warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
-    warnings += found.warnings
+    warnings: tuple[str, ...] = (*doubts, *estimate.status.reasons, *found.warnings)
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "

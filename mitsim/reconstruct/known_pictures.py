@@ -500,8 +500,7 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
             code = "one code a side explains" if terms == 1 else f"{terms} codes that change over the scene explain"
             sentence = f"Calibrated by known pictures: {code} {explained:.1%} of the frames beside uniform light"
         status = Status(verdict, sentence, remedy, figures)
-        # Without its figures, which differ by plane.
-        warnings = (*doubts, *(() if status.ok else (f"{sentence}; {remedy}.",)))
+        warnings = (*doubts, *status.reasons)
         result: dict[str, Any] = {
             "n": left.shape[1],
             "frames": read.frames,

@@ -45,7 +45,7 @@ from scipy.sparse import csr_matrix
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.accumulation import CHANCE, TINY, Accumulation, DerivedCapture, FrameNoise, print_energy
+from mitsim.reconstruct.accumulation import CHANCE, OFF, TINY, Accumulation, DerivedCapture, FrameNoise, print_energy
 from mitsim.reconstruct.factors import decibels
 from mitsim.reconstruct.residuals import NoiseTest, Place, Reading, Residuals, find_readings, is_negative
 from mitsim.reconstruct.solver import IndexArray, Pair, Solution, Status, robust_scatter
@@ -295,8 +295,6 @@ def _limit(count: int) -> float:
 
 # ---- Single frames ---------------------------------------------------------------------------------------------------
 
-OFF = 7e-3
-"""Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
 _DOTS = "under dots each scene pixel is in one frame, so that only the picture shows a change of lamp, camera or scene."
 _LEAKING = "Light of the room cancels. A projector that leaks it since it was calibrated darkens the image as much."
@@ -340,7 +338,9 @@ class FrameCheck:
 
     def faults(self) -> tuple[FrameFault, ...]:
         noise, count, sums, picture = self._data.noise, len(self._shots), self._sums, self.picture
-        found, powers, by_model = list[FrameFault](), list[FrameFault](), [*self._unlike_model()]
+        # The error of a coarse simulation differs by pattern, so that no frame is at fault.
+        by_model = [] if noise.coarse else [*self._unlike_model()]
+        found, powers = list[FrameFault](), list[FrameFault]()
         if abs(float(noise.means.sum())) < CHANCE * float(np.sqrt(noise.variance.sum() / sums.squares.size)):
             found.append(self._fault("dark", range(count), "holds no light" if count == 1 else "hold no light"))
         for digest, shots in sums.same.items():
@@ -362,7 +362,7 @@ class FrameCheck:
                 words = "show a part of the scene otherwise than the frames around"
                 powers.append(self._fault("picture", strongest, words))
             powers += self._powers(picture.power, picture.power_error, range(count), 15.0)
-        if len(sums.powers) >= 4 and noise.stated:
+        if len(sums.powers) >= 4 and noise.stated and not noise.coarse:
             power, error = np.concatenate([*sums.powers.values()], axis=1)
             numbers = [self._number[(*pattern, sign)] for pattern in sums.powers for sign in (1, -1)]
             powers += self._powers(power, error, numbers, CHANCE)
@@ -503,9 +503,9 @@ class Misfit:
     """Part of the measurements that the model does not explain, and its cause.
 
     ``chi_square`` is the residual's energy over the expected one, by tile in ``tiles``; ``unexplained`` is the rms of
-    the excess beyond print, relative to the measurements, of which the calibration predicts ``predicted``. Without
-    ``stated`` noise only gross misfit is flagged. ``noise`` is measured over stated noise, ``gain`` the camera's stated
-    gain [DN per electron].
+    the excess beyond print, relative to the measurements, of which the calibration predicts ``predicted``. A
+    simulation that is stated to be coarse has the relative error ``rendered``. Without ``stated`` noise only gross
+    misfit is flagged. ``noise`` is measured over stated noise, ``gain`` the camera's stated gain [DN per electron].
     """
 
     chi_square: float
@@ -518,6 +518,7 @@ class Misfit:
     noise: NoiseTest | None = None
     gain: float | None = None
     predicted: float | None = None
+    rendered: float = 0.0
     faults: tuple[FrameFault, ...] = ()
     places: tuple[Place, ...] = ()
     readings: tuple[Reading, ...] = ()
@@ -586,6 +587,9 @@ class Misfit:
         sentence, remedy = head + self.reason, self.cause.value[1]
         if self.predicted:
             sentence += f"; its calibration foretells up to {self.predicted:.1%} ({decibels(self.predicted):.1f} dB)"
+        if self.rendered:
+            sentence += f"; the run states an error of {self.rendered:.1%} of its own light"
+            remedy = f"capture with a finer accuracy; otherwise {remedy}"
         if len(self.faults) > _SHOWN and self.cause is Cause.FRAMES:
             sentence += f"; and {len(self.faults) - _SHOWN} more"
         return status.with_misfit(sentence, remedy)
@@ -616,7 +620,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     energies = sums.residual, sums.energy, sums.expected_energy(ratio, factor_energy or 0.0), sums.pixels
     found, excess = weigh(energies, known, noise, of_ramps)
     chi_square = whole / max(stated + beside, TINY) if off else found.chi_square  # by the stated noise
-    found = replace(found, noise=test, gain=digital.gain_dn_per_e, chi_square=chi_square)
+    found = replace(found, noise=test, gain=digital.gain_dn_per_e, chi_square=chi_square, rendered=noise.coarse)
     if lack := data.lack(image):
         found = replace(found, predicted=float(np.sqrt(lack[1] / energy)))
     if with_defects and noise.stated and not sums.clipped:

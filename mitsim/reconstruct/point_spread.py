@@ -53,6 +53,7 @@ from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
+from mitsim.core.headline import each_once
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
@@ -594,7 +595,7 @@ def reconstruct_psf_request(
         known = variance / reduce**2 / camera.count if digital.noise_is_stated else None
         fit = find_fit(camera, frames, known)
     status = fit.judge(solution.status)
-    flags = [f"The capture was flagged: {' '.join(warning.split()).rstrip('.')}." for warning in shots.warnings]
+    flags = [*each_once({"the capture": shots.warnings})]
     if saturated:
         flags.append(f"{saturated} readings are at the full well or the ADC's end: use a shorter exposure.")
     return Reconstruction(

@@ -14,6 +14,7 @@ from mitsim.core.configuration import Drawn, takes
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields
 from mitsim.core.exr import verify_files, write_frame
 from mitsim.core.files import output_folder, plain, read_json, remove_page, write_bytes, write_json
+from mitsim.core.headline import each_once, image_headline
 from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
@@ -208,8 +209,9 @@ class Reconstruction(Solution):
             "uncertainty_budget": known_to and known_to.budget,
             "uncertainty_extrapolated": known_to and known_to.extrapolated,
             "regularisation_bias_factor": known_to and known_to.bias_factor,
+            "shape": self.image.shape,
             "status": str(self.status),
-            "warnings": () if self.ok else (str(self.status),),
+            "warnings": self.status.reasons,
             "seconds": {**self.seconds, "total": sum(self.seconds.values())},
             "predicted": self.predicted and self.predicted.seconds,
             "predicted_seconds": self.predicted and sum(self.predicted.seconds.values()),
@@ -259,7 +261,8 @@ class Reconstruction(Solution):
                 checksums[name] = write_frame(folder / name, values, {"method": self.inputs["method"]})
         checksums[PICTURE_FILE] = write_bytes(folder / PICTURE_FILE, png(self.image / self.white))
         stated = {"inputs": self.inputs, "checksums": checksums}
-        write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), **stated})
+        result = {**(more or {}), **self.summary(), **stated}
+        write_json(folder / RESULT_FILE, {"headline": image_headline(result, self.status.reasons), **result})
         return folder
 
     @takes(Drawn)
@@ -415,11 +418,7 @@ def reconstruct_request(
             uncertainties = replace(uncertainties, sources={**uncertainties.sources, "frames": frames})
     status, image = misfit.judge(solution.status) if misfit else solution.status, solution.image
     doubts.append(uncertainties.loss(image) if uncertainties else "")
-    inherited = (
-        f"The {what} was flagged: {' '.join(warning.split()).rstrip('.')}."
-        for what, warnings in (("capture", data.shots.warnings), ("calibration", factors.warnings))
-        for warning in warnings
-    )
+    inherited = each_once({"the capture": data.shots.warnings, "the calibration": factors.warnings})
     flags = (*status.flags, *filter(None, doubts), *inherited)
     left, right = data.model.sides
     return Reconstruction(

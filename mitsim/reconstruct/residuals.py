@@ -320,7 +320,7 @@ class Residuals:
             typical, usual = away.ravel()[::step], np.median((squares / own).ravel()[::step])
             away = (away - np.median(typical)) / max(robust_scatter(typical), 1.0)
             beyond[name] = np.where(away > 7.0, squares - usual * own, 0.0)
-        least = 0.02 * float(whole[1].sum())
+        least = 0.02 * float(whole[1].sum()) + self.noise.rendering  # whose error is not even
         found = []
         for name, each in beyond.items():
             if each.sum() > least:

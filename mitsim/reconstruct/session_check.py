@@ -203,13 +203,17 @@ def check_session(
     name: Callable[[Half], str] = frame_words,
     saturated: bool = False,
     unsteady: bool = False,
+    stated: tuple[StripeSums, StripeSums] | None = None,
 ) -> CheckedSession:
     """Check a session, make repairs that a check afterwards confirms, and add remaining errors to the stated error.
 
     ``order`` and ``name`` are those of the frames. The lamp's power is not divided out of a session whose lamp is
-    stated as ``unsteady``. Raises MitsimError for faults that cannot be mended, with the frames that do not fit.
+    stated as ``unsteady``. Light that noise-free responses of the ``stated`` camera contain, too, is not ambient.
+    Raises MitsimError for faults that cannot be mended, with the frames that do not fit.
     """
     check = _Check(sums, signs, order, name)
+    for own, expected in zip(check.sides, stated or (), strict=False):
+        own.ambient = own.ambient - expected.ambient
     if not check.paired:
         apart = abs(check.sides[0].power - check.sides[1].power)
         for own in check.sides:
@@ -255,7 +259,7 @@ class _Side:
         self.side: Side = SIDES[axis]
         self.vectors, self.misfits = sums.vectors.copy(), sums.misfits.copy()
         self.extras: dict[str, float] = {}
-        self.light = AmbientLight(sums.common, len(self.vectors))
+        self.light, self.ambient = AmbientLight(sums.common, len(self.vectors)), sums.ambient
         self.misfits -= self.light.energies(sums.ambient)  # ambient light that changes within pairs is no noise
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
         self.noise = self.variance * len(self.vectors) / float(np.dot(sums.common, sums.common))
@@ -402,7 +406,7 @@ class _Check:
         return True
 
     def subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
-        for found, effect, scale in zip(own.sums.ambient.T, own.light.effects, own.light.variances, strict=True):
+        for found, effect, scale in zip(own.ambient.T, own.light.effects, own.light.variances, strict=True):
             variance = own.variance * scale
             # Without pairs, all responses share the uniform and dark frames, a third of their noise at most.
             shared = 0.0 if self.paired else float(np.median(found))

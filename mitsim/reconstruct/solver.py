@@ -100,6 +100,14 @@ class Status:
         """Whether the verdict is good and nothing was flagged before."""
         return self.verdict.good and not self.flags
 
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Reasons why the result is flagged, each with its remedy."""
+        own = f"{self.sentence}; {self.remedy}" if self.remedy else self.sentence
+        if self.verdict.good:
+            return (*self.flags, own) if self.flags and self.remedy else self.flags
+        return own, *self.flags
+
     def __str__(self) -> str:
         remedy = f"; {self.remedy}" if self.remedy else ""
         return " ".join(part for part in (f"{self.sentence}{remedy}.", self.figures, *self.flags) if part)
@@ -732,7 +740,7 @@ class Prepared:
             words = f"Ill-conditioned: rounding may change more than {ROUNDING_LIMIT:.0%} of the image"
             return status(Verdict.ILL_CONDITIONED, words, f"raise lambda above {least:.1e}, or use more patterns")
         if lost:
-            words = f"Solved, but {lost} of {self.unknowns} directions are not measured above {limit}"
+            words = f"Partly measured: {lost} of {self.unknowns} directions are not measured above {limit}"
             remedy = "use more patterns" if limit == "rounding" else "calibrate with more frames, or use more patterns"
             return status(Verdict.PARTLY_MEASURED, f"{words} and follow from lambda alone", remedy)
         return status(Verdict.SOLVED, "Solved: every direction of the image is measured")

@@ -133,8 +133,8 @@ def _find_minimum(
         words = f"Not converged: after {iterations} iterations {name} {far}"
         found = status(Verdict.NOT_CONVERGED, words, f"{remedy} or a larger tolerance")
     elif lost:
-        words = f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured"
-        words += f" above {limit} and follow from {name} alone"
+        words = f"Partly measured: {lost} of {prepared.unknowns} directions are not measured above {limit}"
+        words += f" and follow from {name} alone, which converged in {iterations} iterations"
         found = status(Verdict.PARTLY_MEASURED, words, "use more patterns")
     else:
         words = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"

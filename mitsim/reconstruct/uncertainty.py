@@ -230,7 +230,7 @@ class Uncertainty:
         return self.bias_factor > 1.35 and 2 * lost**2 > rms(self.total) ** 2
 
     def loss(self, image: FloatArray) -> str:
-        """Return a sentence if lambda removes most of an ``image``, or the uncertainty exceeds it, else nothing."""
+        """Return a sentence if lambda removes most of an ``image``, or most of it is noise, else nothing."""
         lost, left, total = self.budget.get("regularisation_bias", 0.0), rms(image), rms(self.total)
         if lost > left:
             return (
@@ -238,7 +238,7 @@ class Uncertainty:
                 f"it leaves ({left:.1e}), so what is dark may be lost; expose longer, take more patterns or shots, or "
                 "give a smaller lambda."
             )
-        if total > left:
+        if 2 * total**2 > left**2:  # the image has the energy of its noise, too
             return (
                 f"The image is hardly more than noise: its uncertainty is {total:.1e} rms, the image itself "
                 f"{left:.1e}; expose longer, take more patterns or shots, or give a larger lambda."

@@ -24,6 +24,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, finite_channel, read_frame, verify_files, write_frame
 from mitsim.core.files import PAGE, PICTURES, output_folder, read_json, remove_page, write_bytes, write_text
+from mitsim.core.headline import calibration_headline, each_once, frames_headline, image_headline
 from mitsim.core.images import card, data_uri, grey_png, lightness, png
 from mitsim.core.job import size_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
@@ -147,11 +148,14 @@ def _content(folder: Path) -> Shown:
 def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> Shown:
     parts = {name: _content(folder / name) for name in names}
     first, *_, last = *parts.values(), *parts.values()
+    reasons = each_once({name: part["warnings"] for name, part in parts.items()})
+    name_all = calibration_headline if first["kind"] == "Calibration" else frames_headline
     return _shown(
         f"{first['kind']} by {axis}",
         first["subject"],
-        f"{len(parts)} {axis}{'s' if len(parts) > 1 else ''}: {', '.join(parts)}{unit}",
-        warnings=[f"{name}: {text}" for name, part in parts.items() for text in part["warnings"]],
+        name_all([part["result"] for part in parts.values()], reasons),
+        detail=f"{len(parts)} {axis}{'s' if len(parts) > 1 else ''}: {', '.join(parts)}{unit}.",
+        warnings=reasons,
         command=first["command"],
         seconds=last["seconds"],
         tables={"Versions": first["tables"]["Versions"]},
@@ -186,7 +190,7 @@ def _of_run(lines: SpectralFolder) -> Shown:
     manifest, taken, black = shots.manifest, shots.manifest.patterns, np.float64(shots.manifest.digital.black_level_dn)
     accuracy = (manifest.plan or {}).get("accuracy")
     accuracy = accuracy if isinstance(accuracy, float) else None
-    error, count = manifest.total_error_bound, len(taken.captures)
+    result, count = shots.summary(), len(taken.captures)
 
     def frame(name: str) -> FloatArray:
         return np.asarray(shots.read(name)[0]["DN"] - black)
@@ -208,13 +212,13 @@ def _of_run(lines: SpectralFolder) -> Shown:
     for each in effects if isinstance(effects, list) else ():
         with suppress(ValidationError):
             plan.append(row.validate_python(each))
-    asked = "" if error is None or accuracy is None else f"accuracy {accuracy:g} asked for, "
+    asked = "" if accuracy is None else f", accuracy {accuracy:g} asked for"
     return _shown(
         "Capture",
         _subject(manifest, lines.folder / MANIFEST),
-        f"{count} frame{'s' if count > 1 else ''}{'' if error is None else f', error at most {error:.1e}'}",
-        detail=f"{first.shape[0]} x {first.shape[1]} pixels, patterns {taken.family or 'from elsewhere'}, {asked}"
-        f"exposure {shots.exposure_s:.3g} s a frame",
+        frames_headline([result], manifest.warnings),
+        result=result,
+        detail=f"Patterns {taken.family or 'from elsewhere'}{asked}, exposure {shots.exposure_s:.3g} s a frame.",
         warnings=manifest.warnings,
         command=manifest.command,
         pictures=pictures,
@@ -229,10 +233,6 @@ def _of_run(lines: SpectralFolder) -> Shown:
 def _of_calibration(folder: Path) -> Shown:
     factors = load_calibration(folder)
     manifest, result = factors.manifest, factors.manifest.result
-    errors = (result.get(name) for name in ("phi_error", "predicted_phi_error"))
-    error = next((value for value in errors if isinstance(value, float)), None)
-    verdict = (manifest.verdict or "a calibration").capitalize()
-    verdict = f"Flagged. {verdict}" if manifest.warnings else verdict
     pictures = []
     for name, side, axis in (("left", factors.left, "rows"), ("right", factors.right, "columns")):
         about = f"{side.shape[1]} projector {axis} (down) x {side.shape[0]} sensor {axis} (across)"
@@ -243,8 +243,9 @@ def _of_calibration(folder: Path) -> Shown:
     return _shown(
         "Calibration",
         _subject(manifest, folder / MANIFEST),
-        verdict if error is None else f"{verdict}, factor error {error:.1e}",
-        detail="" if manifest.estimate in manifest.warnings else manifest.estimate or "",
+        calibration_headline([result], manifest.warnings),
+        result=result,
+        detail="" if manifest.warnings else manifest.estimate or "",
         warnings=manifest.warnings,
         command=manifest.command,
         pictures=pictures,
@@ -277,9 +278,7 @@ def _numbers(data: Any) -> dict[str, float]:
 def _of_image(folder: Path) -> Shown:
     result = read_result(folder)
     image = finite_channel(read_frame(folder / IMAGE_FILE)[0], "reflectance", folder / IMAGE_FILE)
-    quality, similar, warnings = result.get("psnr"), result.get("ssim"), result.get("warnings") or ()
-    known = [f"PSNR {quality:.1f} dB"] if isinstance(quality, float) else ["An image, and no truth to judge it by"]
-    known += [f"SSIM {similar:.3f}"] if isinstance(similar, float) else []
+    warnings = [*map(str, result.get("warnings") or ())]
     inputs = result.get("inputs") if isinstance(result.get("inputs"), dict) else {}
     white, truth, size = result.get("white"), truth_of(result), f"{image.shape[0]} x {image.shape[1]} projector pixels"
     by_spread = POINT_SPREAD in (inputs or {}) and isinstance(white, float)
@@ -287,7 +286,9 @@ def _of_image(folder: Path) -> Shown:
     method, weight = (inputs or {}).get("method"), result.get("lambda")
     how = [f"method {method}"] if isinstance(method, str) else []
     how += [f"lambda {weight:.2g} (electrons/s)²"] if isinstance(weight, float) else []
-    about = ", ".join([*how, *(known if isinstance(quality, float) else ()), size])
+    known = {"PSNR {:.1f} dB": result.get("psnr"), "SSIM {:.3f}": result.get("ssim")}
+    how += [text.format(value) for text, value in known.items() if isinstance(value, float)]
+    about = ", ".join([*how, size])
     pictures = [Picture.of("image", "The image", image, about, unit, (0.0, most))]
     if truth is not None and truth.shape == image.shape:
         pictures += [Picture.of("truth", "The truth", truth, _TRUTH), _difference("error", "Difference", image, truth)]
@@ -309,9 +310,9 @@ def _of_image(folder: Path) -> Shown:
     return _shown(
         "Image",
         _subject_of_image(result.get(MADE_OF), folder / RESULT_FILE),
-        ("Flagged. " if warnings else "") + ", ".join(known),
+        image_headline({**result, "shape": image.shape}, warnings),
         detail="" if warnings else str(result.get("status", "")),
-        warnings=[*map(str, warnings)],
+        warnings=warnings,
         command=result.get("command"),
         pictures=pictures,
         seconds=_numbers(result.get("seconds")),
@@ -378,15 +379,8 @@ def _of_colours(lines: SpectralFolder) -> Shown:
             for number, name in enumerate(names)
         },
     )
-    verdict, detail = f"An image from {len(files)} spectral lines", "No truth to compare it with."
-    quality = "" if image.psnr_db is None else f"PSNR of the {len(files)} lines: {image.psnr_db:.1f} dB. "
-    if image.patches:
-        verdict = f"Mean Delta E 2000 of {len(image.patches)} patches: {image.patch_mean('delta_e'):.2f}"
-        floor = image.patch_mean("floor")
-        detail = f"{quality}The floor is {floor:.2f}: these spectral lines alone, without a camera."
-    elif image.delta_e is not None:
-        verdict = f"Mean Delta E 2000 to the truth: {image.delta_e.mean():.2f}"
-        detail = f"{quality}Mean over all pixels."
+    data |= {"shape": images.shape[:2], "channels": colours.channels}
+    reasons = data.get("warnings") or ()
     swatches = []
     if image.chart is not None:  # the spectrum's colour, and this image's
         both = np.stack([chart().xyz, image.chart.means(image.xyz)], axis=1)
@@ -414,9 +408,9 @@ def _of_colours(lines: SpectralFolder) -> Shown:
     return _shown(
         "Image in colour",
         _subject_of_image(data.get(MADE_OF), folder / colour_files.COLOUR),
-        verdict,
-        detail=detail,
-        warnings=data.get("warnings") or (),
+        image_headline(data, reasons),
+        detail="" if truth is None and not image.patches else " ".join(f"{text}." for text in image.sentences[1:]),
+        warnings=reasons,
         command=data.get("command"),
         pictures=pictures,
         tables={"Versions": versions()},
@@ -517,12 +511,15 @@ class ColourImage:
 
     @property
     def sentences(self) -> list[str]:
-        sentences = [f"colours by a matrix fitted on {self.model.fitted_on}"]
+        sentences = [f"Colours follow from a matrix fitted on {self.model.fitted_on}"]
         if self.delta_e is not None:
-            sentences.append(f"Delta E 2000 of a pixel to the truth {self.delta_e.mean():.2f} in the mean")
+            sentences.append(f"The mean Delta E 2000 of all pixels to the truth is {self.delta_e.mean():.2f}")
         if self.patches:
             mean, floor = self.patch_mean("delta_e"), self.patch_mean("floor")
-            sentences.append(f"of {len(self.patches)} patches to their spectra {mean:.2f}, floor {floor:.2f}")
+            sentences.append(
+                f"The mean Delta E 2000 of {len(self.patches)} patches to their spectra is {mean:.2f}; these spectral "
+                f"lines alone, without a camera, leave {floor:.2f}"
+            )
         return sentences
 
     @property
@@ -545,18 +542,19 @@ class ColourImage:
             {**line.model_dump(), **summary_of(self.qualities[line.name]), **self.of_lines.get(line.name, {})}
             for line in self.lines.channels
         ]
+        known = {"psnr": self.psnr_db, "shape": self.images.shape[:2], "channels": channels}
         return {
+            "headline": image_headline(known, self.warnings),
             **self.solution,
-            "channels": channels,
+            **known,
             "ssim": _mean(channel["ssim"] or None for channel in channels),
             **self.model.summary(),
-            "psnr": self.psnr_db,
             "delta_e": None if self.delta_e is None else float(self.delta_e.mean()),
             "delta_e_chart": self.patch_mean("delta_e"),
             "delta_e_floor": self.patch_mean("floor"),
             "patches": self.patches or None,
             "warnings": self.warnings,
-            "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
+            "status": " ".join(self.warnings) or "Every line's image can be used as it is.",
             "seconds": dict(self.seconds),
             "output": self.output,
         }

@@ -6,7 +6,7 @@ A run has one unnamed line, a folder for each line, or frames of all lines behin
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -30,6 +30,7 @@ from mitsim.core.configuration import takes
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, read_json, write_bytes
+from mitsim.core.headline import each_once, image_headline
 from mitsim.core.images import png
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, read_manifest
@@ -44,7 +45,7 @@ from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import MADE_OF, Reconstruction, check_same_inputs, may_replace, reconstruct_request
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
-from mitsim.reconstruct.solver import Solution, Status, automatic_lambda, prepare
+from mitsim.reconstruct.solver import Solution, automatic_lambda, prepare
 from mitsim.report.folder_page import ColourImage, report_folder, state_image
 
 # -------- The image of one line
@@ -60,7 +61,8 @@ class Judged:
     truth: FloatArray | None = None
 
     def summary(self) -> dict[str, Any]:
-        return {**summary_of(self.quality), **self.reconstruction.summary(), "output": self.output}
+        result = {**summary_of(self.quality), **self.reconstruction.summary(), "output": self.output}
+        return {"headline": image_headline(result, result["warnings"]), **result}
 
 
 def reconstruct(
@@ -225,7 +227,7 @@ def reconstruct_colours(
                     "lambda": ", ".join(f"{name} {each.lam:.3g}" for name, each in solved.items()),
                     "residual of the frames": ", ".join(f"{name} {each.residual:.1e}" for name, each in solved.items()),
                 },
-                warnings=one_paragraph({name: each.status for name, each in solved.items()}),
+                warnings=each_once({name: each.status.reasons for name, each in solved.items()}),
                 seconds={"total": sum(each["seconds"]["total"] for each in of_lines.values())},
                 of_lines=of_lines,
             )
@@ -291,9 +293,8 @@ def _solve_at_once(
                 f"Misfit: {unexplained:.1e} of the measurements are explained by no image of these lines, beyond "
                 "noise; look for depth, light over several surfaces or another camera than was calibrated."
             )
-        flags = {"The capture": mosaic.warnings}
-        flags |= {f"The calibration of {name}": each.warnings for name, each in factors.items()}
-        warnings += [f"{what} was flagged: {text.rstrip('.')}." for what, texts in flags.items() for text in texts]
+        flags = {f"the calibration of {name}": each.warnings for name, each in factors.items()}
+        warnings += each_once({"the capture": mosaic.warnings, **flags})
         state_image(folder, lines, status="incomplete", inputs=inputs)
         for name, image in zip(lines.names, solved.image, strict=True):
             with output_folder(folder / name, overwrite=True) as place:
@@ -316,23 +317,6 @@ def _solve_at_once(
             | {"residual": residual, "unexplained": unexplained},
             inputs=inputs,
         )
-
-
-def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
-    """Combine the ``statuses`` of lines to one warning; return none where all are usable.
-
-    Each verdict has the sentence of its first line, and each flag appears once.
-    """
-    flagged = {name: status for name, status in statuses.items() if not status.ok}
-    parts = []
-    for verdict in dict.fromkeys(status.verdict for status in flagged.values()):
-        names = [name for name, status in flagged.items() if status.verdict is verdict]
-        first = flagged[names[0]]
-        alike = len({flagged[name].sentence for name in names}) == 1
-        of_first = "" if alike else f" (so {names[0]}; the table has the others)"
-        parts.append(f"{', '.join(names)}: {first.sentence}{of_first}{'; ' if first.remedy else ''}{first.remedy}.")
-    flags = dict.fromkeys(flag for status in flagged.values() for flag in status.flags)
-    return (" ".join([*parts, *flags]),) if parts else ()
 
 
 # -------- Images of the lines from frames behind colour filters

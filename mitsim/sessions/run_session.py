@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import time
 from collections.abc import Generator, Mapping, Sequence
@@ -34,6 +33,7 @@ from mitsim.core.files import (
     write_json,
     write_text,
 )
+from mitsim.core.headline import calibration_headline, each_once, frames_headline, headline, image_headline
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.devices.framelist import load_chart
@@ -99,15 +99,23 @@ class SessionResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return the warnings of all steps, each with its folder."""
-        return tuple(dict.fromkeys(f"{step.output}: {text}" for step in self.steps for text in step.warnings))
+        """Return the warnings of all steps, each once, with the folder of the step that caused it."""
+        return each_once({step.output: step.warnings for step in self.steps})
+
+    @property
+    def headline(self) -> str:
+        """Number of steps, the last figure of any step, and the main flag."""
+        figures = [", " + figure for step in self.steps if (figure := step.says.partition(", ")[2])]
+        count, last = len(self.steps), "".join(figures[-1:])
+        return headline(f"Ran {count} step{'s' * (count > 1)}{last}", self.warnings)
 
     def payload(self) -> dict[str, Any]:
-        return {**asdict(self), "warnings": self.warnings}
+        return {"headline": self.headline, **asdict(self), "warnings": self.warnings}
 
     def lines(self) -> list[str]:
-        each = [f"{step.output}: {step.says}{' (finished before)' if step.left_alone else ''}" for step in self.steps]
-        return [*each, f"Page: {self.page}" if self.page else f"Session: {self.output}"]
+        marks = [" (flagged)" * bool(step.warnings) + " (finished before)" * step.left_alone for step in self.steps]
+        each = [f"{step.output}: {step.says}{mark}" for step, mark in zip(self.steps, marks, strict=True)]
+        return [self.headline, *each, f"Page: {self.page}" if self.page else f"Session: {self.output}"]
 
 
 class _Made(Configuration):
@@ -210,12 +218,10 @@ def run(
 
             opened = any(step.verb in OF_A_BENCH for step in read.steps)
             about = (scene_name(steps.bench.loaded.path), steps.bench.sensor.name) if opened else ("", "")
-            count, flagged = len(results), sum(bool(step.warnings) for step in results)
-            verdict = f"{count} step{'s' * (count > 1)} done{f', {flagged} flagged' if flagged else ''}"
             page = render_page(
                 "session.html",
                 title=f"Session {folder.name}: {subject(*about)}",
-                verdict=verdict,
+                verdict=done.headline,
                 warnings=done.warnings,
                 command=job and job.command,
                 steps=results,
@@ -333,15 +339,9 @@ class _Steps:
         task = Task(place, self.asked.resume, self.job.apart("capture "))
         more = {name: value for name, value in own.items() if name != "patterns"}
         found = capture_in(self.bench, colour, request.patterns, more, task, self.light)
-
-        def said(result: Mapping[str, Any]) -> Said:
-            size, bound = "x".join(map(str, result["shape"])), result["total_error_bound"]
-            says = f"{result['frames']} frames of {size}, error up to {bound:.1e}, {result['exposure_s']:.3g} s each"
-            return says, result["warnings"]
-
-        if isinstance(found, Mapping):
-            return _of_lines({name: said(run.summary()) for name, run in found.items()})
-        return said(found.summary())
+        runs = found if isinstance(found, Mapping) else {"": found}
+        reasons = each_once({name: run.warnings for name, run in runs.items()})
+        return frames_headline([run.summary() for run in runs.values()]), reasons
 
     def _calibrate(self, step: Step) -> Work:
         values, colour = step.of(SessionRequest), step.values.get("colour", NO)
@@ -361,14 +361,9 @@ class _Steps:
             BoardSession(self.bench, recipe, asked.seed).check_mask(self.job)
         yield
         task = Task(self.folder / step.output, self.asked.resume, self.job.apart("calibrate "))
-        said = {}
-        for name, factors in calibrate_in(self.bench, colour, asked, task).items():
-            result = factors.manifest.result
-            numbers = (result[each] for each in ("phi_error", "separability_residual"))
-            error, residual = (math.inf if each is None else each for each in numbers)  # JSON has no infinity
-            says = f"{result['frames']} frames, factor error {error:.1e}, separability residual {residual:.2%}"
-            said[name] = says, result["warnings"]
-        return said[""] if [*said] == [""] else _of_lines(said)
+        found = calibrate_in(self.bench, colour, asked, task)
+        reasons = each_once({name: factors.warnings for name, factors in found.items()})
+        return calibration_headline([factors.manifest.result for factors in found.values()]), reasons
 
     def _reconstruct(self, step: Step) -> Work:
         values, place, options = step.values, self.folder / step.output, step.of(ImageRequest)
@@ -403,11 +398,9 @@ class _Steps:
         again: Any = {"overwrite": self.asked.resume, "job": self.job.apart(f"{step.output} ")}
         if coloured:
             colours = reconstruct_colours(run, calibration, place, chart, page=False, **again, **options)
-            known = "" if colours.psnr_db is None else f", PSNR {colours.psnr_db:.2f} dB over all lines"
-            return f"an image of every line{known}", colours.warnings
+            return image_headline(colours.summary()), colours.warnings
         judged = reconstruct(run, calibration, place, **again, **options)
-        sentence = f"{judged.reconstruction.status.sentence}."
-        return str(judged.quality or sentence), judged.summary()["warnings"]
+        return image_headline(judged.summary()), judged.reconstruction.status.reasons
 
     def _study(self, step: Step) -> Work:
         options = dict(step.values)
@@ -416,7 +409,7 @@ class _Steps:
         study = prepare_study(name, scene, self.folder / step.output, StudyOptions(**options), job)
         yield
         found = study()
-        return found.lines()[0], found.warnings
+        return found.headline.partition(". Flagged")[0], found.warnings
 
     def _export(self, step: Step) -> Work:
         values, place = step.values, self.folder / step.output
@@ -432,7 +425,7 @@ class _Steps:
         yield
         again = self.asked.resume and not pictures
         found = export(run, output=place, calibration=calibration, overwrite=again, **how)
-        return f"{found['frames']} frames as {found['format']}", ()
+        return f"Exported {found['frames']} frames as {found['format']}", ()
 
 
 _WORK = {
@@ -443,11 +436,6 @@ _WORK = {
     "study": _Steps._study,
     "export": _Steps._export,
 }
-
-
-def _of_lines(each: Mapping[str, Said]) -> Said:
-    warnings = [f"{name}: {text}" for name, (_, texts) in each.items() for text in texts]
-    return "; ".join(f"{name} {says}" for name, (says, _) in each.items()), warnings
 
 
 def _checksums(place: Path) -> dict[str, str]:

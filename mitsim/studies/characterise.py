@@ -24,6 +24,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import write_json, write_text
+from mitsim.core.headline import headline
 from mitsim.core.images import image_pages, read_image
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import in_threads
@@ -396,6 +397,7 @@ class Characterisation:
         transfer = self.found.transfer
         fields = [asdict(row) for row in self.fields]
         return {
+            "headline": self.headline,
             "camera": self.camera,
             **self.asked,
             "exposure_s": float(self.session.exposure_s[self.session.dark]),
@@ -412,12 +414,11 @@ class Characterisation:
         }  # fmt: skip
 
     @property
-    def message(self) -> str:
-        named = {"gain_dn_per_e": "Gain", "read_noise_e": "read noise", "full_well_e": "full well"}
+    def headline(self) -> str:
+        named = {"gain_dn_per_e": "gain", "read_noise_e": "read noise", "full_well_e": "full well"}
         rows = {named[row.name]: row for row in self.fields if row.name in named}
-        return ", ".join(
-            f"{name} {row.found:{'.4g' if row.found < 1e4 else '.0f'}} {row.unit}" for name, row in rows.items()
-        )
+        found = (f"{name} {row.found:{'.4g' if row.found < 1e4 else '.0f'}} {row.unit}" for name, row in rows.items())
+        return headline(f"Characterised {self.camera}: {', '.join(found)}", self.warnings)
 
     @property
     def where(self) -> str:
@@ -454,7 +455,7 @@ class Characterisation:
         )  # fmt: skip
 
     def lines(self) -> list[str]:
-        lines = [f"{self.camera}: {self.where}"]
+        lines = [self.headline, f"Frames: {self.where}"]
         if self.output:
             lines.append(f"Page, plots, JSON and the camera found, camera.toml: {self.output}")
         for part in self.parts:
@@ -566,7 +567,7 @@ def _write(done: Characterisation, folder: Path | None) -> Characterisation:
     pictures = {name: page_figure(figure) for name, figure in write_figures(folder, figures_of(done)).items()}
     title, light = "Camera after EMVA 1288", "real frames" if done.real else "simulated even light"
     shown: dict[str, Any] = {"warnings": done.warnings, "scene": light, "camera": done.camera}
-    section = Section("characterise", title, done.message, done.where, pictures, done.parts, **shown)
+    section = Section("characterise", title, done.headline, done.where, pictures, done.parts, **shown)
     write_page([section], folder / "characterise.html", title)
     write_text(folder / CAMERA_FILE, done.found.toml())
     write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})

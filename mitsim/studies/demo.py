@@ -20,6 +20,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.files import write_json, write_text
+from mitsim.core.headline import each_once, headline
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture, frame_name
 from mitsim.devices.session import load_recipe
@@ -55,7 +56,7 @@ class DemoResult:
     warnings: tuple[str, ...]
 
     def payload(self) -> dict[str, Any]:
-        return asdict(self)
+        return {"headline": headline(self.verdict, self.warnings), **asdict(self)}
 
     def lines(self) -> list[str]:
         table = [
@@ -63,7 +64,7 @@ class DemoResult:
             for name, value in self.psnr.items()
         ]
         truth = f"The truth is good to {-20 * math.log10(self.truth_error):.1f} dB." if self.truth_error else ""
-        return [f"{self.verdict}.", f"Report: {self.report}", *table, *filter(None, (truth,))]
+        return [headline(self.verdict, self.warnings), f"Report: {self.report}", *table, *filter(None, (truth,))]
 
 
 def demo(bench: Bench, output: Path | str, request: Request | None = None, job: Job | None = None) -> DemoResult:
@@ -117,7 +118,8 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
             families[name] = _compare(lit, factors, name, shots if name == request.patterns else None)
             job.progress(f"compare families: {label(name)}", (index + 1) / len(names))
     main = families[request.patterns]
-    warnings = shots.warnings + factors.warnings + doubts(main)
+    flags = {"the capture": shots.warnings, "the calibration": factors.warnings, "the image": doubts(main)}
+    warnings = each_once(flags)
     with job.clock.stage("views"):
         view = pinhole_view(bench, load_recipe().board_reflectance, request.seed)
         count = len(shots.manifest.patterns.captures)
@@ -132,7 +134,8 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
             frames[f"{label(request.patterns)}, {caption}"] = frame["DN"]
     with job.clock.stage("report"):
         page = {
-            **_page(light, shots, factors, families, request.patterns),
+            **(content := _page(light, shots, factors, families, request.patterns)),
+            "verdict": headline(content["verdict"], warnings),
             "render": view,
             "frames": frames,
             "warnings": warnings,
@@ -147,7 +150,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
         psnr_ideal={name: each.idealised.quality.psnr_db for name, each in families.items() if each.idealised},
         exposure={name: dict(each.by_exposure) for name, each in families.items()},
         gain_db=psnr[request.patterns] - psnr["uniform"],
-        verdict=page["verdict"],
+        verdict=content["verdict"],
         mc_error=shots.manifest.mc_error or 0.0,
         truth_error=light.apparent.error,
         trust={name: each.trust.summary() for name, each in rendered.items() if each.trust},
@@ -194,7 +197,7 @@ def _page(
     light: SampledLight, shots: Capture, factors: Factors, families: dict[str, FamilyResult], main: str
 ) -> dict[str, Any]:
     bench, session, plan, geometry = light.bench, factors.manifest.result, light.plan, light.bench.geometry
-    headline, detail = verdict(families[main], families["uniform"])
+    best, detail = verdict(families[main], families["uniform"])
     unexplained = session["unexplained_residual"]  # JSON has no infinity: None
     beyond = "" if not unexplained else f" Beyond the sensor's noise, {unexplained:.1e} of the responses is left."
     budget = (
@@ -210,7 +213,7 @@ def _page(
     mask = f"{geometry.mask_words}, {geometry.mask_feature * 1e3:g} um, {geometry.mask_distance:g} mm from the sensor"
     return {
         "title": f"Comparison of patterns: {subject(scene_name(bench.loaded.path), bench.sensor.name)}",
-        "verdict": headline,
+        "verdict": best,
         "verdict_detail": detail,
         "truth": light.truth,
         "scene": scene_line(bench.loaded.path),

@@ -243,9 +243,9 @@ def test_flags_of_folders_reach_the_image(bench: Callable[..., tuple[Path, Path]
     found = image_of(run, cal)
     assert not found.ok and found.rank == 64
     for sentence in (
-        "The capture was flagged: 3 frames have pixels at the full well.",
-        "The calibration was flagged: Factors are noise.",
-        "The calibration was flagged: b.",
+        "In the capture, 3 frames have pixels at the full well",
+        "In the calibration, factors are noise",
+        "In the calibration, b",
     ):
         assert sentence in str(found.status)
     assert str(found.status).startswith("Solved: ") and "Rank 64 of 64" in str(found.status)
@@ -263,12 +263,14 @@ def test_the_command_ends_with_1(
         cli.run()
     out, err = capsys.readouterr()
     status = json.loads(out)["status"]
-    assert stop.value.code == 1 and "The calibration was flagged: 12 of 64 frames" in status and status in err
+    warning = "In the calibration, 12 of 64 frames have pixels at the full well"
+    assert stop.value.code == 1 and warning in status and err.count(warning) == 1
     assert (run / "reconstruction" / "image.exr").is_file(), "the image is kept"
     monkeypatch.setattr(sys, "argv", [*sys.argv[:-1], "-o", str(run / "again")])
     with pytest.raises(SystemExit):
         cli.run()
-    assert capsys.readouterr().out.startswith("Flagged: "), "solved, but of what was flagged"
+    first, _, _ = capsys.readouterr().out.partition("\nImage:")
+    assert " ".join(first.split()).endswith(f"Flagged: {warning[0].lower()}{warning[1:]}")
 
 
 @pytest.mark.parametrize(

@@ -424,7 +424,7 @@ def test_every_status_names_rank_and_condition() -> None:
         "Solved: every": (spread(10), 0.0, True),
         "Ill-conditioned": (spread(1e7), 0.0, False),
         "Rank deficient": (twin, 0.0, False),
-        "Solved, but": (twin, 1e-3, True),
+        "Partly measured: ": (twin, 1e-3, True),
         "Under-determined": (spread(10, 8, 8)[:5], 1e-3, False),
     }
     for start, (factor, lam, ok) in cases.items():

@@ -116,7 +116,7 @@ def test_reconstruct(call: Call, lab: Any, tmp_path: Path) -> None:
         *("truth_error", "rank_sides", "condition_whole", "condition_sides"),
         *("misfit", "uncertainty", "uncertainty_budget", "focus_mm", "focus_error_mm", "depths"),
         *("uncertainty_extrapolated", "regularisation_bias_factor", "focus_range_mm", "focus_alternatives"),
-        *("objective", "relative_gap", "iterations", "white"),
+        *("objective", "relative_gap", "iterations", "white", "headline", "shape"),
         *("predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes", "report"),
     }
     assert found["focus_mm"] is None and found["focus_error_mm"] is None
@@ -443,4 +443,4 @@ def test_a_refusal_on_a_terminal_leaves_one_line(
 def test_no_bar_where_stderr_is_no_terminal(call: Call, lab: Any, tmp_path: Path) -> None:
     outcome = call("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", "dots:4")
     assert outcome.code == 0 and outcome.err == ""
-    assert len(outcome.out.splitlines()) <= 3 and "\x1b" not in outcome.out  # a long folder has a line of its own
+    assert len(outcome.out.splitlines()) <= 4 and "\x1b" not in outcome.out  # a long folder has a line of its own

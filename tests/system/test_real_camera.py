@@ -166,7 +166,7 @@ def test_what_the_command_says_of_measured_frames(call: Call, tmp_path: Path) ->
     frames = session.write(tmp_path / "frames")
     done = call("calibrate", "--frames", "frames", "-o", "cal", cwd=tmp_path)
     assert done.code == 0 and done.err == "", done.err
-    assert done.out.startswith("16 frames of 4 stripes in ") and "\nNot known: parallax: " in done.out
+    assert done.out.startswith("Calibrated 4 x 4 pixels, factor error ") and "\nNot known: parallax: " in done.out
     full = session.frame(np.ones((4, 4)))
     full[0, 0] = 4095
     write_image(frames / "f_0.png", full)

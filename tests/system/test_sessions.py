@@ -82,7 +82,7 @@ def test_a_session_file_repeats_a_figure_bit_by_bit(call: Call, lab: Any, imaged
     ms.session_of(imaged).save(tmp_path / "again.toml")
     done = call("run", tmp_path / "again.toml", "-o", tmp_path / "out", "--json", "--no-pictures")
     assert done.code == 0, done.err
-    assert done.payload.keys() == {"steps", "output", "page", "warnings"}
+    assert done.payload.keys() == {"headline", "steps", "output", "page", "warnings"}
     keys = {"step", "output", "says", "warnings", "seconds", "page", "left_alone"}
     assert [each.keys() == keys and each["output"] for each in done.payload["steps"]] == [
         "run",

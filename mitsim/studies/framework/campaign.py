@@ -29,6 +29,7 @@ from mitsim.bench.apparatus import check_scene
 from mitsim.core import files
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
+from mitsim.core.headline import each_once, headline
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
@@ -57,14 +58,23 @@ class StudyResult:
     figures: tuple[str, ...] = ()
     section: Section | None = field(default=None, repr=False)
 
+    @property
+    def headline(self) -> str:
+        """Number of points, of claims by verdict, and the main flag."""
+        from mitsim.studies.framework.claims import tally
+
+        claims = f", {tally(self.claims)}" if self.claims else ""
+        return headline(f"Measured {self.points} points of the study {self.study}{claims}", self.warnings)
+
     def payload(self) -> dict[str, Any]:
-        names = ("study", "output", "points", "missing", "seconds", "rows", "claims", "figures", "warnings")
+        names = ("headline", "study", "output", "points", "missing", "seconds", "rows", "claims", "figures", "warnings")
         return {name: getattr(self, name) for name in names} | {"claims": [asdict(claim) for claim in self.claims]}
 
     def lines(self) -> list[str]:
         if self.missing:
             return [
-                f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
+                self.headline,
+                f"{self.missing} points of other parts are missing: {self.output}",
                 "Join all parts with: mitsim study merge PART... -o FOLDER",
             ]
         heads, lines = self.section.heads if self.section else HEADS, []
@@ -72,7 +82,7 @@ class StudyResult:
             figures = zip(heads, (each.paper, each.idealised, each.rendered), strict=True)
             stated = ", ".join(f"{head.lower()} {figure}" for head, figure in figures if figure)
             lines.append(f"{each.verdict}: {each.claim} ({stated})")
-        return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
+        return [self.headline, f"Table, figures and page: {self.output} (in {self.seconds:.0f} s)", *lines]
 
     def to_pandas(self) -> Any:
         import pandas
@@ -293,10 +303,6 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
         files.write_json(folder / f"{ALL}.json", {**head, "status": "incomplete"})
         found = [each(name, folder / name) for name in PAPER]
         sections = [one.section for one in found if one.section]
-        if len(sections) == len(found):
-            from mitsim.studies.framework.panels import write_page
-
-            write_page(sections, folder / f"{ALL}.html", "The paper's claims on rendered frames")
         result = StudyResult(
             ALL,
             str(folder),
@@ -305,8 +311,13 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
             seconds=sum(one.seconds for one in found),
             claims=tuple(claim for one in found for claim in one.claims),
             figures=tuple(f"{one.study}/{name}" for one in found for name in one.figures),
-            warnings=tuple(f"{one.study}: {text}" for one in found for text in one.warnings),
+            warnings=each_once({one.study: one.warnings for one in found}),
         )
+        if len(sections) == len(found):
+            from mitsim.studies.framework.panels import write_page
+
+            title = "The paper's claims on rendered frames"
+            write_page(sections, folder / f"{ALL}.html", title, result.headline)
         files.write_json(folder / f"{ALL}.json", {**head, "status": "complete", **result.payload()})
         return result
 
@@ -342,7 +353,6 @@ def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Stor
         figures = write_figures(folder, experiment.draw(results), scope.style)
         files.write_text(folder / f"{name}.csv", results.frame.to_csv(index=False))
         section = section_of(experiment, study, claims, figures, results)
-        write_page([section], folder / f"{name}.html", section.title)
         result = replace(
             result,
             rows=tuple(results.rows),
@@ -351,6 +361,7 @@ def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Stor
             section=section,
             warnings=section.warnings,
         )
+        write_page([section], folder / f"{name}.html", section.title, result.headline)
         files.write_json(place, {**head, "status": "complete", **result.payload()})
     return result
 

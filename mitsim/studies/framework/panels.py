@@ -441,9 +441,9 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     )
 
 
-def write_page(sections: Sequence[Section], path: Path, title: str) -> Path:
-    """Write a page of one study, or of several with the verdicts of all first."""
-    message = sections[0].message if len(sections) == 1 else tally([claim for one in sections for claim in one.claims])
+def write_page(sections: Sequence[Section], path: Path, title: str, message: str = "") -> Path:
+    """Write a page of one study, or of several with the verdicts of all first; ``message`` is the headline."""
+    message = message or tally([claim for one in sections for claim in one.claims]) or sections[0].message
     scenes, cameras = {one.scene for one in sections}, {one.camera for one in sections}
     scene, camera = (names.pop() if len(names) == 1 else "" for names in (scenes, cameras))
     images = any(file.startswith("images") for one in sections for file in one.pictures)

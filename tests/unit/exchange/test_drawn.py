@@ -240,7 +240,7 @@ def test_a_studys_rows_are_a_table(tmp_path: Path) -> None:
     rows = ({"x": 1, "psnr_db": 20.5}, {"x": 2, "psnr_db": 21.5})
     found = StudyResult("toy", str(tmp_path), rows, points=2)
     (tmp_path / "toy.png").write_bytes(b"\x89PNG")
-    assert found.pictures == {"toy.png": tmp_path / "toy.png"} and "2 points in" in found._repr_html_()
+    assert found.pictures == {"toy.png": tmp_path / "toy.png"} and "Measured 2 points" in found._repr_html_()
     assert found.to_pandas().equals(pandas.DataFrame([*rows]))
 
 

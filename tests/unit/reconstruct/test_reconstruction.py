@@ -190,7 +190,7 @@ def test_a_status_is_a_verdict_with_a_remedy(shots: Capture, factors: Factors) -
     assert str(lost.status).startswith(f"{lost.status.sentence}; {lost.status.remedy}. Rank 8 of 16")
     flagged = Factors(twins.left, twins.right, factors.manifest.model_copy(update={"warnings": ("old",)}), twins.status)
     result = reconstruct(shots, flagged, 1.0)
-    assert not result.ok and str(result.status).endswith("The calibration was flagged: old.")
+    assert not result.ok and str(result.status).endswith("In the calibration, old")
     assert "data:image/png" in result._repr_html_() and "old" in result._repr_html_()
 
 

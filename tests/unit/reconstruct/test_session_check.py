@@ -377,6 +377,19 @@ def test_large_faults_are_refused(pairs: bool, make: Callable[[], Frames], words
         checked(make(), pairs)
 
 
+def test_light_that_the_stated_camera_explains_is_not_ambient() -> None:
+    """A tilted mask adds light that no product has to every response, and noise-free responses of the stated camera
+    have it, too. (Planted: the stated camera's light counts as ambient light.)"""
+    camera = every(lambda frame: frame, 0.0)
+    rng = np.random.default_rng(6)
+    own = {half: frame + 0.03 * rng.random() for half, frame in camera.items()}
+    noise = np.random.default_rng(7)
+    shown = {half: frame + 1e-3 * noise.standard_normal(PIXELS) for half, frame in own.items()}
+    found = check_session(sums_of(shown), SIGNS, ORDER, stated=sums_of(own))
+    assert any("ambient light" in words for words in checked(shown).doubts)
+    assert not any("ambient light" in words for words in found.doubts)
+
+
 # ---- Without pairs ---------------------------------------------------------------------------------------------------
 
 

@@ -22,12 +22,10 @@ import mitsim as ms
 from mitsim.acquire.capture import Rendered
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import lightness, linear_light
-from mitsim.reconstruct.solver import Status, Verdict
 from mitsim.report import plots
 from mitsim.report.folder_page import Trust
 from mitsim.report.pages import Mean, round_to_error, scientific, typeset
 from mitsim.report.plots import curves, grouped_bars, image_grid
-from mitsim.report.reconstruct_run import one_paragraph
 from tests.exchanged import made
 from tests.unit.planner.test_choice import plan as invented_plan
 
@@ -189,20 +187,6 @@ def test_an_error_of_a_mean_is_never_nought() -> None:
     """(Planted: one place whatever the error, so 0.04 dB was 0.0.)"""
     assert str(Mean(23.41, 0.04, 2)) == "23.41 \N{PLUS-MINUS SIGN} 0.04"
     assert str(Mean(23.41, 0.94, 2)) == "23.4 \N{PLUS-MINUS SIGN} 0.9" and str(Mean(23.41, math.nan, 1)) == "23.4"
-
-
-# ---- One warning for all lines of a run ----
-
-
-def test_lines_share_one_warning_and_no_flag_is_repeated() -> None:
-    flag = "The calibration was flagged: a quarter of the frames is left over."
-    lost = {name: Status(Verdict.PARTLY_MEASURED, f"Solved, but {n} directions are not measured", "use more patterns",
-                         flags=(flag,)) for name, n in (("r", 7), ("g", 9))}  # fmt: skip
-    noise = Status(Verdict.SOLVED, "Solved", flags=(flag, "The image is hardly more than noise."))
-    (text,) = one_paragraph({**lost, "b": noise, "good": Status(Verdict.SOLVED, "Solved")})
-    assert text.startswith("r, g: Solved, but 7 directions are not measured (so r;") and "b: Solved." in text
-    assert text.count(flag) == 1 and text.count("hardly more than noise") == 1 and "good" not in text
-    assert one_paragraph({"good": Status(Verdict.SOLVED, "Solved")}) == ()
 
 
 # ---- Results on axes: units, numbers, and no global state of matplotlib ----
