@@ -122,6 +122,25 @@ def test_the_largest_terms_of_a_raster_form_the_correlations_frames(
     np.testing.assert_allclose(seen, frames[0], rtol=1e-9)
 
 
+@pytest.mark.parametrize("camera", [BARE, turned()])
+def test_light_in_few_cells_is_where_it_is_among_all_cells(
+    camera: CameraGeometry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Six of 99 cells in four rows and five columns are lit. (Planted: columns counted backwards.)"""
+    flat, values = np.array([2, 14, 18, 58, 63, 97]), np.arange(1.0, 7.0)
+    few = FrameOptics(camera, ROWS, COLUMNS, (300.0,), 1).frame(flat, values)
+    monkeypatch.setattr(image_formation, "_FILLED", 0.0)
+    whole = FrameOptics(camera, ROWS, COLUMNS, (300.0,), 1).frame(flat, values)
+    np.testing.assert_allclose(few, whole, rtol=0, atol=1e-6 * whole.mean())
+
+
+def test_the_error_of_a_raster_is_that_of_its_frame() -> None:
+    """Of a turned mask, in light of 9 rows and 11 columns of cells, against a raster of half the cells. (Planted: rows
+    for columns.)"""
+    error, known = image_formation.raster_error(turned(), ROWS, COLUMNS, 300.0, None, np.eye(9, 11))
+    assert not known and 0 < error < 0.02
+
+
 def test_few_terms_are_summed_where_they_take_less_time_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light in 6 rows and 4 columns of cells, a frame of 30 x 50 pixels: T terms take T x 4 x (6 + 30) multiplications
     for each column of the result, and 8 x T x (4 + 6) x 50 bytes. (Planted: the longer side first; fewer bytes; sums
@@ -192,3 +211,15 @@ def test_waves_of_large_drawings_are_refused_before_they_are_drawn() -> None:
     with pytest.raises(MitsimError, match=r"drawing noise\.png: .* use --effects=-diffraction"):
         rasters.check_waves(camera, Spectrum(np.array([500.0]), np.ones(1)))
     assert camera.is_drawn(waves=False) and camera.mask_terms == 1
+
+
+def test_a_raster_has_cells_for_the_light_that_the_longest_wave_carries_beyond_the_mask() -> None:
+    """Twice as many cells a side where they are half as wide. (Planted: cells that grow; the shortest wave.)"""
+    camera = turned(CameraGeometry(pixels=512, pixel_pitch=0.02))
+    whole = rasters.cells_a_side(camera, None)
+    assert abs(rasters.cells_a_side(camera, None, 0.5) - 2 * whole) <= 4
+    short, long, both = (
+        rasters.cells_a_side(camera, Spectrum(np.array(nm), np.ones(len(nm)) / len(nm)))
+        for nm in ([400.0], [800.0], [400.0, 800.0])
+    )
+    assert whole < short < long == both

@@ -446,6 +446,10 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
     always = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
     alike(lit, expected_frames(optics, more, np.append(labels, weights.shape[1]), always, 5))
     assert next(iter(lit)).variance > 0 and plain[1].variance == 0
+    alike(lit.of_projector, plain)
+    for shot in lit:
+        parts = shot.by_group
+        assert shot.heaviest == pytest.approx(parts.max() / np.trace(parts))
     assert np.allclose(lit.projector_off.irradiance, expected, rtol=1e-10) and lit.projector_off.variance == 0
     dark = expected_frames(optics, groups, labels, weights, 5).projector_off
     assert dark.irradiance.shape == expected.shape and not dark.irradiance.any()

@@ -12,6 +12,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence, ProjectorModel, Spectrum
+from mitsim.optics import frames as module
 from mitsim.optics.fft_shadow import geometric_samplers, wave_samplers
 from mitsim.optics.frames import Beams, _cuts, add_speckle, contrast_of, specular_frames
 from tests.invented import sensor
@@ -285,3 +286,25 @@ def test_lines_are_as_coherent_as_the_surface_is_smooth(roughness_um: float, lin
     found = contrast_of(devices(pitch=1e-6, lines=LINES, polarisation=1.0, **given), (SIDE, SIDE), np.ones((N, N)))
     # One in sqrt(2 x 6400) of a standard deviation, four times; 60 points are not quite many.
     assert found == pytest.approx(float(light.std()), rel=4 / np.sqrt(2 * count) + 1 / points)
+
+
+def test_gradients_of_a_beam_are_its_differences() -> None:
+    """Places are bilinear in both sides of a beam, so that central differences are exact. (Planted: one corner for
+    another.)"""
+    corners = np.random.default_rng(3).normal(size=(2, 2, 2, 2))
+    a, b, step = np.array([0.2, 0.7]), np.array([0.1, 0.4, 0.9]), 0.05
+    along, across = module._gradients(corners, a, b)
+    place = module._bilinear
+    by_a = (place(corners, a + step, b) - place(corners, a - step, b)) / (2 * step)
+    by_b = (place(corners, a, b + step) - place(corners, a, b - step)) / (2 * step)
+    np.testing.assert_allclose(np.broadcast_to(along, by_a.shape), by_a, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(np.broadcast_to(across, by_b.shape), by_b, rtol=1e-9, atol=1e-12)
+
+
+def test_frames_of_beams_are_formed_if_there_are_any_and_fit_into_memory() -> None:
+    """(Planted: none where there are some; memory of frames that shrinks with the pixels.)"""
+    for beams, formed in (([], None), ([1], "frames")):
+        light = module.SpecularLight(beams)  # type: ignore[arg-type]
+        light._kept = lambda *_: "frames"  # type: ignore[assignment, return-value]
+        assert light.frames(np.zeros(4, int), None, None) == formed  # type: ignore[arg-type]
+    assert module.at_once(4096) == 1 and module.at_once(64) == 32

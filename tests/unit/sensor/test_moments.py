@@ -1,6 +1,7 @@
 """Closed forms of the sensor's noise, where a wrong term is smaller than the tolerances of measured frames."""
 
 import math
+from types import SimpleNamespace
 
 import mpmath
 import numpy as np
@@ -11,7 +12,7 @@ from mitsim.core.configuration import shipped_path
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import load_sensor
 from mitsim.sensor import chain
-from mitsim.sensor.camera_fit import average_moments
+from mitsim.sensor.camera_fit import average_moments, saturation_of
 from mitsim.sensor.chain import poisson_quantile, specimen
 from tests.invented import sensor
 
@@ -155,3 +156,20 @@ def test_rounding_shows_offsets_by_its_slope() -> None:
     assert math.sqrt(between[0]) == pytest.approx(1e-3 * (1 - 2 * wave[0] + 2 * wave[1]), rel=2e-3)
     _, _, between = average_moments(np.array([1e4]), model, 0.05)
     assert math.sqrt(between[0]) == pytest.approx(0.05, rel=1e-2)  # noise of light dithers
+
+
+def test_a_bright_set_is_saturated_where_mean_and_variance_rise_too_little() -> None:
+    """Twice the light has a fifth of the variance, and 4 % or 1 % more signal above a dark level of 1000 DN. 5 % of the
+    rise of the light are 2.5 %. (Planted: the dark level added to the signal.)"""
+    for near, last in ((1960.0, None), (1990.0, 2)):
+        sets = [(0.0, 1000.0, 1.0), (1.0, near, 100.0), (2.0, 2000.0, 21.0)]
+        taken = [SimpleNamespace(light=light, mean=mean, variance=variance) for light, mean, variance in sets]
+        assert saturation_of(taken) == (1, last)  # type: ignore[arg-type]
+
+
+def test_the_mean_variance_is_that_of_the_pixels() -> None:
+    """By the short form of linear noise, and by all moments where pixels share light. (Planted: a sum.)"""
+    camera, electrons = load_sensor(shipped_path("calibration", "imx249.toml")), np.linspace(0, 2e5, 30).reshape(5, 6)
+    for model in (camera, camera.model_copy(update={"crosstalk": 0.05})):
+        expected = chain.frame_moments(electrons, 0.5, model)[1].mean()
+        assert chain.mean_variance(electrons, 0.5, model) == pytest.approx(expected)
