@@ -41,6 +41,7 @@ def test_the_quality_of_an_image_plus_a_constant_is_known(folder: Path, tmp_path
     one, _, plus, picture = found.images
     assert [row["name"] for row in found.images] == ["one", "run", "plus.npy", "image.png"]
     assert plus["psnr_to_first"] == pytest.approx(40, abs=1e-5)
+    assert found.largest_difference == pytest.approx(0.01, rel=0.2) and found.white == pytest.approx(1, abs=0.1)
     assert plus["mean_difference"] == pytest.approx(0.01) and plus["rms_difference"] == pytest.approx(0.01)
     image, truth = read_frame(folder / "one" / "image.exr")[0]["reflectance"], ms.load_run(run).truth
     assert truth is not None and one["psnr"] == pytest.approx(ms.psnr(image.astype(np.float64), truth))
