@@ -75,7 +75,8 @@ class Comparison:
     def table(self) -> Part:
         cells = [[DASH if row[key] is None else f"{row[key]:.4g}" for key in _COLUMNS] for row in self.images]
         rows = tuple((row["name"], *line) for row, line in zip(self.images, cells, strict=True))
-        return Part("Quality", "", ("image", *_COLUMNS.values()), rows, notes=self.notes)
+        lead = f"Figures show differences up to {reflectance(self.largest_difference)} of the board's reflectance."
+        return Part("Quality", lead, ("image", *_COLUMNS.values()), rows, notes=self.notes)
 
     def lines(self) -> list[str]:
         return [*self.table().lines(), f"Figures and page: {self.output}"]
