@@ -562,7 +562,7 @@ SIZES = {
     "scene": (5, 1359),
     "sensor": (4, 1118),
     "sessions": (4, 901),
-    "studies": (23, 5266),
+    "studies": (23, 5267),
     "transport": (15, 3992),
     "verbs": (1, 392),
     "version": (1, 1),
