@@ -268,11 +268,7 @@ class StudyOptions(Styled, Opening, Seeded):
         AUTO, "only with sweep: regularisations of its images, or auto", "--lambda", metavar="auto|VALUE,...", kind=str
     )
     seeds: int = option(
-        1,
-        "only with sweep: seeds, from --seed on, to take means and 95 % intervals of",
-        metavar="N",
-        min=1,
-        max=1000,
+        1, "only with sweep: seeds, from --seed on, to take means and 95 % intervals of", metavar="N", min=1, max=1000
     )
 
     @property

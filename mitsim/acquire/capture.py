@@ -462,7 +462,9 @@ class Rendered:
         """Draw the mean of the channels with a colour bar on ``ax`` or a new figure, and return the axes."""
         from mitsim.core.images import from_above
 
-        return from_above("report.plots", "draw_rendered")(self, ax, **figure)
+        channels = f", mean of {self.mean.shape[2]} channels" if self.mean.shape[2] > 1 else ""
+        title = f"{self.facts['estimator']} estimator{channels}"
+        return from_above("report.plots", "draw_frame")(self.mean.mean(2), title, "irradiance [W/m$^2$]", ax, **figure)
 
     def __repr__(self) -> str:
         rows, columns = self.mean.shape[:2]

@@ -73,7 +73,8 @@ class Sensed:
     @takes(Drawn)
     def plot(self, ax: Axes | None = None, **figure: Any) -> Axes:
         """Draw the digital numbers with a colour bar on ``ax`` or a new figure, and return the axes."""
-        return from_above("report.plots", "draw_sensed")(self, ax, **figure)
+        title = f"{self.sensor.name}, exposure {self.exposure_s:.3g} s"
+        return from_above("report.plots", "draw_frame")(self.digital, title, "digital number [DN]", ax, **figure)
 
     def __repr__(self) -> str:
         rows, columns = self.digital.shape

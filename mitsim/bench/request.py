@@ -375,11 +375,7 @@ _COLOUR_WORDS = (
 class Coloured(Options):
     """Which of the projector's light is told apart."""
 
-    colour: Annotated[str, validated_by(_known_colour)] = option(
-        NO,
-        _COLOUR_WORDS,
-        metavar="no|lines|bands:K|mosaic",
-    )
+    colour: Annotated[str, validated_by(_known_colour)] = option(NO, _COLOUR_WORDS, metavar="no|lines|bands:K|mosaic")
 
 
 class AnyColour(Coloured):

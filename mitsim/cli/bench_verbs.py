@@ -414,11 +414,7 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
             *([f"Frames are behind {payload['mosaic']} filters"] if "mosaic" in payload else []),
             f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
             f"exposure {payload['exposure_s']:.3g} s a frame",
-            *common.details(
-                f"Accuracy {payload['accuracy']:g}",
-                f"Seconds: {stages}",
-                memory_line(payload),
-            ),
+            *common.details(f"Accuracy {payload['accuracy']:g}", f"Seconds: {stages}", memory_line(payload)),
         ]
     lines += _kernel_lines(payload["kernels"])
     if ambient := payload.get("ambient_frame"):

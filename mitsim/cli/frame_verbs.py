@@ -359,12 +359,8 @@ def import_(asked: Importing) -> int:
     $ mitsim import hand.png -o hand --list diffusercam
     $ mitsim import run.h5 -o copy --calibration-output cal
     """
-    source, output, calibration, facts = (
-        asked.source,
-        asked.output,
-        asked.calibration_output,
-        asked.given_of(FrameFacts),
-    )
+    source, output, calibration = asked.source, asked.output, asked.calibration_output
+    facts = asked.given_of(FrameFacts)
     if output is None and calibration is None:
         raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
     if source.suffix.lower() in READERS:

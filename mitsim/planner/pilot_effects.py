@@ -199,11 +199,8 @@ class FollowedRuns(AnchorRuns):
     def changes(self) -> dict[Approximation, FloatArray]:
         if not self._lit or not any(self._simulation().at_anchors) or not norm(self._frames(1)):
             return {}
-        found, one, (cells, layers) = (
-            self.until(self.tolerance, _FOLLOWED_JUDGE),
-            self._beyond_mean(1, ()),
-            self._worth_a_look,
-        )
+        found, one = self.until(self.tolerance, _FOLLOWED_JUDGE), self._beyond_mean(1, ())
+        cells, layers = self._worth_a_look
         missing = (self._beyond_mean(2, ()) - one) / (1 - EVEN_CELLS) if cells else np.zeros_like(one)
         layered = self._beyond_mean(1, layers) if layers else one
         return {**found, WIDE: np.asarray(layered + missing - self._beyond_mean(0, ()))}

@@ -143,15 +143,9 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...]) -> Fac
         (True, f"phi_error, noise_free_residual: {exact}"),
         (noise is None, "digital.read_noise_e: noise cannot be distinguished from responses that are not separable"),
         (listed.digital.saturation_dn is None, f"digital.saturation_dn: {end}"),
-        (
-            listed.board_reflectance is None,
-            ("board_reflectance: 1 in an image is the board's, which is unknown"),
-        ),
+        (listed.board_reflectance is None, "board_reflectance: 1 in an image is the board's, which is unknown"),
         (listed.parallax is None, "parallax: `reconstruct --focus` can use only the depth of the board"),
-        (
-            not session.pairs,
-            ("motion, ambient light, nonlinearity: hardly found without pairs; take pairs"),
-        ),
+        (not session.pairs, "motion, ambient light, nonlinearity: hardly found without pairs; take pairs"),
         (bool(session.dark) and session.pairs, "dark: pairs have no dark signal, and dark frames are not used"),
     )
     result = {

@@ -393,10 +393,8 @@ def _of_colours(lines: SpectralFolder) -> Shown:
             caption = f"{about}; white is a perfect reflector; colours beyond the screen's are clipped"
             pictures.append(Picture(name, f"The {name}", caption, png(linear_srgb(xyz), LARGEST, SMALLEST)))
     if image.delta_e is not None:
-        about, ends = (
-            "an eye sees a difference of 1 side by side",
-            (0.0, max(float(np.percentile(image.delta_e, 99)), 1.0)),
-        )
+        about = "an eye sees a difference of 1 side by side"
+        ends = 0.0, max(float(np.percentile(image.delta_e, 99)), 1.0)
         title, unit = "Colour difference of image and truth", "CIE Delta E 2000"
         pictures.append(Picture.of("error", title, image.delta_e, about, unit, ends, quantity="error"))
     for number, line in enumerate(colours.channels):

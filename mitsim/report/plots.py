@@ -33,8 +33,6 @@ from mitsim.core.images import lightness, linear_light
 from mitsim.report.pages import Mean, scientific, typeset
 
 if TYPE_CHECKING:
-    from mitsim.acquire.capture import Rendered
-    from mitsim.acquire.sense import Sensed
     from mitsim.core.runs import Capture
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
@@ -334,16 +332,8 @@ def draw_shot(
 
 
 @_drawn
-def draw_sensed(sensed: Sensed, ax: Axes | None = None) -> Axes:
-    title = f"{sensed.sensor.name}, exposure {sensed.exposure_s:.3g} s"
-    return _draw(ax, sensed.digital, title, "digital number [DN]")
-
-
-@_drawn
-def draw_rendered(rendered: Rendered, ax: Axes | None = None) -> Axes:
-    channels = rendered.mean.shape[2]
-    title = f"{rendered.facts['estimator']} estimator" + (f", mean of {channels} channels" if channels > 1 else "")
-    return _draw(ax, rendered.mean.mean(axis=2), title, "irradiance [W/m$^2$]")
+def draw_frame(frame: npt.ArrayLike, title: str, unit: str, ax: Axes | None = None) -> Axes:
+    return _draw(ax, frame, title, unit)
 
 
 @_drawn

@@ -177,7 +177,7 @@ def run(
         steps = _Steps(read, folder, job or Job(), asked, {step.output: step for step in earlier.steps}, earlier.made)
         work = []
         for step in read.steps:
-            task = _WORK[step.verb](steps, step)
+            task = getattr(steps, f"_{step.verb}")(step)
             next(task)
             work.append((step, task))
         for step, task in work:
@@ -426,16 +426,6 @@ class _Steps:
         again = self.asked.resume and not pictures
         found = export(run, output=place, calibration=calibration, overwrite=again, **how)
         return f"Exported {found['frames']} frames as {found['format']}", ()
-
-
-_WORK = {
-    "transport": _Steps._transport,
-    "capture": _Steps._capture,
-    "calibrate": _Steps._calibrate,
-    "reconstruct": _Steps._reconstruct,
-    "study": _Steps._study,
-    "export": _Steps._export,
-}
 
 
 def _checksums(place: Path) -> dict[str, str]:

@@ -371,10 +371,7 @@ def _check_steps(session: Session, found: _Mistakes) -> None:
                 if name in values:
                     found.say((*place, name), "is the transport's; give it in [transport]")
             if colour != NO:
-                found.say(
-                    (*place, "colour"),
-                    ("cannot go with [transport], which sums all light; leave one out"),
-                )
+                found.say((*place, "colour"), "cannot go with [transport], which sums all light; leave one out")
         elif step.verb == "calibrate" and capture and colour != (other := capture.values.get("colour", NO)):
             found.say((*place, "colour"), f"{colour}, but the capture's is {other}; give both the same")
         elif step.verb == "reconstruct":

@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -50,15 +51,8 @@ from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 # -------- A scene in the light of each line
 
 _SPECTRUM = re.compile(r'value="(\s*[\d.]+\s*:[^"]*)"')
-_LAMP = """
-    <shape type="rectangle" id="daylight">
-        <transform name="to_world">
-            <scale x="200" y="80" z="1"/> <rotate x="1" angle="90"/> <translate x="0" y="600" z="300"/>
-        </transform>
-        <emitter type="area"> <spectrum name="radiance" value="{radiance:g}"/> </emitter>
-        <bsdf type="diffuse"> <spectrum name="reflectance" value="0"/> </bsdf>
-    </shape>
-</scene>"""
+_LAMP = Path(__file__).parent / "templates" / "daylight_lamp.xml"
+"""End of a scene file, with a lamp of daylight."""
 DAYLIGHT_RADIANCE = 117.0
 """Radiance of the lamp [W m^-2 sr^-1] that lights the sheet as the projector's white does."""
 FULL_LX = 2.97 * 205.0
@@ -112,7 +106,8 @@ def daylight_frame(studio: Studio, setup: Setup) -> tuple[FloatArray, float]:
         text, count = _SPECTRUM.subn(even, file.read_text(encoding="utf-8"))
         found += count
         if file.name == own.name:
-            text = text[: text.rindex("</scene>")] + _LAMP.format(radiance=DAYLIGHT_RADIANCE)
+            lamp = Template(_LAMP.read_text("utf-8")).substitute(radiance=f"{DAYLIGHT_RADIANCE:g}")
+            text = text[: text.rindex("</scene>")] + lamp
         file.write_text(text, encoding="utf-8")
     if not found:
         raise MitsimError(

@@ -173,34 +173,8 @@ class Learned:
 _MASK_MM, _SHEET_MM = 10.0, 1000.0
 """Sensor to mask and to sheet. Frames determine only the product of the mask's distance and an angle."""
 _WIDER = 1.05
-_SCENE = Template("""<scene version="3.0.0">
-<integrator type="path"><integer name="max_depth" value="2"/></integrator>
-<sensor type="mitsim_lensless" id="camera">
-    <float name="pixel_pitch" value="$pitch"/><float name="mask_distance" value="$mask"/>
-    <float name="mask_offset_row" value="$offset_row"/><float name="mask_offset_column" value="$offset_column"/>
-    <float name="scene_distance" value="$sheet"/><float name="fov" value="$fov"/>
-    <film type="hdrfilm"><integer name="width" value="$columns"/><integer name="height" value="$rows"/>
-        <rfilter type="box"/><string name="pixel_format" value="luminance"/>
-        <string name="component_format" value="float32"/></film>
-    <sampler type="independent"><integer name="sample_count" value="16"/></sampler>
-</sensor>
-<emitter type="projector" id="projector">
-    <transform name="to_world"><translate x="$half" y="0" z="0"/></transform>
-    <string name="fov_axis" value="x"/><float name="fov" value="$throw"/><float name="scale" value="1e6"/>
-    <texture name="irradiance" type="bitmap"><string name="filename" value="projector.png"/>
-        <boolean name="raw" value="true"/><string name="filter_type" value="nearest"/>
-        <string name="wrap_mode" value="clamp"/></texture>
-</emitter>
-<shape type="rectangle" id="sheet">
-    <transform name="to_world"><rotate z="1" angle="180"/><scale x="$width" y="$height" z="1"/>
-        <translate z="$sheet"/></transform>
-    <boolean name="flip_normals" value="true"/>
-    <bsdf type="diffuse"><texture name="reflectance" type="bitmap"><string name="filename" value="reflectance.png"/>
-        <boolean name="raw" value="true"/><string name="filter_type" value="nearest"/>
-        <string name="wrap_mode" value="clamp"/></texture></bsdf>
-</shape>
-</scene>
-""")
+_TEMPLATE = Path(__file__).parent / "templates" / "twin_scene.xml"
+"""Scene of the simulated camera, with $names in place of numbers."""
 
 
 @single_threaded_blas()
@@ -223,7 +197,7 @@ def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> Floa
     window = np.zeros((128, 256))
     window[:, 128:] = 1  # as the photograph's: the right half of a shifted lens
     (folder / "projector.png").write_bytes(grey_png(window))
-    text = _SCENE.substitute(
+    text = Template(_TEMPLATE.read_text("utf-8")).substitute(
         pitch=PITCH_MM, mask=_MASK_MM, sheet=_SHEET_MM, offset_row=beside[0], offset_column=beside[1],
         rows=codes.sides[0].sensor, columns=codes.sides[1].sensor, width=width, height=height, half=half,
         fov=2 * np.degrees(np.arctan(_WIDER * half / _SHEET_MM)), throw=2 * np.degrees(np.arctan(2 * half / _SHEET_MM)),

@@ -583,10 +583,8 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
 @keep_scenes()
 def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
     _, rng = base.streams(0, dr.arange(mi.UInt32, _LAMP_POINTS), mi.UInt32(0))
-    to_world, place = (
-        camera.world_transform(),
-        shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32())),
-    )
+    to_world = camera.world_transform()
+    place = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
     sensor = dr.zeros(mi.SurfaceInteraction3f, _LAMP_POINTS)
     sensor.p = to_world @ mi.Point3f(0)
     way = place.p - sensor.p
