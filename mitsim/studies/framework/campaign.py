@@ -388,11 +388,19 @@ def _open(shared: str | None) -> Any:
     return Studio(shared)
 
 
+@dataclass(frozen=True)
+class _LazyStudio:
+    shared: str | None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_open(self.shared), name)
+
+
 def measure_batch(name: str, batch: Batch, shared: str | None = None) -> Iterator[tuple[Point, Found | str]]:
     """Yield each point of a ``batch`` with its findings, or with the refusal that ends the batch."""
     for point in batch:
         try:
-            yield point, find_experiment(name).measure(_open(shared), point)
+            yield point, find_experiment(name).measure(_LazyStudio(shared), point)
         except MitsimError as error:
             yield point, str(error)
             return
