@@ -34,7 +34,7 @@ from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PARTS, output_folder, plain, remove_page, whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Job, Limits
-from mitsim.core.manifests import MANIFEST, CalibrationManifest, resumable
+from mitsim.core.manifests import MANIFEST, CalibrationManifest, other_request, resumable
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.framelist import LISTS, FrameList
@@ -241,11 +241,8 @@ def _run_sessions(
         if again and place is not None:
             before, own = resumable(place, KIND), plain(configuration)
             earlier = before["configuration"] if isinstance(before.get("configuration"), dict) else {}
-            if changed := [key for key in {**own, **earlier} if earlier.get(key) != own.get(key)]:
-                raise MitsimError(
-                    f"resume=True: {place} holds a session of another configuration ({', '.join(changed)} differ); "
-                    "use the same options, or another folder"
-                )
+            if earlier != own:
+                raise other_request(place, "a session", earlier, own)
             if session.depth is not None and before.get("status") == "complete":
                 return [load_calibration(place)]
         # The folder is claimed before any work; a new one is removed if the session fails before writing.

@@ -479,6 +479,13 @@ def resumable(folder: Path, kind: str) -> dict[str, Any]:
     return data
 
 
+def other_request(place: Path, kind: str, earlier: Mapping[str, Any], own: Mapping[str, Any]) -> MitsimError:
+    """Return the refusal to resume work whose ``earlier`` configuration differs from one's ``own``."""
+    changed = ", ".join(key for key in {**own, **earlier} if earlier.get(key) != own.get(key)) or "unknown"
+    words = f"holds {kind} of another configuration ({changed} differ)"
+    return MitsimError(f"resume=True: {place} {words}; use the same options, or another folder")
+
+
 def write_manifest(folder: Path, manifest: RunHead | CalibrationManifest) -> None:
     # Version 0.10.0 refuses keys that it does not know.
     left_out = {key for key in ("closing_frame", "order") if getattr(manifest, key, None) is None}

@@ -625,11 +625,7 @@ def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[Recorder]:
         data, place = manifests.resumable(path, "capture"), f"{path}/{MANIFEST}"
         before = validate(RunHead, data, place, manifests.UNVERSIONED)
         if before.configuration_sha256 != head.configuration_sha256:
-            changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
-            raise MitsimError(
-                f"resume=True: {path} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
-                "use the same options, or another folder"
-            )
+            raise manifests.other_request(path, "a run", before.configuration, head.configuration)
         if before.status == "complete":
             known = manifests.read_manifest(path, RunManifest).checksums
     with output_folder(path, overwrite=again) as folder:

@@ -32,7 +32,7 @@ HDF5, PNG = "hdf5", "png"
 FORMATS = {
     HDF5: "packed.write_hdf5",
     "mat": "other_programs.write_matlab",
-    "torch": "other_programs.write_tensors",
+    "torch": "other_programs.write_torch",
     PNG: "other_programs.write_pngs",
 }
 """Functions that write each format: from place, run, and calibration or projector to notes on the use of the file, or

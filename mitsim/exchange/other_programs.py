@@ -5,7 +5,6 @@ PyTorch and xarray are extras (`pip install mitsim[torch,xarray]`), imported whe
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,7 +19,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray, read_variables, write_variables
 from mitsim.core.colour_files import CALIBRATION, lines_of_planes
 from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate, validate
-from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channel
 from mitsim.core.files import whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Limits
@@ -34,6 +33,7 @@ from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
 from mitsim.devices.session import UNIFORM, halves_in_order
 from mitsim.exchange.capture_list import TURNED
 from mitsim.exchange.packed import FACTORS, Calibration, Content, Loaded, Packed, Run, as_channel, shots_of
+from mitsim.learn.requests import check_torch
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
 from mitsim.version import __version__
@@ -128,16 +128,17 @@ def load_flatcam(path: Path, channel: str | None) -> Iterator[Loaded]:
 # -------- Tensors of PyTorch
 
 
-def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
+def write_torch(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
     """Write a run as tensors that `torch.load` reads with `weights_only`, whole or not at all.
 
     `y` (K K', rows, columns) are electrons a second without ambient light, patterns row-major over (i, j).
     MitsimError if PyTorch is not installed or a frame cannot be read.
     """
-    try:
-        torch: Any = importlib.import_module("torch")
-    except ImportError as error:
-        raise MitsimError(f"torch is not installed ({error}); type: pip install 'mitsim[torch]'") from error
+    check_torch("the format torch needs", "torch")
+    import torch
+
+    from mitsim.learn.networks import write_tensors
+
     part = run.parts[""]
     shots = Capture(part.manifest, None, {file: part.read(file) for file in dict.fromkeys(part.names)})
     left, right = shots.patterns
@@ -149,11 +150,7 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
         factors = (calibration.parts[""].read(file)[0]["factor"] for file in FACTORS)
         arrays.update({side: np.asarray(factor, np.float64) for side, factor in zip(SIDES, factors, strict=True)})
     tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
-    with whole_file(path) as place:
-        try:
-            torch.save(tensors, place)
-        except RuntimeError as error:  # torch's own words for a full disk, in pages
-            raise OSError(f"torch: {cut(reason_of(error))}") from error
+    write_tensors(path, tensors)
     return ()
 
 

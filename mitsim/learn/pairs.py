@@ -37,6 +37,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import PAIRS, check_plain, output_folder, plain, write_json
 from mitsim.core.images import read_reflectance
 from mitsim.core.job import Cost
+from mitsim.core.manifests import other_request
 from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import digital_of
@@ -302,11 +303,8 @@ def make_pairs(bench: Bench, asked: PairsRequest, task: Task) -> tuple[PairStore
     configuration: dict[str, Any] = dict(plain(about))
     if again:
         before = read_pairs_manifest(task.output).configuration
-        if changed := [key for key, value in configuration.items() if before.get(key) != value]:
-            raise MitsimError(
-                f"resume=True: {task.output} holds pairs of another configuration ({', '.join(changed)} differ); use "
-                "the same options, or another folder"
-            )
+        if before != configuration:
+            raise other_request(task.output, "pairs", before, configuration)
     digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
     shards = list[Shard]()
     ends = [asked.count * group // len(groups) for group in range(len(groups) + 1)]

@@ -139,7 +139,7 @@ class Training(Schedule):
             raise MitsimError(f"method {self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
 
 
-def check_torch() -> None:
+def check_torch(needed_by: str = "networks need", extra: str = "learn") -> None:
     """Raise MitsimError if torch, an extra, is not installed."""
     if find_spec("torch") is None:
-        raise MitsimError("torch is not installed, which networks need; type: pip install 'mitsim[learn]'")
+        raise MitsimError(f"torch is not installed, which {needed_by}; type: pip install 'mitsim[{extra}]'")

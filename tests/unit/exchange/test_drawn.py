@@ -250,7 +250,7 @@ def test_a_studys_rows_are_a_table(tmp_path: Path) -> None:
 def test_a_missing_package_is_told_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = made(tmp_path)
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MitsimError, match=r"torch is not installed .* pip install 'mitsim\[torch\]'"):
+    with pytest.raises(MitsimError, match=r"torch is not installed, .* pip install 'mitsim\[torch\]'"):
         export(bench.run, "torch", tmp_path / "run.pt", bench.calibration)
     assert not (tmp_path / "run.pt").exists()
 
