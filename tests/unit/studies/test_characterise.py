@@ -117,9 +117,9 @@ def test_page_plots_and_json_lie_in_the_folder(tmp_path: Path) -> None:
         *(f"{name}.{kind}" for name in ("dark_current", "linearity", "photon_transfer") for kind in PLOTS),
     ]  # fmt: skip
     page = (tmp_path / "found" / "characterise.html").read_text(encoding="utf-8")
-    assert page.count('<img src="data:image/') == 3 and done.message in page and done.warnings == ()
+    assert page.count('<img src="data:image/') == 3 and done.headline in page and done.warnings == ()
     gain = next(row for row in done.fields if row.name == "gain_dn_per_e")
-    assert done.message.startswith(f"Gain {gain.found:.4g} DN/e-, read noise ")
+    assert done.headline.startswith(f"Characterised invented: gain {gain.found:.4g} DN/e-, read noise ")
     assert all(f"<td>{row.name}</td>" in page for row in (*done.rows, *done.fields))
     written = json.loads((tmp_path / "found" / "characterise.json").read_text())
     assert written["kind"] == "characterise" and written["pixels"] == 32
