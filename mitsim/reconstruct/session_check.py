@@ -33,8 +33,9 @@ from mitsim.reconstruct.solver import robust_scatter
 
 # ---- The moving shadow ----------------------------------------------------------------------------------------------
 
-_MOVES = (0, -1), (1, -1), (-1, -1), (2, -1)
-"""Turns and sign of the frequencies that pixels alias to k in [0, pi]; masks of two pixels a feature need them."""
+_TURNS = 0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6
+"""Turns of the frequencies 2 pi t - k that pixels alias to k in [0, pi]; a pixel as wide as some features of the mask
+needs most of them."""
 _LINES = 8
 _ENOUGH = 16, 40
 _PREDICTED = 0.15
@@ -81,11 +82,12 @@ class MovingShadow:
         step = float(steps[int(np.argmax(power[np.arange(len(self.angles)), places].sum(axis=1)))])
         # The modes are these phases, and those of aliases, times slow polynomials.
         degree = max(min(3, n // _LINES - 1), 0)
-        slow, aliases = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree), list[ComplexArray]()
-        for turns, sign in _MOVES[: max(1, 3 * n // _LINES // (degree + 1))]:
-            phase = np.exp(1j * step * np.outer(2 * np.pi * turns + sign * self.angles, np.arange(n)))
-            aliases.append(phase[..., None] * slow)
-        modes = np.asarray(np.linalg.qr(np.concatenate(aliases, axis=2))[0])
+        slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree)
+        # Aliases that nearly coincide at this step are one alias.
+        turns = [t for i, t in enumerate(_TURNS) if all(abs((t - u) * step % 1 - 0.5) < 0.5 - 1 / n for u in _TURNS[:i])]
+        aliases = 2 * np.pi * np.array(turns[: max(1, 3 * n // _LINES // (degree + 1))]) - self.angles[:, None]
+        phases = np.exp(1j * step * aliases[:, None] * np.arange(n)[:, None])
+        modes = np.asarray(np.linalg.qr((phases[..., None] * slow[:, None]).reshape(len(phases), n, -1))[0])
         turned = modes.conj().transpose(0, 2, 1)
         # Squared length of each pattern's stripes beyond the modes.
         own = np.maximum(n / count - np.square(np.abs(np.matmul(turned, signs))).sum(axis=1), 1e-9)
