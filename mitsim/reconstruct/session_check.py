@@ -84,7 +84,8 @@ class MovingShadow:
         degree = max(min(3, n // _LINES - 1), 0)
         slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree)
         # Aliases that nearly coincide at this step are one alias.
-        turns = [t for i, t in enumerate(_TURNS) if all(abs((t - u) * step % 1 - 0.5) < 0.5 - 1 / n for u in _TURNS[:i])]
+        near = 0.5 - 1 / n
+        turns = [t for i, t in enumerate(_TURNS) if all(abs((t - u) * step % 1 - 0.5) < near for u in _TURNS[:i])]
         aliases = 2 * np.pi * np.array(turns[: max(1, 3 * n // _LINES // (degree + 1))]) - self.angles[:, None]
         phases = np.exp(1j * step * aliases[:, None] * np.arange(n)[:, None])
         modes = np.asarray(np.linalg.qr((phases[..., None] * slow[:, None]).reshape(len(phases), n, -1))[0])
