@@ -31,7 +31,7 @@ from mitsim.bench.request import (
     family_of,
 )
 from mitsim.core import environment
-from mitsim.core.colour_files import BANDS, LINES, RUN, bands_of
+from mitsim.core.colour_files import BANDS, LINES, RUN, bands_of, spectral_of
 from mitsim.core.colour_files import MOSAIC as MOSAIC_RUN
 from mitsim.core.configuration import (
     CAMERA,
@@ -116,7 +116,7 @@ def open_as(scene: Path | str, opening: Opening, job: Job, colour: str = NO) -> 
     """Open the bench of a ``scene`` as ``opening`` states, for a ``colour``, in a stage of the ``job``."""
     from mitsim.api.bench import open_bench
 
-    variant = opening.traced_in(colour)
+    variant = opening.variant if colour in (NO, AUTO) else spectral_of(opening.variant)
     with job.clock.stage("open scene"):
         return open_bench(
             scene, variant, opening.camera, opening.projector, opening.allow_outside_files, **opening.parameters

@@ -429,11 +429,8 @@ def open_apparatus(
     devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
     # By their whole paths: who repeats this from another folder finds them.
     whole = {**defines, **{name: path for path, name in loaded.own.items()}}
-    named = {
-        "camera": camera and str(sensor_path.absolute()),
-        "projector": projector and str(projector_path.absolute()),
-    }
-    opened = {**named, "allow_outside_files": allow_outside_files}
+    opened: dict[str, Any] = {"camera": camera and str(sensor_path.absolute())}
+    opened |= {"projector": projector and str(projector_path.absolute()), "allow_outside_files": allow_outside_files}
     return Apparatus(loaded, devices, variant, whole, opened=opened)
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mitsim.bench.effects import parse_switches
 from mitsim.core import configuration
-from mitsim.core.colour_files import BANDS, LINES, bands_of, spectral_of
+from mitsim.core.colour_files import BANDS, LINES, bands_of
 from mitsim.core.configuration import CAMERA, PROJECTOR, QUALITY, FilePath, Options, option, shipped_names, validated_by
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
@@ -303,10 +303,6 @@ class Opening(LitScene):
     camera: FilePath | None = option(
         None, "camera: shipped name, or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, CAMERA)
     )
-
-    def traced_in(self, colour: str) -> str:
-        """Return the variant that traces light for a ``colour``: one that knows wavelengths if lines are told apart."""
-        return self.variant if colour in (NO, AUTO) else spectral_of(self.variant)
 
     def check(
         self, scene: Path | str, patterns: str | None = None, timing: Exposure | None = None, colour: str = NO

@@ -15,21 +15,10 @@ from typing import Annotated
 import typer
 
 import mitsim
+from mitsim.cli import frame_verbs
 from mitsim.cli.bench_verbs import capture, demo, doctor, pairs, plan, render, run_, study, transport, view
 from mitsim.cli.calibrate_verb import calibrate
 from mitsim.cli.commands import Program, Verb, help_of, message_of
-from mitsim.cli.frame_verbs import (
-    characterise,
-    compare,
-    export,
-    import_,
-    patterns,
-    reconstruct,
-    report,
-    sense,
-    show,
-    train,
-)
 from mitsim.cli.shelf_verbs import list_, new
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.worker import INTERRUPTED, end_stopped, end_uncaught, is_stopped, say_note
@@ -108,12 +97,12 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 
 _VERBS = {
-    "Main steps": (demo, run_, view, plan, capture, calibrate, reconstruct),
-    "Light and sensor alone": (render, sense, characterise),
-    "Experiments": (study, compare),
-    "Neural networks": (pairs, train),
-    "Real devices and other programs": (export, import_, patterns, transport),
-    "Files and installation": (show, report, list_, new, doctor),
+    "Main steps": (demo, run_, view, plan, capture, calibrate, frame_verbs.reconstruct),
+    "Light and sensor alone": (render, frame_verbs.sense, frame_verbs.characterise),
+    "Experiments": (study, frame_verbs.compare),
+    "Neural networks": (pairs, frame_verbs.train),
+    "Real devices and other programs": (frame_verbs.export, frame_verbs.import_, frame_verbs.patterns, transport),
+    "Files and installation": (frame_verbs.show, frame_verbs.report, list_, new, doctor),
 }
 """Verbs by heading, in the order of the help."""
 for _panel, _verbs in _VERBS.items():

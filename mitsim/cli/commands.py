@@ -181,11 +181,8 @@ class Pictured(Common):
 
             start, (path, values, unit) = time.perf_counter(), frame
             drawn = Picture.of(path.name, path.name, values, unit=unit, ends=(None, None))
-            return {
-                "file": str(drawn.write(path.parent)),
-                "shows": drawn.scale,
-                "seconds": time.perf_counter() - start,
-            }
+            written = str(drawn.write(path.parent))
+            return {"file": written, "shows": drawn.scale, "seconds": time.perf_counter() - start}
 
         made, failed = self._attempt(make, "the frame is kept")
         said = [] if made is None else [f"picture {made['file']}: {made['shows']}"]

@@ -18,19 +18,7 @@ from pydantic import BaseModel
 
 from mitsim.bench.effects import DISCRETISED, EFFECTS
 from mitsim.cli.commands import Common, Replaced, argument, command, to_make
-from mitsim.core.configuration import (
-    CAMERA,
-    DEFAULT_CAMERA,
-    PROJECTOR,
-    RECIPE,
-    WHAT,
-    load_model,
-    opening_words,
-    option,
-    read_toml,
-    shipped_files,
-    toml_value,
-)
+from mitsim.core import configuration
 from mitsim.core.errors import MitsimError, near_name
 from mitsim.core.files import output_file, whole_folder, write_text
 from mitsim.devices.patterns import FAMILIES
@@ -53,7 +41,7 @@ class Entry:
 
 
 def _cameras() -> Iterator[Entry]:
-    for name, path in shipped_files("calibration", ".toml", CAMERA).items():
+    for name, path in configuration.shipped_files("calibration", ".toml", configuration.CAMERA).items():
         sensor = load_sensor(path)
         verbs = "capture, sense, characterise" if sensor.states_efficiency else "capture in colour, characterise"
         if sensor.sensor_only:
@@ -70,7 +58,7 @@ def _masks() -> Iterator[Entry]:
 def _studies() -> Iterator[Entry]:
     """Read the studies from their source, because importing all of them takes three seconds."""
     for name in EXPERIMENTS:
-        tree = _source(f"mitsim.studies.{SHARED.get(name, f'{name}_study')}")
+        tree = ast.parse(_source(f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"))
         calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and len(node.args) > 2)
         named = next(call for call in calls if isinstance(call.args[0], ast.Constant) and call.args[0].value == name)
         yield Entry(name, ast.literal_eval(named.args[2]))
@@ -82,7 +70,8 @@ def _methods() -> Iterator[Entry]:
 
     for name, solver in SOLVERS.items():
         yield Entry(name, _clause(str(type(solver).__doc__)))
-    classes = {node.name: node for node in _source("mitsim.learn.networks").body if isinstance(node, ast.ClassDef)}
+    nodes = ast.parse(_source("mitsim.learn.networks")).body
+    classes = {node.name: node for node in nodes if isinstance(node, ast.ClassDef)}
     words = {name.lower(): _clause(ast.get_docstring(node) or "") for name, node in classes.items()}
     for name in METHODS:
         yield Entry(name, f"{words[name.replace('-', '')]}; to be trained")
@@ -90,12 +79,13 @@ def _methods() -> Iterator[Entry]:
 
 KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
     "scenes": lambda: (
-        Entry(name, *opening_words(path)[::-1]) for name, path in shipped_files("scenes", "scene.xml").items()
+        Entry(name, *configuration.opening_words(path)[::-1])
+        for name, path in configuration.shipped_files("scenes", "scene.xml").items()
     ),
     "cameras": _cameras,
     "projectors": lambda: (
-        Entry(name, opening_words(path)[1], read_toml(path)["name"])
-        for name, path in shipped_files("calibration", ".toml", PROJECTOR).items()
+        Entry(name, configuration.opening_words(path)[1], configuration.read_toml(path)["name"])
+        for name, path in configuration.shipped_files("calibration", ".toml", configuration.PROJECTOR).items()
     ),
     "masks": _masks,
     "studies": _studies,
@@ -108,10 +98,10 @@ KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
 """Entries of each kind that `mitsim list` knows, as the files and modules state them."""
 
 
-def _source(module: str) -> ast.Module:
+def _source(module: str) -> str:
     found = importlib.util.find_spec(module)
     assert found is not None and found.origin is not None, module
-    return ast.parse(Path(found.origin).read_text(encoding="utf-8"))
+    return Path(found.origin).read_text(encoding="utf-8")
 
 
 def _clause(text: str) -> str:
@@ -184,11 +174,11 @@ class _Starter:
 
 
 _STARTERS = {
-    "camera": _Starter(_CAPTURE, DEFAULT_CAMERA, CAMERA),
-    "projector": _Starter("mitsim plan photograph --projector {}", "mp_cl1", PROJECTOR),
+    "camera": _Starter(_CAPTURE, configuration.DEFAULT_CAMERA, configuration.CAMERA),
+    "projector": _Starter("mitsim plan photograph --projector {}", "mp_cl1", configuration.PROJECTOR),
     "scene": _Starter("mitsim plan {}/scene.xml", "photograph"),
-    "mask": _Starter(_CAPTURE, DEFAULT_CAMERA, CAMERA),
-    "recipe": _Starter("mitsim calibrate photograph -o cal --recipe {}", "session", RECIPE),
+    "mask": _Starter(_CAPTURE, configuration.DEFAULT_CAMERA, configuration.CAMERA),
+    "recipe": _Starter("mitsim calibrate photograph -o cal --recipe {}", "session", configuration.RECIPE),
     "session": _Starter("mitsim run {} -o session-output", "demo"),
     "study": _Starter("mitsim study {} -o study --quick"),
     "list": _Starter("mitsim import FRAMES -o run --list {} --camera NAME --exposure SECONDS"),
@@ -198,8 +188,10 @@ _STARTERS = {
 def _shipped(kind: str) -> Mapping[str, Path]:
     """Return the files that one of a ``kind`` may be like, by name."""
     if field := _STARTERS[kind].field:
-        return shipped_files("calibration", ".toml", field)
-    return shipped_files("scenes", "scene.xml") if kind == "scene" else shipped_files("sessions", ".toml")
+        return configuration.shipped_files("calibration", ".toml", field)
+    if kind == "scene":
+        return configuration.shipped_files("scenes", "scene.xml")
+    return configuration.shipped_files("sessions", ".toml")
 
 
 def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
@@ -217,7 +209,7 @@ def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
         yield ""
         yield from starter(MaskProfile, {"kind": mask, **_MASK, **_MASKS[mask]}, "mask")
     elif kind == "projector":
-        yield from begun(load_model(like, ProjectorModel), name=name)
+        yield from begun(configuration.load_model(like, ProjectorModel), name=name)
     elif kind == "recipe":
         yield from begun(load_recipe(like))
     elif kind == "session":
@@ -225,9 +217,7 @@ def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
     elif kind == "list":  # what `mitsim import` needs beside a camera and an exposure
         yield from starter(CaptureList, {"patterns": "dots:7", "n": 128})
     elif kind == "study":
-        found = importlib.util.find_spec("mitsim.studies.starter_study")
-        assert found is not None and found.origin is not None
-        yield Path(found.origin).read_text(encoding="utf-8").replace('"starter"', f'"{name}"').rstrip()
+        yield _source("mitsim.studies.starter_study").replace('"starter"', f'"{name}"').rstrip()
 
 
 class Beginning(Replaced, Common):
@@ -238,12 +228,12 @@ class Beginning(Replaced, Common):
     kind: str = argument(..., ", ".join(_STARTERS), "KIND", complete=lambda: _STARTERS)
     name: str = argument(..., "name of letters, digits, - and _ that begins with a letter", "NAME")
     output: Path | None = to_make(None, "file to write, or folder for a scene; by default named after NAME", "PATH")
-    like: str | None = option(
+    like: str | None = configuration.option(
         None,
         "shipped file to copy from; for a mask also a kind of masks (`mitsim list masks`)",
         metavar="NAME",
         show_default="imx249, mp_cl1, photograph, session, demo",
-        panel=WHAT,
+        panel=configuration.WHAT,
         complete=lambda: dict.fromkeys(
             name for kind, each in _STARTERS.items() if each.like for name in [*_shipped(kind), *_MASKS]
         ),
@@ -285,7 +275,7 @@ def new(asked: Beginning) -> int:
         names = [*masks, *known]
         raise MitsimError(f"--like {like}: is no shipped {kind}; {near_name(str(like), names)}give {', '.join(names)}")
     use = begin.use.format(output)
-    if begin.field == CAMERA and not load_sensor(source).states_efficiency:
+    if begin.field == configuration.CAMERA and not load_sensor(source).states_efficiency:
         use = f"mitsim characterise {output} -o figures"
     if kind == "scene":
         with whole_folder(output) as folder:
@@ -335,4 +325,4 @@ def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") 
             part = next(kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel))
             yield from ("", *comment, *starter(part, value, f"{table}.{name}".removeprefix(".")))
         else:
-            yield from (*comment, f"{name} = {toml_value(value)}")
+            yield from (*comment, f"{name} = {configuration.toml_value(value)}")

@@ -193,10 +193,8 @@ def import_file(
     from mitsim.core.runs import load_run
 
     with _function(READERS[source.suffix.lower()])(source, channel) as (run, calibration):
-        wanted = {
-            "run": ("output", output, run),
-            "calibration": ("calibration_output", calibration_output, calibration),
-        }
+        factors = "calibration_output", calibration_output, calibration
+        wanted = {"run": ("output", output, run), "calibration": factors}
         for kind, (argument, place, held) in wanted.items():
             if place is not None and held is None:
                 raise ArgumentError(argument, f"{place}: {source} contains no {kind}; leave this option out")

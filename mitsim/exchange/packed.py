@@ -38,15 +38,6 @@ from mitsim.core.files import (
 from mitsim.core.headline import each_once, frames_headline
 from mitsim.core.images import LEAST_RESPONSE, CommonFactor, Numbers, Preparer, image_pages, read_images
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import (
-    AmbientFile,
-    CalibrationManifest,
-    ClosingFile,
-    Patterns,
-    RunHead,
-    RunManifest,
-    ShotFile,
-)
 from mitsim.core.picture_files import CORRECTIONS, Preparation, image_files
 from mitsim.core.runs import AMBIENT, CLOSING, TRUTH, frame_name, load_run
 from mitsim.devices.patterns import PatternFamily, parse_patterns, shot_orders
@@ -57,7 +48,7 @@ from mitsim.version import __version__
 if TYPE_CHECKING:
     import h5py
 
-Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
+Manifest = TypeVar("Manifest", manifests.RunManifest, manifests.CalibrationManifest)
 FACTORS = tuple(f"{name}.exr" for name in manifests.SIDES)
 
 # -------- The content of a folder
@@ -131,19 +122,19 @@ class Content(colour_files.Coloured, Generic[Manifest]):
             write_text(folder / colour_files.COLOUR, self.text)
 
 
-Run = Content[RunManifest]
-Calibration = Content[CalibrationManifest]
+Run = Content[manifests.RunManifest]
+Calibration = Content[manifests.CalibrationManifest]
 Loaded = tuple[Run | None, Calibration | None]
 """Run and calibration of an exchanged file, if present."""
 
 
-def pack_run(folder: Path) -> Packed[RunManifest]:
+def pack_run(folder: Path) -> Packed[manifests.RunManifest]:
     shots = load_run(folder)
     return Packed(shots.manifest, read_text(folder / manifests.MANIFEST, MOST_BYTES), shots.files, shots.read, folder)
 
 
-def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
-    manifest = manifests.read_manifest(folder, CalibrationManifest)
+def pack_calibration(folder: Path) -> Packed[manifests.CalibrationManifest]:
+    manifest = manifests.read_manifest(folder, manifests.CalibrationManifest)
 
     def read(name: str) -> tuple[Channels, Metadata]:
         verify(folder, name, manifest.checksums, "calibrate again")
@@ -165,7 +156,7 @@ def read_content(folder: Path, *kinds: str) -> Content[Any]:
     return Content({name: pack(part) for name, part in lines.parts.items()}, lines.colours, text, truths)
 
 
-def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Metadata]]:
+def shots_of(run: Packed[manifests.RunManifest]) -> Iterator[tuple[manifests.ShotFile, Channels, Metadata]]:
     """Yield every shot with its channels, (rows, columns) each, and metadata, read one at a time.
 
     MitsimError for a shot that does not have the shape and channels of the first, because other formats use one array.
@@ -223,7 +214,7 @@ def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> 
                 held.create_dataset(channel, data=values, **PACKED)
             held.create_dataset("metadata", data=[json.dumps(dict(metadata))])
 
-    def write_shots(place: h5py.Group, shots: Packed[RunManifest]) -> None:
+    def write_shots(place: h5py.Group, shots: Packed[manifests.RunManifest]) -> None:
         group = place.create_group("run", track_order=True)
         write_text(group, "manifest", shots.text)
         captures, stacks, texts = shots.manifest.patterns.captures, group.create_group("shots", track_order=True), []
@@ -306,10 +297,10 @@ def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
         yield run, calibration
 
 
-def _run_in(place: h5py.Group, path: Path) -> Packed[RunManifest]:
+def _run_in(place: h5py.Group, path: Path) -> Packed[manifests.RunManifest]:
     group = hdf5_item(place, "run", path, "Group")
     text, data = _json_in(group, "manifest", path)
-    manifest = manifests.checked_manifest(data, RunManifest, path)
+    manifest = manifests.checked_manifest(data, manifests.RunManifest, path)
     for name in (*(shot.file for shot in manifest.patterns.captures), *manifest.others.values()):
         if name in (".", "..", manifests.MANIFEST, LOCK, TRUTH) or not name.isprintable():
             raise MitsimError(f"{path}: a frame is called {cut(name)!r}; give it a name of its own")
@@ -336,7 +327,7 @@ def _run_in(place: h5py.Group, path: Path) -> Packed[RunManifest]:
     return Packed(manifest, text, (*(shot.file for shot in captures), *others), read, path)
 
 
-def _calibration_in(place: h5py.Group, path: Path) -> Packed[CalibrationManifest]:
+def _calibration_in(place: h5py.Group, path: Path) -> Packed[manifests.CalibrationManifest]:
     group = hdf5_item(place, "calibration", path, "Group")
     text, data = _json_in(group, "manifest", path)
 
@@ -344,7 +335,7 @@ def _calibration_in(place: h5py.Group, path: Path) -> Packed[CalibrationManifest
         with hdf5_errors(path):
             return _frame_in(group, Path(name).stem, path)
 
-    return Packed(manifests.checked_manifest(data, CalibrationManifest, path), text, FACTORS, read, path)
+    return Packed(manifests.checked_manifest(data, manifests.CalibrationManifest, path), text, FACTORS, read, path)
 
 
 def _colours_in(place: h5py.Group, kind: str, path: Path, beside: Sequence[str] = ()) -> tuple[str, ColourManifest]:
@@ -563,11 +554,11 @@ class _Plane:
                 if isinstance(shot, dict)
             ]
             named = {key: data[key] for key in ("family", "n", "P_L", "P_R") if key in data}
-            self.patterns = validate(Patterns, {**named, "captures": captures}, known.patterns)
+            self.patterns = validate(manifests.Patterns, {**named, "captures": captures}, known.patterns)
         else:
             left, right = (parse_patterns(known.patterns, side, known.listed.seed) for side in scene)
             family = PatternFamily(known.patterns, left.left, right.right)
-            self.patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
+            self.patterns = manifests.Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
         sides = tuple(len(matrix) for matrix in self.patterns.matrices)
         if sides != scene:
             raise MitsimError(
@@ -582,7 +573,7 @@ class _Plane:
         places: list[tuple[Path, int]],
         first: Numbers,
         command: str | None,
-    ) -> tuple[Packed[RunManifest], tuple[int, ...], int]:
+    ) -> tuple[Packed[manifests.RunManifest], tuple[int, ...], int]:
         """Return the run, the shape of its frames, and the number of pixels with too little response."""
         known, camera, listed, captures = self.known, self.camera, self.known.listed, self.patterns.captures
         preparer = Preparer.of(how, camera.digital, known.wanted)
@@ -590,7 +581,8 @@ class _Plane:
         shape = self._part(places[0][0], preparer.frame(places[0][0], first), how).shape
         ambient = listed.ambient and self._ambient(Path(listed.ambient), preparer, shape)
         seconds = listed.closing_exposure_s or camera.digital.exposure_s
-        closing = listed.closing_frame and ClosingFile(kind=listed.closing_frame, file=CLOSING, exposure_s=seconds)
+        kind = listed.closing_frame
+        closing = kind and manifests.ClosingFile(kind=kind, file=CLOSING, exposure_s=seconds)
         # The dark level depends on the exposure.
         of_last = replace(preparer, digital=preparer.digital.model_copy(update={"exposure_s": seconds}))
         names = (
@@ -615,15 +607,15 @@ class _Plane:
             "seed": listed.seed,
             **listed.model_dump(include={"closing_frame", "closing_exposure_s", "order"}, exclude_none=True),
         }
-        head = RunHead.of(configuration)
-        manifest = RunManifest(
+        head = manifests.RunHead.of(configuration)
+        manifest = manifests.RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,
             camera=self.identity or own,
             digital=preparer.digital,
             patterns=self.patterns,
             sensor_noise=None,
-            ambient_frame=AmbientFile(file=AMBIENT, shots=ambient[1]) if ambient else None,
+            ambient_frame=manifests.AmbientFile(file=AMBIENT, shots=ambient[1]) if ambient else None,
             closing_frame=closing,
             order=listed.order,
             checksums=dict.fromkeys(names, ""),  # worked out as the files are written

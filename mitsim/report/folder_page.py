@@ -32,17 +32,10 @@ from mitsim.core.runs import TRUTH, load_mosaic, load_run
 from mitsim.devices.framelist import ChartPlace
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality, psnr, summary_of, truth_for
+from mitsim.reconstruct import reconstruct
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import camera_parts, load_calibration
 from mitsim.reconstruct.misfit import chi_square_text
-from mitsim.reconstruct.reconstruct import (
-    DEPTH_FILE,
-    MADE_OF,
-    POINT_SPREAD,
-    UNCERTAINTY_FILE,
-    Reconstruction,
-    read_result,
-)
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, RESULT_FILE
 from mitsim.report import pages
 from mitsim.report.pages import LARGEST, REFLECTANCE, SMALLEST, Picture, lines_of, page_figure, render_page
@@ -50,7 +43,7 @@ from mitsim.report.pages import LARGEST, REFLECTANCE, SMALLEST, Picture, lines_o
 _ELSEWHERE = {
     *("kind", "format", "status", "configuration", "configuration_sha256", "checksums", "patterns", "plan"),
     *("seconds", "warnings", "versions", "command", "kernels", "result", "estimate", "verdict", "camera"),
-    *("opened", "inputs", MADE_OF),
+    *("opened", "inputs", reconstruct.MADE_OF),
 }
 """Keys of a manifest or result outside the table of numbers."""
 _ABOVE_BLACK = "DN above the black level"
@@ -276,12 +269,12 @@ def _numbers(data: Any) -> dict[str, float]:
 
 
 def _of_image(folder: Path) -> Shown:
-    result = read_result(folder)
+    result = reconstruct.read_result(folder)
     image = finite_channel(read_frame(folder / IMAGE_FILE)[0], "reflectance", folder / IMAGE_FILE)
     warnings = [*map(str, result.get("warnings") or ())]
     inputs = result.get("inputs") if isinstance(result.get("inputs"), dict) else {}
     white, truth, size = result.get("white"), truth_of(result), f"{image.shape[0]} x {image.shape[1]} projector pixels"
-    by_spread = POINT_SPREAD in (inputs or {}) and isinstance(white, float)
+    by_spread = reconstruct.POINT_SPREAD in (inputs or {}) and isinstance(white, float)
     unit, most = ("electrons/s", white) if by_spread else (REFLECTANCE, 1.0)
     method, weight = (inputs or {}).get("method"), result.get("lambda")
     how = [f"method {method}"] if isinstance(method, str) else []
@@ -292,10 +285,11 @@ def _of_image(folder: Path) -> Shown:
     pictures = [Picture.of("image", "The image", image, about, unit, (0.0, most))]
     if truth is not None and truth.shape == image.shape:
         pictures += [Picture.of("truth", "The truth", truth, _TRUTH), _difference("error", "Difference", image, truth)]
+    sigma, depth = reconstruct.UNCERTAINTY_FILE, reconstruct.DEPTH_FILE
     for file, channel, title, about, unit, ends in (
-        (UNCERTAINTY_FILE, "uncertainty", "Standard uncertainty", "without the truth", REFLECTANCE, (0.0, None)),
-        (DEPTH_FILE, "depth_mm", "Depth", "distance from the sensor", "mm", (None, None)),
-        (DEPTH_FILE, "confidence", "Confidence of the depth", "", "1 = certain", (0.0, 1.0)),
+        (sigma, "uncertainty", "Standard uncertainty", "without the truth", REFLECTANCE, (0.0, None)),
+        (depth, "depth_mm", "Depth", "distance from the sensor", "mm", (None, None)),
+        (depth, "confidence", "Confidence of the depth", "", "1 = certain", (0.0, 1.0)),
     ):
         if (path := folder / file).is_file():
             values, name = finite_channel(read_frame(path)[0], channel, path), channel.removesuffix("_mm")
@@ -309,7 +303,7 @@ def _of_image(folder: Path) -> Shown:
         pictures.append(Picture.of("misfit", "Misfit of the frames", tiles, about, chi, ends, quantity="chi-square"))
     return _shown(
         "Image",
-        _subject_of_image(result.get(MADE_OF), folder / RESULT_FILE),
+        _subject_of_image(result.get(reconstruct.MADE_OF), folder / RESULT_FILE),
         image_headline({**result, "shape": image.shape}, warnings),
         detail="" if warnings else str(result.get("status", "")),
         warnings=warnings,
@@ -318,7 +312,7 @@ def _of_image(folder: Path) -> Shown:
         seconds=_numbers(result.get("seconds")),
         tables={
             "Numbers": lines_of({key: value for key, value in result.items() if key not in _ELSEWHERE}),
-            "Configuration": lines_of({"inputs": inputs, MADE_OF: result.get(MADE_OF) or {}}),
+            "Configuration": lines_of({"inputs": inputs, reconstruct.MADE_OF: result.get(reconstruct.MADE_OF) or {}}),
             "Versions": {},
         },
     )
@@ -333,7 +327,7 @@ def _difference(name: str, title: str, image: FloatArray, truth: FloatArray) -> 
 
 def truth_of(result: Mapping[str, Any]) -> FloatArray | None:
     """Return the truth of an image; None where run or calibration are gone, or have changed."""
-    made_of, inputs = result.get(MADE_OF), result.get("inputs")
+    made_of, inputs = result.get(reconstruct.MADE_OF), result.get("inputs")
     if not isinstance(made_of, dict) or not isinstance(inputs, dict):
         return None
     try:
@@ -405,7 +399,7 @@ def _of_colours(lines: SpectralFolder) -> Shown:
             pictures.append(_difference(f"error_{line.name}", f"{title}, difference", own, truth[..., number]))
     return _shown(
         "Image in colour",
-        _subject_of_image(data.get(MADE_OF), folder / colour_files.COLOUR),
+        _subject_of_image(data.get(reconstruct.MADE_OF), folder / colour_files.COLOUR),
         image_headline(data, reasons),
         detail="" if truth is None and not image.patches else " ".join(f"{text}." for text in image.sentences[1:]),
         warnings=reasons,
@@ -618,7 +612,7 @@ class Trust:
     cause: str = ""
 
     @classmethod
-    def of(cls, image: Reconstruction, truth: FloatArray) -> Trust | None:
+    def of(cls, image: reconstruct.Reconstruction, truth: FloatArray) -> Trust | None:
         """Compare an ``image`` with the truth; None where its uncertainty is not known."""
         if image.uncertainty is None:
             return None

@@ -13,19 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mitsim.core import colour_files
 from mitsim.core.arrays import FloatArray
-from mitsim.core.colour_files import (
-    COLOUR,
-    IMAGE,
-    JOINT,
-    MOSAIC,
-    RUN,
-    ColourManifest,
-    check_lines,
-    is_coloured,
-    open_lines,
-    read_colours,
-)
 from mitsim.core.configuration import takes
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import write_frame
@@ -175,9 +164,9 @@ def reconstruct_colours(
         For folders of different lines, and as :func:`reconstruct`.
     """
     run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
-    found = open_lines(run, RUN, MOSAIC)
-    lines = found.filters or read_colours(run, RUN)
-    check_lines(lines, str(run), calibration)
+    found = colour_files.open_lines(run, colour_files.RUN, colour_files.MOSAIC)
+    lines = found.filters or colour_files.read_colours(run, colour_files.RUN)
+    colour_files.check_lines(lines, str(run), calibration)
     boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
     if len(boards) > 1:
         raise MitsimError(
@@ -195,9 +184,11 @@ def reconstruct_colours(
             raise ArgumentError(name, "has no effect behind colour filters; leave it out")
         image = _solve_at_once(lines, run, calibration, output, board, overwrite, job, finish, **options)
     else:
-        replaces = is_coloured(output) and (read_colours(output, IMAGE).names == lines.names or overwrite)
+        replaces = colour_files.is_coloured(output) and (
+            colour_files.read_colours(output, colour_files.IMAGE).names == lines.names or overwrite
+        )
         with output_folder(output, overwrite=replaces) as folder:
-            begins, images = not is_coloured(folder), dict[str, Judged]()
+            begins, images = not colour_files.is_coloured(folder), dict[str, Judged]()
             if begins:
                 state_image(folder, lines, status="incomplete")
             try:
@@ -206,7 +197,7 @@ def reconstruct_colours(
                     images[name] = reconstruct(run / name, calibration / name, folder / name, **own)
             except BaseException:
                 if begins and not any((folder / name).is_dir() for name in lines.names):  # refused before any image
-                    (folder / COLOUR).unlink()
+                    (folder / colour_files.COLOUR).unlink()
                 raise
             solved = {name: judged.reconstruction for name, judged in images.items()}
             shapes = {each.image.shape for each in solved.values()}
@@ -238,7 +229,7 @@ def reconstruct_colours(
 
 @single_threaded_blas()
 def _solve_at_once(
-    lines: ColourManifest,
+    lines: colour_files.ColourManifest,
     run: Path,
     calibration: Path,
     output: Path,
@@ -256,12 +247,12 @@ def _solve_at_once(
         for each in factors.values():
             each.check_fit(shots)
     made_of = "-".join(each.fingerprint for each in factors.values())
-    inputs = {"run": shots.fingerprint, "calibration": made_of, "mosaic": JOINT, "lambda": lam}
-    replaces = is_coloured(output)
+    inputs = {"run": shots.fingerprint, "calibration": made_of, "mosaic": colour_files.JOINT, "lambda": lam}
+    replaces = colour_files.is_coloured(output)
     if replaces:
-        read_colours(output, IMAGE)
+        colour_files.read_colours(output, colour_files.IMAGE)
         if not overwrite:
-            check_same_inputs(output, read_json(output / COLOUR), inputs)
+            check_same_inputs(output, read_json(output / colour_files.COLOUR), inputs)
     with output_folder(output, overwrite=replaces) as folder:
         with clock.stage("accumulate"):
             pairs = [(each.left, each.right) for each in factors.values()]
@@ -307,13 +298,13 @@ def _solve_at_once(
             qualities=qualities,
             facts={
                 "frames": "all lines at once, behind colour filters",
-                "solved": f"{JOINT}, {solved.iterations} steps",
+                "solved": f"{colour_files.JOINT}, {solved.iterations} steps",
                 "lambda": f"{lam:.3g}",
                 "residual of the frames": f"{residual:.1e}, of which {unexplained:.1e} is unexplained",
             },
             warnings=tuple(warnings),
             seconds=clock.seconds(),
-            solution={"mosaic": JOINT, "lambda": lam, "steps": solved.iterations}
+            solution={"mosaic": colour_files.JOINT, "lambda": lam, "steps": solved.iterations}
             | {"residual": residual, "unexplained": unexplained},
             inputs=inputs,
         )

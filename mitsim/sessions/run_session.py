@@ -18,21 +18,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, Field
 
 from mitsim.bench.request import NO, Exposure, Opening, Request, SessionRequest, Task
+from mitsim.core import files
 from mitsim.core.colour_files import MOSAIC, RUN, is_coloured, open_lines
 from mitsim.core.configuration import Configuration, takes, validate
 from mitsim.core.environment import deciding_versions
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.files import (
-    PAGE,
-    PICTURES,
-    check_output,
-    output_folder,
-    plain,
-    read_json,
-    remove_page,
-    write_json,
-    write_text,
-)
 from mitsim.core.headline import calibration_headline, each_once, frames_headline, headline, image_headline
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
@@ -40,18 +30,7 @@ from mitsim.devices.framelist import load_chart
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, check_export, export
 from mitsim.reconstruct.request import MODEL, ImageRequest
-from mitsim.sessions.session_file import (
-    FOLDERS,
-    OF_A_BENCH,
-    SESSION_FILE,
-    SUMMARY,
-    Session,
-    Step,
-    calibration_for,
-    read_session,
-    session_text,
-    stated,
-)
+from mitsim.sessions import session_file
 from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, load_network, open_as, prepare_study
 
 if TYPE_CHECKING:
@@ -167,13 +146,14 @@ def run(
     >>> ms.load_run("repeated/run").truth  # doctest: +SKIP
     """
     asked = RunOptions(**options)
-    read, place = read_session(session, values), Path(output)
-    again, earlier = (place / SUMMARY).is_file(), _Earlier(kind=KIND)
+    read, place = session_file.read_session(session, values), Path(output)
+    again, earlier = (place / session_file.SUMMARY).is_file(), _Earlier(kind=KIND)
     if again and not asked.resume:
         raise MitsimError(f"output {place}: holds a session already; use resume=True, or choose another folder")
-    with output_folder(place, overwrite=again) as folder:
+    with files.output_folder(place, overwrite=again) as folder:
         if again:
-            earlier = validate(_Earlier, read_json(folder / SUMMARY), f"resume=True: {folder / SUMMARY}")
+            summary = folder / session_file.SUMMARY
+            earlier = validate(_Earlier, files.read_json(summary), f"resume=True: {summary}")
         steps = _Steps(read, folder, job or Job(), asked, {step.output: step for step in earlier.steps}, earlier.made)
         work = []
         for step in read.steps:
@@ -181,19 +161,19 @@ def run(
             next(task)
             work.append((step, task))
         for step, task in work:
-            if step.verb in OF_A_BENCH:
+            if step.verb in session_file.OF_A_BENCH:
                 next(task)
-        head = {"kind": KIND, "session": stated(read.tables, folder), "versions": deciding_versions()}
-        results, text = list[StepResult](), session_text(read.tables, folder)
+        head = {"kind": KIND, "session": session_file.stated(read.tables, folder), "versions": deciding_versions()}
+        results, text = list[StepResult](), session_file.session_text(read.tables, folder)
 
         def note(**more: Any) -> None:
             """Write the finished steps and the one at work, so that a killed session can be resumed."""
             kept = {**steps.earlier, **{each.output: each for each in results}}
             known = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
-            write_json(folder / SUMMARY, {**head, **known, **more})
+            files.write_json(folder / session_file.SUMMARY, {**head, **known, **more})
 
         if not again:
-            write_text(folder / SESSION_FILE, text)
+            files.write_text(folder / session_file.SESSION_FILE, text)
         for step, task in work:
             started = time.perf_counter()
             if steps.is_finished(step):
@@ -208,15 +188,16 @@ def run(
                     says, warnings = ended.value
                 steps.made[step.output] = _Made(inputs=steps.inputs(step), files=_checksums(folder / step.output))
                 found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
-                write_text(folder / SESSION_FILE, text)  # not before: a step that is refused changes no session
+                # Not before, because a step that is refused changes no session.
+                files.write_text(folder / session_file.SESSION_FILE, text)
             results.append(replace(found, page=steps.page_of(step, found.left_alone)))
             note()
-        remove_page(folder)
-        done = SessionResult(tuple(results), str(folder), str(folder / PAGE) if asked.pictures else None)
+        files.remove_page(folder)
+        done = SessionResult(tuple(results), str(folder), str(folder / files.PAGE) if asked.pictures else None)
         if asked.pictures:
             from mitsim.report.pages import render_page, scene_name, subject
 
-            opened = any(step.verb in OF_A_BENCH for step in read.steps)
+            opened = any(step.verb in session_file.OF_A_BENCH for step in read.steps)
             about = (scene_name(steps.bench.loaded.path), steps.bench.sensor.name) if opened else ("", "")
             page = render_page(
                 "session.html",
@@ -227,9 +208,9 @@ def run(
                 steps=results,
                 images=[step for step in results if (folder / step.output / "image.png").is_file()],
                 text=text,
-                file=SESSION_FILE,
+                file=session_file.SESSION_FILE,
             )
-            write_text(folder / PAGE, page)
+            files.write_text(folder / files.PAGE, page)
         note(**done.payload(), status="complete", command=job and job.command)
     return done
 
@@ -251,7 +232,7 @@ class _Steps:
     that of an earlier step, in which frames are exposed.
     """
 
-    session: Session
+    session: session_file.Session
     folder: Path
     job: Job
     asked: RunOptions
@@ -261,20 +242,20 @@ class _Steps:
 
     # ---- Files that are there already ----
 
-    def inputs(self, step: Step) -> str:
+    def inputs(self, step: session_file.Step) -> str:
         """Return the SHA-256 of all that decides the files of a ``step``: values, files that it reads, steps before."""
         read = "run", "calibration"
         values = {name: _contents(value) for name, value in step.values.items() if name not in read}
         asked: dict[str, Any] = {"versions": deciding_versions(), step.verb: values}
-        if step.verb in OF_A_BENCH:
+        if step.verb in session_file.OF_A_BENCH:
             above = [each.values for each in self.session.steps if each.verb == "transport"]
             asked |= {**self.bench.deciding, **self.bench.identity(), "above": above}
         if step.verb in ("reconstruct", "export"):
             places = [self._source(step, name) for name in read]
             asked["read"] = [_checksums(place) for place in places if place.exists()]
-        return hashlib.sha256(json.dumps(plain(asked), sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(files.plain(asked), sort_keys=True).encode()).hexdigest()
 
-    def is_finished(self, step: Step) -> bool:
+    def is_finished(self, step: session_file.Step) -> bool:
         """Return True if an earlier run made the ``step``'s files from the same inputs and they have not changed."""
         if step.verb == "transport":  # whose light is in no file
             capture = self.session.step("capture")
@@ -285,14 +266,15 @@ class _Steps:
         there = _checksums(self.folder / step.output)
         return made.inputs == self.inputs(step) and made.files.items() <= there.items()
 
-    def page_of(self, step: Step, left_alone: bool) -> str:
+    def page_of(self, step: session_file.Step, left_alone: bool) -> str:
         """Write the page of a finished ``step`` unless it is there, and return its name; empty without one."""
         place = self.folder / step.output
-        if self.asked.pictures and step.verb in FOLDERS and not (left_alone and (place / PAGE).is_file()):
+        there = left_alone and (place / files.PAGE).is_file()
+        if self.asked.pictures and step.verb in session_file.FOLDERS and not there:
             from mitsim.report.folder_page import report_folder
 
             report_folder(place)
-        pages = [place / PAGE, *sorted(place.glob("*.html"))] if place.is_dir() else []
+        pages = [place / files.PAGE, *sorted(place.glob("*.html"))] if place.is_dir() else []
         return next((str(each.relative_to(self.folder)) for each in pages if each.is_file()), "")
 
     # ---- The bench, and folders that steps read ----
@@ -315,7 +297,7 @@ class _Steps:
         self.bench.family(request.patterns, request.seed)
         yield
 
-    def _source(self, step: Step, name: str) -> Path:
+    def _source(self, step: session_file.Step, name: str) -> Path:
         """Return the folder of the ``run`` or the ``calibration`` of a ``step``: as it states, or this session's."""
         if name in step.values:
             return Path(step.values[name])
@@ -324,13 +306,13 @@ class _Steps:
 
     # ---- A verb each ----
 
-    def _transport(self, step: Step) -> Work:
+    def _transport(self, step: session_file.Step) -> Work:
         asked = step.of(Request)
         yield from self._asked(Request(**asked), None)
         self.light = self.bench.light(job=self.job.apart("transport "), **asked)
         return f"{self.light.paths} paths of light by projector pixel", self.light.warnings
 
-    def _capture(self, step: Step) -> Work:
+    def _capture(self, step: session_file.Step) -> Work:
         own, colour, place = step.of(Request), step.values.get("colour", NO), self.folder / step.output
         above, request = self.session.step("transport"), Request(**own)
         if above:
@@ -343,7 +325,7 @@ class _Steps:
         reasons = each_once({name: run.warnings for name, run in runs.items()})
         return frames_headline([run.summary() for run in runs.values()]), reasons
 
-    def _calibrate(self, step: Step) -> Work:
+    def _calibrate(self, step: session_file.Step) -> Work:
         values, colour = step.of(SessionRequest), step.values.get("colour", NO)
         if (own := values.get("recipe")) is not None:
             table = isinstance(own, Mapping)
@@ -365,7 +347,7 @@ class _Steps:
         reasons = each_once({name: factors.warnings for name, factors in found.items()})
         return calibration_headline([factors.manifest.result for factors in found.values()]), reasons
 
-    def _reconstruct(self, step: Step) -> Work:
+    def _reconstruct(self, step: session_file.Step) -> Work:
         values, place, options = step.values, self.folder / step.output, step.of(ImageRequest)
         run, calibration = (self._source(step, name) for name in ("run", "calibration"))
         if "run" in values:
@@ -402,7 +384,7 @@ class _Steps:
         judged = reconstruct(run, calibration, place, **again, **options)
         return image_headline(judged.summary()), judged.reconstruction.status.reasons
 
-    def _study(self, step: Step) -> Work:
+    def _study(self, step: session_file.Step) -> Work:
         options = dict(step.values)
         name, scene = options.pop("name"), options.pop("scene", None)
         job = self.job.apart(f"{step.output} ")
@@ -411,17 +393,17 @@ class _Steps:
         found = study()
         return found.headline.partition(". Flagged")[0], found.warnings
 
-    def _export(self, step: Step) -> Work:
+    def _export(self, step: session_file.Step) -> Work:
         values, place = step.values, self.folder / step.output
         how = {name: values[name] for name in ("format", "projector") if name in values}
         run, calibration = self._source(step, "run"), None
-        if "calibration" in values or calibration_for(self.session, step):
+        if "calibration" in values or session_file.calibration_for(self.session, step):
             calibration = self._source(step, "calibration")
         if "run" in values and ("calibration" in values or calibration is None):
             check_export(run, output=place, calibration=calibration, **how)
         pictures = values["format"] == PNG  # a folder of which is not replaced, so it is refused before any work
         if not self.is_finished(step) if pictures else step.output not in self.made:
-            check_output(place, kind="folder" if pictures else "file")
+            files.check_output(place, kind="folder" if pictures else "file")
         yield
         again = self.asked.resume and not pictures
         found = export(run, output=place, calibration=calibration, overwrite=again, **how)
@@ -433,7 +415,7 @@ def _checksums(place: Path) -> dict[str, str]:
     found = {}
     for path in sorted(place.rglob("*")) if place.is_dir() else [place] if place.is_file() else []:
         name = path.relative_to(place)
-        shown = path.suffix == ".html" or PICTURES in name.parts or any(part.startswith(".") for part in name.parts)
+        shown = path.suffix == ".html" or any(part == files.PICTURES or part[0] == "." for part in name.parts)
         if path.is_file() and not (shown and path != place):
             status = path.stat()
             found[str(name)] = _checksum(path, status.st_size, status.st_mtime_ns)

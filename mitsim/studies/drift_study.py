@@ -33,18 +33,8 @@ from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response, specimen
 from mitsim.studies.causes import Changed, Expected, Gains, LinearImage, Noise
+from mitsim.studies.framework import experiment
 from mitsim.studies.framework.claims import Gain
-from mitsim.studies.framework.experiment import (
-    IMAGE,
-    TEST_IMAGES,
-    TRUTH,
-    Found,
-    Point,
-    Scope,
-    Study,
-    group_by_setup,
-    number_of,
-)
 from mitsim.studies.framework.panels import Bars, Images
 from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 
@@ -301,11 +291,12 @@ AGREE_DB = 0.5
 """Largest useful difference [dB] between predicted and measured loss."""
 
 
-def _points(scope: Scope) -> Sequence[Point]:
+def _points(scope: experiment.Scope) -> Sequence[experiment.Point]:
     recipe, first = recipe_of(scope.recipe), scope.seeds[0]
     drift, sweep = recipe.drift, dict(scope.sweep)
     read_name(scope.patterns)
-    asked = [(kind, drift.alone(kind, number_of(kind, text))) for kind, texts in sweep.items() for text in texts]
+    numbers = [(kind, experiment.number_of(kind, text)) for kind, texts in sweep.items() for text in texts]
+    asked = [(kind, drift.alone(kind, number)) for kind, number in numbers]
     alone = asked if sweep else [(kind, drift) for kind in drift.kinds]
     amounts = [(kind, getattr(each, kind)) for kind, each in alone]
     if not amounts:
@@ -316,7 +307,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml", CAMERA)).known_line_time_s()
     sheet = lamp = scope.setup
     if scope.pictures != (None,):
-        sheet = replace(scope.setup, picture=TEST_IMAGES[0])
+        sheet = replace(scope.setup, picture=experiment.TEST_IMAGES[0])
         lamp = replace(sheet, scene=_LAMP_SCENE).with_parameters(lamp=_LAMP)
     found = []
     for seed in scope.choose(range(first, first + _SEEDS), scope.seeds):
@@ -324,8 +315,8 @@ def _points(scope: Scope) -> Sequence[Point]:
             (unit, words), shared = DRIFTS[kind], {"recipe": scope.recipe, "patterns": scope.patterns, "kind": kind}
             size = f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"
             setup, what = lamp if kind in _LAMPS else sheet, f"{words}, {size}"
-            found.append(Point.of(setup, **shared, unit=unit, amount=amount, seed=seed, what=what))
-    return group_by_setup(found)
+            found.append(experiment.Point.of(setup, **shared, unit=unit, amount=amount, seed=seed, what=what))
+    return experiment.group_by_setup(found)
 
 
 def recipe_of(path: str | None) -> SessionRecipe:
@@ -333,7 +324,7 @@ def recipe_of(path: str | None) -> SessionRecipe:
     return load_recipe(shipped_path("calibration", "drift.toml") if path is None else Path(path))
 
 
-def _measure(studio: Studio, point: Point) -> Found:
+def _measure(studio: Studio, point: experiment.Point) -> experiment.Found:
     setup, seed, kind = point.setup, int(point["seed"]), str(point["kind"])
     recipe, lit = recipe_of(point["recipe"]), studio.lit_scene(setup)
     drift = recipe.drift.alone(kind, float(point["amount"]))
@@ -358,11 +349,11 @@ def _measure(studio: Studio, point: Point) -> Found:
     measured, image = known.outcome(drift, session, moved)
     others = (*lit.light.warnings, *lit.light.unreached, *known.factors.warnings)
     flags = flags_of(known.before.status, others=others)
-    shown = {IMAGE: image, _BEFORE: known.before.image, TRUTH: lit.truth}
-    return Found((point.row(**measured, **flags),), single_precision(shown))
+    shown = {experiment.IMAGE: image, _BEFORE: known.before.image, experiment.TRUTH: lit.truth}
+    return experiment.Found((point.row(**measured, **flags),), single_precision(shown))
 
 
-STUDY = Study(
+STUDY = experiment.Study(
     "drift",
     "What drifts between calibration and capture",
     "How many decibels does each kind of drift cost, and do closed forms say so?",
@@ -386,8 +377,8 @@ STUDY = Study(
     panels=(
         Bars("what", file="losses", colour=_LINES, x_label="PSNR lost [dB]", ordered=True, errors=_ERRORS),
         Images(
-            {_BEFORE: (_BEFORE, "{before_db:.1f} dB"), IMAGE: ("with it", "{after_db:.1f} dB")},
-            before={TRUTH: "truth"},
+            {_BEFORE: (_BEFORE, "{before_db:.1f} dB"), experiment.IMAGE: ("with it", "{after_db:.1f} dB")},
+            before={experiment.TRUTH: "truth"},
             down=("what",),
         ),
     ),

@@ -11,20 +11,8 @@ from typing import TYPE_CHECKING, Any
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_PEAK, RENDERED
+from mitsim.studies.framework import experiment
 from mitsim.studies.framework.claims import distinct
-from mitsim.studies.framework.experiment import (
-    ASKED,
-    KNOBS,
-    MEASURES,
-    NO_SCENE,
-    Axes,
-    Point,
-    Results,
-    Scope,
-    Study,
-    check_sweep,
-    number_of,
-)  # fmt: skip
 from mitsim.studies.framework.panels import Images, Lines, Panel, Part, Pivot, is_number
 from mitsim.studies.framework.studio import measure_image
 
@@ -32,37 +20,37 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def _points(scope: Scope) -> Sequence[Point]:
-    check_sweep(scope.sweep, len(scope.pictures) * len(scope.seeds))
+def _points(scope: experiment.Scope) -> Sequence[experiment.Point]:
+    experiment.check_sweep(scope.sweep, len(scope.pictures) * len(scope.seeds))
     knobs: dict[str, Any] = dict(scope.sweep)
     values = {"patterns": (scope.patterns,), "exposure": (EQUAL_PEAK,)}
-    values |= {name: knobs[name] for name in ("patterns", "exposure", "method", ASKED) if name in knobs}
-    scene = {name: each for name, each in knobs.items() if name not in NO_SCENE}
+    values |= {name: knobs[name] for name in ("patterns", "exposure", "method", experiment.ASKED) if name in knobs}
+    scene = {name: each for name, each in knobs.items() if name not in experiment.NO_SCENE}
     own = replace(scope, seeds=tuple(int(each) for each in knobs.get("seed", scope.seeds)))
     points = []
     for accuracy in knobs.get("accuracy", (None,)):
-        setup = replace(scope.setup, accuracy=number_of("accuracy", accuracy)) if accuracy else scope.setup
+        setup = replace(scope.setup, accuracy=experiment.number_of("accuracy", accuracy)) if accuracy else scope.setup
         varied = {"accuracy": (accuracy,), **values} if accuracy else values
-        points += Axes({"model": (RENDERED,), **varied}, scene)(replace(own, setup=setup))
+        points += experiment.Axes({"model": (RENDERED,), **varied}, scene)(replace(own, setup=setup))
     return points
 
 
-def _knobs(results: Results) -> list[str]:
+def _knobs(results: experiment.Results) -> list[str]:
     knobs = list(dict(results.scope.sweep))
     return [name for name in knobs if len(distinct(results.frame, name)) > 1] or knobs[:1]
 
 
-def _bars(scope: Scope) -> str:
+def _bars(scope: experiment.Scope) -> str:
     """Return the meaning of the bars; nothing if each mean is of one image."""
     prints, seeds = len(scope.pictures), len(scope.seeds)
     of = f"{prints} pictures" if prints > 1 else f"{seeds} seeds"
     return f"95 % interval of {of}" if prints * seeds > 1 else ""
 
 
-def _axis(scope: Scope, knob: str) -> str:
+def _axis(scope: experiment.Scope, knob: str) -> str:
     """Return the name of an axis: the parameter, and its meaning and unit as the scene file's comment states them."""
-    if knob in NO_SCENE:
-        return MEASURES["lambda"][1] if knob == ASKED else f"{knob} [1]"
+    if knob in experiment.NO_SCENE:
+        return experiment.MEASURES["lambda"][1] if knob == experiment.ASKED else f"{knob} [1]"
     found = None
     with suppress(OSError, MitsimError):  # parts may be merged where the scene is not
         text = locate(scope.setup.scene, "scenes", "scene.xml").read_text("utf-8")
@@ -73,7 +61,7 @@ def _axis(scope: Scope, knob: str) -> str:
     return f"{knob}: {found[2]} [{unit}]" if found else f"{knob} [{unit}]"
 
 
-def _panels(results: Results) -> Mapping[str, Figure]:
+def _panels(results: experiment.Results) -> Mapping[str, Figure]:
     first, *others = knobs = _knobs(results)
     values = [(knob, each) for knob in knobs for each in distinct(results.frame, knob)]
     names: dict[Any, str] = {(knob, each): f"{knob.removeprefix('asked_')} {each}" for knob, each in values}
@@ -82,7 +70,7 @@ def _panels(results: Results) -> Mapping[str, Figure]:
     panels: list[Panel] = [Images(first, title=title, down=("picture", *others), names=names | {None: ""})]
     numeric = [knob for knob in knobs if all(map(is_number, distinct(results.frame, knob)))]
     for measure in results.scope.measures if numeric else ():
-        (column, axis), x = MEASURES[measure], numeric[0]
+        (column, axis), x = experiment.MEASURES[measure], numeric[0]
         panels.append(
             Lines(x, _axis(results.scope, x), file=measure, y=column, y_label=axis, names=names, facet="",
                   colour=[knob for knob in knobs if knob != x], interval=True, title=f"Mean and {bars}" if bars else "")
@@ -90,9 +78,9 @@ def _panels(results: Results) -> Mapping[str, Figure]:
     return {file: figure for panel in panels for file, figure in panel.draw(results).items()}
 
 
-def _table(results: Results) -> Sequence[Part]:
-    columns = {MEASURES[name][0]: f"{name.replace('_', '-')} {MEASURES[name][1].rpartition(' ')[2]}"
-               for name in results.scope.measures}  # fmt: skip
+def _table(results: experiment.Results) -> Sequence[Part]:
+    shown = {name: experiment.MEASURES[name] for name in results.scope.measures}
+    columns = {column: f"{name.replace('_', '-')} {axis.rpartition(' ')[2]}" for name, (column, axis) in shown.items()}
     names = {(knob, each): str(each) for knob in _knobs(results) for each in distinct(results.frame, knob)}
     bars = _bars(results.scope)
     title = f"Measures by setting{f': mean +- {bars}' if bars else ''}"
@@ -100,9 +88,9 @@ def _table(results: Results) -> Sequence[Part]:
     return [*table.draw(results).values()]
 
 
-STUDY = Study(
+STUDY = experiment.Study(
     "sweep",
-    f"Sweep of {KNOBS}",
+    f"Sweep of {experiment.KNOBS}",
     "What does each value do to the image?",
     points=_points,
     measure=measure_image,
