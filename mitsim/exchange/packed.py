@@ -581,8 +581,8 @@ class _Plane:
         shape = self._part(places[0][0], preparer.frame(places[0][0], first), how).shape
         ambient = listed.ambient and self._ambient(Path(listed.ambient), preparer, shape)
         seconds = listed.closing_exposure_s or camera.digital.exposure_s
-        kind = listed.closing_frame
-        closing = kind and manifests.ClosingFile(kind=kind, file=CLOSING, exposure_s=seconds)
+        last = listed.closing_frame
+        closing = last and manifests.ClosingFile(kind=last, file=CLOSING, exposure_s=seconds)
         # The dark level depends on the exposure.
         of_last = replace(preparer, digital=preparer.digital.model_copy(update={"exposure_s": seconds}))
         names = (

@@ -278,7 +278,7 @@ def test_a_run_behind_filters_comes_back(tmp_path: Path) -> None:
     export(run, "hdf5", tmp_path / "b.h5")
     import_file(tmp_path / "b.h5", tmp_path / "run 2")
     assert whole(tmp_path / "run 2") == whole(run)
-    with pytest.raises(MitsimError, match="holds no calibration"):
+    with pytest.raises(MitsimError, match="contains no calibration"):
         import_file(tmp_path / "b.h5", tmp_path / "run 3", tmp_path / "cal 3")
 
 
