@@ -410,7 +410,7 @@ def test_a_plane_of_a_real_flatcams_calibration(angle: float, tmp_path: Path) ->
         assert factors.manifest.camera == {"name": "calib", "channel": name}
     with pytest.raises(MitsimError, match="use r, gb, gr, b"):
         import_file(tmp_path / "calib.mat", None, tmp_path / "cal 2", "green")
-    with pytest.raises(MitsimError, match="holds no run"):
+    with pytest.raises(MitsimError, match="contains no run"):
         import_file(tmp_path / "calib.mat", tmp_path / "run", None, "r")
 
 
