@@ -129,7 +129,7 @@ def test_page_plots_and_json_lie_in_the_folder(tmp_path: Path) -> None:
     written = json.loads((tmp_path / "found" / "characterise.json").read_text())
     assert written["kind"] == "characterise" and written["pixels"] == 32
     assert [figure["name"] for figure in written["figures"]] == [row.name for row in done.rows]
-    assert done.lines()[1] == f"Page, plots, JSON and the camera found, camera.toml: {tmp_path / 'found'}"
+    assert done.lines()[2] == f"Page, plots, JSON and the camera found, camera.toml: {tmp_path / 'found'}"
     assert load_sensor(tmp_path / "found" / "camera.toml") == done.found.sensor
 
 
