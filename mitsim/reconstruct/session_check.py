@@ -139,6 +139,7 @@ _LINE = 0.15
 _DARK, _LIT = (0.02, 0.3), 0.1
 _NAMED = 12
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
+_PHOTONS = "photon noise of bright pixels; use more light"
 _LAMP = "the lamp's power changes; use a steadier one"
 _BENT = "numbers are not in proportion to light; switch gamma and other processing off, or use a shorter exposure"
 _POWER = "frames are of different power; use a steadier lamp, or pairs"
@@ -266,6 +267,9 @@ class _Side:
         self.misfits -= self.light.energies(sums.ambient)  # ambient light that changes within pairs is no noise
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
         self.noise = self.variance * len(self.vectors) / float(np.dot(sums.common, sums.common))
+        # Bright pixels have more weight in the vectors, and more photon noise than the mean pixel.
+        bright = np.abs(sums.common) ** (0.0 if sums.centre else 1.0)
+        self.peaked = float(np.mean(bright**3) / max(np.mean(bright) * np.mean(bright**2), 1e-300))
         # The uniform frames of this side against the mean of both sides': their power, and their place in pixels.
         self.shapes = np.stack([self.uniform, np.gradient(self.uniform)])
         own = np.linalg.lstsq(self.shapes.T, self.vectors[:, 0], rcond=None)[0]
@@ -379,7 +383,9 @@ class _Check:
             self._refuse(self.sides[axis], 0, _UNEQUAL)
         self.judge()
         for axis, (own, good) in enumerate(zip(self.sides, self.good, strict=True)):
-            own.add(_UNKNOWN_LIGHT, float(excess[axis][good].sum()))
+            photons = min((own.peaked - 1) * own.noise * self.count, float(excess[axis][good].sum()))
+            own.add(_PHOTONS, photons)
+            own.add(_UNKNOWN_LIGHT, float(excess[axis][good].sum()) - photons)
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             words = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
             own.add(words, lag**2 * (0.75**2 + 0.5**2) * own.size)
@@ -548,7 +554,7 @@ class _Check:
         energies = {why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for why in reasons}
         order, total = sorted(energies, key=lambda why: -energies[why]), float(np.sqrt(sum(energies.values())))
         least = (_MATTERS * self.noise) ** 2
-        doubts = [why for why in order if why not in (_LAMP, _REPLACED) and energies[why] > least]
+        doubts = [why for why in order if why not in (_LAMP, _REPLACED, _PHOTONS) and energies[why] > least]
         if total > LARGEST_ERROR or (self.refused and doubts):
             raise MitsimError(f"all frames: {order[0]}: it leaves a factor error of {total:.0%}; take them again")
         if self.refused:

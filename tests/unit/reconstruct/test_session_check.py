@@ -393,6 +393,19 @@ def test_light_that_the_stated_camera_explains_is_not_ambient() -> None:
 # ---- Without pairs ---------------------------------------------------------------------------------------------------
 
 
+def test_photon_noise_of_peaked_light_is_no_changing_light() -> None:
+    """Bright pixels are noisier and weigh more; the stated error includes it. (Planted: all excess is named light.)"""
+    rng, falloff = np.random.default_rng(5), np.outer(*(np.sin(np.pi * (np.arange(m) + 0.5) / m) ** 2 for m in PIXELS))
+    clean = frames(lambda frame, time, half: falloff * frame, noise=1e-7)
+    shown = {half: frame + 1e-3 * np.sqrt(np.abs(frame)) * rng.standard_normal(PIXELS) for half, frame in clean.items()}
+    found = checked(shown)
+    assert not found.doubts and min(found.extra) > 0
+    exact, measured = checked(clean).estimate(SIGNS, None), found.estimate(SIGNS, None)
+    for name, stated in zip(("left", "right"), measured.predicted_error, strict=True):
+        one, other = getattr(measured, name), getattr(exact, name)
+        assert np.linalg.norm(one - other) / np.linalg.norm(other) == pytest.approx(stated, rel=0.15)
+
+
 def test_a_sign_is_turned_without_pairs() -> None:
     half, clean = ("vertical", 20, 1), error(checked(frames(), pairs=False))[0]
     found = checked({**frames(), half: light(("vertical", 20, -1))}, pairs=False)
