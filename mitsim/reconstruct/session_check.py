@@ -269,7 +269,7 @@ class _Side:
         self.noise = self.variance * len(self.vectors) / float(np.dot(sums.common, sums.common))
         # Bright pixels have more weight in the vectors, and more photon noise than the mean pixel.
         bright = np.abs(sums.common) ** (0.0 if sums.centre else 1.0)
-        self.peaked = float(np.mean(bright**3) / max(np.mean(bright) * np.mean(bright**2), 1e-300))
+        self.peaked = float(np.mean(bright**3) / (np.mean(bright) * np.mean(bright**2) + 1e-300))
         # The uniform frames of this side against the mean of both sides': their power, and their place in pixels.
         self.shapes = np.stack([self.uniform, np.gradient(self.uniform)])
         own = np.linalg.lstsq(self.shapes.T, self.vectors[:, 0], rcond=None)[0]
