@@ -171,7 +171,8 @@ WRONG: list[Any] = [
 """Values that are wrong for most arguments; a folder where a file belongs is the last path."""
 OF_A_BENCH = [object(), b"x", 1j, np.array([]), np.array([1j]), np.array([None])]
 """Values that no argument of a bench may be."""
-RENDERS = {"open_bench", "make_pairs", "pairs", "calibrate_model", "plan_calibration", "demo", "run", "study", "doctor", "train"}
+RENDERS = {"open_bench", "make_pairs", "pairs", "calibrate_model", "plan_calibration", "demo", "run", "study"}
+RENDERS |= {"doctor", "train"}
 """What may begin long work by an argument of the right kind: it gets those of no kind alone."""
 CLASSES = ["Clock", "Job", "Limits", "Modelling", "Request"]
 """Classes that users make things of."""
