@@ -555,10 +555,10 @@ def shortage(bench: Apparatus, family: PatternFamily) -> Fault | None:
         return None
     least = " x ".join(str(n // max(rows, 1) + 1) for rows in lit)
     return Fault(
-        f"{patterns[0]} x {patterns[1]} patterns ({family.name}) on {lit[0]} x {lit[1]} sensor pixels that the mask "
-        f"lights give {patterns[0] * lit[0]} x {patterns[1] * lit[1]} numbers for {n} x {n} unknowns"
-        f"{f' of each of {lines} lines' if lines > 1 else ''}, so that "
-        + ("noise cannot be distinguished from the image" if data <= rank else "the image is not determined"),
+        ("noise cannot be distinguished from the image" if data <= rank else "the image is not determined")
+        + f": {patterns[0]} x {patterns[1]} patterns ({family.name}) on {lit[0]} x {lit[1]} sensor pixels that the "
+        f"mask lights give {patterns[0] * lit[0]} x {patterns[1] * lit[1]} numbers for {n} x {n} unknowns"
+        f"{f' of each of {lines} lines' if lines > 1 else ''}",
         f"use at least {least} patterns, or more sensor pixels",
         1.0 if data <= rank else 1 - math.prod(ranks) / math.prod(needed),
     )

@@ -43,7 +43,7 @@ from mitsim.report.pages import LARGEST, REFLECTANCE, SMALLEST, Picture, lines_o
 _ELSEWHERE = {
     *("kind", "format", "status", "configuration", "configuration_sha256", "checksums", "patterns", "plan"),
     *("seconds", "warnings", "versions", "command", "kernels", "result", "estimate", "verdict", "camera"),
-    *("opened", "inputs", reconstruct.MADE_OF),
+    *("opened", "inputs", "headline", reconstruct.MADE_OF),
 }
 """Keys of a manifest or result outside the table of numbers."""
 _ABOVE_BLACK = "DN above the black level"
@@ -301,6 +301,7 @@ def _of_image(folder: Path) -> Shown:
         ends = 0.0, max(float(tiles.max()), _MISFIT)
         chi = "chi-square per datum"
         pictures.append(Picture.of("misfit", "Misfit of the frames", tiles, about, chi, ends, quantity="chi-square"))
+    numbers = lines_of({key: value for key, value in result.items() if key not in _ELSEWHERE})
     return _shown(
         "Image",
         _subject_of_image(result.get(reconstruct.MADE_OF), folder / RESULT_FILE),
@@ -311,7 +312,7 @@ def _of_image(folder: Path) -> Shown:
         pictures=pictures,
         seconds=_numbers(result.get("seconds")),
         tables={
-            "Numbers": lines_of({key: value for key, value in result.items() if key not in _ELSEWHERE}),
+            "Numbers": {key: value for key, value in numbers.items() if key != "misfit.reason"},  # a warning has it
             "Configuration": lines_of({"inputs": inputs, reconstruct.MADE_OF: result.get(reconstruct.MADE_OF) or {}}),
             "Versions": {},
         },

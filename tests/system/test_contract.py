@@ -11,6 +11,7 @@ import re
 import sys
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import pytest
 
 from mitsim.bench.layout import Preview
 from mitsim.report import lit_scene
+from tests.system.conftest import Outcome
 from tests.system.refusals import Call
 
 VERBS = ["demo", "run", "view", "plan", "capture", "calibrate", "reconstruct", "render", "study", "report", "doctor"]
@@ -37,6 +39,17 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
     assert {*stages, "total"} <= seconds.keys()
     assert all(number(value) for value in seconds.values())
     assert sum(seconds[stage] for stage in stages) <= seconds["total"] * 1.001
+
+
+def assert_said_once(outcome: Outcome, folder: Path) -> None:
+    """No sentence of eight words or more is twice on the terminal, or on the page of the ``folder``."""
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    page = re.sub(r"<(style|script|svg|title)\b.*?</\1>|<!--.*?-->", "", page, flags=re.DOTALL)
+    lines = (outcome.out + outcome.err).replace("\n  ", " "), re.sub(r"<[^>]*>", "\n", page)
+    for text in lines:
+        parts = (part.strip().lower() for part in re.split(r"[:;.]\s|\n", text))
+        counts = Counter(part for part in parts if len(part.split()) >= 8)
+        assert not [part for part, count in counts.items() if count > 1]
 
 
 # ---- keys and types --------------------------------------------------------------------------------------------------
@@ -272,16 +285,22 @@ def test_a_flagged_result_exits_with_1_and_says_why(call: Call, lab: Any, tmp_pa
 
 
 def test_a_saturated_capture_is_flagged(call: Call, lab: Any, tmp_path: Path) -> None:
-    outcome = call("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", "dots:4", "--exposure", "1000")
+    arguments = "-o", tmp_path / "run", "--patterns", "dots:4", "--exposure", "1000"
+    outcome = call("capture", *lab.arguments, *arguments, pictures=True)
     assert outcome.code == 1 and "full well" in outcome.err
+    assert_said_once(outcome, tmp_path / "run")
+    image = call("reconstruct", tmp_path / "run", "--calibration", lab.calibration, pictures=True)
+    assert image.code == 1
+    assert_said_once(image, tmp_path / "run" / "reconstruction")
 
 
 @pytest.mark.slow
 def test_an_under_determined_image_is_flagged(call: Call, lab: Any, tmp_path: Path) -> None:
     # 12 sensor rows cannot tell 16 scene rows apart under one pattern.
     scene = lab.write_scene("few", pixels=12)
-    captured = call("capture", scene, *lab.electronics, "-o", tmp_path / "run", "--patterns", "uniform")
+    captured = call("capture", scene, *lab.electronics, "-o", tmp_path / "run", "--patterns", "uniform", pictures=True)
     assert captured.code == 1 and "noise cannot be distinguished from the image" in captured.err
+    assert_said_once(captured, tmp_path / "run")
     assert call("calibrate", scene, *lab.electronics, "-o", tmp_path / "cal").code in (0, 1)
     outcome = call("reconstruct", tmp_path / "run", "--calibration", tmp_path / "cal", "--json", "--lambda", "1")
     assert outcome.code == 1
