@@ -558,7 +558,7 @@ SIZES = {
     "optics": (7, 1757),
     "planner": (6, 1633),
     "reconstruct": (16, 5528),
-    "report": (6, 1940),
+    "report": (6, 1941),
     "scene": (5, 1359),
     "sensor": (4, 1118),
     "sessions": (4, 871),
