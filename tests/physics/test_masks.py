@@ -655,7 +655,7 @@ def test_a_session_behind_a_slanted_bar_is_refused_for_its_mask(
     along = np.arange(16) - 7.5
     path = camera_file(tmp_path, "bar", (np.abs(along[:, None] - along) < 2).astype(float))
     bench = open_bench(small_scene(mask_order=8), variant, path)
-    sentence = r"^the mask \(drawing bar.npy\) has no two factors: [^\n]*use a mask of the kind separable"
+    sentence = r"^the mask \(drawing bar.npy\) is not separable: [^\n]*use a mask of the kind separable"
     recipe = load_recipe().model_copy(update={"depths": (380.0, 400.0)})
     for refused in (
         lambda: bench.calibrate(output=tmp_path / "cal"),
@@ -709,5 +709,5 @@ def test_a_mask_without_factors_is_not_calibrated(
     session = Session(bench, load_recipe())
     (warned,) = session.mask_warnings
     assert float(re.findall(r"leaves ([0-9.]+)%", warned)[0]) > 20
-    with pytest.raises(MitsimError, match="has no two factors"):
+    with pytest.raises(MitsimError, match=rf"\(drawing {drawing}.npy\) is not separable: frames can be captured"):
         session.check_mask()

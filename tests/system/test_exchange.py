@@ -16,7 +16,7 @@ from tests.exchanged import frame_of
 from tests.system.refusals import Call, Refused, mentions
 
 EXPORTED = {"format", "frames", "calibration", "notes", "output"}
-IMPORTED = {"frames", "output", "calibration_output", "holds", "left_out", "report", "notes", "warnings"}
+IMPORTED = {"headline", "frames", "output", "calibration_output", "holds", "left_out", "report", "notes", "warnings"}
 
 
 def image(call: Call, run: Path, calibration: Path, to: Path) -> np.ndarray:
@@ -30,6 +30,7 @@ def test_out_and_back(call: Call, lab: Any, tmp_path: Path) -> None:
     assert out.code == 0 and out.payload.keys() == EXPORTED and out.payload["frames"] == 16
     back = call("import", tmp_path / name, "-o", tmp_path / "run", "--calibration-output", tmp_path / "cal", "--json")
     assert back.code == 0 and back.payload.keys() == IMPORTED and back.payload["holds"] == ["run", "calibration"]
+    assert back.payload["headline"].startswith("Captured 16 frames of 64 x 64 pixels, total error up to ")
     again = image(call, tmp_path / "run", tmp_path / "cal", tmp_path / "b")
     assert np.array_equal(again, image(call, lab.run, lab.calibration, tmp_path / "a"))
 
@@ -42,6 +43,7 @@ def test_pictures_and_frames_again(call: Call, lab: Any, tmp_path: Path) -> None
     names = {"NAME": lab.camera, "CAL": lab.calibration, "RUN": tmp_path / "run"}
     back = call(*(names.get(word, word) for word in line.split()), "--json")
     assert back.code == 0 and back.payload.keys() == {*IMPORTED, "shape", "divided_by", "planes"}
+    assert back.payload["headline"] == "Imported 16 frames of 64 x 64 pixels"
     assert back.payload["shape"] == [64, 64] and "truth" in back.payload["left_out"]
     again = image(call, tmp_path / "run", lab.calibration, tmp_path / "b")
     assert np.array_equal(again, image(call, lab.run, lab.calibration, tmp_path / "a"))
@@ -107,6 +109,6 @@ def test_patterns_are_drawn(call: Call, tmp_path: Path) -> None:
 
 
 def test_patterns_that_cannot_be_drawn(refused: Refused) -> None:
-    mentions(refused("patterns", "stripes", "-o", "new"), "--camera is not given")
+    mentions(refused("patterns", "stripes", "-o", "new"), "--camera is missing")
     mentions(refused("patterns", "dots:2", "-o", "new", "--exposure", 1), "--exposure 1.0", "only for stripes")
     mentions(refused("patterns", "dots:2", "-o", "new", "--projector-pixels", 0), "--projector-pixels")

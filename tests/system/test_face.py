@@ -131,6 +131,8 @@ def test_a_saved_capture_is_that_of_the_command_line(
     # What the process took is as little of the result as its seconds.
     taken = reported.pop("memory_bytes")
     assert 0 <= taken < reported["predicted_memory_bytes"]
+    error = f"{reported['total_error_bound']:.1e}"
+    assert reported.pop("headline") == f"Captured 9 frames of 64 x 64 pixels, total error up to {error}"
     summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": reported["output"]}
     timed = {"seconds": 0, "kernels": 0, "predicted_seconds": 0, "report": None}
     assert {**summary, **timed} == {**reported, **timed}

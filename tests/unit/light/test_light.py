@@ -165,9 +165,9 @@ def test_light_for_another_family_says_how_much_worse_its_frames_are(bench: Benc
     and what to do, within it one line says so. (Planted: the ratio turned, nothing said.)"""
     light = bench.light("uniform", accuracy=1e-2)
     (found,) = light.expose("dots:8").warnings
-    assert found.startswith("the total error is up to") and found.endswith("trace it for dots:8")
+    assert found.startswith("the total error is up to") and found.endswith("trace the light for dots:8")
     lax = replace(light, plan=replace(light.plan, accuracy=0.1))
-    with pytest.warns(UserWarning, match=r"traced for uniform, .* trace it for dots:8$") as message:
+    with pytest.warns(UserWarning, match=r"traced for uniform, .* trace the light for dots:8$") as message:
         shots = lax.expose("dots:8")
     assert len(message) == 1 and not shots.warnings
     with warnings.catch_warnings():
