@@ -150,7 +150,7 @@ class PictureCheck:
                 scores = np.abs(total) / np.sqrt(np.maximum(number, dots**2 * length / 2) * usual + 1e-300)
                 # A texture with a period of its own deviates in most frames, and a disturbance in few.
                 few = int(0.2 * (len(scores) - 1))
-                # Noise of pixels that share a frame is correlated, so that most windows scatter more than single pixels.
+                # Noise of pixels that share a frame is correlated, so that windows scatter more than single pixels.
                 usual_score = max(float(np.median(scores)) / 0.6745, 1.0)
                 scores /= np.maximum(np.partition(scores, few, axis=0)[few] / 0.253, usual_score)
                 for k, worst in enumerate(scores.max(axis=(1, 2))):
