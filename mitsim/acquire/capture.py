@@ -341,7 +341,7 @@ def _warnings(
     elif total.bound > accuracy and not predicted_warnings:
         reason = _foreign(light, totals, request)
         yield (
-            f"the total error is up to {total.bound:.1e} (95 %); the accuracy {accuracy:g} was not reached"
+            f"the total error is up to {total.bound:.3g} (95 %); the accuracy {accuracy:g} was not reached"
             + (f": {reason}" if reason else "")
         )
     if totals.removed > accuracy:

@@ -213,7 +213,7 @@ def test_scatter_that_the_picture_s_errors_explain_is_no_flicker() -> None:
 
 def test_noise_that_the_dots_of_a_frame_share_is_no_disturbance() -> None:
     """Dots whose shadows overlap have correlated noise. (Seen: good frames of lamp_bench beside a bright lamp were
-    called faulty, for which the automatic weight cost 5 dB. Planted: windows counted as those of independent pixels.)"""
+    called faulty, for which the automatic weight cost 5 dB. Planted: windows counted as of independent pixels.)"""
     worst, hands = [], []
     for seed in range(6):
         rng, n = np.random.default_rng(seed), 128
