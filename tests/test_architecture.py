@@ -557,7 +557,7 @@ SIZES = {
     "mitsim": (1, 26),
     "optics": (7, 1757),
     "planner": (6, 1633),
-    "reconstruct": (16, 5528),
+    "reconstruct": (16, 5529),
     "report": (6, 1941),
     "scene": (5, 1359),
     "sensor": (4, 1118),
