@@ -350,7 +350,8 @@ def capture(asked: Capturing) -> int:
             payload = payload_of_lines(RUN, {name: run.summary() for name, run in found.items()}, output)
         else:
             payload = found.summary()
-    payload["headline"] = frames_headline(payload.get("channels", [payload]), payload["warnings"])
+    runs = payload["channels"] if payload.get("kind") == RUN else [payload]  # filters have every line in each frame
+    payload["headline"] = frames_headline(runs, payload["warnings"])
     payload["memory_bytes"] = memory_since(held)
     return asked.finish_folder(output, payload, _capture_lines(payload, asked), payload["warnings"])
 

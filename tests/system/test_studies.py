@@ -26,7 +26,7 @@ def test_keys_of_a_study(study: Call, tmp_path: Path) -> None:
     found = study("-o", tmp_path / "out", "--quick", "--json")
     assert found.code == 0, found.err
     payload = found.payload
-    keys = {"study", "points", "missing", "seconds", "rows", "claims", "warnings", "figures", "output"}
+    keys = {"headline", "study", "points", "missing", "seconds", "rows", "claims", "warnings", "figures", "output"}
     assert keys == payload.keys()
     assert payload["points"] == len(payload["rows"]) == 8 and payload["missing"] == 0
     for claim in payload["claims"]:
@@ -38,7 +38,7 @@ def test_keys_of_a_study(study: Call, tmp_path: Path) -> None:
 def test_parts_merge_on_the_command_line(study: Call, tmp_path: Path) -> None:
     for number in (1, 2):
         part = study("-o", tmp_path / f"p{number}", "--quick", "--shard", f"{number}/2", "--jobs", 1)
-        assert part.code == 0 and "4 points measured, 4 of other parts are missing" in part.out
+        assert part.code == 0 and "Measured 4 points" in part.out and "4 points of other parts are missing" in part.out
     parts = tmp_path / "p1", tmp_path / "p2"
     refused = study(*parts, "-o", tmp_path / "whole", name="merge")
     assert refused.code == 2 and "--experiment MODULE" in refused.err and not (tmp_path / "whole").exists()

@@ -19,7 +19,7 @@ from mitsim.bench.request import AUTO, Request
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import read_name
-from mitsim.reconstruct.request import METHODS, MODEL, TIKHONOV, ImageRequest
+from mitsim.reconstruct.request import METHODS, TIKHONOV, ImageRequest
 from mitsim.report import CONVENTIONS
 from mitsim.studies import ALL, EXPERIMENTS, GONE, SHARED
 
@@ -398,7 +398,7 @@ def values_of(text: str) -> tuple[str, tuple[str, ...]]:
 
 def check_sweep(sweep: Sweep, pictures: int) -> None:
     """Raise MitsimError for a ``sweep`` that varies nothing, or an impossible knob."""
-    knobs, allowed = dict(sweep), {"exposure": CONVENTIONS}
+    knobs, allowed = dict(sweep), {"exposure": CONVENTIONS, "method": METHODS}
     if len(knobs) < len(sweep):
         raise MitsimError("study sweep: something is varied twice; give all its values at once")
     if not knobs:
@@ -419,8 +419,6 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
         elif name in ("seed", "accuracy"):
             Request.of(**{name: number_of(name, text, int if name == "seed" else float)})
     for method, lam in product(knobs.get("method", (TIKHONOV,)), knobs.get(ASKED, (AUTO,))):
-        if method.endswith(MODEL):
-            raise MitsimError(f"--method {method}: a sweep has no networks; use {', '.join(METHODS)}")
         number: Any = lam if lam == AUTO else number_of("lambda", lam)
         ImageRequest(method=method, lam=number)
 

@@ -176,7 +176,7 @@ def test_no_more_data_than_unknowns_or_no_signal_is_refused():
     prepared = solver.prepare(np.eye(4), np.eye(4), np.ones((4, 1)), np.ones((4, 1)))
     sums = prepared.accumulator()
     sums.add(np.ones((4, 4)), 0, 0)
-    with pytest.raises(MitsimError, match="no more data"):
+    with pytest.raises(MitsimError, match="too few data"):
         prepared.solve(sums, "auto")
     prepared = solver.prepare(np.eye(5, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
     sums = prepared.accumulator()

@@ -398,8 +398,8 @@ def test_method_and_lambda_of_a_sweep_are_axes_like_others() -> None:
         ("tikhonov", "auto", 4), ("tikhonov", "1e6", 4), ("tv", "auto", 4), ("tv", "1e6", 4), ("tikhonov", "auto", 5)
     ]  # fmt: skip
     for options, line in (
-        ({"method": "tikhonov,x"}, "method 'x': use tikhonov"),
-        ({"method": "net.pt"}, "--method net.pt: a sweep has no networks"),
+        ({"method": "tikhonov,x"}, "--over method=x: use tikhonov"),
+        ({"method": "net.pt"}, "--over method=net.pt: use tikhonov"),
         ({"lam": "-1"}, "lam -1.0: give a finite number of at least 0"),
         ({"lam": "much"}, "--over lambda=much: give numbers"),
         ({"over": ["method=tv"], "method": "tv"}, "something is varied twice"),
