@@ -119,7 +119,7 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
         except OSError as error:
             raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
         if occupied and not overwrite:
-            remedy = "choose a new folder, or empty this one"
+            remedy = "choose a new folder, or empty this one; commands replace earlier results with --overwrite"
             with suppress(MitsimError, ValueError, RecursionError, AttributeError):  # a killed work left its manifest
                 manifest = path / (PAIRS if (path / PAIRS).is_file() else "manifest.json")
                 if json.loads(read_text(manifest, _LONGEST_HEAD)).get("status") == "incomplete":

@@ -508,7 +508,7 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
             "or depth_range, or calibrate nearer to the scene."
         )
     elif not (error < pixel and rise > max(indifferent(rise), 2e-5 * basis.energy)):
-        doubt = "These patterns hardly determine depth: use shifting dots."
+        doubt = "These patterns hardly determine depth: use shifting dots of a longer period, such as dots:7x32."
     elif alternatives:
         others_mm = (f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in alternatives)
         named = " and ".join(others_mm)
