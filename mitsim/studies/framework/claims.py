@@ -41,12 +41,20 @@ def choose_rows(rows: DataFrame, where: Where) -> DataFrame:
         if callable(value):
             kept = column.map(lambda each, accept=value: bool(accept(each)))
         elif isinstance(value, (list, tuple, set, frozenset)):
-            kept = column.isin([each for each in value if each is not None])
+            kept = column.map(_number).isin([_number(each) for each in value if each is not None])
             kept = kept | column.isna() if None in value else kept
         else:
-            kept = column.isna() if value is None else column == value
+            kept = column.isna() if value is None else column.map(_number) == _number(value)
         rows = rows[kept.astype(bool)]
     return rows
+
+
+def _number(value: Any) -> Any:
+    """Return a value as a number if it is one, because a sweep's column may hold "2" where a study states 2.0."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return value
 
 
 def _chosen(where: Where) -> Mapping[str, Any]:
