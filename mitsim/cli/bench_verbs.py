@@ -414,7 +414,8 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
         lines += [
             *([f"Frames are behind {payload['mosaic']} filters"] if "mosaic" in payload else []),
             f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise"
-            f"{' and limits the image' if payload['mc_to_sensor_noise'] > 1 else ''}; exposure {payload['exposure_s']:.3g} s a frame",
+            f"{', so that it limits the image' * (payload['mc_to_sensor_noise'] > 1)}; "
+            f"exposure {payload['exposure_s']:.3g} s a frame",
             *common.details(f"Accuracy {payload['accuracy']:g}", f"Seconds: {stages}", memory_line(payload)),
         ]
     lines += _kernel_lines(payload["kernels"])

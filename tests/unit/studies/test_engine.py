@@ -78,7 +78,7 @@ def test_rows_are_chosen_by_values_sets_and_functions() -> None:
     assert len(choose_rows(table, {"depth": lambda depth: depth > 395})) == 6
     assert len(choose_rows(table, {"psnr_db": measured})) == 12 and len(choose_rows(table, {"patterns": None})) == 1
     assert len(choose_rows(table, {"focus": None})) == 13 and choose_rows(table, {"focus": "auto"}).empty
-    assert len(choose_rows(table, {"depth": "390"})) == len(choose_rows(table, {"depth": ("390.0",)})) == 6  # as numbers
+    assert len(choose_rows(table, {"depth": "390"})) == len(choose_rows(table, {"depth": ("390.0",)})) == 6
     assert distinct(table, "depth") == [390.0, 400.0] and distinct(table, "focus") == []
 
 
