@@ -2,8 +2,8 @@
 
     python benchmarks/accuracy.py --json FILE [--scene photograph ...] [--accuracy 1e-2 ...] [--seeds N]
 
-The answer is light of two other seeds with every effect of the scene, one step finer in anchors, layers, cells and
-coarse cells than the plan at 3e-4. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the squared error of all
+The answer is light of two other seeds with every effect of the scene, in anchors, layers and cells of a plan at 1e-4.
+With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the squared error of all
 frames a without the noise of the answer; its standard error is the jackknife's over shots. That does not see noise
 which all shots share, of lamps and of followed light: at 3e-4 two halves found 1.5 times the accuracy of cookie_bag,
 with an interval of 1.15 to 1.84, where eight find 0.65 to 0.9. ``--halves N`` makes answers of more halves; the error
@@ -45,24 +45,23 @@ from harness import ROOT, arguments, held, show, write
 
 import mitsim as ms
 from mitsim.acquire.exposure import Exposer, Totals
+from mitsim.bench.effects import present
 from mitsim.core.exr import read_frame
 from mitsim.core.seeds import integer
 from mitsim.light import light as light_module
 from mitsim.light.light import Sampling, trace_light
-from mitsim.planner.choose import predicted_candidate
+from mitsim.light.settings import SURE
+from mitsim.planner.choose import table_of
+from mitsim.planner.pilot import PilotRuns
 from mitsim.planner.planner import make_plan
-from mitsim.studies.accuracy_study import Probe
 
 SCENES = (
     *("photograph", "colour_chart", "resolution_target", "keystone", "gift_card", "corner", "cards", "metal_blade"),
     *("compact_disc", "mirror", "lamp_bench", "cookie_bag"),
 )
 PATTERNS, ACCURACIES = "dots:7", (1e-2, 3e-3, 1e-3, 3e-4)
-FINEST, NOISE = 3e-4, 1e-3
-"""Accuracy whose settings the answer goes one step beyond, and the Monte Carlo error of each of its halves, whose own
-energy drops out."""
-SEEN = 3
-"""How many times as closely the pilot of the answer looks, so that more pixels count as occluded, and more is tried."""
+FINEST, NOISE = 1e-4, 1e-3
+"""Accuracy of the answer's plan, and the Monte Carlo error of each of its halves, whose own energy drops out."""
 SEED, ANSWERS = 0, 811
 PLANNED = 40
 """Seeds of ``--cover`` that share a plan."""
@@ -75,10 +74,10 @@ def answer(scene: str, noise: float, halves: int = 2) -> npt.NDArray[np.float32]
     """(halves, shots, pixels, pixels) irradiance of all shots in so many independent ``halves``."""
     bench = ms.open_bench(scene)
     family = bench.family(PATTERNS, SEED)
-    stand = Probe(bench, family, ANSWERS, FINEST / SEEN)
-    finest = stand.finest(stand.plan(FINEST))
-    samples = predicted_candidate(noise, stand.pilot_result, finest.settings, {}).settings
-    plan = replace(finest, settings=samples, sampling_target=noise)
+    plan = make_plan(bench, family.lighting, FINEST, ANSWERS, dict.fromkeys(present(bench), True))
+    measured = PilotRuns(bench, family.lighting, FINEST, ANSWERS).pilot_result
+    samples = table_of(measured, plan.settings, {}).candidate(noise, SURE).settings
+    plan = replace(plan, settings=samples, sampling_target=noise)
     found = []
     for seed in range(ANSWERS, ANSWERS + halves):
         light = trace_light(bench, plan, family.lighting, integer(seed, "answer"), Sampling(by_pixel=False)).merge()

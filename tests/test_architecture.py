@@ -542,7 +542,6 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
 SIZES = {
-    "__main__": (1, 18),
     "acquire": (5, 1254),
     "api": (2, 224),
     "bench": (5, 1140),
@@ -553,19 +552,16 @@ SIZES = {
     "exchange": (5, 1309),
     "learn": (5, 1197),
     "light": (6, 1681),
-    "metrics": (1, 79),
-    "mitsim": (1, 26),
     "optics": (7, 1757),
-    "planner": (6, 1633),
+    "planner": (6, 1629),
     "reconstruct": (16, 5529),
     "report": (6, 1941),
     "scene": (5, 1359),
     "sensor": (4, 1118),
     "sessions": (4, 871),
-    "studies": (23, 5216),
+    "studies": (23, 5163),
+    "top level": (5, 512),
     "transport": (15, 3990),
-    "verbs": (1, 392),
-    "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
 another, and says which code went."""
@@ -605,7 +601,8 @@ def rooms_by_file(names: list[str]) -> dict[str, set[str]]:
 def test_no_room_grows() -> None:
     sizes: dict[str, tuple[int, int]] = {}
     for name, (text, _) in sources().items():
-        room = name.split(".")[1] if name.count(".") and room_of(name) != "mitsim" else "mitsim"
+        parts = name.split(".")
+        room = parts[1] if len(parts) > 1 and (PACKAGE / parts[1]).is_dir() else "top level"
         files, lines = sizes.get(room, (0, 0))
         sizes[room] = files + 1, lines + lines_of_code(text)
     larger = {room: size for room, size in sizes.items() if any(map(operator.gt, size, SIZES.get(room, (0, 0))))}

@@ -105,13 +105,7 @@ class Candidates:
         return self._chosen[accuracy, sure]
 
 
-def predicted_candidate(
-    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]
-) -> Candidate:
-    return _table_of(pilot_result, settings, switches).candidate(accuracy, SURE)
-
-
-def _table_of(pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]) -> _Table:
+def table_of(pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]) -> _Table:
     row = np.array([[*counts_of(settings), settings.coarse_layers]], dtype=np.float64)
     drawn = pilot_result.raster[cost_model.in_waves(settings.effects)]
     cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
@@ -121,7 +115,7 @@ def _table_of(pilot_result: PilotResult, settings: Settings, switches: Mapping[s
 def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, Approximation]:
     careful, hopeful = (candidates.choice(accuracy, sure) for sure in (SURE, 0.0))
     result, unsure = candidates.pilot_result, dict[Approximation, float]()
-    table = _table_of(result, hopeful.settings, candidates.switches)
+    table = table_of(result, hopeful.settings, candidates.switches)
     for part in result.changes.parts:
         if weight := float(table.weight(part)[0]):
             unsure[part] = weight**2 * (result.error(part).bound ** 2 - result.error(part).value ** 2)

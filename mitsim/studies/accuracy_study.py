@@ -10,33 +10,25 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mitsim.acquire.capture import capture, render, show_pattern
 from mitsim.acquire.spectral import SpectralBench
-from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.effects import EFFECTS, Physics, names, present
+from mitsim.api.bench import Bench
+from mitsim.bench.effects import names, present
 from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import PatternFamily, read_name
-from mitsim.light.cost_model import frame_seconds
 from mitsim.light.light import SampledLight, Sampling, trace_light
-from mitsim.light.passes import Simulation
-from mitsim.light.plan import Plan
-from mitsim.light.settings import COUNTED, Approximation, PilotResult
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.planner import pilot
-from mitsim.planner.choose import counts_of, predicted_candidate
-from mitsim.planner.planner import SceneFacts, explain_plan
 from mitsim.report.pages import Value
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.claims import Judged, choose_rows
@@ -53,51 +45,10 @@ SAMPLES = (16, 64)
 LONGEST_S = 30.0
 """Predicted seconds above which a run, or a step of the reference, is skipped."""
 JUDGE_S = 12.0
-"""Predicted seconds of the judge's light."""
+"""Predicted seconds of the judge."""
 _REPEATS, _REPEATED_S = 3, 5.0
 """Repeats of runs that take at most so many seconds; longer runs are timed once."""
-_FINER, _STEP = 10.0, 1.25
-"""The judge's noise is a tenth of the quoted accuracy where time allows, and grows by this factor otherwise."""
 RUN, REFERENCE = "factored", "reference"
-
-
-@dataclass(frozen=True, eq=False)
-class Probe:
-    """A scene and its patterns, with the results of the pilot."""
-
-    bench: Apparatus
-    family: PatternFamily
-    seed: int
-    accuracy: float
-
-    @cached_property
-    def pilot_result(self) -> PilotResult:
-        return pilot.PilotRuns(self.bench, self.family.lighting, self.accuracy, self.seed).pilot_result
-
-    def plan(self, accuracy: float) -> Plan:
-        return explain_plan(accuracy, self.pilot_result, SceneFacts.of(self.bench))
-
-    def finest(self, plan: Plan) -> Plan:
-        """Return the plan with every effect of the scene, and one step finer in all numbers."""
-        ladders, now = self.pilot_result.ladders, plan.settings
-        anchors, layers, cells, followed, occluded = (
-            next((finer for finer in ladders[name] if finer > count), count)
-            for name, count in zip(COUNTED, counts_of(now), strict=True)
-        )
-        settings = replace(
-            now,
-            anchors=anchors,
-            layers=self.pilot_result.layers[layers] if layers > 1 else (),
-            subdivision=cells,
-            effects=frozenset(present(self.bench)),
-            followed_anchors=followed,
-            occluded_anchors=occluded,
-            coarse_layers=True,
-        )
-        return replace(plan, settings=settings)
-
-    def trace(self, plan: Plan, seed: int) -> SampledLight:
-        return trace_light(self.bench, plan, self.family.lighting, seed, Sampling(by_pixel=False))
 
 
 def stack_frames(expected: ExpectedFrames) -> tuple[FloatArray, float]:
@@ -115,34 +66,24 @@ def stack_frames(expected: ExpectedFrames) -> tuple[FloatArray, float]:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Reference answer for errors: its light, its expected frames, and their errors."""
+    """Reference answer for errors: light with every effect of the scene, its expected frames, and their noise."""
 
-    probe: Probe
+    bench: Bench
+    family: PatternFamily
+    seed: int
     light: SampledLight
     frames: FloatArray
     mc_error: float
-    systematic_error: float
 
     @classmethod
-    def trace(cls, probe: Probe, seconds: float = JUDGE_S) -> Judge:
-        """Trace the finest plan with the least noise within the predicted ``seconds``.
-
-        If the finest plan takes longer at any accuracy, the plan's own numbers are used.
-        """
-        plan, pilot_result = probe.plan(probe.accuracy), probe.pilot_result
-        for numbers in (probe.finest(plan), plan):
-            accuracy = plan.accuracy / _FINER
-            choice = predicted_candidate(accuracy, pilot_result, numbers.settings, {})
-            while choice.work > seconds and accuracy <= plan.accuracy:
-                accuracy *= _STEP
-                choice = predicted_candidate(accuracy, pilot_result, numbers.settings, {})
-            chosen = replace(numbers, settings=choice.settings, sampling_target=choice.target)
-            if choice.work <= seconds:
-                break
-        light = probe.trace(chosen, probe.seed + 1)
-        counted = zip(COUNTED, counts_of(chosen.settings), strict=True)
-        left = pilot_result.error(*(Approximation(*both) for both in counted)).value
-        return cls(probe, light, *stack_frames(light.frames(probe.family.lighting, probe.seed + 1)), left)
+    def trace(cls, bench: Bench, family: PatternFamily, seed: int, seconds: float) -> Judge:
+        """Trace light as accurately as the predicted ``seconds`` allow, and at least to the quoted accuracy."""
+        asked: dict[str, Any] = {"seed": seed + 1, "effects": dict.fromkeys(present(bench), True)}
+        plan = bench.plan(family.name, seconds=seconds, **asked)
+        if plan.accuracy > QUOTED:
+            plan = bench.plan(family.name, accuracy=QUOTED, **asked)
+        light = trace_light(bench, plan, family.lighting, seed + 1, Sampling(by_pixel=False))
+        return cls(bench, family, seed, light, *stack_frames(light.frames(family.lighting, seed + 1)))
 
     def error(self, frames: FloatArray) -> float:
         """Return the relative error of ``frames`` without the judge's own noise, at least half of that noise."""
@@ -150,7 +91,7 @@ class Judge:
         return max(math.sqrt(max(distance**2 - self.mc_error**2, 0.0)), self.mc_error / 2)
 
     def row(self, **measured: Value) -> dict[str, Value]:
-        return {**measured, "judge_error": math.hypot(self.mc_error, self.systematic_error)}
+        return {**measured, "judge_error": math.hypot(self.mc_error, self.light.plan.systematic_error)}
 
 
 # -------- Measurement of one point
@@ -158,16 +99,14 @@ class Judge:
 
 def measure_run(judge: Judge, accuracy: float, opening_s: float) -> dict[str, Value]:
     """Return the row of a whole capture, with the median of repeated times and stages."""
-    probe, stages, errors = judge.probe, [], []
-    bench, plan = probe.bench, probe.plan(accuracy)
-    around = sum(frame_seconds(bench, len(probe.family.shots)).values())
+    bench, name, stages, errors = judge.bench, judge.family.name, [], []
     known: dict[str, Value] = {"estimator": RUN, "setting": f"accuracy {accuracy:g}", "accuracy": accuracy}
-    if (predicted := plan.predicted_seconds + around) > LONGEST_S:
+    if (predicted := bench.plan(name, accuracy=accuracy, seed=judge.seed).predicted_seconds) > LONGEST_S:
         by = f"not measured, predicted to take {predicted:.0f} s"
         return judge.row(**known, seconds=predicted, extrapolated=True, by=by)
     # Speckle is drawn anew in every frame and is no error of the light.
     effects = {"speckle": False} if "speckle" in present(bench) else {}
-    request = Request.of(patterns=probe.family.name, seed=probe.seed, accuracy=accuracy, effects=effects)
+    request = Request.of(patterns=name, seed=judge.seed, accuracy=accuracy, effects=effects)
     took: list[float] = []
     while len(took) < (_REPEATS if not took or took[0] <= _REPEATED_S else 1):
         job = Job()
@@ -188,26 +127,21 @@ def measure_run(judge: Judge, accuracy: float, opening_s: float) -> dict[str, Va
 
 def measure_reference(judge: Judge) -> list[dict[str, Value]]:
     """Return a row for each number of samples of the reference whose predicted time is short enough."""
-    probe, light, shots = judge.probe, judge.light, judge.probe.family.shots
-    absent, settings = names(lambda effect: not effect.in_reference), light.plan.settings
-    if any(EFFECTS[name].retraced(Physics.of(probe.bench)) for name in absent & settings.effects):
-        plain = replace(light.plan, settings=replace(settings, effects=settings.effects - absent))
-        light = probe.trace(plain, probe.seed + 1)
-    else:  # frames are formed without the effects
-        formed = light.simulation.settings
-        light = replace(
-            light, simulation=Simulation(light.bench, replace(formed, effects=formed.effects - absent))
-        )  # fmt: skip
+    bench, family, light, shots = judge.bench, judge.family, judge.light, judge.family.shots
+    plan, absent = light.plan, names(lambda effect: not effect.in_reference)
+    if absent & plan.settings.effects:
+        plain = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects - absent))
+        light = trace_light(bench, plain, family.lighting, judge.seed + 1, Sampling(by_pixel=False))
     index, rows = len(shots) // 2, list[dict[str, Value]]()
-    answer, _ = stack_frames(light.frames(probe.family.lighting.shots([index]), probe.seed + 1))
-    with show_pattern(probe.bench, probe.family.light(shots[index])):
+    answer, _ = stack_frames(light.frames(family.lighting.shots([index]), judge.seed + 1))
+    with show_pattern(bench, family.light(shots[index])):
         started = time.perf_counter()
-        render(probe.bench, REFERENCE, SAMPLES[0], 1e-3, probe.seed)  # compiles kernels
+        render(bench, REFERENCE, SAMPLES[0], 1e-3, judge.seed)  # compiles kernels
         predicted_s = time.perf_counter() - started
         for spp in SAMPLES:
             if predicted_s > LONGEST_S:
                 break
-            rendered = render(probe.bench, REFERENCE, spp, 1e-3, probe.seed)
+            rendered = render(bench, REFERENCE, spp, 1e-3, judge.seed)
             one = float(rendered.facts["seconds"])
             predicted_s = 5 * one  # four times the samples, and some more
             error = relative_error(rendered.mean.mean(axis=2), answer[0])
@@ -233,7 +167,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         started, seed = time.perf_counter(), int(point["seed"])
         bench = studio.bench(point.setup)
         seconds = time.perf_counter() - started
-        return Judge.trace(Probe(bench, bench.family(point["patterns"], seed), seed, QUOTED)), seconds
+        return Judge.trace(bench, bench.family(point["patterns"], seed), seed, JUDGE_S), seconds
 
     judge, opening_s = studio.once("judge", 1, (point.setup, point["patterns"], point["seed"]), opened)
     if point["measured"] == REFERENCE:

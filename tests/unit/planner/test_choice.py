@@ -52,7 +52,7 @@ from mitsim.light.settings import (
     SharpPixels,
 )
 from mitsim.planner import planner
-from mitsim.planner.choose import Candidate, Candidates, counts_of, predicted_candidate, value_of_refining
+from mitsim.planner.choose import Candidate, Candidates, counts_of, table_of, value_of_refining
 from mitsim.planner.planner import SceneFacts, explain_plan
 from mitsim.scene.check import Unfit
 from mitsim.scene.outline import Tag
@@ -112,6 +112,10 @@ ACCURACIES = [0.1, 1e-2, 3e-3, 1e-3, 3e-4]
 def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
     """The choice of least work that keeps ``accuracy``, or of least error if none does."""
     return Candidates(pilot_result, switches).choice(accuracy, sure)
+
+
+def predicted(accuracy: float, pilot_result: PilotResult, settings: Settings) -> Candidate:
+    return table_of(pilot_result, settings, {}).candidate(accuracy, SURE)
 
 
 def plan(
@@ -193,7 +197,7 @@ def test_no_choice_that_fits_is_cheaper(accuracy: float, seed: int) -> None:
     others += [replace(now, coarse_layers=all_) for all_ in (False, True)]
     others += [replace(now, effects=frozenset({"blur", "speckle"}), anchors=1, layers=(), subdivision=1)]
     for settings in others:
-        other = predicted_candidate(accuracy, pilot_result, settings, {})
+        other = predicted(accuracy, pilot_result, settings)
         assert not other.fits or other.work >= chosen.work * (1 - 1e-12)
 
 
@@ -240,16 +244,14 @@ def test_opposite_errors_are_left_together() -> None:
         vectors[Approximation("diffraction")] = sign * np.full((REPLICATES, 2), 5.6e-4)
         pilot_result = replace(PILOT_RESULT, changes=ErrorCovariance.between(vectors, 1.0), apart={})
         bare = replace(cheapest(1e-3, pilot_result, {}).settings, effects=frozenset({"blur"}), subdivision=1)
-        assert predicted_candidate(1e-3, pilot_result, bare, {}).fits == fits
+        assert predicted(1e-3, pilot_result, bare).fits == fits
 
 
 def test_light_that_is_missing_leaves_less_for_other_errors_to_be_part_of() -> None:
     """A fifth of the light, and a tenth, come over what no tracer finds: errors are those of the rest."""
     settings = cheapest(1e-2, PILOT_RESULT, {}).settings
     lacking = replace(PILOT_RESULT, unresolved=0.2, left_out=0.1)
-    before, after = (
-        predicted_candidate(1e-2, pilot_result, settings, {}).systematic for pilot_result in (PILOT_RESULT, lacking)
-    )
+    before, after = (predicted(1e-2, pilot_result, settings).systematic for pilot_result in (PILOT_RESULT, lacking))
     assert before.value > 1e-3 and after == pytest.approx([0.3 + 0.7 * error for error in before])
 
 
@@ -294,7 +296,7 @@ def test_the_largest_doubt_is_looked_at_as_it_counts_in_the_choice() -> None:
     its square.)"""
     settings = cheapest(1e-3, PILOT_RESULT, parse_switches("+interreflection")).settings
     settings = replace(settings, subdivision=4 * CELLS_OF_COARSE, coarse_layers=True)
-    chosen = replace(predicted_candidate(1e-3, PILOT_RESULT, settings, {}), fits=True, work=2.0)
+    chosen = replace(predicted(1e-3, PILOT_RESULT, settings), fits=True, work=2.0)
     points, even = Approximation("anchors", settings.anchors), Approximation("indirect cells", 1)
     result = Doubtful(**{each.name: getattr(PILOT_RESULT, each.name) for each in fields(PILOT_RESULT)})
     found: Any = SimpleNamespace(pilot_result=result, switches={}, choice=lambda *_: chosen)
@@ -325,7 +327,7 @@ def test_occluded_pixels_have_several_anchors_where_the_others_do(accuracy: floa
     assert (settings.anchors > 1) == (settings.occluded_anchors > 1) and settings.occluded == tuple(range(150))
     assert chosen.fits and chosen.total.bound <= accuracy
     left = {1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5}[settings.occluded_anchors]
-    with_none = predicted_candidate(accuracy, with_occluded({1: 0.0}), replace(settings, occluded_anchors=1), {})
+    with_none = predicted(accuracy, with_occluded({1: 0.0}), replace(settings, occluded_anchors=1))
     assert chosen.systematic.value == pytest.approx(math.hypot(with_none.systematic.value, left), rel=1e-6)
     off = cheapest(1e-3, pilot_result, {"anchors": False})
     assert off.settings.anchors == off.settings.occluded_anchors == 1 and off.fits, "what the user wants does not count"
@@ -361,7 +363,7 @@ def test_one_hit_of_a_small_target_is_a_quarter_of_the_noise_and_counts_beside_i
     one_hit = 1 / (few.hits * float(PASSES["direct"].whole(chosen.settings.samples["direct"])))
     assert chosen.settings.samples["direct"] > 4 * cheapest(1e-2, PILOT_RESULT, {}).settings.samples["direct"]
     assert 0.2 < one_hit / chosen.target <= 0.25
-    rest = predicted_candidate(1e-2, PILOT_RESULT, chosen.settings, {}).systematic
+    rest = predicted(1e-2, PILOT_RESULT, chosen.settings).systematic
     assert chosen.systematic.value == pytest.approx(math.hypot(rest.value, 0.75 * one_hit))
     assert chosen.systematic.bound == pytest.approx(math.hypot(rest.bound, 1.5 * one_hit))
     assert chosen.fits and chosen.total.bound <= 1e-2
@@ -375,7 +377,7 @@ def test_doubt_of_the_pilot_is_in_the_bound_alone() -> None:
     bare = replace(bare, anchors=1, followed_anchors=1, subdivision=1)
     left = {Approximation("anchors", 1), Approximation("layers", 1), Approximation("cells", 1)}
     left |= {Approximation("interreflection"), Approximation("ambient")}
-    found = predicted_candidate(0.1, doubtful, bare, {}).systematic
+    found = predicted(0.1, doubtful, bare).systematic
     assert found == pytest.approx(doubtful.changes.estimate(left)) and found.bound > 1.002 * found.value
 
 
@@ -387,7 +389,7 @@ def test_what_interpolation_leaves_of_sharp_light_counts() -> None:
         with_sample_costs(replace(ONE_CLASS, sharp=each), sharp=light) for each in (sharp, replace(sharp, left=0.0))
     )
     chosen = cheapest(1e-3, found, {})
-    without = predicted_candidate(1e-3, exact, replace(chosen.settings, sharp=exact.sharp), {})
+    without = predicted(1e-3, exact, replace(chosen.settings, sharp=exact.sharp))
     assert chosen.fits and chosen.systematic.value == pytest.approx(math.hypot(without.systematic.value, 6e-4))
     assert not cheapest(5e-4, found, {}).fits
     assert any("anchors of sharp light (7), 6.0e-04" in warning for warning in plan(5e-4, found).warnings)
@@ -506,7 +508,7 @@ def test_a_miss_and_a_window_off_square_are_told() -> None:
     (Planted: cells of two pixels not named; the row's name and state exchanged.)"""
     chosen = cheapest(1e-3, with_wide := replace(FOLLOWS, changes=changes(SIZES | {WIDE: 0.4})), {})
     wide = replace(chosen.settings, followed_anchors=2, subdivision=2 * CELLS_OF_COARSE, coarse_layers=True)
-    missed = predicted_candidate(1e-3, with_wide, wide, {})
+    missed = predicted(1e-3, with_wide, wide)
     (warning, *_) = planner._shortfall(1e-3, with_wide, missed)
     assert wide.followed_width == 2 and "cells of their light (2 pixels), 1.0e-01" in warning
     found = rows(plan(facts=SceneFacts(notes={}, keystone=2.5)))["keystone"]

@@ -3,16 +3,15 @@
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.planner.choose import counts_of, predicted_candidate
+from mitsim.bench.effects import present
 from mitsim.studies import accuracy_study as accuracy
-from mitsim.studies.accuracy_study import Judge, Probe
+from mitsim.studies.accuracy_study import Judge
 from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
 
@@ -40,7 +39,7 @@ def results(scene: Path, variant: str) -> Iterator[Results]:
     with pytest.MonkeyPatch.context() as patch, Studio() as studio:
         patch.setattr(accuracy, "ACCURACIES", (3e-2, QUOTED, 1e-6))
         patch.setattr(accuracy, "QUOTED", QUOTED)
-        patch.setattr(accuracy, "JUDGE_S", 0.2)
+        patch.setattr(accuracy, "JUDGE_S", 2.5)
         patch.setattr(accuracy, "_REPEATS", 2)
         patch.setattr(accuracy, "_REPEATED_S", math.inf)
         found = [accuracy.STUDY.measure(studio, point) for point in accuracy.STUDY.points(scope)]
@@ -83,7 +82,7 @@ def test_claims_and_figures_are_of_what_was_measured(results: Results, monkeypat
 
 def test_the_judges_own_noise_is_subtracted(bench: Bench) -> None:
     """Frames of the judge's mean light and of independent noise leave that noise."""
-    answer = Judge.trace(Probe(bench, bench.family("uniform"), SEED, 3e-2), 0.0)
+    answer = Judge.trace(bench, bench.family("uniform"), SEED, 0.1)
     size = np.linalg.norm(answer.frames) / answer.frames.size**0.5
     rng, noise = np.random.default_rng(0), answer.mc_error
     for own in (3 * noise, 0.01 * noise):
@@ -91,23 +90,17 @@ def test_the_judges_own_noise_is_subtracted(bench: Bench) -> None:
         assert answer.error(apart) == pytest.approx(max(own, noise / 2), rel=0.05)
 
 
-def test_a_judge_takes_a_plans_own_numbers_where_its_time_does_not_buy_finer_ones(
+def test_a_judge_has_every_effect_and_is_at_least_as_accurate_as_the_quoted_run(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And states what they leave; all the time that there is goes into samples."""
-    probe, traced = Probe(bench, bench.family("uniform"), SEED, 3e-2), []
-    plan = probe.plan(3e-2)
-    finest = probe.finest(plan).settings
-    formed = SimpleNamespace(frames=lambda *_: [SimpleNamespace(irradiance=np.ones((2, 2)), variance=0.0)])
-    monkeypatch.setattr(Probe, "trace", lambda _, plan, seed: traced.append((plan, seed)) or formed)
-    dear = predicted_candidate(3e-2 / 10 * 1.25**11, probe.pilot_result, finest, {}).work
-    for seconds, taken in ((math.inf, finest), (dear, finest), (0.99 * dear, plan.settings), (0.0, plan.settings)):
-        answer = Judge.trace(probe, seconds)
-        own, seed = traced.pop()
-        assert counts_of(own.settings) == counts_of(taken) and own.settings.effects == taken.effects
-        assert seed == SEED + 1 and answer.systematic_error > 0
-        assert own.sampling_target < 3e-2 / 9 or seconds < math.inf
-    assert counts_of(finest) != counts_of(plan.settings)
+    """(Planted: effects left to the plan; the loosest plan where no time is enough.)"""
+    monkeypatch.setattr(accuracy, "QUOTED", 3e-2)
+    in_haste = Judge.trace(bench, bench.family("uniform"), SEED, 0.1)
+    at_leisure = Judge.trace(bench, bench.family("uniform"), SEED, 5.0)
+    for answer in (in_haste, at_leisure):
+        assert answer.light.plan.settings.effects >= frozenset(present(bench)) and answer.light.seed == SEED + 1
+    assert in_haste.light.plan.accuracy == 3e-2 and at_leisure.light.plan.accuracy < 3e-3
+    assert at_leisure.mc_error < in_haste.mc_error / 3
 
 
 THICK = '<float name="mask_thickness" value="0.3"/>'
@@ -135,7 +128,8 @@ def test_the_judge_of_the_reference_has_what_the_registry_says(
             "focus_mm = 200.0\n"
         )
     bench = open_bench(scene, variant, projector=projector)
-    answer = Judge.trace(Probe(bench, bench.family("hadamard:2"), SEED, 1e-2), 1.0)
+    monkeypatch.setattr(accuracy, "QUOTED", 1e-2)
+    answer = Judge.trace(bench, bench.family("hadamard:2"), SEED, 1.0)
     monkeypatch.setattr(accuracy, "SAMPLES", (64, 1024 if lacking == "thick mask" else 256))
     monkeypatch.setattr(accuracy, "LONGEST_S", math.inf)
     rows: list[dict[str, Any]] = list(accuracy.measure_reference(answer))
