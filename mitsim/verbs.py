@@ -63,13 +63,13 @@ from mitsim.reconstruct.request import TIKHONOV
 from mitsim.studies import OF_CAPTURES, OF_NO_SCENE, find_files
 
 if TYPE_CHECKING:
+    from mitsim.acquire.capture import Light
     from mitsim.acquire.sense import Sensed
     from mitsim.api.bench import Bench
     from mitsim.core.arrays import FloatArray
     from mitsim.core.runs import Capture
     from mitsim.learn.networks import LearnedSolver, Trained
     from mitsim.learn.pair_store import PairStore
-    from mitsim.light.light import SampledLight
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
     from mitsim.studies.characterise import Characterisation
@@ -142,12 +142,7 @@ def plan_in(bench: Bench, colour: str, request: Planned) -> Plan:
 
 
 def capture_in(
-    bench: Bench,
-    colour: str,
-    what: Plan | str,
-    request: Mapping[str, Any],
-    task: Task,
-    light: SampledLight | None = None,
+    bench: Bench, colour: str, what: Plan | str, request: Mapping[str, Any], task: Task, light: Light | None = None
 ) -> Capture | Mapping[str, Capture]:
     """Return the capture of a family, or of a plan, in a ``colour``; of lines, one for each by name.
 
@@ -160,18 +155,18 @@ def capture_in(
     task, light
         Where frames go; and light that is traced already, of whose patterns ``what`` is one.
     """
-    output, resume, job = task.output, task.resume, task.job
+    where = task.output, task.resume, task.job
     if light is not None:
         from mitsim.acquire.capture import expose
 
-        return expose(light, str(what), output, job, resume, **request)
+        return expose(light, str(what), task, **request)
     if colour == AUTO:
         chosen = bench.choose_colour(str(what), **request)
         bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
     if by_line(colour):
-        return in_colour(bench, colour).capture_lines(what, output, resume, job, **request)
+        return in_colour(bench, colour).capture_lines(what, *where, **request)
     take: Any = bench.capture_mosaic if colour == MOSAIC else bench.capture
-    return take(what, output, resume, job, **request)  # type: ignore[no-any-return]
+    return take(what, *where, **request)  # type: ignore[no-any-return]
 
 
 def calibrate_in(bench: Bench, colour: str, request: SessionRequest, task: Task) -> Mapping[str, Factors]:
@@ -592,14 +587,9 @@ def sense(
         check_image(Path(image))
     elif asked.channel is not None:
         raise ArgumentError("channel", f"{asked.channel!r}: an array has no channels; leave it out")
-    from mitsim.acquire.sense import irradiance_behind_lens, read_image
     from mitsim.acquire.sense import sense as run_sense
 
-    light, notes = read_image(image, asked.channel) if isinstance(image, str | Path) else (image, tuple[str, ...]())
-    light = light * asked.scale
-    if asked.f_number is not None:
-        light = irradiance_behind_lens(light, asked.f_number)
-    return run_sense(light, sensor, asked.timing, asked.seed, asked.wavelength, notes)
+    return run_sense(image, sensor, asked)
 
 
 # ---- networks, which need torch, an extra that is imported when it is used -------------------------------------------
@@ -640,10 +630,8 @@ def make_pairs(
     own = {name: options.pop(name) for name in ("pictures", "vary") if name in options}
     asked = PairsRequest(capture=Request(patterns=patterns, **options), count=count, **own)
     check_output(output, overwrite=resume and (output / PAIRS).is_file())
-    task = Task.of(output, resume, job)
-    with task.importing():
+    with Task.of(output, resume, job).importing() as task:
         from mitsim.learn.pairs import make_pairs
-
     return make_pairs(bench, asked, task)[0]
 
 

@@ -21,7 +21,7 @@ from mitsim.acquire.spectral import MosaicLight, SpectralBench, excess_behind_fi
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import names, present
 from mitsim.bench.layout import obstacles
-from mitsim.bench.request import FEWEST_PASSES, REFERENCE, Request, Task, check_accuracy, check_samples
+from mitsim.bench.request import FEWEST_PASSES, REFERENCE, Request, Task, check_samples
 from mitsim.core import colour_files, manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Drawn, takes
@@ -78,7 +78,7 @@ class Light(SampledLight):
         Raises MitsimError for patterns that do not fit, an output that cannot be written, or a field that needs other
         light.
         """
-        return expose(self, patterns, output, job, **Request(**request).given)
+        return expose(self, patterns, Task.of(output, job=job), **Request(**request).given)
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
@@ -108,17 +108,10 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None, seed: in
     return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
 
 
-def expose(
-    light: SampledLight,
-    patterns: str,
-    output: Path | str | None = None,
-    job: Job | None = None,
-    resume: bool = False,
-    **request: Any,
-) -> Capture:
+def expose(light: SampledLight, patterns: str, task: Task | None = None, **request: Any) -> Capture:
     own = replace(light.plan, request=light.plan.known_request.with_values(patterns=patterns, seed=light.seed))
     bench = SpectralBench(light.bench)
-    return capture(bench, request_of(own, request), Task.of(output, resume, job), lights=[light]).runs[0]
+    return capture(bench, request_of(own, request), task, lights=[light]).runs[0]
 
 
 def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
@@ -158,14 +151,14 @@ def capture(
     bench: SpectralBench,
     request: Request,
     task: Task | None = None,
-    plan: Plan | None = None,
+    plan: Plan | str | None = None,
     lights: Sequence[SampledLight] = (),
 ) -> Captured:
     """Render and expose every shot of a pattern family; see :meth:`mitsim.api.bench.Bench.capture`.
 
-    Nothing is written before all input has been checked.
+    Nothing is written before all input has been checked. A family's name in place of a ``plan`` is planned for.
     """
-    task = task or Task()
+    task, plan = task or Task(), None if isinstance(plan, str) else plan
     job, spent = task.job, task.job.clock.seconds()
     starting = spent["total"] - spent.get("plan", 0.0)
     bench.check(request)
@@ -197,7 +190,7 @@ def capture(
             asked["light"] = {"patterns": lights[0].plan.request.patterns, "seed": lights[0].seed}
         heads = [manifests.RunHead.of({**each.provenance(), **each.identity(), **asked}) for each in readings]
         recorders = [
-            places.enter_context(claim_run(place, head, task.resume)) if place else Recorder()
+            places.enter_context(claim_run(place, head, task.resume)) if place else Recorder(head=head)
             for place, head in zip(folders, heads, strict=True)
         ]
         least = first_shadow(bench.whole, request.effects)
@@ -218,21 +211,13 @@ def capture(
         if bench.whole.filters is not None and bench.manifest is not None:
             seen = [MosaicLight.of(bench.whole, lights, bench.manifest.wavelengths_nm)]
         runs = [
-            _run(each, light, plan, request, job, head, recorder)
-            for each, light, head, recorder in zip(readings, seen, heads, recorders, strict=True)
+            _run(each, light, plan, request, job, recorder)
+            for each, light, recorder in zip(readings, seen, recorders, strict=True)
         ]
     return Captured(tuple(runs), tuple(light.apparent for light in lights))
 
 
-def _run(
-    bench: Apparatus,
-    light: SampledLight,
-    plan: Plan,
-    request: Request,
-    job: Job,
-    head: manifests.RunHead,
-    recorder: Recorder,
-) -> Capture:
+def _run(bench: Apparatus, light: SampledLight, plan: Plan, request: Request, job: Job, recorder: Recorder) -> Capture:
     family = bench.family(request.patterns, request.seed)
     patterns = manifests.Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     with job.clock.stage("truth"):
@@ -262,8 +247,8 @@ def _run(
         ambient_file = manifests.AmbientFile(file=AMBIENT, shots=ambient.shots, part=part, noise=noise)
     total = light.plan.total(totals.noise)
     manifest = manifests.RunManifest(
-        configuration=head.configuration,
-        configuration_sha256=head.configuration_sha256,
+        configuration=recorder.head.configuration,
+        configuration_sha256=recorder.head.configuration_sha256,
         camera=bench.identity(),
         digital=digital_of(bench.sensor, exposure_s),
         patterns=patterns,
@@ -306,12 +291,12 @@ def colour_folder(task: Task, manifest: colour_files.ColourManifest) -> Iterator
         colour_files.write_colours(folder, manifest)
 
 
-def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> dict[str, Capture]:
+def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | str) -> dict[str, Capture]:
     lines = SpectralBench.of(bench, colour_files.RUN)
     return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
-def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> MosaicCapture:
+def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | str) -> MosaicCapture:
     lines = SpectralBench.of(bench, colour_files.MOSAIC)
     assert isinstance(lines.manifest, colour_files.MosaicManifest)
     captured, board = capture(lines, request, task, plan), load_recipe().board_reflectance
@@ -541,16 +526,8 @@ def show_pattern(bench: Apparatus, pattern: FloatArray) -> Iterator[None]:
         parameters.update()
 
 
-def render(
-    bench: Apparatus,
-    estimator: str,
-    spp: int | None,
-    accuracy: float,
-    seed: int,
-    effects: Mapping[str, bool] | None = None,
-    job: Job | None = None,
-) -> Rendered:
-    job = job or Job()
+def render(bench: Apparatus, estimator: str, spp: int | None, asked: Request, job: Job | None = None) -> Rendered:
+    job, seed = job or Job(), asked.seed
     check_samples(estimator, spp)
     if spp is None:
         spp = bench.loaded.samples or _SAMPLES
@@ -558,7 +535,6 @@ def render(
             check_samples(estimator, spp)
         except MitsimError as wrong:
             raise MitsimError(f"{bench.loaded.path}: sample_count of its sampler, taken for {wrong}") from None
-    check_accuracy(accuracy)
     warnings, notes, bound = tuple[str, ...](), tuple[str, ...](), None
     started = time.perf_counter()
     if estimator == REFERENCE:
@@ -583,8 +559,8 @@ def render(
         warnings += tuple(unseen_lamps(bench.loaded, spp * mean.shape[0] * mean.shape[1], "the reference"))
     else:
         uniform = Lighting.uniform(bench.n)
-        with job.planning(str(bench.loaded.path), first_shadow(bench, effects or {})):
-            plan = make_plan(bench, uniform, accuracy, seed, effects)
+        with job.planning(str(bench.loaded.path), first_shadow(bench, asked.effects)):
+            plan = make_plan(bench, uniform, asked.accuracy, seed, asked.effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
         with job.clock.stage("transport"):
             light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)

@@ -211,6 +211,7 @@ Exposed = tuple[int, Shot, FloatArray, Digital, float, float, bool, FloatArray]
 saturated, and sums over the pixels, of a frame."""
 
 
+@dataclass(eq=False)
 class Shooting:
     """Exposes expected frames and records them; frames that a resumed run already has are kept.
 
@@ -218,17 +219,13 @@ class Shooting:
     light.
     """
 
-    def __init__(
-        self,
-        family: PatternFamily,
-        recorder: Recorder,
-        exposer: Exposer,
-        ambient: AmbientFrame | None,
-        always: FloatArray,
-    ) -> None:
-        self.family, self.recorder, self.exposer = family, recorder, exposer
-        self.ambient, self.always = ambient, always
-        self.saturated, self.noise_ratio = 0, 0.0
+    family: PatternFamily
+    recorder: Recorder
+    exposer: Exposer
+    ambient: AmbientFrame | None
+    always: FloatArray
+    saturated: int = 0
+    noise_ratio: float = 0.0
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
         exposer, wavelength = self.exposer, self.exposer.devices.projector.effective_wavelength_nm

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.bench.request import Exposure, Irradiance, check_ending, check_image
+from mitsim.bench.request import Irradiance, check_ending, check_image
 from mitsim.core.arrays import FloatArray, npy_header
 from mitsim.core.configuration import Drawn, takes
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
-from mitsim.core.files import FRAME_LIMITS, fits_a_frame, whole_file
-from mitsim.core.images import from_above
+from mitsim.core.files import FRAME_LIMITS, fits_a_frame
+from mitsim.core.images import from_above, write_numbers
 from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
-from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak
+from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak, saturated_pixels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,8 +46,6 @@ class Sensed:
     @property
     def saturated(self) -> int:
         """Return the number of pixels that reached the full well or the end of the ADC."""
-        from mitsim.sensor.chain import saturated_pixels
-
         return saturated_pixels(self.digital, self.electrons, self.exposure_s, self.sensor)
 
     @property
@@ -96,40 +94,21 @@ class Sensed:
             facts = {"exposure_s": self.exposure_s, "wavelength_nm": self.wavelength_nm, "seed": self.seed}
             channels = {"DN": numbers, "electrons": self.electrons.astype(np.float32)}
             write_frame(path, channels, {"camera": self.sensor.name, **facts, **versions()})
-            return path
-        if path.suffix.lower() == ".npy":
-            with whole_file(path) as part, open(part, "wb") as file:
-                np.save(file, self.digital, allow_pickle=False)
-            return path
-        from PIL import Image
-
-        with whole_file(path) as part:
-            Image.fromarray(np.asarray(self.digital, dtype=np.uint16)).save(part, format="PNG")
+        else:
+            write_numbers(path, self.digital.astype(np.uint16) if path.suffix.lower() == ".png" else self.digital)
         return path
 
 
-def sense(
-    irradiance: FloatArray,
-    sensor: SensorModel,
-    exposure: Exposure | None = None,
-    seed: int = 0,
-    wavelength_nm: float = 550.0,
-    notes: tuple[str, ...] = (),
-) -> Sensed:
+def sense(image: FloatArray | Path | str, sensor: SensorModel, asked: Irradiance | None = None) -> Sensed:
     """Return the frame that a sensor reads under an image of irradiance.
 
     Parameters
     ----------
-    irradiance
-        (rows, columns) mean over each (binned) pixel [W m^-2].
-    exposure
-        Seconds, or the part of the full well that the brightest pixel fills; default 0.8.
-    seed
-        Seed of the noise; the camera's fixed pattern has its own.
-    wavelength_nm
-        Wavelength that converts watts to photons.
-    notes
-        Assumptions about the image.
+    image
+        (rows, columns) mean over each (binned) pixel [W m^-2], or a file of it.
+    asked
+        Exposure, seed of the noise (the camera's fixed pattern has its own), and meaning of the image's numbers. A lens
+        of f-number N makes the irradiance pi L / (4 N^2) of the radiance L of a distant object, on the axis.
 
     Raises
     ------
@@ -137,22 +116,26 @@ def sense(
         For values that are negative or not finite, no light although the exposure depends on it, or a camera without
         quantum efficiency.
     """
-    Irradiance(wavelength=wavelength_nm)
+    asked, notes = asked or Irradiance(), tuple[str, ...]()
+    seed, wavelength_nm, timing = asked.seed, asked.wavelength, asked.timing
+    if isinstance(image, str | Path):
+        image, notes = read_image(image, asked.channel)
     if sensor.mosaic is not None:
         raise MitsimError(
             f"sensor {sensor.name!r}: has a mosaic {sensor.mosaic} of colour filters, but the image has one channel; "
             "use a monochrome camera, or capture a scene with --colour mosaic"
         )
-    light = np.asarray(irradiance, dtype=np.float64)
+    light = np.asarray(image, dtype=np.float64) * asked.scale
+    if asked.f_number is not None:
+        light = light * (math.pi / (4 * asked.f_number**2))
     if light.ndim != 2 or not light.size or not (light.min() >= 0 and light.max() < np.inf):
         shown = f"the range is {light.min()} to {light.max()}" if light.size else "it is empty"
         raise MitsimError(
             f"image: its shape is {light.shape} and {shown}; give rows x columns of irradiance, finite and 0 or more"
         )
-    asked = exposure or Exposure()
-    seconds = asked.seconds
+    seconds = timing.seconds
     if seconds is None:
-        seconds = exposure_for_peak(float(light.max()), asked.fraction, sensor, wavelength_nm)
+        seconds = exposure_for_peak(float(light.max()), timing.fraction, sensor, wavelength_nm)
         shortest, longest = EXPOSURE_S
         if not shortest <= seconds <= longest:
             raise MitsimError(
@@ -196,12 +179,3 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
         asked = "several channels" if name is None else f"no channel {name!r}"
         raise MitsimError(f"image {path}: has {asked}; its channels are {', '.join(channels)}; name one by channel")
     return finite_channel(channels, name, path), ()
-
-
-def irradiance_behind_lens(radiance: FloatArray, f_number: float) -> FloatArray:
-    """Return the irradiance [W m^-2] on the axis behind a lens: E = pi L / (4 N^2), for a distant object.
-
-    ``radiance`` is in W m^-2 sr^-1. Raises ArgumentError for an f-number N below 0.5.
-    """
-    Irradiance(f_number=f_number)
-    return np.asarray(radiance * (math.pi / (4 * f_number**2)))

@@ -193,13 +193,10 @@ class Bench(Apparatus):
             for a request that cannot be served, an output that cannot be written or holds something else, or more
             memory, disk or time than the job's limits allow.
         """
-        task = Task.of(output, resume, job)
-        with task.importing():
+        with Task.of(output, resume, job).importing() as task:
             from mitsim.acquire.capture import capture, request_of
             from mitsim.acquire.spectral import SpectralBench
-
-        known = None if isinstance(plan, str) else plan
-        return capture(SpectralBench(self), request_of(plan, request), task, known).runs[0]
+        return capture(SpectralBench(self), request_of(plan, request), task, plan).runs[0]
 
     # ---- Spectral lines and colour filters ----
 
@@ -232,12 +229,9 @@ class Bench(Apparatus):
             as :meth:`capture`; for another variant, a projector of more than four lines, and lamps where the camera's
             efficiency is not known.
         """
-        task = Task.of(output, resume, job)
-        with task.importing():
+        with Task.of(output, resume, job).importing() as task:
             from mitsim.acquire.capture import capture_lines, request_of
-
-        known = None if isinstance(patterns, str) else patterns
-        return capture_lines(self, request_of(patterns, request), task, known)
+        return capture_lines(self, request_of(patterns, request), task, patterns)
 
     @takes(Request, without="patterns")
     def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured:
@@ -285,10 +279,8 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`calibrate`, for a variant that is not spectral, and a projector of more than four lines.
         """
-        task = Task.of(output, resume, job)
-        with task.importing():
+        with Task.of(output, resume, job).importing() as task:
             from mitsim.calibrate.calibrate import calibrate_lines
-
         return calibrate_lines(self, SessionRequest(**request), task)
 
     @takes(Request, without="patterns")
@@ -319,12 +311,9 @@ class Bench(Apparatus):
             as :meth:`capture_lines`, for a camera without a mosaic, lines that its curves do not hold, a sensor of an
             odd number of pixels, and a projector with speckle, which is not simulated behind filters.
         """
-        task = Task.of(output, resume, job)
-        with task.importing():
+        with Task.of(output, resume, job).importing() as task:
             from mitsim.acquire.capture import capture_mosaic, request_of
-
-        known = None if isinstance(patterns, str) else patterns
-        return capture_mosaic(self, request_of(patterns, request), task, known)
+        return capture_mosaic(self, request_of(patterns, request), task, patterns)
 
     @takes(SessionRequest)
     def calibrate_mosaic(
@@ -346,10 +335,8 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`calibrate_lines` and :meth:`capture_mosaic`, and for a filter that passes nothing of a line.
         """
-        task = Task.of(output, resume, job)
-        with task.importing():
+        with Task.of(output, resume, job).importing() as task:
             from mitsim.calibrate.calibrate import calibrate_lines
-
         return calibrate_lines(self, SessionRequest(**request), task, mosaic=True)
 
     # ---- Calibration sessions ----
@@ -374,10 +361,8 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`capture`.
         """
-        task = Task.of(output, resume, job)
-        with task.importing():
+        with Task.of(output, resume, job).importing() as task:
             from mitsim.calibrate.calibrate import calibrate
-
         return calibrate(self, SessionRequest(**request), task)
 
     @takes(SessionRequest)
@@ -460,7 +445,7 @@ class Bench(Apparatus):
         """
         from mitsim.acquire.capture import render
 
-        return render(self, estimator, spp, accuracy, seed, effects, job)
+        return render(self, estimator, spp, Request(accuracy=accuracy, seed=seed, effects=effects or {}), job)
 
     @check_arguments
     def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Self:
@@ -553,6 +538,8 @@ def _write_array(picture: object) -> Path:
     """Write an array to a file that is named by its content, so that another process finds it."""
     import numpy as np
 
+    from mitsim.core.images import write_numbers
+
     try:
         values = np.asarray(picture)
     except ValueError as error:
@@ -575,7 +562,5 @@ def _write_array(picture: object) -> Path:
     folder.mkdir(exist_ok=True)
     path = folder / f"{digest}.npy"
     if not path.is_file():
-        with tempfile.NamedTemporaryFile(dir=folder, suffix=".npy", delete=False) as file:
-            np.save(file, values)
-        Path(file.name).replace(path)  # whole, or not at all
+        write_numbers(path, values)
     return path

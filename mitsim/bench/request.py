@@ -78,10 +78,10 @@ class Task:
         return cls(None if output is None else Path(output), resume, job or Job())
 
     @contextmanager
-    def importing(self) -> Iterator[None]:
-        """Count the time of this context as the stage "imports" of the job's clock."""
+    def importing(self) -> Iterator[Task]:
+        """Count the time of this context as the stage "imports" of the job's clock; yield the task."""
         with self.job.clock.stage("imports"), pause_collector():
-            yield
+            yield self
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-from PIL import Image
 
 from mitsim.acquire.exposure import Exposer, camera_warnings, levels, used_in_chunks
 from mitsim.bench.apparatus import Apparatus
@@ -25,8 +24,9 @@ from mitsim.bench.layout import MOST_LOST, before_board, mask_fault, missed_pixe
 from mitsim.bench.request import Exposure
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import whole_file
+from mitsim.core.images import write_numbers
 from mitsim.core.job import Cost, Job
+from mitsim.core.manifests import CalibrationManifest, Digital
 from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.framelist import StripeFile
 from mitsim.devices.patterns import Lighting, PatternFamily, stripe_signs
@@ -44,7 +44,7 @@ from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.factors import SEPARABLE_RESIDUAL, decibels
-from mitsim.sensor.chain import Digital
+from mitsim.sensor import chain
 
 _IN_RAYS = 0.5
 """Part (rms) of the geometric residual below which the residual is attributed to diffraction."""
@@ -232,6 +232,14 @@ class Session:
             every = boards or (self.board,)
             lights = trace_lines(self.board, every, plan, lighting, self.seed, sampling, job.progress)
         return [light.merge() for light in lights]
+
+
+def manifest_of(
+    bench: Apparatus, digital: Digital, board_reflectance: float | None, depth: float, **more: Any
+) -> CalibrationManifest:
+    """Return the manifest of a calibration of a ``bench`` before a board at a ``depth`` [mm]."""
+    more |= {"camera": bench.identity(), "centre": bench.geometry.centred, "board_reflectance": board_reflectance}
+    return CalibrationManifest(digital=digital, parallax=bench.parallax_from(depth), **more)
 
 
 def _lines(n: int) -> Lighting:
@@ -492,17 +500,14 @@ class LitSession:
         exposer = Exposer(session.bench.devices, self.exposure_s, session.seed, self.speckle)
         passed = Frame(session.through_filters(irradiance), 0.0, 0.0, 0.0)
         lit = exposer.shot_electrons(passed, "calibration", side, index)
-        total: Digital | FloatArray = np.zeros(0)
+        total: chain.Digital | FloatArray = np.zeros(0)
         for repeat, power in enumerate(session.powers[side, index]):
             names = ("repeat", repeat) if repeat else ()
             light = power * lit
             digital = exposer.digital(light, "calibration", side, index, *names)
             if self.kept is not None:
-                with whole_file(self.kept / session.files[side, index, repeat].file) as part, part.open("wb") as file:
-                    if session.as_tiff:
-                        Image.fromarray(digital.astype(np.uint16)).save(file, "TIFF")
-                    else:
-                        np.save(file, digital)
+                path = self.kept / session.files[side, index, repeat].file
+                write_numbers(path, digital.astype(np.uint16) if session.as_tiff else digital)
             saturated += int(exposer.saturates(digital, light))
             total = total + digital if repeat else digital if repeats == 1 else digital.astype(np.float64)
         rate = exposer.rate(total if repeats == 1 else total / repeats)

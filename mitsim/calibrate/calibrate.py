@@ -27,14 +27,14 @@ from mitsim.acquire.capture import colour_folder
 from mitsim.acquire.spectral import SpectralBench, without_filters
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, SessionRequest, Task
-from mitsim.calibrate.board_session import LitSession, Response, Session
+from mitsim.calibrate.board_session import LitSession, Response, Session, manifest_of
 from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import CALIBRATION
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PARTS, output_folder, plain, remove_page, whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Job, Limits
-from mitsim.core.manifests import MANIFEST, CalibrationManifest, other_request, resumable
+from mitsim.core.manifests import MANIFEST, other_request, resumable
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.framelist import LISTS, FrameList
@@ -157,7 +157,7 @@ def calibrate(bench: Apparatus, request: SessionRequest, task: Task, frames: Pat
             pixels, number_bytes = math.prod(bench.geometry.frame_shape), 2 if session.as_tiff else 8
             size = Cost(disk_bytes=float(session.shots * pixels * number_bytes))
             size.check("frames", Limits(), folder)
-        return _run_sessions([session], request, task, [task.output], folder)[0]
+        return _run_sessions([session], request.accuracy, task, [task.output], folder)[0]
 
 
 def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> dict[float, Factors]:
@@ -177,7 +177,7 @@ def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> d
         for depth in recipe.depths:
             session = Session(bench, recipe, integer(request.seed, "depth", f"{depth:g}"), depth)
             own = replace(task, job=task.job.apart(f"{depth:g} mm "))
-            (found[depth],) = _run_sessions([session], request, own, [folder and folder / f"{depth:g}"])
+            (found[depth],) = _run_sessions([session], request.accuracy, own, [folder and folder / f"{depth:g}"])
     return found
 
 
@@ -209,16 +209,12 @@ def calibrate_lines(whole: Apparatus, request: SessionRequest, task: Task, mosai
     ]
     with colour_folder(task, bench.manifest) as folder:
         places = [folder and folder / name for name in names]
-        return dict(zip(names, _run_sessions(sessions, request, task, places), strict=True))
+        return dict(zip(names, _run_sessions(sessions, request.accuracy, task, places), strict=True))
 
 
 @single_threaded_blas()
 def _run_sessions(
-    lines: Sequence[Session],
-    request: SessionRequest,
-    task: Task,
-    places: Sequence[Path | None],
-    frames: Path | None = None,
+    lines: Sequence[Session], accuracy: float, task: Task, places: Sequence[Path | None], frames: Path | None = None
 ) -> list[Factors]:
     for session in lines:
         session.check_mask(task.job)
@@ -231,7 +227,7 @@ def _run_sessions(
         configuration = {
             **bench.provenance(),
             **bench.identity(),
-            "accuracy": request.accuracy,
+            "accuracy": accuracy,
             "seed": session.seed,
             **({} if session.depth is None else {"depth_mm": session.depth}),
             "recipe": recipe.model_dump(exclude_defaults=True, exclude={"depths"}),
@@ -248,7 +244,7 @@ def _run_sessions(
         # The folder is claimed before any work; a new one is removed if the session fails before writing.
         with nullcontext() if place is None else output_folder(place, overwrite=again) as folder:
             checkpoint = Checkpoint(folder, configuration)
-            plan = plan or whole.plan(request.accuracy, job)
+            plan = plan or whole.plan(accuracy, job)
             checkpoint.begin()
             light = kept_light(checkpoint, session, plan)
             if light is None:
@@ -320,19 +316,9 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         "predicted_memory_bytes": plan.cost and plan.cost.memory_bytes,
         "warnings": warnings,
     }
-    manifest = CalibrationManifest(
-        configuration=checkpoint.configuration,
-        camera=bench.identity(),
-        centre=session.centre,
-        board_reflectance=session.recipe.board_reflectance,
-        digital=digital,
-        parallax=bench.parallax_from(session.distance),
-        result=result,
-        warnings=warnings,
-        versions=versions(),
-        command=job.command,
-        opened=bench.opened,
-    )
+    made: dict[str, Any] = {"configuration": checkpoint.configuration, "versions": versions(), "command": job.command}
+    made |= {"result": result, "warnings": warnings, "opened": bench.opened}
+    manifest = manifest_of(bench, digital, session.recipe.board_reflectance, session.distance, **made)
     much = lacks is not None and lacks.residual > SEPARABLE_RESIDUAL
     factors = Factors.of(noisy, manifest, lacks.terms if lacks and much else ())
     if checkpoint.folder is not None:
@@ -399,11 +385,10 @@ def session_sums(
         for kind in kinds:
             both = []
             for side in SIDES:
-                own = {name.removeprefix(f"{kind}_{side}_"): values for name, values in arrays.items()}
-                single = float(own["misfit"]), float(own["energy"]), int(own["done"])
-                both.append(StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single))
-                for name in ("misfits", "energies", "ambient", "lights"):
-                    setattr(both[-1], name, own[name])
+                begin = f"{kind}_{side}_"
+                own = {name[len(begin) :]: values for name, values in arrays.items() if name.startswith(begin)}
+                both.append(StripeSums(side, bool(own["centre"]), own["common"], own["vectors"]))
+                vars(both[-1]).update((name, each if each.ndim else each.item()) for name, each in own.items())
             found[kind] = both[0], both[1]
     else:
         saturated = 0

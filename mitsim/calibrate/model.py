@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import SessionRequest
-from mitsim.calibrate.board_session import LitSession, Session
+from mitsim.calibrate.board_session import LitSession, Session, manifest_of
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
@@ -116,16 +116,9 @@ def calibrate_model(
         job.progress("fit", 0.5)
         with job.clock.stage("fit"):
             fitted = fit_placement(camera, shown, modelling.free)
-        manifest = CalibrationManifest(
-            configuration={**bench.provenance(), **bench.identity(), **configuration},
-            camera=bench.identity(),
-            centre=bench.geometry.centred,
-            board_reflectance=reflectance,
-            digital=digital,
-            parallax=bench.parallax,
-            versions=versions(),
-            command=job.command,
-        )
+        made: dict[str, Any] = {"configuration": {**bench.provenance(), **bench.identity(), **configuration}}
+        made |= {"versions": versions(), "command": job.command}
+        manifest = manifest_of(bench, digital, reflectance, bench.geometry.scene_distance, **made)
         factors = modelled_factors(camera, fitted, used, manifest, job)
         if place is not None:
             factors.write(place)

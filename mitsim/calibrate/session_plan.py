@@ -24,11 +24,10 @@ from mitsim.acquire.exposure import Exposer
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, Request, check_psnr
-from mitsim.calibrate.board_session import LitSession, Session, session_seconds
+from mitsim.calibrate.board_session import LitSession, Session, manifest_of, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
 from mitsim.core.errors import check_arguments
 from mitsim.core.job import Job
-from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_FRACTION, digital_of
@@ -125,10 +124,9 @@ class CalibrationPlan:
 
     def payload(self) -> dict[str, Any]:
         """Return the values of the command line's JSON."""
+        own = "psnr_asked", "patterns", "reached", "frames", "exposure_s", "simulation_s", "seconds", "warnings"
         return {
-            "psnr_asked": self.psnr_asked,
-            "patterns": self.patterns,
-            "reached": self.reached,
+            **{name: getattr(self, name) for name in own},
             "psnr": self.trial.psnr_db,
             "psnr_spread": self.trial.spread_db,
             "psnr_ceiling": self.ceiling.psnr_db,
@@ -136,16 +134,11 @@ class CalibrationPlan:
             "recipe": self.recipe.model_dump(mode="json", exclude_defaults=True),
             "exposure_fraction": self.recipe.exposure_fraction,
             "repeats": self.recipe.repeats,
-            "frames": self.frames,
-            "exposure_s": self.exposure_s,
             "exposure_total_s": self.frames * self.exposure_s,
             "electrons_a_pixel": self.electrons,
             "photons_a_pixel": self.photons,
             "electrons_a_pixel_total": self.frames * self.electrons,
             "photons_a_pixel_total": self.frames * self.photons,
-            "simulation_s": self.simulation_s,
-            "seconds": self.seconds,
-            "warnings": self.warnings,
         }
 
     def lines(self) -> list[str]:
@@ -225,13 +218,8 @@ def plan_calibration(
 
     def trial(recipe: SessionRecipe | None) -> Trial:
         lit, found, budget = whole if recipe is None else by(recipe), [], dict[str, float]()
-        manifest = CalibrationManifest(
-            camera=bench.identity(),
-            centre=session.centre,
-            board_reflectance=largest.board_reflectance,
-            digital=digital_of(bench.sensor, lit.exposure_s),
-            parallax=bench.parallax,
-        )
+        digital = digital_of(bench.sensor, lit.exposure_s)
+        manifest = manifest_of(bench, digital, largest.board_reflectance, bench.geometry.scene_distance)
         for draw in range(_DRAWS) if recipe else (None,):
             image = reconstruct(shots, Factors.of(drawn_estimate(lit, sums, draw), manifest))
             found.append(psnr_of(image.image, truth))

@@ -42,7 +42,7 @@ from mitsim.cli.commands import (
     wrap_text,
 )
 from mitsim.core.colour_files import MONO, RUN, read_colours
-from mitsim.core.configuration import OUTPUT, QUALITY, WHAT, option
+from mitsim.core.configuration import OUTPUT, QUALITY, WHAT, option, value_of
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PAIRS, check_apart, check_output, output_file
 from mitsim.core.headline import each_once, frames_headline
@@ -134,8 +134,6 @@ def run_(asked: Running) -> int:
         texts[name] = value
     if "variant" in asked.given:
         texts["scene.variant"] = asked.variant
-    from mitsim.sessions.session_file import value_of
-
     values = {name: value_of(text) for name, text in texts.items()}
     advise(RESUME)
     options = {**asked.given_of(RunOptions), "pictures": not asked.no_pictures}
@@ -353,7 +351,7 @@ def capture(asked: Capturing) -> int:
     runs = payload["channels"] if payload.get("kind") == RUN else [payload]  # filters have every line in each frame
     payload["headline"] = frames_headline(runs, payload["warnings"])
     payload["memory_bytes"] = memory_since(held)
-    return asked.finish_folder(output, payload, _capture_lines(payload, asked), payload["warnings"])
+    return asked.finish_folder(output, payload, _capture_lines(payload, asked))
 
 
 def check_work(output: Path, resume: bool, kind: str, several: bool = False) -> None:
@@ -480,7 +478,7 @@ def render(asked: Rendering) -> int:
         *payload["notes"],
     ]
     mean = frame.mean[..., 0] if frame.mean.shape[2] == 1 else frame.mean
-    return asked.finish_frame((output, mean, "W/m^2"), payload, lines, frame.warnings)
+    return asked.finish_frame((output, mean, "W/m^2"), payload, lines)
 
 
 class Tracing(OfScene, Planned, KnownPlan, Overwritten, Opening, Limited):

@@ -81,7 +81,7 @@ def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memo
     if is_coloured(folder):
         payload = {**payload_of_lines(CALIBRATION, results, folder), "memory_bytes": memory}
     payload = {**payload, "headline": calibration_headline([*results.values()], warnings), "warnings": warnings}
-    return asked.finish_folder(folder, payload, lines, warnings)
+    return asked.finish_folder(folder, payload, lines)
 
 
 def _simulated(asked: Calibrating, folder: Path) -> int:
@@ -153,7 +153,7 @@ def _known(asked: Calibrating, folder: Path) -> int:
             f"{name or 'Frames'}: {each['terms']} codes a side explain {each['explained']:.1%}, left over beyond noise "
             f"{each['unexplained_residual']:.2%}, factor error {each['predicted_frame_error']:.1e} in such frames"
         )
-    return asked.finish_folder(folder, payload, lines, warnings)
+    return asked.finish_folder(folder, payload, lines)
 
 
 def _plan(asked: Calibrating, _: Path) -> int:
@@ -210,7 +210,7 @@ def _fit(asked: Calibrating, folder: Path) -> int:
         f"Unexplained {result['unexplained_residual']:.2%}, chi-square {result['chi_square']:.3g} a datum, condition "
         f"{result['condition']:.2e}",
     ]
-    return asked.finish_folder(folder, {**result, "output": str(folder)}, lines, factors.warnings)
+    return asked.finish_folder(folder, {**result, "output": str(folder)}, lines)
 
 
 _OPENING = " ".join((*Opening.model_fields, "max_seconds", "max_memory"))

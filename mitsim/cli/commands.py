@@ -85,7 +85,7 @@ class Common(Options):
     """Options of every verb; the variant is listed only by verbs that open a scene.
 
     Of the fields of a verb's model those of ``FIRST`` are listed first, those of ``HIDDEN`` belong to Python alone, and
-    ``CHANGES`` shows some otherwise than the models that it derives from; names have spaces between.
+    ``CHANGES`` has arguments of :func:`option` that replace those of the models; names have spaces between.
     """
 
     PANEL = OUTPUT
@@ -152,24 +152,18 @@ class Pictured(Common):
 
     no_pictures: bool = option(False, "make neither pictures nor the page report.html")
 
-    def finish_folder(
-        self, folder: Path, payload: Mapping[str, Any], lines: Sequence[str], warnings: Sequence[str]
-    ) -> int:
+    def finish_folder(self, folder: Path, payload: Mapping[str, Any], lines: Sequence[str]) -> int:
         """Make the pictures and the page of a finished ``folder``, which JSON names as ``report``; print the result.
 
-        The ``headline`` of the ``payload`` is printed before the ``lines``.
+        The ``headline`` of the ``payload`` is printed before the ``lines``, and its ``warnings`` go to stderr.
         """
         made, failed = self._attempt(lambda: page_of(folder), f"`mitsim report {folder}` makes them later")
         said = [] if made is None else [page_line(made)]
         lines = [payload["headline"], *lines, *said]
-        return self.finish({**payload, "report": made}, lines, [*warnings, *failed])
+        return self.finish({**payload, "report": made}, lines, [*payload["warnings"], *failed])
 
     def finish_frame(
-        self,
-        frame: tuple[Path, npt.NDArray[Any], str],
-        payload: Mapping[str, Any],
-        lines: Sequence[str],
-        warnings: Sequence[str],
+        self, frame: tuple[Path, npt.NDArray[Any], str], payload: Mapping[str, Any], lines: Sequence[str]
     ) -> int:
         """Make a picture next to a file of one frame, which JSON names as ``picture``; print the result.
 
@@ -186,7 +180,7 @@ class Pictured(Common):
 
         made, failed = self._attempt(make, "the frame is kept")
         said = [] if made is None else [f"picture {made['file']}: {made['shows']}"]
-        return self.finish({**payload, "picture": made}, [*lines, *said], [*warnings, *failed])
+        return self.finish({**payload, "picture": made}, [*lines, *said], [*payload["warnings"], *failed])
 
     def _attempt(self, make: Callable[[], dict[str, Any]], kept: str) -> tuple[dict[str, Any] | None, list[str]]:
         """Return the result of ``make``, unless pictures are not wanted.

@@ -137,7 +137,7 @@ def reconstruct(asked: Reconstructing) -> int:
             found = reconstruct_run.reconstruct(run, calibration, **where)
     payload = {**found.summary(), "memory_bytes": memory_since(held)}
     shown = _colours_lines(found, asked) if lines.colours else _image_lines(found, payload, asked)
-    return asked.finish_folder(output, payload, shown, payload["warnings"])
+    return asked.finish_folder(output, payload, shown)
 
 
 def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> list[str]:
@@ -305,7 +305,7 @@ def sense(asked: Sensing) -> int:
         f"mean {payload['mean_dn']:.5g} DN, largest {payload['largest_dn']:.5g}: {payload['output']}",
         *frame.notes,
     ]
-    return asked.finish_frame((asked.output, frame.digital, "DN"), payload, lines, frame.warnings)
+    return asked.finish_frame((asked.output, frame.digital, "DN"), payload, lines)
 
 
 # ---- Exchange --------------------------------------------------------------------------------------------------------
@@ -380,7 +380,7 @@ def import_(asked: Importing) -> int:
     if payload["left_out"]:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
     if payload["output"]:
-        return asked.finish_folder(Path(payload["output"]), payload, lines, payload["warnings"])
+        return asked.finish_folder(Path(payload["output"]), payload, lines)
     return asked.finish({**payload, "report": None}, [payload["headline"], *lines], payload["warnings"])
 
 

@@ -218,6 +218,14 @@ def toml_value(value: object) -> str:
     return re.sub(r",\n\s*", ", ", re.sub(r"(?<=\[)\n\s*|,\n\s*(?=\])", "", text))
 
 
+def value_of(text: str) -> Any:
+    """Return the TOML value in a ``text``; the text itself if it has none."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        return text
+
+
 # -------- Options of verbs
 
 WHAT, QUALITY, DEVICES = "Main options", "Quality", "Scene and devices"

@@ -11,10 +11,12 @@ import shutil
 import stat
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
+
+from pydantic_core import to_jsonable_python
 
 from mitsim.core.errors import MitsimError, cut
 
@@ -297,21 +299,13 @@ MOST_BYTES = 32 << 20
 
 def plain(value: Any) -> Any:
     """Convert to JSON types; NaN and infinities become null, TypeError for unknown types."""
-    if hasattr(value, "model_dump"):
+    if hasattr(value, "model_dump"):  # because pydantic would keep its infinities
         value = value.model_dump()
-    if hasattr(value, "tolist"):  # arrays and numbers of numpy, which plain data can do without
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    if value is not None and not isinstance(value, (str, bool, int)):
-        raise TypeError(f"plain: {value!r} is {type(value).__name__}, which JSON cannot hold; convert it first")
-    return value
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=_known)
+
+
+def _known(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else dict(value)
 
 
 def json_text(obj: Any) -> str:

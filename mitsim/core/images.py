@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, npy_header
 from mitsim.core.errors import MitsimError, reason_of
-from mitsim.core.files import FRAME_LIMITS, MOST_SIDE, check_plain, fits_a_frame
+from mitsim.core.files import FRAME_LIMITS, MOST_SIDE, check_plain, fits_a_frame, whole_file
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import Digital
 from mitsim.core.picture_files import (
@@ -451,8 +451,20 @@ class CommonFactor:
         return likely if self.high / likely <= end else 1
 
 
-def size_of(values: npt.NDArray[np.generic]) -> str:
-    return "x".join(map(str, values.shape))
+def size_of(values: npt.NDArray[np.generic] | Sequence[int]) -> str:
+    """Return the sides of an array, or of a shape, as text."""
+    return "x".join(map(str, getattr(values, "shape", values)))
+
+
+def write_numbers(path: Path, values: Numbers) -> None:
+    """Write whole numbers of 8 or 16 bits to a PNG or TIFF file, or any numbers to an NPY file; whole or not at all."""
+    from PIL import Image
+
+    with whole_file(path) as part, part.open("wb") as file:
+        if path.suffix.lower() == ".npy":
+            np.save(file, values, allow_pickle=False)
+        else:
+            Image.fromarray(values).save(file, "PNG" if path.suffix.lower() == ".png" else "TIFF")
 
 
 # -------- Pictures to be printed

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
 
+Memory = Mapping[str, tuple[Channels, Metadata]]
+"""Channels and metadata by file name."""
 _SHOWN = 3
 _EVERY = 8
 """Stride of rows and columns that distinguish frames: 4096 noisy numbers of 512 x 512 pixels."""
@@ -48,15 +50,10 @@ class Capture:
         Folder of the files; None for a capture in memory. Frames are read when they are first requested.
     """
 
-    def __init__(
-        self,
-        manifest: RunManifest,
-        folder: Path | None = None,
-        memory: Mapping[str, tuple[Channels, Metadata]] | None = None,
-    ) -> None:
+    def __init__(self, manifest: RunManifest, folder: Path | None = None, memory: Memory | None = None) -> None:
         """Make a capture from a folder, or from channels and metadata by file name in ``memory``."""
         self.manifest, self.folder = manifest, folder
-        self._memory = memory or {}
+        self._memory: Memory = memory or {}
 
     @property
     def name(self) -> str:
@@ -551,14 +548,14 @@ class Recorder:
     def __init__(
         self, folder: Path | None = None, head: RunHead | None = None, known: Mapping[str, str] | None = None
     ) -> None:
-        self.folder, self._head, self._known = folder, head or RunHead(), known or {}
+        self.folder, self.head, self._known = folder, head or RunHead(), known or {}
         self.files, self._checksums = dict[str, tuple[Channels, Metadata]](), dict[str, str]()
 
     def begin(self) -> None:
         """Begin to write after all input was checked."""
         if self.folder is not None:
             remove_page(self.folder)
-            configuration, digest = self._head.configuration, self._head.configuration_sha256
+            configuration, digest = self.head.configuration, self.head.configuration_sha256
             head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
             manifests.write_manifest(self.folder, head)
 
@@ -609,7 +606,7 @@ class Recorder:
         for name, values in sorted(channels.items()):
             digest.update(name.encode())
             digest.update(np.ascontiguousarray(values).data)
-        return {"run": self._head.configuration_sha256, "index": index, "pixels_sha256": digest.hexdigest()}
+        return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": digest.hexdigest()}
 
 
 @contextmanager

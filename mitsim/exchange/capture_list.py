@@ -205,23 +205,14 @@ class RealCapture:
 
 # ---- Options in place of a list ----
 
-_LISTED = {
-    **{name: name for name in ("patterns", "closing_frame", "order", "seed", "ambient_shots")},
-    "closing_exposure": "closing_exposure_s",
-    "ambient_frame": "ambient",
-    "projector_pixels": "n",
-}
-_PREPARED = {
-    "channel": "channel",
-    "mosaic": "mosaic",
-    "divide": "divide_by",
-    "turn": "turn_deg",
-    "orientation": "orientation",
-    "dark_frame": "dark",
-    "flat_frame": "flat",
-    "flat_dark_frame": "flat_dark",
-}
-"""Fields of a list, and of its preparation, by the option that takes the place of each."""
+_FIELDS = {
+    "closing_exposure": "closing_exposure_s", "ambient_frame": "ambient", "projector_pixels": "n",
+    "divide": "divide_by", "turn": "turn_deg",
+    "dark_frame": "dark", "flat_frame": "flat", "flat_dark_frame": "flat_dark",
+}  # fmt: skip
+"""Fields of a list, or of its preparation, by the option of another name that replaces each."""
+_OWN = {"camera", "bits", "crop"}
+"""Options whose fields of the same name have another meaning or form."""
 LISTS, CAMERAS, PROJECTORS = (
     partial(configuration.shipped_names, field)
     for field in (configuration.LIST, configuration.CAMERA, configuration.PROJECTOR)
@@ -283,8 +274,10 @@ class FrameFacts(Options):
         known, prepare = (
             {name: getattr(each, name) for name in each.model_fields_set} for each in (listed, listed.prepare)
         )
-        given = {name: str(each) if isinstance(each, Path) else each for name, each in self if each is not None}
-        prepare |= {field: given[name] for name, field in _PREPARED.items() if name in given}
+        stated = {_FIELDS.get(name, name): each for name, each in self if each is not None}
+        given = {name: str(each) if isinstance(each, Path) else each for name, each in stated.items()}
+        same = given.keys() - _OWN
+        prepare |= {name: given[name] for name in same & Preparation.model_fields.keys()}
         if self.channel is not None:
             picture_files.check_channel(self.channel)
         if self.crop is not None:
@@ -297,7 +290,7 @@ class FrameFacts(Options):
             known.pop("n", None)
         if self.shape is not None:
             known["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little")
-        known |= {field: given[name] for name, field in _LISTED.items() if name in given}
+        known |= {name: given[name] for name in same & CaptureList.model_fields.keys()}
         known["prepare"] = validate(Preparation, prepare, "import")
         calibration = None if self.calibration is None else Path(self.calibration)
         listed = validate(CaptureList, known, "import")

@@ -95,7 +95,7 @@ def export(
         holds something or has another format's suffix, an invalid folder, and a run that the format cannot hold.
     """
     asked = Exported(format=format, output=output, calibration=calibration, **options)
-    check_export(run, format, output, calibration, asked.projector)
+    check_export(run, asked)
     with nullcontext() if format == PNG else output_file(Path(output), asked.overwrite):
         from mitsim.exchange.packed import read_content
 
@@ -111,41 +111,33 @@ def export(
     }
 
 
-def check_export(
-    run: Path | str,
-    format: str,
-    output: Path | str,
-    calibration: Path | str | None = None,
-    projector: str | None = None,
-) -> None:
+def check_export(run: Path | str, asked: Exported) -> None:
     """Raise the errors that :func:`export` raises before it writes."""
-    check_format(format, output, calibration, projector)
-    lines = colour_files.open_lines(Path(run), colour_files.RUN, colour_files.MOSAIC)
-    calibrated = None if calibration is None else lines.check_calibration(Path(calibration))
-    if lines.colours and format != HDF5:
-        raise MitsimError(f"{run}: has several spectral lines, and {format} holds one; use {HDF5}, or a line's folder")
+    check_format(asked)
+    lines, kind = colour_files.open_lines(Path(run), colour_files.RUN, colour_files.MOSAIC), asked.format
+    calibrated = None if asked.calibration is None else lines.check_calibration(Path(asked.calibration))
+    if lines.colours and kind != HDF5:
+        raise MitsimError(f"{run}: has several spectral lines, and {kind} holds one; use {HDF5}, or a line's folder")
     for part in lines.parts.values():  # refused before numpy is imported
         manifest = manifests.read_manifest(part, RunManifest)
-        if format == PNG:
-            _function("other_programs.check_pictures")(manifest, projector, str(part))
+        if kind == PNG:
+            _function("other_programs.check_pictures")(manifest, asked.projector, str(part))
     for part in calibrated.parts.values() if calibrated else ():
         manifests.read_manifest(part, CalibrationManifest)
-    check_apart(Path(output), [each.folder for each in (lines, calibrated) if each])
+    check_apart(Path(asked.output), [each.folder for each in (lines, calibrated) if each])
 
 
-def check_format(
-    format: str, output: Path | str, calibration: Path | str | None = None, projector: str | None = None
-) -> None:
+def check_format(asked: Exported) -> None:
     """Raise the errors that :func:`export` raises before it opens a folder."""
-    if format not in FORMATS:
-        raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
-    if projector is not None and format != PNG:
-        raise ArgumentError("projector", f"{projector}: is only for png; leave it out with {format}")
-    if calibration is not None and format == PNG:
-        raise ArgumentError("calibration", (f"{calibration}: {format} cannot contain one; leave it out"))
-    ending, own = Path(output).suffix.lower(), {HDF5: (".h5", ".hdf5"), "mat": (".mat",)}.get(format, ())
-    if ending in READERS and ending not in own:
-        raise MitsimError(f"output {output}: files of {format} do not end in {ending}; choose another name")
+    kind, ending = asked.format, Path(asked.output).suffix.lower()
+    if kind not in FORMATS:
+        raise ArgumentError("format", f"{kind!r}: use {', '.join(FORMATS)}")
+    if asked.projector is not None and kind != PNG:
+        raise ArgumentError("projector", f"{asked.projector}: is only for png; leave it out with {kind}")
+    if asked.calibration is not None and kind == PNG:
+        raise ArgumentError("calibration", f"{asked.calibration}: {kind} cannot contain one; leave it out")
+    if ending in READERS and ending not in {HDF5: (".h5", ".hdf5"), "mat": (".mat",)}.get(kind, ()):
+        raise MitsimError(f"output {asked.output}: files of {kind} do not end in {ending}; choose another name")
 
 
 # ---- Import ----

@@ -21,7 +21,8 @@ from mitsim.core.colour_files import CALIBRATION, lines_of_planes
 from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channel
-from mitsim.core.files import whole_file, whole_folder, write_json
+from mitsim.core.files import whole_folder, write_json
+from mitsim.core.images import write_numbers
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import SIDES, CalibrationManifest, ClosingKind, Patterns, RunManifest
 from mitsim.core.picture_files import ALL, WAVELENGTHS_NM
@@ -371,7 +372,7 @@ def _draw_picture(path: Path, light: npt.NDArray[Any], where: Mapping[str, Any])
     cells = (_WHITE * light).astype(np.uint8).repeat(where["cell"], axis=0).repeat(where["cell_columns"], axis=1)
     picture = np.zeros((where["rows"], where["columns"]), np.uint8)
     picture[where["first_row"] :, where["first_column"] :][: cells.shape[0], : cells.shape[1]] = cells
-    write_png(path, picture)
+    write_numbers(path, picture)
 
 
 def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any]:
@@ -445,13 +446,6 @@ def describe(patterns: Patterns) -> dict[str, Any]:
     return {**patterns.model_dump(include={"family", "n", "P_L", "P_R"}), "shots": shots}
 
 
-def write_png(path: Path, values: npt.NDArray[Any]) -> None:
-    from PIL import Image
-
-    with whole_file(path) as part:
-        Image.fromarray(values).save(part, format="png")
-
-
 def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[str, ...]:
     """Write the frames of a run, and its patterns as pictures, to a new folder, whole or not at all.
 
@@ -474,10 +468,9 @@ def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[st
                     f"{shots.place / file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up "
                     f"to {_LARGEST}; use the format hdf5"
                 )
-            write_png(place / "frames" / frame_name(index), dn.astype(np.uint16))
+            write_numbers(place / "frames" / frame_name(index), dn.astype(np.uint16))
         if (ambient := manifest.ambient_frame) is not None:
-            with whole_file(place / "ambient.npy") as part, part.open("wb") as stream:
-                np.save(stream, shots.read(ambient.file)[0]["DN"])
+            write_numbers(place / "ambient.npy", shots.read(ambient.file)[0]["DN"])
             again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {ambient.shots}"
         if closing is not None:
             again += f" --closing-frame {closing.kind} --closing-exposure {closing.exposure_s!r}"

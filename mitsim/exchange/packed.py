@@ -36,7 +36,7 @@ from mitsim.core.files import (
     write_text,
 )
 from mitsim.core.headline import each_once, frames_headline
-from mitsim.core.images import LEAST_RESPONSE, CommonFactor, Numbers, Preparer, image_pages, read_images
+from mitsim.core.images import LEAST_RESPONSE, CommonFactor, Numbers, Preparer, image_pages, read_images, size_of
 from mitsim.core.job import Cost, Limits
 from mitsim.core.picture_files import CORRECTIONS, Preparation, image_files
 from mitsim.core.runs import AMBIENT, CLOSING, TRUTH, frame_name, load_run
@@ -440,8 +440,7 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
             first = first if places else frame
             if frame.shape != first.shape:
                 raise MitsimError(
-                    f"{path}: is {_size(frame.shape)}, but {files[0].name} {_size(first.shape)}; "
-                    "give frames of one size"
+                    f"{path}: is {size_of(frame)}, but {files[0].name} {size_of(first)}; give frames of one size"
                 )
             places.append((path, number))
             common.add(frame)
@@ -462,7 +461,7 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     prepare, runs = prepare.model_copy(update={"divide_by": factor}), {}
     for plane in planes:
         how = prepare.model_copy(update={"channel": plane.name}) if plane.name else prepare
-        runs[plane.name], shape, unlit = plane.pack(how, source, files, places, first, command)
+        runs[plane.name], shape, unlit = plane.pack(how, source, places, first, command)
         if unlit:
             warnings.append(
                 f"flat: {unlit} pixels{f' of {plane.name}' if plane.name else ''} have less than {LEAST_RESPONSE:g} of "
@@ -562,17 +561,12 @@ class _Plane:
         sides = tuple(len(matrix) for matrix in self.patterns.matrices)
         if sides != scene:
             raise MitsimError(
-                f"{known.patterns}: is for {_size(sides)} projector pixels, but {_size(scene)} are calibrated or stated"
+                f"{known.patterns}: is for {size_of(sides)} projector pixels, but {size_of(scene)} are calibrated or "
+                "stated"
             )
 
     def pack(
-        self,
-        how: Preparation,
-        source: Path,
-        files: tuple[Path, ...],
-        places: list[tuple[Path, int]],
-        first: Numbers,
-        command: str | None,
+        self, how: Preparation, source: Path, places: list[tuple[Path, int]], first: Numbers, command: str | None
     ) -> tuple[Packed[manifests.RunManifest], tuple[int, ...], int]:
         """Return the run, the shape of its frames, and the number of pixels with too little response."""
         known, camera, listed, captures = self.known, self.camera, self.known.listed, self.patterns.captures
@@ -596,7 +590,7 @@ class _Plane:
             if (place := getattr(how, name)) is not None
         }
         configuration = {
-            "imported": {path.name: checksum(path) for path in files},
+            "imported": {path.name: checksum(path) for path in dict.fromkeys(path for path, _ in places)},
             "ambient": {path.name: checksum(path) for path in more},
             "patterns": known.patterns,
             **camera.stated,
@@ -659,7 +653,7 @@ class _Plane:
             if min(row, column) >= 0:  # as FlatCam's loader cuts it
                 frame = frame[row : row + self.shape[0], column : column + self.shape[1]]
         if self.shape is not None and frame.shape != self.shape:
-            raise MitsimError(f"{path}: is {_size(frame.shape)}, but the calibration's frames are {_size(self.shape)}")
+            raise MitsimError(f"{path}: is {size_of(frame)}, but the calibration's frames are {size_of(self.shape)}")
         return frame
 
     def _ambient(self, source: Path, preparer: Preparer, shape: tuple[int, ...]) -> tuple[Channel, int]:
@@ -669,12 +663,8 @@ class _Plane:
                 _check_range(path, frame, self.camera, preparer.how.divide_by or 1, mean=True)
                 part = self._part(path, preparer.frame(path, frame, mean=True), preparer.how)
                 if part.shape != shape:
-                    raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(shape)}")
+                    raise MitsimError(f"{path}: is {size_of(part)}, but others are {size_of(shape)}")
                 total, count = total + part, count + 1
         if stated is not None and count != 1:
             raise ArgumentError("ambient_shots", f"{stated}: {source} holds {count} frames; leave it out")
         return (total / count).astype(np.float32), stated or count
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return "x".join(map(str, shape))

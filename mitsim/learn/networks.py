@@ -648,16 +648,10 @@ class Trained:
 
 @single_threaded_blas()
 def train_network(
-    store: PairStore,
-    factors: Factors,
-    request: Training,
-    output: Path | str,
-    job: Job | None = None,
-    resume: bool = False,
+    store: PairStore, factors: Factors, request: Training, output: Path, job: Job | None = None, resume: bool = False
 ) -> Trained:
     """Train a network for the calibration ``factors`` and write its file, beside which the resumable state lies."""
-    job, output = job or Job(), Path(output)
-    started = time.perf_counter()
+    job, started = job or Job(), time.perf_counter()
     if len(store) < FEWEST_PAIRS:
         raise MitsimError(f"{store.folder}: holds {len(store)} pairs; give at least {FEWEST_PAIRS}")
     if (count := len(np.unique(store.photographs))) < FEWEST_PHOTOGRAPHS:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
 from mitsim.core import colour_files, files
@@ -655,8 +654,8 @@ class Trust:
 class Recovery:
     image: FloatArray
     quality: Quality
-    lam: float | None = None
-    status: str = ""
+    lam: float
+    status: str
     trust: Trust | None = None
 
 
@@ -671,17 +670,15 @@ class FamilyResult:
     name: str
     label: str
     shots: int
-    patterns: tuple[FloatArray, ...] = ()
-    singular_values: FloatArray | None = None
-    idealised: Recovery | None = None
-    rendered: Recovery | None = None
-    by_exposure: Mapping[str, float] = field(default_factory=dict)
+    patterns: tuple[FloatArray, ...]
+    singular_values: FloatArray
+    idealised: Recovery
+    rendered: Recovery
+    by_exposure: Mapping[str, float]
 
 
 def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
-    """Return headline and detail, such as "49 dots beat uniform by 11.0 dB"; MitsimError without a rendered result."""
-    if best.rendered is None or baseline.rendered is None:
-        raise MitsimError(f"report: no rendered result of {best.label} or {baseline.label}; reconstruct both first")
+    """Return headline and detail, such as "49 dots beat uniform by 11.0 dB"."""
     ours, theirs = best.rendered.quality.psnr_db, baseline.rendered.quality.psnr_db
     if best.name == baseline.name:
         return f"{best.label}: {ours:.1f} dB", "PSNR, rendered light and calibrated factors."
@@ -694,11 +691,9 @@ def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
         headline = f"{best.label}: {abs(gain):.1f} dB {'above' if gain >= 0 else 'below'} {name}"
     if best.rendered.quality.is_image and gain >= 0 and best.rendered.trust and best.rendered.trust.cause:
         headline += ", but part of their light fits no image"
+    ideal = best.idealised.quality.psnr_db - baseline.idealised.quality.psnr_db
     detail = f"{ours:.1f} against {theirs:.1f} dB PSNR, rendered light and calibrated factors."
-    if best.idealised is not None and baseline.idealised is not None:
-        ideal = best.idealised.quality.psnr_db - baseline.idealised.quality.psnr_db
-        detail += f" The idealised model says {ideal:+.1f} dB."
-    return headline, detail
+    return headline, f"{detail} The idealised model says {ideal:+.1f} dB."
 
 
 def render_demo(report: Mapping[str, Any]) -> str:
@@ -707,38 +702,30 @@ def render_demo(report: Mapping[str, Any]) -> str:
     ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, row 0 at the top as seen along +z. ``main``
     is the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in DN by
     caption, and ``budget`` has name, relative rms of the expected frames (None: unknown) and meaning of each source of
-    error. MitsimError when an image is not finite.
+    error.
     """
     from mitsim.report.plots import singular_values
 
-    families, best = report["families"], {}
-    for row in ("idealised", "rendered"):
-        psnr = {each.name: getattr(each, row).quality.psnr_db for each in families if getattr(each, row) is not None}
-        best[row] = max(psnr, key=psnr.__getitem__) if psnr else ""
-    curves = {each.label: each.singular_values for each in families if each.singular_values is not None}
-    trust = next((each.rendered.trust for each in families if each.rendered and each.name == report["main"]), None)
+    families, best = report["families"], dict[str, str]()
+    for row in ("idealised", "rendered") if families else ():
+        best[row] = max(families, key=lambda each: getattr(each, row).quality.psnr_db).name
+    curves = {each.label: each.singular_values for each in families}
+    trust = next((each.rendered.trust for each in families if each.name == report["main"]), None)
 
-    def finite(image: npt.ArrayLike, name: str) -> FloatArray:
-        values = np.asarray(image, dtype=np.float64)
-        if values.ndim != 2 or values.size == 0 or not np.all(np.isfinite(values)):
-            raise MitsimError(f"report: {name} of shape {values.shape} must be rows x columns of finite numbers")
-        return values
-
-    def pattern_of(pattern: npt.ArrayLike) -> str:
-        values = finite(pattern, "pattern")[:_PATTERN_CORNER, :_PATTERN_CORNER]
+    def pattern_of(pattern: FloatArray) -> str:
+        values = pattern[:_PATTERN_CORNER, :_PATTERN_CORNER]
         return data_uri(grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values, smallest=_SMALLEST))
 
-    shown = {name: finite(dn, name) for name, dn in report["frames"].items()}
     return render_page(
         "report.html",
         report=report,
         best=best,
         singular_values=page_figure(singular_values(curves))[0] if curves else "",
-        frames=[Picture.of(name, name, dn, unit="DN", ends=(None, None)) for name, dn in shown.items()],
+        frames=[Picture.of(name, name, dn, unit="DN", ends=(None, None)) for name, dn in report["frames"].items()],
         errors=trust.pictures() if trust else (),
-        grey=pages.colour_map("light")[0],
+        grey=pages.MAPS["light"][0],
         pattern_corner=_PATTERN_CORNER,
-        picture_of=lambda image, name: data_uri(grey_png(lightness(finite(image, name)), smallest=_SMALLEST)),
+        picture_of=lambda image: data_uri(grey_png(lightness(image), smallest=_SMALLEST)),
         pattern_of=pattern_of,
         chi_square=chi_square_text,
     )

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
@@ -72,7 +71,8 @@ LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
 class LitScene:
     def __init__(self, light: SampledLight) -> None:
         self.light, self.bench = light, light.bench
-        self.uniform_s = cache(self._uniform_s)
+        uniform = self.bench.family("uniform")
+        self.uniform_s = cache(lambda model: peak_time(self.bench, self.expected_frames(model, uniform)))
 
     @property
     def truth(self) -> FloatArray:
@@ -102,9 +102,6 @@ class LitScene:
         """Return frames of the paper's model with its own factors; their noise differs from that of rendered frames."""
         camera = self._ideal
         return Unexposed(self, IDEALISED, family, camera.calibrated(self.board_flux), camera.centre, seed + 1, plane)
-
-    def _uniform_s(self, model: str) -> float:
-        return peak_time(self.bench, self.expected_frames(model, self.bench.family("uniform")))
 
     @cached_property
     def _merged(self) -> SampledLight:
@@ -433,7 +430,6 @@ class BenchView:
     def figure(self) -> Figure:
         with rc_context(_STYLE):
             figure = Figure(figsize=(13, 8.6), layout="constrained")
-            FigureCanvasAgg(figure)
             grid = figure.add_gridspec(3, 2, width_ratios=(2.3, 1))
             for place, (_, _, draw) in zip((0, 2, 1, 3, 5), self._parts, strict=True):
                 draw(figure.add_subplot(grid[place]))
@@ -641,7 +637,6 @@ class BenchView:
         for name, inches, draw in self._parts:
             with rc_context(_STYLE):
                 figure = Figure(figsize=inches, layout="constrained")
-                FigureCanvasAgg(figure)
                 draw(figure.subplots())
             pictures[name] = page_figure(figure)
         model = self.model().update_layout(height=None)  # the page's style sets the height

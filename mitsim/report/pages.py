@@ -177,21 +177,16 @@ _SEQUENTIAL = "#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"
 _DIVERGING = "#003c5e", "#0072b2", "#f5f5f5", "#d55e00", "#6e2f00"
 _GREY = tuple(f"#{3 * f'{round(255 * level):02x}'}" for level in lightness(np.linspace(0, 1, 9)).tolist())
 """Equal steps of light, as :func:`mitsim.core.images.png` shows them."""
-_MAPS: dict[str, tuple[tuple[str, ...], float | None]] = {
+MAPS: dict[str, tuple[tuple[str, ...], float | None]] = {
     "light": (_GREY, None),
     **dict.fromkeys(("uncertainty", "error", "depth", "confidence"), (_SEQUENTIAL, None)),
     "difference": (_DIVERGING, 0.0),
     "chi-square": (_DIVERGING, 1.0),
 }
+"""Colours of each quantity from its lowest to its highest number, and the number in their middle.
 
-
-def colour_map(quantity: str) -> tuple[tuple[str, ...], float | None]:
-    """Return the colours of a ``quantity`` from its lowest to its highest number, and the number in their middle.
-
-    Light and reflectance are grey. Quantities that begin at a lowest number have a sequential map. Quantities that may
-    lie on either side of an ideal number have a diverging map, in which that number is almost white.
-    """
-    return _MAPS[quantity]
+Light and reflectance are grey. Quantities that begin at a lowest number have a sequential map. Quantities that may lie
+on either side of an ideal number have a diverging map, in which that number is almost white."""
 
 
 @dataclass(frozen=True)
@@ -230,12 +225,12 @@ class Picture:
     ) -> Picture:
         """Draw ``values`` in a ``unit`` between the ``ends`` of a scale; an end of None is that of the values.
 
-        ``quantity`` chooses the colours (:func:`colour_map`).
+        ``quantity`` chooses the colours (:data:`MAPS`).
         """
         low, high = (
             float(known(values)) if end is None else end for end, known in zip(ends, (np.min, np.max), strict=True)
         )
-        high, (colours, centre) = high if high > low else low + 1.0, colour_map(quantity)
+        high, (colours, centre) = high if high > low else low + 1.0, MAPS[quantity]
         beyond = 100 * float(np.mean((values < low) | (values > high)))
         cut = f"{beyond:.2g} % of the pixels lie outside the scale" if beyond else ""
         numbers, steps = [low, *([] if centre is None else [centre]), high], np.linspace(0, 1, len(colours))

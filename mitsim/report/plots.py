@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import FuncNorm
 from matplotlib.figure import Figure
@@ -216,12 +215,11 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
 def panels_of(
     rows: int, columns: int, height: float, width: float = WIDTH, layout: Layout = "constrained", **shared: Any
 ) -> tuple[Figure, Any]:
-    """Return an empty figure [inches] with its own Agg canvas and axes.
+    """Return an empty figure [inches] with axes.
 
     The layout "compressed" leaves space around images of fixed aspect.
     """
     figure = Figure(figsize=(width, height), layout=layout)
-    FigureCanvasAgg(figure)
     places: Any = figure.subplots(rows, columns, squeeze=False, **shared)
     for axes in places.flat:
         axes.spines[["top", "right"]].set_visible(False)
@@ -360,7 +358,7 @@ def draw_image(
     }[quantity]
     if values is None:
         raise ArgumentError("quantity", f"{quantity!r}: is not known of this image; draw image")
-    return _draw(ax, values, title, unit, pixel="projector ", cmap="viridis")
+    return _draw(ax, values, title, unit, pixel="projector ")
 
 
 @_drawn
@@ -399,17 +397,14 @@ def _axes(ax: Axes | None, height: float = 0.5 * WIDTH, width: float = 0.7 * WID
 
 
 def _draw(
-    ax: Axes | None,
-    values: npt.ArrayLike,
-    title: str,
-    unit: str,
-    pixel: str = "",
-    white: float | None = None,
-    cmap: str = "gray",
+    ax: Axes | None, values: npt.ArrayLike, title: str, unit: str, pixel: str = "", white: float | None = None
 ) -> Axes:
-    """Draw numbers in equal steps, or reflectances as a screen shows them where ``white`` is given."""
+    """Draw numbers in equal steps, or reflectances as a screen shows them where ``white`` is given.
+
+    Numbers of the projector's pixels that are no reflectances are in colour.
+    """
     shown, axes = np.asarray(values, dtype=np.float64), _axes(ax)
-    style: dict[str, Any] = {"cmap": cmap, "interpolation": "none"}
+    style: dict[str, Any] = {"cmap": "viridis" if pixel and white is None else "gray", "interpolation": "none"}
     extend, scale = "neither", "linear"
     if white is not None:
         style["norm"], scale = reflectance_norm(white), "shown by the sRGB curve"

@@ -55,31 +55,25 @@ class Judged:
 
 
 def reconstruct(
-    run: Path | str,
-    calibration: Path | str,
-    output: Path | str,
-    lam: float | Literal["auto"] = "auto",
-    overwrite: bool = False,
-    job: Job | None = None,
-    **options: Any,
+    run: Path, calibration: Path, output: Path, overwrite: bool = False, job: Job | None = None, **options: Any
 ) -> Judged:
     """Recover the image of a run with a calibration, and write image.exr, image.png and result.json.
 
     ``output`` is a new or empty folder, or one with an earlier image of the same inputs (of other inputs with
-    ``overwrite``). ``lam`` and ``options`` are those of :class:`mitsim.reconstruct.request.ImageRequest`.
+    ``overwrite``). The ``options`` are those of :class:`mitsim.reconstruct.request.ImageRequest`.
 
     Raises
     ------
     MitsimError
         For folders that do not fit each other, options that are not allowed, or an output that cannot be written.
     """
-    started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam=lam, **options)
+    started, job, request = time.perf_counter(), job or Job(), ImageRequest(**options)
     with job.clock.stage("read"):
         shots, factors = load_run(run), load_calibration(calibration)
         factors.check_fit(shots)
         board = factors.manifest.board_reflectance
         truth, truth_error = truth_for(shots, board), truth_error_for(shots, board)
-    replaces = may_replace(Path(output), request.inputs(shots, factors), overwrite)
+    replaces = may_replace(output, request.inputs(shots, factors), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         read = time.perf_counter() - started
         image = reconstruct_request(shots, factors, request, job)
@@ -91,13 +85,7 @@ def reconstruct(
 
 
 def reconstruct_psf(
-    run: Path | str,
-    psf: Path | str,
-    output: Path | str,
-    reduce: int = 1,
-    overwrite: bool = False,
-    job: Job | None = None,
-    **options: Any,
+    run: Path, psf: Path, output: Path, reduce: int = 1, overwrite: bool = False, job: Job | None = None, **options: Any
 ) -> Judged:
     """Recover the image of a run with a measured point spread function, and write the files of :func:`reconstruct`.
 
@@ -109,16 +97,15 @@ def reconstruct_psf(
     request = ImageRequest(**options)
     request.check_point_spread(reduce)
     shots, light = load_run(run), load_psf(psf, reduce)
-    replaces = may_replace(Path(output), psf_inputs(shots, light, reduce, request), overwrite)
+    replaces = may_replace(output, psf_inputs(shots, light, reduce, request), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         judged = Judged(reconstruct_psf_request(shots, psf, reduce, request, job), None, str(folder))
         judged.reconstruction.write(folder, {**judged.summary(), **_origin(job, run)})
     return judged
 
 
-def _origin(job: Job | None, run: Path | str, calibration: Path | str | None = None) -> dict[str, Any]:
-    folders = {"run": run, "calibration": calibration}
-    made_of = {name: str(Path(folder).absolute()) for name, folder in folders.items() if folder is not None}
+def _origin(job: Job | None, run: Path, calibration: Path | None = None) -> dict[str, Any]:
+    made_of = {"run": str(run.absolute())} | ({"calibration": str(calibration.absolute())} if calibration else {})
     return {"command": job and job.command, MADE_OF: made_of}
 
 

@@ -11,7 +11,7 @@ import os
 import time
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -28,7 +28,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.devices.framelist import load_chart
 from mitsim.devices.session import SessionRecipe, load_recipe
-from mitsim.exchange.formats import PNG, check_export, export
+from mitsim.exchange.formats import PNG, Exported, check_export, export
 from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.sessions import session_file
 from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, load_network, open_as, prepare_study
@@ -378,11 +378,9 @@ class _Steps:
         from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
 
         again: Any = {"overwrite": self.asked.resume, "job": self.job.apart(f"{step.output} ")}
-        if coloured:
-            colours = reconstruct_colours(run, calibration, place, chart, page=False, **again, **options)
-            return image_headline(colours.summary()), colours.warnings
-        judged = reconstruct(run, calibration, place, **again, **options)
-        return image_headline(judged.summary()), judged.reconstruction.status.reasons
+        make: Any = partial(reconstruct_colours, chart=chart, page=False) if coloured else reconstruct
+        found = make(run, calibration, place, **again, **options).summary()
+        return image_headline(found), found["warnings"]
 
     def _study(self, step: session_file.Step) -> Work:
         options = dict(step.values)
@@ -395,18 +393,18 @@ class _Steps:
 
     def _export(self, step: session_file.Step) -> Work:
         values, place = step.values, self.folder / step.output
-        how = {name: values[name] for name in ("format", "projector") if name in values}
-        run, calibration = self._source(step, "run"), None
+        how: dict[str, Any] = {name: values[name] for name in ("format", "projector") if name in values}
+        run, how["output"] = self._source(step, "run"), place
         if "calibration" in values or session_file.calibration_for(self.session, step):
-            calibration = self._source(step, "calibration")
-        if "run" in values and ("calibration" in values or calibration is None):
-            check_export(run, output=place, calibration=calibration, **how)
+            how["calibration"] = self._source(step, "calibration")
+        if "run" in values and ("calibration" in values or "calibration" not in how):
+            check_export(run, Exported(**how))
         pictures = values["format"] == PNG  # a folder of which is not replaced, so it is refused before any work
         if not self.is_finished(step) if pictures else step.output not in self.made:
             files.check_output(place, kind="folder" if pictures else "file")
         yield
         again = self.asked.resume and not pictures
-        found = export(run, output=place, calibration=calibration, overwrite=again, **how)
+        found = export(run, overwrite=again, **how)
         return f"Exported {found['frames']} frames as {found['format']}", ()
 
 

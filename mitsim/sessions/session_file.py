@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +31,7 @@ from mitsim.core.configuration import (
     shipped_path,
     validate,
     validated_by,
+    value_of,
 )
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions
 from mitsim.core.errors import (
@@ -51,11 +51,6 @@ from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, Exported, check_format
 from mitsim.reconstruct.request import METHODS, MODEL, RESULT_FILE, ImageRequest
 from mitsim.verbs import StudyOptions
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 # ---- Tables ----------------------------------------------------------------------------------------------------------
 
@@ -219,14 +214,6 @@ def stated(value: Any, base: Path | None = None) -> Any:
     return relative if os.sep in relative else os.path.join(os.curdir, relative)  # a bare name could be a shipped one
 
 
-def value_of(text: str) -> Any:
-    """Return the TOML value in a ``text``; the text itself if it has none."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        return text
-
-
 # ---- Reading ---------------------------------------------------------------------------------------------------------
 
 
@@ -377,8 +364,8 @@ def _check_steps(session: Session, found: _Mistakes) -> None:
         elif step.verb == "reconstruct":
             needed = {"run": "capture", "calibration": "calibrate"}
         elif step.verb == "export":
-            calibration, needed = values.get("calibration") or calibration_for(session, step), {"run": "capture"}
-            found.attempt(place, check_format, values["format"], step.output, calibration, values.get("projector"))
+            own, needed = {"output": step.output, "calibration": calibration_for(session, step)}, {"run": "capture"}
+            found.attempt(place, check_format, Exported(**{**own, **step.of(Exported)}))
         for name, verb in needed.items():
             if name not in values and session.step(verb) is None:
                 found.say((*place, name), f"is missing, and there is no [{verb}]; give the folder, or add the table")

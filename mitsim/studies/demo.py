@@ -13,7 +13,7 @@ import numpy as np
 
 from mitsim.acquire.capture import expose, trace_request
 from mitsim.api.bench import Bench
-from mitsim.bench.request import Exposure, Request
+from mitsim.bench.request import Exposure, Request, Task
 from mitsim.calibrate.board_session import Session
 from mitsim.core.configuration import opening_words
 from mitsim.core.environment import versions
@@ -108,7 +108,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
         sparsest = min(names, key=lambda name: bench.family(name, request.seed).lighting.lit)
         plan = bench.plan(**{**request.model_dump(), "patterns": sparsest})
     light = trace_request(bench, plan, job)
-    shots = expose(light, request.patterns, folder / "run", job)
+    shots = expose(light, request.patterns, Task(folder / "run", job=job))
     session = job.apart("calibration ")
     factors = bench.calibrate(seed=request.seed, accuracy=request.accuracy, output=folder / "calibration", job=session)
     job.clock.add(session.clock.seconds(), "calibration ")

@@ -234,7 +234,7 @@ def bench(tmp_path: Path) -> Callable[..., tuple[Path, Path]]:
 
 
 def image_of(run: Path, cal: Path) -> Reconstruction:
-    return reconstruct(run, cal, run / "image", 0.0).reconstruction
+    return reconstruct(run, cal, run / "image", lam=0.0).reconstruction
 
 
 def test_flags_of_folders_reach_the_image(bench: Callable[..., tuple[Path, Path]]) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.acquire.sense import irradiance_behind_lens, read_image, sense
-from mitsim.bench.request import check_ending
+from mitsim.acquire.sense import read_image, sense
+from mitsim.bench.request import Irradiance, check_ending
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
@@ -25,21 +25,23 @@ IMAGE = np.linspace(0, 2e-6, 60 * 80).reshape(60, 80)
 
 def test_an_image_is_exposed_and_read_as_a_capture_s_frame() -> None:
     """Auto exposure fills 0.8 of the well at the brightest pixel; squared z-scores of all 4800 pixels, 5 deviations."""
-    frame = sense(IMAGE, CAMERA, seed=3)
+    frame = sense(IMAGE, CAMERA, Irradiance(seed=3))
     assert frame.exposure_s == chain.exposure_for_peak(2e-6, 0.8, CAMERA, 550.0)
     assert frame.electrons.max() == pytest.approx(6400, rel=1e-12)
     mean, variance = chain.frame_moments(frame.electrons, frame.exposure_s, CAMERA)
     squares = float((np.square(frame.digital - mean) / variance).sum())
     assert abs(squares - IMAGE.size) < 5 * math.sqrt(2 * IMAGE.size)
-    assert np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=3).digital)
-    assert not np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=4).digital)
+    assert np.array_equal(frame.digital, sense(IMAGE, CAMERA, Irradiance(seed=3)).digital)
+    assert not np.array_equal(frame.digital, sense(IMAGE, CAMERA, Irradiance(seed=4)).digital)
     assert not frame.warnings and frame.summary()["shape"] == [60, 80]
 
 
 def test_a_lens_of_f_number_n_images_radiance_l_as_pi_l_over_4_n_squared() -> None:
-    assert irradiance_behind_lens(np.array([[4.0]]), 2.0)[0, 0] == pytest.approx(math.pi / 4)
+    behind = sense(IMAGE, CAMERA, Irradiance(f_number=2.0, exposure=0.1)).electrons
+    direct = sense(math.pi / 16 * IMAGE, CAMERA, Irradiance(exposure=0.1)).electrons
+    np.testing.assert_allclose(behind, direct, rtol=1e-12)
     with pytest.raises(MitsimError, match="f_number"):
-        irradiance_behind_lens(IMAGE, 0.1)
+        Irradiance(f_number=0.1)
 
 
 @pytest.mark.parametrize("ending", [".png", ".exr", ".npy"])
@@ -94,7 +96,7 @@ def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match="quantum_efficiency"):
         sense(IMAGE, sensor(quantum_efficiency=None))
     with pytest.raises(MitsimError, match="wavelength"):
-        sense(IMAGE, CAMERA, wavelength_nm=0.0)
+        sense(IMAGE, CAMERA, Irradiance(wavelength=0.0))
     with pytest.raises(MitsimError, match="mosaic BGGR of colour filters, but the image has one channel"):
         sense(IMAGE, load_sensor(shipped_path("calibration", "ov5647.toml")))
 

@@ -230,14 +230,14 @@ def test_the_folders_are_refused_before_work(
     shots: Capture, factors: Factors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folders = shots.save(tmp_path / "run"), factors.save(tmp_path / "cal"), tmp_path / "image"
-    reconstruct_folders(*folders, 1.0)
-    reconstruct_folders(*folders, 1.0)
+    reconstruct_folders(*folders, lam=1.0)
+    reconstruct_folders(*folders, lam=1.0)
     monkeypatch.setattr(reconstruct_run, "reconstruct_request", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match=r"other inputs \(lambda differ\).*overwrite=True"):
-        reconstruct_folders(*folders, 2.0)
+        reconstruct_folders(*folders, lam=2.0)
     (tmp_path / "image" / "result.json").unlink()
     with pytest.raises(MitsimError, match="run, calibration, lambda, method differ"):
-        reconstruct_folders(*folders, 1.0)
+        reconstruct_folders(*folders, lam=1.0)
 
 
 # ---- Results in a notebook -------------------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ def example(n: int = N, frame_size: int = 48) -> dict[str, Any]:
         image = truth + 10 ** (-decibel / 20) * rng.standard_normal((n, n))
         error = 10 ** (-decibel / 20)
         trust = Trust(np.full((n, n), error), np.abs(image - truth), 1.02, "depth" if decibel < 20 else "")
-        return R.Recovery(image, Quality(decibel, 0.98 - 0.6 * error), 3e-6, trust=trust)
+        return R.Recovery(image, Quality(decibel, 0.98 - 0.6 * error), 3e-6, "", trust)
 
     def dots(k: int) -> np.ndarray:
         row = np.arange(n) % k == 0
@@ -254,8 +254,9 @@ def test_a_loss_is_called_a_loss() -> None:
 @pytest.mark.parametrize(("decibel", "headline"), [(-42.0, "49 dots: no image, -42.0 dB"), (0.1, "49 dots beat b by")])
 def test_a_gain_over_nothing_is_no_gain(decibel: float, headline: str) -> None:
     """A mirror's demo said that 9 dots beat uniform by 23.3 dB, of images at -42 and -65 dB."""
+    whole = example()["families"][0]
     ours, theirs = (
-        R.FamilyResult(name, name, 1, rendered=R.Recovery(np.ones((4, 4)), Quality(value, None)))
+        replace(whole, name=name, label=name, rendered=R.Recovery(np.ones((4, 4)), Quality(value, None), 1.0, ""))
         for name, value in (("49 dots", decibel), ("B", -65.3))
     )
     assert R.verdict(ours, theirs)[0].startswith(headline)
@@ -543,7 +544,7 @@ def test_a_page_is_gone_before_what_it_shows_changes(folders: Made, image: Path,
     place = tmp_path / "image"
     shutil.copytree(image, place)
     report_folder(place)
-    reconstruct(folders.run, folders.calibration, place, 0.5, overwrite=True)
+    reconstruct(folders.run, folders.calibration, place, lam=0.5, overwrite=True)
     assert not (place / "report.html").exists() and not (place / "pictures").exists()
 
 
@@ -562,9 +563,9 @@ def test_a_full_disk_costs_the_page_alone(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", full)
-        assert Pictured(as_json=True).finish_folder(run, {"headline": "said"}, [], []) == 1
+        assert Pictured(as_json=True).finish_folder(run, {"headline": "said", "warnings": ()}, []) == 1
     out, err = capsys.readouterr()
-    assert json.loads(out) == {"headline": "said", "report": None}
+    assert json.loads(out) == {"headline": "said", "warnings": [], "report": None}
     assert "No space left" in err and f"`mitsim report {run}` makes them later" in err
     assert {path.name for path in run.iterdir()} == before and load_run(run).dn.shape[0] == 6
 
@@ -573,9 +574,9 @@ def test_pictures_are_made_unless_nobody_wants_them(
     folders: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = copy(folders.run, tmp_path / "run")
-    assert Pictured(no_pictures=True).finish_folder(run, {"headline": "said"}, [], []) == 0
+    assert Pictured(no_pictures=True).finish_folder(run, {"headline": "said", "warnings": ()}, []) == 0
     assert capsys.readouterr().out == "said\n" and not (run / "report.html").exists()
-    assert Pictured(as_json=True).finish_folder(run, {"headline": ""}, [], []) == 0
+    assert Pictured(as_json=True).finish_folder(run, {"headline": "", "warnings": ()}, []) == 0
     found = json.loads(capsys.readouterr().out)["report"]
     assert found["page"] == str(run / "report.html") and 0 < found["seconds"] < 60
     assert found["pictures"] == [
@@ -588,12 +589,12 @@ def test_a_frame_in_one_file_has_its_picture_beside(tmp_path: Path, capsys: pyte
     replaced by .png.)"""
     (tmp_path / "frame.png").write_bytes(b"another's")
     values = np.linspace(2.0, 4.0, 12).reshape(3, 4)
-    assert Pictured().finish_frame((tmp_path / "frame.exr", values, "W/m^2"), {}, ["said"], []) == 0
+    assert Pictured().finish_frame((tmp_path / "frame.exr", values, "W/m^2"), {"warnings": ()}, ["said"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert said.endswith(f"picture {tmp_path / 'frame.exr.png'}: black 2, white 4 W/m^2")
     assert (tmp_path / "frame.png").read_bytes() == b"another's"
     colour = np.stack([values, 0 * values, values], axis=-1)
-    assert Pictured(as_json=True).finish_frame((tmp_path / "c.exr", colour, "W/m^2"), {}, [], []) == 0
+    assert Pictured(as_json=True).finish_frame((tmp_path / "c.exr", colour, "W/m^2"), {"warnings": ()}, []) == 0
     assert np.asarray(Image.open(json.loads(capsys.readouterr().out)["picture"]["file"])).shape == (384, 512, 3)
 
 

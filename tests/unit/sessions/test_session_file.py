@@ -12,8 +12,8 @@ import pytest
 import mitsim as ms
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
-from mitsim.core.configuration import shipped_path
-from mitsim.sessions.session_file import fields_of, read_session, session_text, value_of
+from mitsim.core.configuration import shipped_path, value_of
+from mitsim.sessions.session_file import fields_of, read_session, session_text
 
 WHOLE = """
 [scene]

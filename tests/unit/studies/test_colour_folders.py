@@ -44,7 +44,7 @@ def test_each_line_is_solved_as_it_is_alone(pair: tuple[Path, Path], tmp_path: P
     run, calibration = pair
     found = reconstruct_colours(run, calibration, tmp_path / "image", lam=1e3)
     for index, name in enumerate(found.qualities):
-        alone = reconstruct(run / name, calibration / name, tmp_path / name, 1e3).reconstruction
+        alone = reconstruct(run / name, calibration / name, tmp_path / name, lam=1e3).reconstruction
         assert np.array_equal(found.reflectances[..., index], alone.image) and alone.lam == 1e3, "options are passed on"
         assert (tmp_path / "image" / name / "result.json").is_file()
     errors = [10 ** (-quality.psnr_db / 10) for quality in found.qualities.values() if quality]
