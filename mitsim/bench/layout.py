@@ -508,7 +508,7 @@ def mask_fault(bench: Apparatus) -> Fault | None:
     own = 0.0 if isinstance(mask, Mask) else min(mask.residuals)
     if own > residual / 2:
         problem = f"the mask ({geometry.mask_words}) is not separable: frames can be captured, but the best separable"
-        remedy = "use a mask of the kind separable, flatcam or mura"
+        remedy = 'use kind = "separable" in its table [mask]'
         return Fault(f"{problem} mask misses {own:.0%} of its shadow, and so do images", remedy, residual)
     needed = 2 * max(float(np.abs(each).max()) for each in crossings)
     if mask.flaws.turn_deg:

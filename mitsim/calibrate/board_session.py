@@ -137,7 +137,7 @@ class Session:
         remedy = fault.remedy if fault else "mount the mask straight"
         if rays < _IN_RAYS * residual:
             cause = f" by diffraction ({rays:.1%} without)"
-            remedy = "bring the mask nearer to the sensor, or enlarge its features, to reduce diffraction"
+            remedy = 'use kind = "separable", or larger features (feature_mm), in its table [mask]'
         return (
             f"the mask ({geometry.mask_words}) is not separable{cause}: the best separable one leaves {residual:.1%} "
             f"of its shadow, {-decibels(residual):.1f} dB below it, and images of these factors lack it; {remedy}",

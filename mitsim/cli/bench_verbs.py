@@ -121,8 +121,9 @@ def run_(asked: Running) -> int:
             check_output(asked.output, asked.overwrite, "file")
         found = mitsim.session_of(folder)
         written = None if asked.output is None else str(found.save(asked.output))
-        payload = {"session": found.text, "output": written, "warnings": found.warnings}
-        lines = [found.text.rstrip()] if written is None else [f"Session file: {written}"]
+        payload = {"session": found.text, "output": written, "needs": found.needs, "warnings": found.warnings}
+        needs = [f"Needs also: {', '.join(found.needs)}"] if found.needs else []
+        lines = [found.text.rstrip()] if written is None else [f"Session file: {written}", *needs]
         return asked.finish(payload, lines, found.warnings)
     if asked.session is None:
         raise MitsimError("run: give a session file, or --from FOLDER to write one")

@@ -22,6 +22,7 @@ from mitsim.cli.commands import (
     shown,
     to_make,
 )
+from mitsim.cli.shelf_verbs import is_scene, list_parameters
 from mitsim.core.colour_files import CALIBRATION, MOSAIC, RUN, SpectralFolder, is_coloured, open_lines
 from mitsim.core.configuration import CAMERA, DEVICES, OUTPUT, WHAT, locate, option, shipped_names
 from mitsim.core.errors import MitsimError
@@ -217,18 +218,20 @@ def report(asked: Reporting) -> int:
 class ShowingFolder(Common):
     """Options of `mitsim show`."""
 
-    folder: Path = argument(..., "folder of any command", "FOLDER")
+    folder: Path = argument(..., "folder of any command, or a scene", "FOLDER|SCENE")
 
 
 @command
 def show(asked: ShowingFolder) -> int:
-    """Describe a folder: its kind, origin, main numbers and next steps.
+    """Describe a folder of results, or the parameters of a scene.
 
     Only its JSON files are read. The status is 1 if the folder is flagged, or its work was interrupted.
 
     $ mitsim show run
-    $ mitsim show cal --json
+    $ mitsim show lamp_bench
     """
+    if is_scene(str(asked.folder)):
+        return list_parameters(str(asked.folder), asked)
     found = mitsim.show(asked.folder)
     return asked.finish(vars(found), found.lines(), found.warnings)
 

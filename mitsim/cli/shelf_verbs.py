@@ -9,18 +9,21 @@ import itertools
 import re
 import shutil
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 from pydantic import BaseModel
 
 from mitsim.bench.effects import DISCRETISED, EFFECTS
 from mitsim.cli.commands import Common, Replaced, argument, command, to_make
 from mitsim.core import configuration
 from mitsim.core.errors import MitsimError, near_name
-from mitsim.core.files import output_file, whole_folder, write_text
+from mitsim.core.files import output_file, whole_folder, write_bytes, write_text
+from mitsim.core.images import png
+from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import FAMILIES
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
@@ -113,29 +116,49 @@ def _clause(text: str) -> str:
 class Listing(Common):
     """Options of `mitsim list`."""
 
-    kind: str | None = argument(None, f"{', '.join(KINDS)}; by default all", "[KIND]", complete=lambda: KINDS)
+    kind: str | None = argument(None, f"{', '.join(KINDS)}; or a scene", "[KIND|SCENE]", complete=lambda: KINDS)
 
 
 @command
 def list_(asked: Listing) -> int:
-    """List scenes, devices, studies, effects and methods.
+    """List scenes, devices, studies and methods, or a scene's parameters.
 
     $ mitsim list scenes
+    $ mitsim list lamp_bench
     $ mitsim list cameras --json
     """
-    kind, lines = asked.kind, list[str]()
+    kind = asked.kind
+    if kind is not None and is_scene(kind):
+        return list_parameters(kind, asked)
     if kind is not None and kind not in KINDS:
-        raise MitsimError(f"list {kind}: no such kind; {near_name(kind, KINDS)}use {', '.join(KINDS)}")
-    found = {name: [*entries()] for name, entries in KINDS.items() if kind in (None, name)}
+        raise MitsimError(f"list {kind}: no such kind; {near_name(kind, KINDS)}use {', '.join(KINDS)}, or a scene")
+    return _print_entries({name: [*entries()] for name, entries in KINDS.items() if kind in (None, name)}, asked)
+
+
+def is_scene(name: str) -> bool:
+    """Return True for a scene's file or folder, and for the name of a shipped scene if there is no such folder."""
+    shipped = name in configuration.shipped_files("scenes", "scene.xml") and not Path(name).exists()
+    return shipped or name.endswith(".xml") or (Path(name) / "scene.xml").is_file()
+
+
+def list_parameters(scene: str, asked: Common) -> int:
+    """Print the parameters of a ``scene`` for -D, with default, unit and meaning."""
+    path = configuration.locate(scene, "scenes", "scene.xml")
+    return _print_entries({"parameters": [Entry(*each) for each in configuration.scene_parameters(path)]}, asked)
+
+
+def _print_entries(found: Mapping[str, Sequence[Entry]], asked: Common) -> int:
+    lines, kind = list[str](), len(found) == 1
     for name, entries in found.items():
         lines += [] if kind else [*([""] if lines else []), f"{name}:"]
         indent = 0 if kind else 2
-        first = max(len(each.name) for each in entries) + indent + 2
+        first = max((len(each.name) for each in entries), default=0) + indent + 2
         width = max(shutil.get_terminal_size().columns, first + 20)
         for each in entries:
             text = each.serves if not each.what or each.what.endswith(".") else f"{each.what}: {each.serves}"
             line = f"{'':{indent}}{each.name}".ljust(first) + text
             lines += textwrap.wrap(line, width, subsequent_indent=" " * first, break_on_hyphens=False)
+        lines += ["", "Parameters of a scene, with units: mitsim list NAME"] if name == "scenes" else []
     return asked.finish({name: [asdict(each) for each in entries] for name, entries in found.items()}, lines)
 
 
@@ -283,13 +306,20 @@ def new(asked: Beginning) -> int:
     else:
         field = {"mask": "camera"}.get(kind, kind)
         places = [line.format(field=field, path=output) for line in _HEAD if field in ("camera", "projector")]
-        head = [f"# {kind.capitalize()} {name}, for: {use}", *places, *([] if kind == "session" else _MORE)]
+        head = [f"# {kind.capitalize()} {name}. For example: {use}", *places, *([] if kind == "session" else _MORE)]
         lines = _lines(kind, name, source, like if like is not None and like in masks else "separable")
         text = "\n".join([*(head if ending == ".toml" else []), *lines]) + "\n"
         with output_file(output, asked.overwrite) as place:
             write_text(place, text)
+    said = [f"{kind.capitalize()} {name}: {output}", f"Try: {use}"]
+    if like in ("drawing", "psf") and not (picture := output.parent / _MASKS[like]["file"]).exists():
+        said.insert(1, f"{picture} is missing: put your picture of the light of one point there")
+        if like == "drawing":
+            values = mls_mask().terms[0]
+            write_bytes(picture, png(np.outer(*values[1:])))
+            said[1] = f"{picture} is an example: replace it by your drawing, in grey"
     payload = {"kind": kind, "name": name, "output": str(output), "use": use}
-    return asked.finish(payload, [f"{kind.capitalize()} {name}: {output}", f"Try: {use}"])
+    return asked.finish(payload, said)
 
 
 # ---- Fields of a file, explained -------------------------------------------------------------------------------------

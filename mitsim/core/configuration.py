@@ -210,6 +210,18 @@ def opening_words(path: Path) -> tuple[str, str]:
     return sentences[0], serves.removeprefix(_SERVES).removesuffix(".")
 
 
+_PARAMETER = re.compile(r'<default name="([^"]+)" value="([^"]*)"/>[ \t]*(?:<!-- *(.*?) *-->)?')
+
+
+def scene_parameters(path: Path) -> list[tuple[str, str]]:
+    """Return each parameter of a scene file as NAME=DEFAULT, with the comment on its line: its unit and meaning."""
+    try:
+        found = _PARAMETER.findall(read_text(path, _MOST_BYTES << 8))
+    except ValueError as error:
+        raise MitsimError(f"file {path}: is not UTF-8 ({error}); save it so") from error
+    return [(f"{name}={value}", words) for name, value, words in found]
+
+
 def toml_value(value: object) -> str:
     import tomli_w
 

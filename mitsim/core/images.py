@@ -204,7 +204,7 @@ def _npy(path: Path, wanted: Wanted) -> _Reader:
             raise wanted.refusal(path, f"holds {payload}; rows x columns of numbers are needed, or pages of them")
         if len(shape) == 3 and sides[1] in _COLOURS_A_PIXEL:
             kind = f"{shape[0]} x {shape[1]} pixels of {shape[2]} numbers, as of red, green and blue"
-            raise wanted.refusal(path, f"holds {kind}; save one number a pixel, raw and not demosaiced")
+            raise wanted.refusal(path, f"holds {kind}; {wanted.grey}")
         pages = shape[0] if len(shape) == 3 else 1
         yield pages, sides, pages * dtype.itemsize + _PIXEL_BYTES
         values = np.load(file, allow_pickle=False)
@@ -249,8 +249,7 @@ def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
     *most, last = (str(count) for count in bits)
     colours = ", nor of red, green and blue of 8 bits" if wanted.colour else ""
     zero = " whose zero is black" if kind == "TIFF" else ""
-    raw = "" if wanted.colour else ", raw and not demosaiced"
-    return f"grey {kind} of {', '.join(most)} or {last} bits{zero}{colours}; save one number a pixel{raw}"
+    return f"grey {kind} of {', '.join(most)} or {last} bits{zero}{colours}; {wanted.grey}"
 
 
 @contextmanager

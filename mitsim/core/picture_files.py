@@ -163,6 +163,12 @@ class Wanted:
     colour: bool = False
     raw: Raw | None = None
 
+    @property
+    def grey(self) -> str:
+        """Return how a picture of one number a pixel is saved."""
+        frame = "save one number a pixel, raw and not demosaiced"
+        return frame if self.what == "frame" else "save it in grey, one number a pixel"
+
     def refusal(self, path: Path, reason: str) -> MitsimError:
         return MitsimError(f"{self.what} {path}: {reason}")
 

@@ -194,7 +194,7 @@ class Plan:
             if differs is not None:
                 place, planned, found = differs
                 one, other = (
-                    "none" if value is None else cut(value if isinstance(value, str) else json.dumps(value), 40)
+                    "none" if value is None else cut(value.partition(", sha256")[0] if isinstance(value, str) else json.dumps(value), 60)
                     for value in (planned, found)
                 )
                 alike = what == "scene" or one == other  # checksums, or what is cut before it differs
@@ -264,6 +264,7 @@ def _digest(own: Any) -> str:
 
 def _difference(one: Any, other: Any, place: str = "") -> tuple[str, Any, Any] | None:
     if isinstance(one, dict) and isinstance(other, dict):
+        one, other = ({**each, "mask": each.get("mask_plate") or each.get("mask")} for each in (one, other))
         each = (_difference(one.get(name), other.get(name), f"{name} ") for name in dict.fromkeys([*one, *other]))
         return next(filter(None, each), None)
     return None if one == other else (place, one, other)

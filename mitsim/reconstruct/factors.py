@@ -241,17 +241,19 @@ def factors_of_sums(
     if unexplained > allowed:
         verdict, words = Verdict.NOT_SEPARABLE, f"Responses are not separable: {unexplained:.1%} of them is left over"
         words += f" ({decibels(unexplained):.1f} dB)"
-        remedy = "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part"
-        remedy += ", or raise the exposure"
+        remedy = "for a FlatCam or MURA mask give centre = true in the list, otherwise look for ambient light or a "
+        remedy += "rotated part, or average more shots (repeats = 4 in the recipe)"
     elif max(predicted) > LARGEST_ERROR:
-        verdict, remedy = Verdict.MOSTLY_NOISE, "raise the exposure or average captures"
+        verdict, times = Verdict.MOSTLY_NOISE, int(np.ceil(min((max(predicted) / LARGEST_ERROR) ** 2, 1024)))
+        remedy = f"average {times} times as many shots (repeats = {times} in the recipe)"
         words = f"Factors are mostly noise: an error of {max(predicted):.0%} is expected of them, allowed are "
         words += f"{LARGEST_ERROR:.0%}"
     elif rank != [n, n]:
         verdict = Verdict.RANK_DEFICIENT
         words = f"Factors are rank deficient: {n - rank[0]} directions of scene rows and {n - rank[1]} of columns are"
         words += " not above noise and rounding"
-        remedy = "use fewer scene pixels, a larger distance from sensor to mask or more exposure"
+        remedy = "capture with dots, which resolve more (--patterns dots:7), enlarge the gap from sensor to mask (-D "
+        remedy += "mask_distance=3), or average more shots (repeats = 4 in the recipe)"
     else:
         verdict, words, remedy = Verdict.CALIBRATED, "Calibrated: responses are separable", ""
     status = Status(verdict, words, remedy, figures)
@@ -490,6 +492,8 @@ class Factors:
             which = "the run's camera, with its scene, --camera, --projector and -D"
             if name in _LIGHT:
                 which = "in this light: its diffraction at the mask differs"
+            if own is None and shots.manifest.plan is None:
+                which = f"again, or import the frames again with --calibration {self.name}"
             both = f"{cut(name)} is {cut(str(other))}, but {shots.name} has {cut(str(own))}"
             raise MitsimError(f"calibration {self.name}: {both}; calibrate {which}")
         for side, pattern, factor in zip(("P_L", "P_R"), shots.patterns, (self.left, self.right), strict=True):

@@ -20,9 +20,9 @@ from pydantic import BaseModel, Field
 from mitsim.bench.request import NO, Exposure, Opening, Request, SessionRequest, Task
 from mitsim.core import files
 from mitsim.core.colour_files import MOSAIC, RUN, is_coloured, open_lines
-from mitsim.core.configuration import Configuration, takes, validate
+from mitsim.core.configuration import Configuration, refuse_together, takes, validate
 from mitsim.core.environment import deciding_versions
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.headline import calibration_headline, each_once, frames_headline, headline, image_headline
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
@@ -147,6 +147,9 @@ def run(
     """
     asked = RunOptions(**options)
     read, place = session_file.read_session(session, values), Path(output)
+    needed = session_file.own_files(read.tables).items()
+    if missing := [f"{field}: {path} is missing; copy it there" for field, path in needed if not path.exists()]:
+        raise refuse_together(f"session {cut(str(session), 100)}", missing)
     again, earlier = (place / session_file.SUMMARY).is_file(), _Earlier(kind=KIND)
     if again and not asked.resume:
         raise MitsimError(f"output {place}: holds a session already; use resume=True, or choose another folder")

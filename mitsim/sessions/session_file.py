@@ -302,6 +302,25 @@ def read_session(source: Path | str | Mapping[str, Any], changes: Mapping[str, A
     return session
 
 
+def own_files(tables: Mapping[str, Any]) -> dict[str, Path]:
+    """Return the files and folders that ``tables`` read beside the shipped ones, by field; a mask's drawing too."""
+    found, scene = dict[str, Path](), tables.get("scene") or {}
+    for name in (name for name in TABLES if name in tables):
+        for number, table in enumerate(tables[name] if name in SEVERAL else [tables[name]]):
+            place = f"{name}.{number}" if name in SEVERAL else name
+            texts = {key: value for key, value in table.items() if key != "output" and isinstance(value, str)}
+            found |= {f"{place}.{key}": Path(value) for key, value in texts.items() if os.path.isabs(value)}
+    camera = found.get("scene.camera", Path())
+    if drawing := camera.is_file() and (read_toml(camera).get("mask") or {}).get("file"):
+        found["scene.camera: mask.file"] = camera.parent / drawing
+    for name in scene.keys() - fields_of("scene").keys():
+        value = Path(str(scene[name]))
+        beside = locate(scene["scene"], "scenes", "scene.xml").parent / value
+        if value.suffix[1:].isalpha() and not beside.exists():
+            found[f"scene.{name}"] = value
+    return found
+
+
 def _change(data: dict[str, Any], name: str, value: Any, where: str) -> None:
     """Set the field of a dotted ``name`` to a ``value``."""
     place: list[str | int] = [int(part) if part.isdecimal() else part for part in str(name).split(".")]
@@ -421,14 +440,17 @@ class Repeat:
         Text of the file, with whole paths.
     warnings
         Sentences.
-    tables, notes
-        Tables of the file, and lines of comment before them.
+    needs
+        Files and folders that the session reads beside the shipped ones.
+    tables, notes, needs
+        Tables of the file, lines of comment before them, and files that the session reads beside the shipped ones.
     """
 
     text: str
     warnings: tuple[str, ...] = ()
     tables: Mapping[str, Any] = field(default_factory=dict, repr=False)
     notes: tuple[str, ...] = field(default=(), repr=False)
+    needs: tuple[str, ...] = ()
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
@@ -463,7 +485,7 @@ def session_of(folder: Path | str) -> Repeat:
     folder = Path(folder)
     if (folder / SUMMARY).is_file() and (folder / SESSION_FILE).is_file():
         tables = read_session(folder / SESSION_FILE).tables
-        return Repeat(session_text(tables), (), tables)
+        return Repeat(session_text(tables), (), tables, (), tuple(map(str, own_files(tables).values())))
     place, found, coloured = folder.absolute(), _Found(), is_coloured(folder)
     data = read_json(folder / COLOUR) if coloured else {}
     if (folder / RESULT_FILE).is_file() or (isinstance(data, dict) and data.get("kind") == IMAGE):
@@ -483,8 +505,10 @@ def session_of(folder: Path | str) -> Repeat:
             "reconstruct"
         )
     tables = read_session(found.tables).tables  # which refuses values that a damaged folder states
-    notes = f"Repeats {place}: mitsim run FILE -o FOLDER", *found.warnings
-    return Repeat(session_text(tables, None, *notes), tuple(found.warnings), tables, notes)
+    needs = tuple(map(str, own_files(tables).values()))
+    said = [f"Needs also: {', '.join(needs)}"] if needs else []
+    notes = f"Repeats {place}: mitsim run FILE -o FOLDER", *said, *found.warnings
+    return Repeat(session_text(tables, None, *notes), tuple(found.warnings), tables, notes, needs)
 
 
 @dataclass
@@ -533,8 +557,10 @@ class _Found:
             value = value_of(text)
             given[name] = value if isinstance(value, (bool, int, float)) and spelling(value) == text else text
         table = {name: value for name, value in given.items() if value is not None}
-        if self.tables.setdefault("scene", table) != table:
-            raise MitsimError(f"{folder}: is of another scene or of other devices than its frames")
+        known = self.tables.setdefault("scene", table)
+        if differ := [name for name in {**known, **table} if known.get(name) != table.get(name)]:
+            both = "; ".join(f"{name} {table.get(name, 'unset')}, not {known.get(name, 'unset')}" for name in differ)
+            raise MitsimError(f"{folder}: has another scene or other devices than its frames ({both})")
         for name, known in {scene.scene: scene.scene_sha256, **scene.scene_files}.items():
             if not Path(name).is_file():
                 self.warn(f"{name} is not there")

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,9 +35,12 @@ from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexpo
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response, specimen
 from mitsim.studies.causes import Changed, Expected, Gains, LinearImage, Noise
 from mitsim.studies.framework import experiment
-from mitsim.studies.framework.claims import Gain
+from mitsim.studies.framework.claims import Gain, mean_of
 from mitsim.studies.framework.panels import Bars, Images
 from mitsim.studies.framework.studio import Studio, flags_of, single_precision
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 AMBIENT, SESSION = "ambient frame", "session"
 OFFSETS = "offset nonuniformity"
@@ -287,6 +291,8 @@ _LAMP_SCENE, _LAMP = "lamp_bench", "11.7"
 """Default scene of lamps' drifts, whose lamp is a tenth as bright on the sheet as the projector."""
 _BEFORE = "without the drift"
 _LINES, _ERRORS = {"lost_db": "measured", "predicted_lost_db": "predicted"}, {"predicted_lost_db": "predicted_error_db"}
+_LEAST = 1e-3
+"""Least part by which a drift adds to the squared error for an extrapolation; less is rounding."""
 AGREE_DB = 0.5
 """Largest useful difference [dB] between predicted and measured loss."""
 
@@ -353,6 +359,17 @@ def _measure(studio: Studio, point: experiment.Point) -> experiment.Found:
     return experiment.Found((point.row(**measured, **flags),), single_precision(shown))
 
 
+def three_decibels(rows: DataFrame) -> str:
+    """Return the amount of a drift at which 3 dB are lost: squared errors grow with the square of the amount."""
+    added = 10 ** (mean_of(rows, "lost_db").value / 10) - 1
+    if added < _LEAST:
+        return ", too little to say when 3 dB are lost"
+    amount, unit = float(rows["amount"].iloc[0]), str(rows["unit"].iloc[0])
+    size, unit = (100, f"%{unit[1:]}") if unit.startswith("1") else (1, unit)
+    until = float(f"{abs(amount) * size * ((10**0.3 - 1) / added) ** 0.5:.2g}")
+    return f", 3 dB at about {until:g} {unit}"
+
+
 STUDY = experiment.Study(
     "drift",
     "What drifts between calibration and capture",
@@ -372,6 +389,7 @@ STUDY = experiment.Study(
             at_least=-AGREE_DB,
             at_most=AGREE_DB,
             apart=True,
+            note=three_decibels,
         ),
     ),
     panels=(

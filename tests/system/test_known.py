@@ -102,7 +102,7 @@ def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
         mentions(line, f"output {path}: would replace", "which is read")
     np.save(tmp_path / "bars.npy", np.outer([1.0, 0, 1, 1], [0, 1.0, 1, 1]))  # of the same name
     line = refused("capture", *own, "--plan", file, "-o", tmp_path / "run")
-    mentions(line, "--plan was made for another camera: the content of mask_plate differs")
+    mentions(line, "--plan was made for another camera: the content of mask differs")
 
 
 def test_what_python_warns_of_is_a_line_of_the_command_line(

@@ -163,7 +163,8 @@ def with_unit(mean: Mean, unit: str, sign: str = "") -> str:
     if unit == "dB":
         return f"{mean:{sign}} dB"
     error = "" if math.isnan(mean.error) else f" \N{PLUS-MINUS SIGN} {round_to_error(mean.error, mean.error)}"
-    return f"{'+' if sign and mean.value >= 0 else ''}{round_to_error(mean.value, mean.error)}{error} {unit}".rstrip()
+    value = round_to_error(mean.value, mean.error if error else abs(mean.value) / 20)
+    return f"{'+' if sign and mean.value >= 0 else ''}{value}{error} {unit}".rstrip()
 
 
 # -------- Declared claims
@@ -288,6 +289,8 @@ class Gain(Level):
         range of the gain of ``one`` over ``other``; by default above 0.
     apart, other_error
         True to state each side under its own head; column of a further error of ``other``.
+    note
+        Function that returns words on the rows of ``one``, for its own head.
     """
 
     one: Where
@@ -297,6 +300,7 @@ class Gain(Level):
     at_least: float = 0.0
     apart: bool = False
     other_error: str = ""
+    note: Callable[[DataFrame], str] | None = None
 
     def sides(self, rows: DataFrame) -> tuple[DataFrame, ...]:
         return choose_rows(rows, self.one), choose_rows(rows, self.other)
@@ -307,7 +311,7 @@ class Gain(Level):
             return judged
         one, other = self.sides(rows)
         before = mean_of(other, self.other_column or self.column, error_column=self.other_error)
-        after = with_unit(mean_of(one, self.column), self.unit)
+        after = with_unit(mean_of(one, self.column), self.unit) + (self.note(one) if self.note else "")
         return replace(judged, idealised=with_unit(before, self.unit), rendered=after)
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:

@@ -116,7 +116,7 @@ def test_new_devices_sessions_and_lists_load(shell_of: Callable[..., str], tmp_p
     assert load_recipe(begun(shell_of, "recipe", tmp_path / "d.toml", "--like", "drift")).drift is not None
     session = begun(shell_of, "session", tmp_path / "run.toml")
     assert read_session(session).steps == read_session("demo").steps
-    assert session.read_text(encoding="utf-8").startswith(f"# Session mine, for: mitsim run {session}")
+    assert session.read_text(encoding="utf-8").startswith(f"# Session mine. For example: mitsim run {session}")
     listed = load_capture_list(begun(shell_of, "list", tmp_path / "l.toml"))
     read_name(str(listed.patterns), listed.n)
 

@@ -205,11 +205,12 @@ def test_changes_take_the_place_of_fields(write: Callable[[str], Path]) -> None:
 
 
 def test_nothing_is_written_where_a_step_would_be_refused(write: Callable[[str], Path], tmp_path: Path) -> None:
-    """The last step too, whatever comes before it. (Planted: steps that are checked as they come.)"""
+    """The last step too, whatever comes before it. (Planted: steps that are checked as they come;
+    only the first missing file named.)"""
     for text, words in (
         ("[capture]\n[study]\nname = 'wether'\n", "there is no such study"),
         ("[capture]\n[reconstruct]\ncalibration = 'none'\n", "no such folder"),
-        ("[capture]\n[calibrate]\nrecipe = 'none.toml'\n", "none.toml: cannot be read"),
+        ("[capture]\n[calibrate]\nrecipe = 'none.toml'\n[reconstruct]\ncalibration = './no'\n", "has 2 mistakes"),
         ("[capture]\n[calibrate]\n[reconstruct]\nchart = 'nosuch'\n", "the frames are not coloured"),
         ("[capture]\npatterns = 'dots:200'\n", "dots:200"),
         ("[capture]\ncolour = 'mosaic'\n", "has no mosaic of colour filters"),

@@ -241,8 +241,8 @@ def test_options_of_the_study(tmp_path: Path) -> None:
 def test_claims_hold_predictions_against_what_was_measured() -> None:
     """Of each kind and amount, mean over seeds. (Planted: all amounts together.)"""
     rows = [
-        {"kind": "power", "what": f"power {amount}", "amount": amount, "seed": seed, "lost_db": amount + 0.1 * seed,
-         "predicted_lost_db": predicted + 0.1 * seed, "predicted_error_db": 0.3}
+        {"kind": "power", "what": f"power {amount}", "amount": amount, "unit": "um", "seed": seed,
+         "lost_db": amount + 0.1 * seed, "predicted_lost_db": predicted + 0.1 * seed, "predicted_error_db": 0.3}
         for amount, predicted in ((1.0, 1.4), (2.0, 9.0))
         for seed in (0, 1)
     ]  # fmt: skip
@@ -250,5 +250,5 @@ def test_claims_hold_predictions_against_what_was_measured() -> None:
     power, other = experiment.judge(results)
     assert power.verdict == "confirmed" and other.verdict == "not confirmed"
     assert power.idealised == "1.45 \N{PLUS-MINUS SIGN} 0.30 dB lost"
-    assert power.rendered == "1.050 \N{PLUS-MINUS SIGN} 0.050 dB lost"
+    assert power.rendered == "1.050 \N{PLUS-MINUS SIGN} 0.050 dB lost, 3 dB at about 1.9 um"
     assert set(experiment.draw(results)) == {"losses.png"}
