@@ -194,7 +194,7 @@ class Plan:
             if differs is not None:
                 place, planned, found = differs
                 one, other = (
-                    "none" if value is None else cut(value.partition(", sha256")[0] if isinstance(value, str) else json.dumps(value), 60)
+                    "none" if value is None else cut(str(value).partition(", sha256")[0], 60)
                     for value in (planned, found)
                 )
                 alike = what == "scene" or one == other  # checksums, or what is cut before it differs
