@@ -14,7 +14,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
 from pydantic import BaseModel
 
 from mitsim.bench.effects import DISCRETISED, EFFECTS
@@ -22,8 +21,6 @@ from mitsim.cli.commands import Common, Replaced, argument, command, to_make
 from mitsim.core import configuration
 from mitsim.core.errors import MitsimError, near_name
 from mitsim.core.files import output_file, whole_folder, write_bytes, write_text
-from mitsim.core.images import png
-from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import FAMILIES
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
@@ -315,8 +312,11 @@ def new(asked: Beginning) -> int:
     if like in ("drawing", "psf") and not (picture := output.parent / _MASKS[like]["file"]).exists():
         said.insert(1, f"{picture} is missing: put your picture of the light of one point there")
         if like == "drawing":
-            values = mls_mask().terms[0]
-            write_bytes(picture, png(np.outer(*values[1:])))
+            from mitsim.core.images import png
+            from mitsim.devices.mask import mls_code
+
+            code = mls_code(9)
+            write_bytes(picture, png(code[:, None] * code))
             said[1] = f"{picture} is an example: replace it by your drawing, in grey"
     payload = {"kind": kind, "name": name, "output": str(output), "use": use}
     return asked.finish(payload, said)

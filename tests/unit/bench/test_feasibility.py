@@ -45,7 +45,7 @@ def test_a_code_of_two_terms_has_factors_once_it_covers_what_the_sensor_sees(sma
 @pytest.mark.parametrize(
     ("mask", "reason", "remedy"),
     [
-        ({"kind": "random", "features": 127}, "random mask of 127 features", "use kind = \"separable\""),
+        ({"kind": "random", "features": 127}, "random mask of 127 features", 'use kind = "separable"'),
         ({"kind": "separable", "rotation_deg": 0.5}, "as it is mounted", "mount it straight"),
         ({"kind": "separable", "opaque_transmission": 0.02}, "", ""),
         ({"kind": "mura", "features": 251}, "", ""),
