@@ -10,7 +10,7 @@ lambda (gram: the paper's; svd+Q: singular vectors of the stacked matrix but the
 frames). Trust: seconds of the stages of whole reconstructions from noisy frames in memory, the best of the repetitions,
 and what the uncertainty takes of adding up and solving; slopes of the factors, which the misfit needs too, count there.
 
-``--forms`` measures what the solver's precision costs in time: error against exact arithmetic (tests/exact_solver.py)
+``--forms`` measures what the solver's precision costs in time: error against exact arithmetic (exact_solver.py)
 and seconds in double and single precision, at three lambdas.
 """
 
@@ -21,11 +21,11 @@ from dataclasses import asdict
 
 import mpmath
 import numpy as np
+from exact_solver import dots, paper_factor, time_solver
 from harness import arguments, median_seconds, show, write
 
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from tests.exact_solver import dots, paper_factor, time_solver
 from tests.ideal_sessions import Bench, picture
 
 N, K = 128, 7

@@ -1,6 +1,6 @@
 """The Python face has a call for each verb of the command line, with its options, and refuses wrong arguments.
 
-Quick: nothing is rendered. What a bench does with arguments of the right kind is tests/system/test_wrong_arguments.py.
+Quick: nothing is rendered.
 """
 
 from __future__ import annotations
@@ -70,18 +70,7 @@ ONE_CALL = [
 ALIKE = {"scenes": "scene", "family": "patterns", "repeated": "folder", "stacks": "frames", "stack_size": "frames"}
 """Arguments that the command line calls otherwise."""
 OF_THE_COMMAND_LINE = {
-    *(
-        "as_json",
-        "quiet",
-        "verbose",
-        "help",
-        "variant",
-        "no_pictures",
-        "max_seconds",
-        "max_memory",
-        "overwrite",
-        "overwrite",
-    ),
+    *("as_json", "quiet", "verbose", "help", "variant", "no_pictures", "max_seconds", "max_memory", "overwrite"),
 }
 """Options that say how it is reported and bounded, as a job does; the variant is a bench's."""
 ANYWAY = {("sense", "output")}
@@ -164,7 +153,7 @@ def test_refusals_name_options_on_the_command_line(argument: str, option: str) -
 
 WRONG: list[Any] = [
     *(object(), b"x", 1j, None, True, False, 0, -1, 10**40, 0.5, -1e300, math.nan, math.inf),
-    *("", "x", "a\0b", "n" * 5000),
+    *("", "x", "a\0b", "n" * 5000, "\udcff"),
     *((), [], {}, [1, "x"], (1.0, 2.0), {"x": object()}, type, Path("no such"), Path(".")),
     *(np.array([]), np.ones((2, 3)), np.array([1j]), np.array([None, "x"]), np.float32("nan"), np.int8(-1)),
 ]

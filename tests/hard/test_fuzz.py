@@ -76,16 +76,8 @@ def test_many_changes(measured: Recorder, kind: str, seconds: float) -> None:
 def test_a_hundred_inputs(measured: Recorder, tmp_path: Path) -> None:
     """Of other seeds than those by which faults were found. (Planted: what was never stored read as zeros; the log of
     Pillow on stderr.)"""
-    command = [
-        sys.executable,
-        "benchmarks/hostile.py",
-        "--count",
-        "110",
-        "--seed",
-        "5000",
-        "--json",
-        tmp_path / "a.json",
-    ]
+    options = ["--count", "110", "--seed", "5000", "--json", tmp_path / "a.json"]
+    command = [sys.executable, "benchmarks/hostile.py", *options]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     reported = json.loads((tmp_path / "a.json").read_text())

@@ -8,7 +8,6 @@ that is rendered to see its own full frames counted.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -250,27 +249,6 @@ def test_flags_of_folders_reach_the_image(bench: Callable[..., tuple[Path, Path]
         assert sentence in str(found.status)
     assert str(found.status).startswith("Solved: ") and "Rank 64 of 64" in str(found.status)
     assert json.loads((run / "image" / "result.json").read_text())["status"] == str(found.status)
-
-
-def test_the_command_ends_with_1(
-    bench: Callable[..., tuple[Path, Path]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from mitsim import cli
-
-    run, cal = bench(calibration=("12 of 64 frames have pixels at the full well",))
-    monkeypatch.setattr(sys, "argv", ["mitsim", "reconstruct", str(run), "--calibration", str(cal), "--json"])
-    with pytest.raises(SystemExit) as stop:
-        cli.run()
-    out, err = capsys.readouterr()
-    status = json.loads(out)["status"]
-    warning = "In the calibration, 12 of 64 frames have pixels at the full well"
-    assert stop.value.code == 1 and warning in status and err.count(warning) == 1
-    assert (run / "reconstruction" / "image.exr").is_file(), "the image is kept"
-    monkeypatch.setattr(sys, "argv", [*sys.argv[:-1], "-o", str(run / "again")])
-    with pytest.raises(SystemExit):
-        cli.run()
-    first, _, _ = capsys.readouterr().out.partition("\nImage:")
-    assert " ".join(first.split()).endswith(f"Flagged: {warning[0].lower()}{warning[1:]}")
 
 
 @pytest.mark.parametrize(

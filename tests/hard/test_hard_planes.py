@@ -18,9 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
 from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.integrator import IndirectTracer, Paths
 from tests.hard.hard_light import HALF, PLACE, SCALE, SEVEN, SLOW, N, Z, gauss, matt, mean, plate, seen_alone
-from tests.physics.radiosity import Furnace
 from tests.robustness import Recorder
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.robustness("Light")]
@@ -67,16 +65,7 @@ def of_plane(centre: np.ndarray, normal: np.ndarray, sensor: np.ndarray, half: f
     return float(da @ np.where(inside, light, 0) @ da)
 
 
-@pytest.mark.parametrize(
-    "angle",
-    [
-        pytest.param(0.0, marks=SLOW),
-        pytest.param(80.0, marks=SLOW),
-        pytest.param(89.0, marks=SLOW),
-        pytest.param(89.9, marks=SLOW),
-        89.99,
-    ],
-)
+@pytest.mark.parametrize("angle", [pytest.param(80.0, marks=SLOW), 89.99])
 def test_a_plane_lit_at_grazing_incidence(measured: Recorder, plane: Callable[..., Bench], angle: float) -> None:
     """Turned about y until the projector's ray meets its centre at the angle; at 89.99 degrees one ray in 80 000 does.
 
@@ -97,7 +86,7 @@ def test_a_plane_lit_at_grazing_incidence(measured: Recorder, plane: Callable[..
     assert gate < 0.12 * expected
 
 
-@pytest.mark.parametrize("angle", [pytest.param(80.0, marks=SLOW), pytest.param(89.0, marks=SLOW), 89.99])
+@pytest.mark.parametrize("angle", [pytest.param(80.0, marks=SLOW), 89.99])
 def test_a_plane_seen_at_grazing_incidence(measured: Recorder, plane: Callable[..., Bench], angle: float) -> None:
     """Turned until the camera's centre sees it at the angle from its normal, on the side that is lit."""
     centre = np.array([-10.0, 0.0, Z])
@@ -252,32 +241,6 @@ def test_metres_and_micrometres_are_refused(small_scene: Callable[..., Path], sc
     assert "\n" not in str(caught.value)
 
 
-# ---- closed rooms
-
-
-def furnace(write: Callable[..., Path], albedo: float) -> IndirectTracer:
-    """The devices inside a closed matt sphere."""
-    sphere = (
-        '<shape type="sphere"><point name="center" x="0" y="0" z="180"/><float name="radius" value="220"/>'
-        f'<boolean name="flip_normals" value="true"/>{matt(albedo)}</shape>'
-    )
-    bench = open_bench(write("furnace", mask="open", extra=sphere, sheet_z=3000))
-    return IndirectTracer(bench.setup, Paths(False, True))
-
-
-@SLOW
-@pytest.mark.parametrize(("albedo", "samples"), [(0.9, 64), (0.99, 32), (0.999, 8)])
-def test_a_closed_room_that_absorbs_little(
-    measured: Recorder, small_scene: Callable[..., Path], albedo: float, samples: int
-) -> None:
-    """Light of 10, 100 and 1000 reflections against the furnace's closed form."""
-    tracer = furnace(small_scene, albedo)
-    expected = Furnace(albedo).indirect(float(np.tan(np.radians(10))))
-    found, error = mean(np.array([tracer.trace(seed, 0, samples).value.sum() / samples for seed in range(8)]))
-    measured(abs(found / expected - 1), at_most=SEVEN * error / expected)
-    assert SEVEN * error < 0.2 * expected
-
-
 # ---- single texels
 
 
@@ -294,13 +257,6 @@ def test_one_pixel_is_a_projector(small_scene: Callable[..., Path]) -> None:
     expected = 0.5 * SCALE / Z**2 * dx @ (1 + x[:, None] ** 2 + y**2) ** -2.0 @ dy
     found, error = mean(seen_alone(bench, 8, 4096)[:, 0, 0])
     assert error < 1e-4 * expected and abs(found - expected) < SEVEN * error + 1e-6 * expected
-
-
-@pytest.mark.slow
-def test_one_pixel_is_captured(small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    bench = open_bench(small_scene(canvas=np.pad([[255.0]], ((1, 2), (5, 2)))))
-    result = bench.capture("uniform", tmp_path / "run", accuracy=2e-2, seed=1, effects={"diffraction": False})
-    assert len(result.dn) == 1 and 0 < result.manifest.mc_error < 2e-2 and np.isfinite(result.exposure_s)
 
 
 @settings(max_examples=8, deadline=None, derandomize=True)

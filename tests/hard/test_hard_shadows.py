@@ -28,12 +28,10 @@ from mitsim.optics.diffraction import EdgeWaves
 from mitsim.optics.fft_shadow import ProfileSampler
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Antiderivative, Directions, ShadowGeometry, Steps, geometric_terms
-from mitsim.optics.terms import shadow_terms
 from tests.robustness import Recorder
 from tests.shadow_factor import steps_of
 
 pytestmark = pytest.mark.robustness("Optics")
-PAPER = Directions.cells((np.arange(129) - 64) * (120 / 128 / 400))
 EPS = np.finfo(float).eps
 power = lambda low, high: st.floats(low, high).map(lambda x: 10.0**x)  # noqa: E731
 
@@ -127,39 +125,6 @@ def test_shadows_equal_fractions_at_any_scale(
             measured(error / bound, at_most=1, what="of the conditioning")
 
 
-EXTREMES = {
-    "the paper's": ({}, 1e-12),
-    "pixels of 1 nm": ({"pixel_pitch": 1e-6}, 1e-8),
-    "pixels of 10 mm": ({"pixel_pitch": 10.0}, 1e-12),
-    "features of 1 um": ({"mask_feature": 1e-3}, 1e-12),
-    "features of 1 um, pixels of 10 mm": ({"mask_feature": 1e-3, "pixel_pitch": 10.0}, 1e-11),
-    "features of 1 mm": ({"mask_feature": 1.0}, 1e-11),
-    "mask at 20 um": ({"mask_distance": 0.02}, 1e-12),
-    "mask at 1 pm": ({"mask_distance": 1e-9}, 1e-11),
-    "mask at 0.999 z": ({"mask_distance": 399.6}, 1e-8),
-    "thick mask at 1 nm": ({"mask_distance": 1e-6, "mask_thickness": 0.01}, 1e-11),
-    "thick mask, pixels of 1 nm": ({"mask_thickness": 0.2, "pixel_pitch": 1e-6}, 1e-8),
-}
-
-
-@pytest.mark.parametrize("name", EXTREMES)
-def test_the_papers_mask_at_extremes_equals_fractions(measured: Recorder, name: str) -> None:
-    """511 features: 4 partly open entries and a corner against fractions, and all entries between 0 and 1.
-
-    Gates are the conditioning, eps x 15 mm over the wider box: 7e-9 for a pixel of 1 nm, 6e-13 for the paper's.
-    """
-    numbers, gate = EXTREMES[name]
-    geometry = CameraGeometry(**numbers)
-    setting = ShadowGeometry.of(geometry, 400.0)
-    ((found, _),) = geometric_terms(setting, PAPER, PAPER)
-    assert np.isfinite(found).all() and found.min() > -1e-9 and found.max() < 1 + 1e-9
-    partial = np.argwhere((found > 1e-6) & (found < 1 - 1e-6))
-    chosen = np.random.default_rng(7).choice(len(partial), 4)
-    entries = [(0, 0), *partial[chosen].tolist()]
-    worst = max(abs(found[i, j] - float(exact_shadow(setting, PAPER, i, j))) for i, j in entries)
-    measured(worst, at_most=gate)
-
-
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(bits=bits_of_masks, feature=power(-3, 0), distance=power(-6, 2), beyond=power(-2, 4), parts=st.integers(1, 40))
 def test_light_through_the_mask_is_neither_made_nor_lost(
@@ -177,26 +142,6 @@ def test_light_through_the_mask_is_neither_made_nor_lost(
     # Neighbours share their ends but for eps of the span, which each of `count` pixels rounds on its own.
     bound = 8 * EPS * span * shrink * count + 1e-9 * span * shrink
     measured(np.abs(width - bits.sum() * feature).max() / bound, at_most=1, what="of the rounding")
-
-
-def test_a_mask_on_the_sensor_is_its_own_shadow(measured: Recorder) -> None:
-    """d to 0: the shadow tends to the mask's mean over each pixel, exact in fractions, in proportion to d.
-
-    A crossing moves by d |tau - u / z|, at most 0.16 d here, and a mean over a pixel by 2 x that over its half width.
-    """
-    cells = Directions(np.linspace(-0.15, 0.15, 5), 0.01)
-    ends = {}
-    for distance in (1e-9, 1e-6, 1e-3):
-        setting = ShadowGeometry.of(CameraGeometry(pixels=12, pixel_pitch=0.05, mask_distance=distance), 400.0)
-        ((found, _),) = geometric_terms(setting, cells, cells)
-        edges, values = mask_edges(setting.mask), [Fraction(int(bit)) for bit in setting.mask.bits]
-        half = Fraction(setting.active_mm) / 2
-        exact = [
-            float(exact_mean(edges, values, Fraction(float(u)), half, Fraction(0))) for u in setting.pixel_centres_mm
-        ]
-        ends[distance] = np.abs(found - np.array(exact)[:, None]).max()
-        measured(ends[distance], at_most=2 * 0.16 * distance / (setting.active_mm / 2) + 1e-12, what=f"{distance:g} mm")
-    assert ends[1e-9] < 1e-4 * ends[1e-3]
 
 
 @pytest.mark.parametrize(("distance", "thickness"), [(400.0, 0.0), (399.9, 0.1), (500.0, 0.0), (1e6, 0.0)])
@@ -305,28 +250,6 @@ def test_cells_of_a_fine_grid_keep_their_values_in_a_mask_of_four_metres() -> No
 
 
 NM = 550.0
-LINE = Spectrum(np.array([NM]), np.array([1.0]))
-
-
-def test_waves_of_a_mask_near_the_sensor_tend_to_its_shadow(measured: Recorder) -> None:
-    """Relative difference over 16 pixels from 20 um down to 10 nm: it falls with the root of lambda d at least.
-
-    Each edge sends light over sqrt(lambda d), 74 nm at 10 nm, of a pixel's 11.72 um. Below 4 nm at 512 pixels the grid
-    is refused, in one line.
-    """
-    at = Directions([-0.1, 0.02], 0.002)
-    errors = []
-    for distance in (2e-2, 1e-3, 1e-4, 1e-5):
-        geometry = CameraGeometry(pixels=16, mask_order=5, mask_distance=distance)
-        ((wave, _),), ((rays, _),) = (shadow_terms(geometry, at, at, 400.0, light) for light in (LINE, None))
-        assert np.isfinite(wave).all() and wave.min() > -1e-9
-        errors.append(float(np.linalg.norm(wave - rays) / np.linalg.norm(rays)))
-    measured(errors[0], at_most=0.2, what="20 um")
-    measured(errors[-1], at_most=1e-3, what="10 nm")
-    for (near, far), (small, large) in zip(pairwise(errors), pairwise((2e-2, 1e-3, 1e-4, 1e-5)), strict=True):
-        assert far / near < 1.3 * math.sqrt(large / small)
-    with pytest.raises(MitsimError, match=r"^mask: its diffraction[^\n]*move the mask off sensor[^\n]*$"):
-        shadow_terms(CameraGeometry(mask_distance=1e-9), at, at, 400.0, LINE)
 
 
 def edge_wave(x: float, product: float) -> mpmath.mpc:
@@ -334,15 +257,6 @@ def edge_wave(x: float, product: float) -> mpmath.mpc:
     with mpmath.workdps(30):
         v = mpmath.mpf(x) * mpmath.sqrt(2 / mpmath.mpf(product))
         return mpmath.mpf(1) / 2 + mpmath.mpc(1, -1) / 2 * mpmath.mpc(mpmath.fresnelc(v), mpmath.fresnels(v))
-
-
-@pytest.mark.parametrize("x", [10.0**k for k in range(-8, 7)])
-def test_fresnel_integrals_keep_their_digits_from_1e_8_to_1e6(measured: Recorder, x: float) -> None:
-    """What waves are made of, against mpmath: 2e-15; of the oscillation 1 / (pi x) at 1e6 nine digits are left."""
-    sine, cosine = fresnel(x)
-    with mpmath.workdps(30):
-        assert abs(sine - mpmath.fresnels(x)) < 1e-16 + 2e-16 * abs(mpmath.fresnels(x))
-        measured(abs(cosine - mpmath.fresnelc(x)), at_most=2.5e-15)
 
 
 @pytest.mark.parametrize(
@@ -410,41 +324,6 @@ def test_a_million_edges_equal_their_sum(measured: Recorder) -> None:
         measured(
             abs(field - complex(math.fsum(terms.real), math.fsum(terms.imag))), at_most=1e-9, what="of an open mask"
         )
-
-
-def exact_waves(geometry: CameraGeometry, step: float) -> np.ndarray:
-    """(pixels,) means of |U|^2 of a wave at normal incidence by the transfer function of free space, not paraxial."""
-    count = 1 << 16
-    s = (np.arange(count) - count / 2 + 0.5) * step
-    bits = mls_mask(order=geometry.mask_order).bits
-    index = np.floor(s / geometry.mask_feature + len(bits) / 2).astype(int)
-    aperture = np.where((index >= 0) & (index < len(bits)), bits[np.clip(index, 0, len(bits) - 1)], 0.0)
-    wavelength, f = NM * 1e-6, np.fft.fftfreq(count, step)
-    root = np.sqrt(np.asarray(1 - (wavelength * f) ** 2, complex))
-    transfer = np.exp(2j * np.pi * geometry.mask_distance / wavelength * (root - 1))
-    upto = np.concatenate(([0.0], np.cumsum(np.abs(np.fft.ifft(np.fft.fft(aperture) * transfer)) ** 2))) * step
-    edges = np.interp(geometry.pixel_edges, np.append(s - step / 2, s[-1] + step / 2), upto)
-    return np.diff(edges) / geometry.pixel_pitch
-
-
-@pytest.mark.parametrize(
-    ("feature", "left"),
-    [(1e-3, 0.05), (2e-3, 0.03), (5e-3, 0.015), (2e-2, 0.01), (0.06, 0.01), (0.2, 0.01), (1.0, 0.01)],
-)
-def test_features_from_a_micrometre_to_a_millimetre(measured: Recorder, feature: float, left: float) -> None:
-    """A mask 0.2 mm away, wave by wave against scalar theory without the paraxial approximation.
-
-    Paraxial waves leave 4 % at 1 um, where light spreads over tangents of 0.5, and 1 % from 20 um on.
-    """
-    # Features of whole steps; the widest mask, 3 mm, fits the 16 mm of the grid.
-    order = 5 if feature <= 0.2 else 2
-    geometry = CameraGeometry(pixels=64, mask_order=order, mask_feature=feature, mask_distance=0.2)
-    at = Directions([0.0], 0.0)
-    ((wave, _),) = shadow_terms(geometry, at, at, math.inf, LINE)
-    exact = exact_waves(geometry, 2.5e-4)
-    assert np.isfinite(wave).all() and wave.min() > -1e-9
-    error = float(np.linalg.norm(wave[:, 0] - exact) / np.linalg.norm(exact))
-    measured(error, at_most=left)
 
 
 @pytest.mark.parametrize(("feature", "warned"), [(5e-4, True), (1e-3, False)])

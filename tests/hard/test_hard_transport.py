@@ -133,12 +133,3 @@ def test_a_capture_flags_fireflies(
         manifest = json.loads((tmp_path / f"run{seed}" / "manifest.json").read_text())
         assert manifest["heaviest_group"] == heaviest
         assert any("fireflies" in warning for warning in manifest["warnings"]) is fireflies
-
-
-@pytest.mark.slow
-def test_ordinary_scenes_have_none(white: Bench, small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    """A sheet, and a plate of roughness 0.1 that adds noise of its own: no warning, shares of plain noise."""
-    for name, bench in (("white", white), ("glossy", open_bench(small_scene(**glossy(0.1))))):
-        result = bench.capture("uniform", tmp_path / name, accuracy=2e-2, seed=1, effects={"diffraction": False})
-        assert not any("fireflies" in warning or "sharp" in warning for warning in result.warnings)
-        assert result.manifest.heaviest_group < 0.72

@@ -265,19 +265,6 @@ def test_a_hostile_frame(folders: tuple[Path, Path], capfd: pytest.CaptureFixtur
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize(
-    ("parts", "header", "words"),
-    [(1, {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}, "tiled"), (2, {}, "several parts")],
-    ids=["tiled", "parts"],
-)
-def test_frames_of_another_make(folders: tuple[Path, Path], parts: int, header: dict[str, Any], words: str) -> None:
-    """The same two refusals for files that OpenEXR itself wrote."""
-    path = folders[0] / "frame_01.exr"
-    pixels = {"DN": np.ones((PIXELS, PIXELS), np.float32)}
-    OpenEXR.File([OpenEXR.Part(dict(header), pixels, name=f"p{i}") for i in range(parts)]).write(str(path))
-    assert words in refusal(lambda: solved(*folders))
-
-
 @pytest.mark.parametrize("compression", ["NO", "RLE", "ZIP", "PIZ", "PXR24", "B44", "DWAB"])
 def test_compressed_frames_of_other_programs_are_read(tmp_path: Path, compression: str) -> None:
     """A constant picture of 1024 x 1024 shrinks most: the guard against bombs must let it pass."""

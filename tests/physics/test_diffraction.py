@@ -9,7 +9,6 @@ frequency leaves on either side is 3e-4, measured by halving both).
 import numpy as np
 import pytest
 from scipy.fft import next_fast_len
-from scipy.integrate import quad
 from scipy.special import fresnel
 
 from mitsim.core.errors import MitsimError
@@ -78,15 +77,6 @@ def pixel_means(values: np.ndarray, s: np.ndarray, low: np.ndarray, high: np.nda
     return (upto(high) - upto(low)) / (high - low)
 
 
-def by_plane_wave(geometry: CameraGeometry, tau: float, depth: float) -> np.ndarray:
-    """(pixels,) means of |U|^2, by a plane wave over the effective distance, at s = u (1 - d/z) + d tau."""
-    d, s = geometry.mask_distance, grid(1 << 16)
-    shrink = 1 - d / depth
-    field = propagated(pattern(code(geometry.mask_order), geometry.mask_feature, s), STEP, d * shrink)
-    edges = geometry.pixel_edges * shrink + d * tau
-    return pixel_means(np.abs(field) ** 2, s, edges[:-1], edges[1:])
-
-
 def by_point_source(
     geometry: CameraGeometry, tau: float, depth: float, paraxial: bool = True, nm: float = LAMBDA_NM
 ) -> np.ndarray:
@@ -111,15 +101,6 @@ def test_a_point_source_equals_its_field_propagated_without_any_scaling(tau: flo
     expected = by_point_source(geometry, tau, 40.0)
     assert relative(left[:, 0], expected) < 1e-3
     assert np.array_equal(left, right)
-
-
-@pytest.mark.parametrize("depth", [10.0, 40.0, 1e9])
-def test_a_point_source_equals_a_plane_wave_over_the_effective_distance(depth: float) -> None:
-    geometry = CameraGeometry(**NEAR)
-    tau = np.array([-0.1, 0.0, 0.07])
-    ((left, _),) = shadow_terms(geometry, Directions(tau, 0.0), Directions([0.0], 0.0), depth, line())
-    for j, one in enumerate(tau):
-        assert relative(left[:, j], by_plane_wave(geometry, one, depth)) < 1e-3
 
 
 @pytest.mark.parametrize(("tau", "left_over"), [(0.0, 0.006), (0.1, 0.016), (0.15, 0.035)])
@@ -180,13 +161,6 @@ def test_the_four_terms_of_a_flatcam_mask_equal_a_field_propagated_in_two_dimens
     assert relative(without, expected) > 0.01, "every term has to matter here"
 
 
-def integral(low: float, high: float) -> complex:
-    """(1 - i)/2 times the integral of exp(i pi w^2 / 2), by quadrature."""
-    real = quad(lambda w: np.cos(np.pi * w * w / 2), low, high, limit=2000, epsabs=1e-10)[0]
-    imaginary = quad(lambda w: np.sin(np.pi * w * w / 2), low, high, limit=2000, epsabs=1e-10)[0]
-    return (1 - 1j) / 2 * (real + 1j * imaginary)
-
-
 def test_a_half_plane_has_a_quarter_at_its_geometric_edge_and_1_37_beside_it() -> None:
     # The other edge is 5 mm away; its wave is faded out there.
     waves = EdgeWaves(LAMBDA_NM, 2.0, STEP, 400, 6.0)
@@ -208,17 +182,6 @@ def test_the_wave_from_an_edge_is_fresnels_integrals() -> None:
 
 def test_lengths_of_transforms_are_scipys() -> None:
     assert [fast_length(n) for n in (*range(1, 2000), 44063)] == [next_fast_len(n) for n in (*range(1, 2000), 44063)]
-
-
-@pytest.mark.parametrize("s", [0.0, 0.021, 0.03, 0.055, -0.2])
-def test_a_slit_is_a_difference_of_two_fresnel_integrals(s: float) -> None:
-    unit = (LAMBDA_NM * 1e-6 * 2.0 / 2) ** 0.5
-    middle = s + STEP / 2
-    expected = integral((-0.03 - middle) / unit, (0.03 - middle) / unit)
-    # Both edges between cells, and the point in the middle of one: no rounding to the grid is left.
-    waves = EdgeWaves(LAMBDA_NM, 2.0, STEP, 1, 6.0)
-    got = waves.field(Steps(np.array([-0.03, 0.03]), np.ones(1)), s)
-    assert abs(got[0] - expected) < 1e-9
 
 
 def test_fringes_that_the_grid_cannot_hold_fade_out() -> None:
@@ -247,16 +210,6 @@ def test_a_range_s_profile_is_part_of_a_wider_one_s(low: float) -> None:
     )
     first = round((start - wide_start) / step)
     np.testing.assert_allclose(part, wide[first : first + len(part)], rtol=0, atol=1e-11)
-
-
-def test_a_thick_mask_s_shadow_in_one_direction_hangs_on_no_other() -> None:
-    """All directions on one side of the axis: the grid of waves must reach the edges that the farthest one sees."""
-    geometry = CameraGeometry(**{**NEAR, "mask_distance": 8.0, "mask_thickness": 0.02, "pixels": 4})
-    tau = np.array([0.1, 0.2, 0.3])
-    ((together, _),) = shadow_terms(geometry, Directions(tau, 0.0), Directions([0.1], 0.0), 40.0, line())
-    for j, one in enumerate(tau):
-        ((alone, _),) = shadow_terms(geometry, Directions([one], 0.0), Directions([0.1], 0.0), 40.0, line())
-        np.testing.assert_allclose(together[:, j], alone[:, 0], rtol=0, atol=1e-11)
 
 
 def test_a_thick_mask_s_grid_is_twice_as_wide_and_each_feature_holds_whole_cells() -> None:
@@ -300,24 +253,7 @@ def test_short_waves_cast_the_geometric_shadow(kind: str) -> None:
     assert found[3] < 8e-3
 
 
-@pytest.mark.parametrize("kind", ["separable", "flatcam", "open"])
-def test_large_features_cast_the_geometric_shadow(kind: str) -> None:
-    geometry = CameraGeometry(mask=kind, pixels=64, pixel_pitch=0.5, mask_order=5, mask_feature=2.0, mask_distance=4.0)
-    at = Directions(np.linspace(-0.5, 0.5, 5), 0.1)
-    wave, rays = shadow_terms(geometry, at, at, 400.0, line()), shadow_terms(geometry, at, at, 400.0)
-    images = [sum(np.einsum("ir,jc->ijrc", left, right) for left, right in terms) for terms in (wave, rays)]
-    assert relative(*images) < 1e-3
-
-
 SCENE = Directions.cells((np.arange(129) - 64) * (120 / 128 / 400))
-
-
-@pytest.mark.parametrize(("nm", "a_side"), [(450.0, 0.231), (550.0, 0.265), (640.0, 0.297)])
-def test_at_the_papers_geometry_diffraction_is_no_detail(nm: float, a_side: float) -> None:
-    """23 to 30 % a side, averaged over a scene pixel: the figures of the feasibility study."""
-    geometry = CameraGeometry()
-    ((wave, _),), ((rays, _),) = (shadow_terms(geometry, SCENE, SCENE, 400.0, light) for light in (line(nm), None))
-    assert relative(wave, rays) == pytest.approx(a_side, abs=2e-3)
 
 
 @pytest.mark.parametrize("distance", [0.5, 2.0, 10.0])
@@ -332,32 +268,6 @@ def test_a_finer_grid_changes_little(monkeypatch: pytest.MonkeyPatch, distance: 
     assert 0 < relative(coarse, fine) < 4e-4
 
 
-def beyond_one_term(terms: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Relative distance of sum_k left_k (x) right_k from its best single separable term; left_k ~ right_k."""
-    terms = [(left, right) for left, right in terms if right.any()]
-    vectors = np.array([right.ravel() for _, right in terms])
-    signs = np.array([np.vdot(left, right) / np.vdot(right, right) for left, right in terms])
-    size, turn = np.linalg.eigh(vectors @ vectors.T)
-    root = turn * np.sqrt(np.maximum(size, 0))
-    values = np.sort(np.abs(np.linalg.eigvalsh(root.T @ np.diag(signs) @ root)))
-    return float((1 - values[-1] ** 2 / np.square(values).sum()) ** 0.5)
-
-
-def test_broadband_light_stays_one_separable_term_to_four_thousandths() -> None:
-    white = Spectrum(np.linspace(400, 700, 13), np.full(13, 1 / 13))
-    terms = shadow_terms(CameraGeometry(), SCENE, SCENE, 400.0, white)
-    assert len(terms) == 13
-    assert beyond_one_term(terms) == pytest.approx(4e-3, abs=5e-4)
-
-
-def test_flatcam_light_is_far_from_one_separable_term() -> None:
-    """Once frames are centred (each row and column of means taken off): 12 % at 450 nm to 18 % at 640 nm."""
-    for nm, expected in ((450.0, 0.12), (640.0, 0.178)):
-        terms = shadow_terms(CameraGeometry(mask="flatcam"), SCENE, SCENE, 400.0, line(nm))
-        centred = [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
-        assert beyond_one_term(centred) == pytest.approx(expected, abs=5e-3)
-
-
 def test_a_hopeless_grid_is_refused() -> None:
     geometry = CameraGeometry(pixels=64, mask_distance=1e-9)
     with pytest.raises(MitsimError, match=r"needs 1.31e\+08 points, .*move the mask off sensor"):
@@ -365,15 +275,14 @@ def test_a_hopeless_grid_is_refused() -> None:
 
 
 @pytest.mark.parametrize("kind", ["separable", "flatcam"])
-@pytest.mark.parametrize("distance", [0.5, 2.0, 8.0])
-@pytest.mark.parametrize("cells", [4, 8])
-def test_interpolated_shadows_are_as_good_as_their_grid(kind: str, distance: float, cells: int) -> None:
+@pytest.mark.parametrize("distance", [0.5, 8.0])
+def test_interpolated_shadows_are_as_good_as_their_grid(kind: str, distance: float) -> None:
     """Between the grid's cells a shadow is interpolated where there are many points: against all points one by one.
 
     Cubic polynomials leave 2e-6 to 3.1e-5, a tenth of the grid's own 3.2e-4; straight lines 3.8e-5 to 1.5e-4.
     """
     shadow = ShadowGeometry.of(CameraGeometry(mask=kind, mask_distance=distance), 400.0)
-    directions = Directions.cells(np.linspace(-0.15, 0.15, 128 * cells + 1))
+    directions = Directions.cells(np.linspace(-0.15, 0.15, 128 * 4 + 1))
     parts, start, step = wave_profiles(shadow, 520.0, -4.4, 4.4, 0.0)
     values = np.stack([profile for _, profile in parts])
     boxes = shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)

@@ -5,9 +5,6 @@ standard deviation taken from the pixels themselves: a box filter makes them ind
 a 1 % error, the test asserts that 1 % is more than twice the gate.
 """
 
-import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -119,46 +116,6 @@ def test_devices_that_move_as_one_see_the_same(small_scene: Callable[..., Path])
     assert np.abs(moved - plain).max() < 0.5 * plain.mean()
     assert np.linalg.norm(moved - plain) < 0.01 * np.linalg.norm(plain)
     assert moved.mean() == pytest.approx(plain.mean(), rel=1e-4)
-
-
-ONE_VARIANT = """
-import json, sys
-import numpy as np
-from pathlib import Path
-from mitsim.api.bench import open_bench
-bench = open_bench(Path(sys.argv[2]), sys.argv[1])
-import mitsuba as mi
-from mitsim.transport.direct import DirectTracer
-frame = np.array(mi.render(bench.loaded.scene, spp=64, seed=1), dtype=np.float64)[..., 0]
-tracer = DirectTracer(bench.setup, 1)
-totals = [tracer.trace(seed, 0, 64).value.sum() / 64 for seed in range(24)]
-print(json.dumps({"reference": [frame.mean(), frame.std(ddof=1) / frame.size**0.5],
-                  "factored": [np.mean(totals), np.std(totals, ddof=1) / 24**0.5]}))
-"""
-
-
-@pytest.mark.slow
-def test_rgb_and_spectral_see_the_grey_of_mono(small_scene: Callable[..., Path]) -> None:
-    path = small_scene(mask="open")
-    expected = {"reference": quadrature(64 * 0.01172 / 2), "factored": quadrature(1e-9)}
-    # Children, because a process must not use objects of one variant under another; side by side to save time.
-    children = {
-        variant: subprocess.Popen(
-            [sys.executable, "-c", ONE_VARIANT, variant, str(path)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for variant in ("llvm_ad_rgb", "llvm_ad_spectral")
-    }
-    for variant, child in children.items():
-        out, err = child.communicate(timeout=600)
-        assert child.returncode == 0, err
-        for estimator, (mean, error) in json.loads(out.splitlines()[-1]).items():
-            # 24 batches: the t distribution of 23 degrees has its 5 sigma at 6.8.
-            gate = (SIGMAS if estimator == "reference" else 6.8) * error + 1e-5 * expected[estimator]
-            assert gate < 0.01 * expected[estimator], f"{variant} {estimator}: too few samples to see 1 %"
-            assert abs(mean - expected[estimator]) < gate, f"{variant} {estimator}"
 
 
 # ---- where things land: a pinhole image, worked out by hand in world coordinates

@@ -27,10 +27,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy import ndimage
 
-from mitsim.api.bench import Bench, open_bench
+from mitsim.api.bench import open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.model import calibrate_model, model_of
@@ -38,33 +37,17 @@ from mitsim.calibrate.session_plan import plan_calibration
 from mitsim.core.configuration import shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job, Limits
-from mitsim.devices.camera import CameraGeometry, centred_edges
+from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Mask, Plate, mls_mask
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import Modelling, load_recipe
 from mitsim.optics.diffraction import wave_terms
 from mitsim.optics.fft_shadow import SampledTerm, geometric_samplers, wave_samplers
-from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
 from mitsim.optics.terms import shadow_terms
 from mitsim.planner.planner import SceneFacts
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.studies.demo import demo
-
-SEEDS = 8
-"""Of the reference: their spread tells the standard error to a quarter."""
-
-
-def slope_of_reference(bench: Bench) -> tuple[float, float, float, float]:
-    """Slope of the reference's frame on the factored one less its mean, and its standard error, of seeds of 128 samples
-    a pixel; means of both frames. Without diffraction and black level, which the reference has not."""
-    factored = bench.render("factored", effects={"diffraction": False, "black-level": False}).mean
-    contrast = factored - factored.mean()
-    seeds = [bench.render("reference", spp=128, seed=seed).mean for seed in range(SEEDS)]
-    slopes = np.array([np.vdot(frame, contrast) / np.vdot(contrast, contrast) for frame in seeds])
-    error = float(slopes.std(ddof=1) / SEEDS**0.5)
-    return float(slopes.mean()), error, float(np.mean(seeds)), float(factored.mean())
-
 
 # -------- A mask off the axis
 
@@ -145,19 +128,6 @@ def test_samplers_of_a_moved_mask_are_a_centred_ones_asked_elsewhere(spectrum: S
             assert np.abs(found - own(s, width)).max() > 0.1 * found.max()
 
 
-@pytest.mark.slow
-def test_the_reference_moves_its_mask_alike(small_scene: Callable[..., Path], variant: str) -> None:
-    """Slope of the reference's frame on the factored one less its mean, 8 seeds of 128 samples a pixel: 1 to five
-    standard errors of their mean; it is 0 +- 0.1 for a mask elsewhere. (Planted: the sign, rows for columns.)"""
-    path = small_scene(mask="separable")
-    offsets = '<float name="mask_offset_row" value="0.3"/> <float name="mask_offset_column" value="-0.54"/>'
-    path.write_text(path.read_text().replace('<float name="fov"', f'{offsets} <float name="fov"', 1))
-    bench = open_bench(path, variant)
-    assert bench.geometry.mask_offset == (0.3, -0.54)
-    slope, error, _, _ = slope_of_reference(bench)
-    assert error < 0.05 and abs(slope - 1) < 5 * error
-
-
 def test_calibrations_of_cameras_without_an_offset_fit_on(small_scene: Callable[..., Path], variant: str) -> None:
     """Their manifests do not know the field: it is in a camera's identity where it is not 0."""
     path = small_scene()
@@ -169,71 +139,6 @@ def test_calibrations_of_cameras_without_an_offset_fit_on(small_scene: Callable[
 
 
 # -------- A thick mask
-
-WIDTH, THICK = 0.06, 0.1
-
-
-def slit(depth: float, thickness: float = THICK) -> ShadowGeometry:
-    """One open feature 2 mm in front of 400 pixels of 0.01 mm, which see all of it."""
-    edges = centred_edges(400, 0.01)
-    return ShadowGeometry(Mask("open", WIDTH, np.ones(1)), (edges[:-1] + edges[1:]) / 2, 0.01, 2.0, thickness, depth)
-
-
-@pytest.mark.parametrize("width", [0.0, 1e-3])
-def test_one_slit_passes_its_width_less_the_wall_shift(width: float) -> None:
-    tau = np.array([-0.65, -0.55, -0.3, -0.1, 0.0, 0.2, 0.59, 0.61])
-    ((left, _),) = geometric_terms(slit(np.inf), Directions(tau, width), Directions([0.0], 0.0))
-    through = left.sum(axis=0) * 0.01 / WIDTH
-    expected = np.maximum(1 - THICK * np.abs(tau) / WIDTH, 0)
-    assert np.allclose(through, expected, rtol=0, atol=1e-9)
-    ((thin, _),) = geometric_terms(slit(np.inf, 0.0), Directions(tau, width), Directions([0.0], 0.0))
-    assert np.allclose(thin.sum(axis=0) * 0.01 / WIDTH, 1, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("tau", [0.0, 0.2, -0.35])
-def test_a_slit_seen_by_a_near_point_keeps_what_both_faces_let_pass(tau: float) -> None:
-    """Edges of both faces projected from the point onto the sensor: the lit part lies between the inner ones."""
-    depth, d = 20.0, 2.0
-    ((left, _),) = geometric_terms(slit(depth), Directions([tau], 0.0), Directions([0.0], 0.0))
-
-    def on_sensor(s: float, plane: float) -> float:
-        return tau * depth + (s - tau * depth) * depth / (depth - plane)
-
-    low = max(on_sensor(-WIDTH / 2, plane) for plane in (d, d + THICK))
-    high = min(on_sensor(WIDTH / 2, plane) for plane in (d, d + THICK))
-    edges = centred_edges(400, 0.01)
-    expected = np.clip((np.minimum(edges[1:], high) - np.maximum(edges[:-1], low)) / 0.01, 0, 1)
-    assert 0.1 < expected.sum() * 0.01 / WIDTH < 1.2
-    assert np.allclose(left[:, 0], expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", ["separable", "flatcam", "open"])
-def test_a_frame_equals_rays_counted_through_both_faces(kind: str) -> None:
-    """A point source: its rays to 40 x 40 points of each pixel, each asked whether both faces let it pass."""
-    geometry = CameraGeometry(
-        pixels=16, pixel_pitch=0.03, mask=kind, mask_order=4, mask_thickness=0.15, scene_distance=30.0
-    )
-    tau_row, tau_column, depth, d = 0.12, -0.16, 30.0, 2.0
-    terms = shadow_terms(geometry, Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth)
-    got = sum(np.outer(left[:, 0], right[:, 0]) for left, right in terms)
-    u = (np.arange(16 * 40) - 320 + 0.5) * 0.03 / 40
-
-    def crossing(tau: float, plane: float) -> np.ndarray:
-        return u + (tau * depth - u) / depth * plane
-
-    mask = geometry.build_mask()
-    rays = np.ones((u.size, u.size))
-    for plane in (d, d + 0.15):
-        rays *= mask.transmission(crossing(tau_row, plane)[:, None], crossing(tau_column, plane)[None, :])
-    counted = rays.reshape(16, 40, 16, 40).mean(axis=(1, 3))
-    # At most two edges a pixel and axis, each placed to half of 1/40.
-    assert np.abs(got - counted).max() < 0.05
-    assert abs(got.mean() - counted.mean()) < 2e-3
-    thin = geometry.model_copy(update={"mask_thickness": 0.0})
-    terms = shadow_terms(thin, Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth)
-    single = sum(np.outer(left[:, 0], right[:, 0]) for left, right in terms)
-    if kind != "open":
-        assert np.abs(single - counted).max() > 0.3, "the second face has to matter"
 
 
 @pytest.mark.usefixtures("variant")
@@ -274,21 +179,6 @@ def test_rendered_frames_are_the_closed_form(kind: str) -> None:
         neutral = CameraGeometry.model_fields[name].default
         other = numbers(closed(geometry.model_copy(update={name: neutral})))
         assert (np.abs(other - 1) > 12 * error).any(), f"{name} has to show"
-
-
-@pytest.mark.parametrize("kind", ["separable", "flatcam"])
-@pytest.mark.parametrize("spectrum", [None, Spectrum([450.0, 640.0], [0.4, 0.6])])
-def test_a_mask_of_next_to_no_thickness_is_a_thin_one(kind: str, spectrum: Spectrum | None) -> None:
-    """Faces a picometre apart: other code, the same frame (the grid of a thick mask's waves is twice as coarse)."""
-    at = Directions(np.linspace(-0.15, 0.15, 5), 2e-3)
-    frames = []
-    for thickness in (0.0, 1e-9):
-        geometry = CameraGeometry(mask=kind, pixels=64, mask_order=6, mask_thickness=thickness)
-        terms = shadow_terms(geometry, at, at, 400.0, spectrum)
-        frames.append(np.asarray(sum(np.einsum("ir,jc->ijrc", left, right) for left, right in terms)))
-    thin, thick = frames
-    error = np.linalg.norm(thick - thin) / np.linalg.norm(thin)
-    assert error < (1e-8 if spectrum is None else 1e-3)
 
 
 @pytest.mark.parametrize("spectrum", [None, Spectrum([550.0], [1.0])])
@@ -352,27 +242,6 @@ def camera_file(folder: Path, name: str, values: np.ndarray | None) -> Path:
         text += f'\n[mask]\nkind = "drawing"\nfeature_mm = 0.06\nfile = "{name}.npy"\n'
     path.write_text(text, encoding="utf-8")
     return path
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["separable", "flatcam"])
-def test_a_drawn_mask_casts_the_named_masks_frames(
-    kind: str, small_scene: Callable[..., Path], variant: str, tmp_path: Path
-) -> None:
-    """Both estimators, diffraction on. The separable mask's one term is its code: to the last bit. FlatCam's two come
-    out as two others of the same sum; of these the reference draws its places in another order."""
-    scene = small_scene(mask=kind, mask_order=8)
-    named, plate, turned = (
-        open_bench(scene, variant, camera_file(tmp_path, name, drawing))
-        for name, drawing in (("named", None), ("plate", drawn(kind, 8)), ("turned", drawn(kind, 8)[::-1]))
-    )
-    assert plate.geometry.mask == "plate" and plate.geometry.centred == named.geometry.centred
-    own, other, expected = (bench.render("factored", accuracy=0.05).mean for bench in (plate, turned, named))
-    np.testing.assert_allclose(own, expected, rtol=0 if kind == "separable" else 1e-6)
-    assert np.linalg.norm(other - expected) > 0.05 * np.linalg.norm(expected)
-    if kind == "separable":
-        own, expected = (bench.render("reference", spp=16).mean for bench in (plate, named))
-        np.testing.assert_array_equal(own, expected)
 
 
 @pytest.mark.parametrize("spectrum", [None, LINES])
@@ -513,27 +382,6 @@ def test_a_model_refuses_masks_that_it_has_not(small_scene: Callable[..., Path],
             model_of(open_bench(small_scene(), variant, path), "geometric")
 
 
-def test_a_bitmap_of_the_mls_mask_casts_its_frames(
-    small_scene: Callable[..., Path], variant: str, tmp_path: Path
-) -> None:
-    """A PNG of black and white, frames to 1e-6. (Planted: rows for columns; grey of 8 bits as 0 to 255.)"""
-    bits = drawn("separable", 8)
-    Image.fromarray((255 * bits).astype(np.uint8)).save(tmp_path / "bitmap.png")
-    path = camera_file(tmp_path, "named", None)
-    named = open_bench(small_scene(mask_order=8), variant, path)
-    text = path.read_text() + '\n[mask]\nkind = "drawing"\nfeature_mm = 0.06\nfile = "bitmap.png"\n'
-    path.write_text(text)
-    bitmap = open_bench(small_scene(mask_order=8), variant, path)
-    at, light = Directions.cells(np.linspace(-0.15, 0.15, 17)), np.random.default_rng(0).random((16, 16))
-    for spectrum in (None, LINES):
-        own, expected = (
-            FrameOptics(bench.geometry, at, at, (400.0,), 1, spectrum).frame(np.arange(256), light.ravel())
-            for bench in (bitmap, named)
-        )
-        np.testing.assert_allclose(own, expected, rtol=1e-6)
-    assert Session(bitmap, load_recipe()).mask_warnings == ()
-
-
 def turned(values: np.ndarray, degrees: float) -> np.ndarray:
     """The drawing turned about its centre, features averaged over 4 x 4 points."""
     fine = ndimage.rotate(values.repeat(4, 0).repeat(4, 1), degrees, reshape=False, order=1)
@@ -593,22 +441,6 @@ def test_waves_behind_flatcam_are_told_to_be_not_separable(small_scene: Callable
     assert Session(open_bench(small_scene(), variant), load_recipe()).mask_warnings == ()
 
 
-@pytest.mark.slow
-def test_a_sessions_factors_predict_the_misfit_behind_flatcam(small_scene: Callable[..., Path], variant: str) -> None:
-    """An even sheet, so that no print is in the misfit: predicted to 5 %, of the session's noise and what terms leave
-    out, and named; 95 % of the image within its uncertainty, less one in twenty by chance of 256 pixels."""
-    bench = open_bench(small_scene(mask="flatcam", pixels=96), variant)
-    factors = bench.calibrate(accuracy=5e-4)
-    assert not factors.ok and len(factors.lacking) >= 2
-    assert factors.manifest.result["shadow_residual"] > 3 * factors.manifest.result["noise_free_residual"]
-    shots = bench.capture("dots:4", accuracy=5e-4)
-    image = reconstruct(shots, factors)
-    assert image.misfit is not None and image.uncertainties is not None and shots.truth is not None
-    assert image.misfit.flagged and "foretells" in str(image.status)
-    assert image.misfit.predicted == pytest.approx(image.misfit.unexplained, rel=0.05)
-    assert (np.abs(image.image - shots.truth) < 1.96 * image.uncertainties.total).mean() > 0.9
-
-
 def test_one_mask_is_stated_once(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
     scene = small_scene()
     scene.write_text(
@@ -620,19 +452,6 @@ def test_one_mask_is_stated_once(small_scene: Callable[..., Path], variant: str,
     assert open_bench(scene, variant, camera).geometry.mask == "plate"
     with pytest.raises(MitsimError, match=r"table \[mask\].*'flatcam'"):
         open_bench(scene, variant, camera, mask="flatcam")
-
-
-@pytest.mark.slow
-def test_the_reference_sees_the_same_random_grey_mask(
-    small_scene: Callable[..., Path], variant: str, tmp_path: Path
-) -> None:
-    """Slope of the reference's frame on the factored one less its mean, 8 seeds of 128 samples a pixel: 1 to five
-    standard errors of their mean."""
-    values = np.random.default_rng(5).random((511, 511)) * (np.random.default_rng(6).random((511, 511)) < 0.4)
-    bench = open_bench(small_scene(), variant, camera_file(tmp_path, "grey", values))
-    slope, error, reference, factored = slope_of_reference(bench)
-    assert error < 0.05 and abs(slope - 1) < 5 * error
-    assert reference == pytest.approx(factored, rel=0.02)
 
 
 @pytest.fixture

@@ -26,7 +26,6 @@ from mitsim.transport import plugins
 from mitsim.transport.connect import ProjectorOptics
 from mitsim.transport.specular import SpecularRays, trace_specular_chains
 from tests.aperture import aperture_scene_parts
-from tests.physics.test_diffraction import by_point_source
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE, REFLECTANCE, D, FEATURE, PITCH = 128, 151250.0, 0.8, 2.0, 0.06, 0.01172
@@ -194,30 +193,6 @@ def test_dots_by_a_mirror(variant: str) -> None:
             for mask, where, dot in ((masks[0], row, i % 7), (masks[1], column, j % 7))
         )
         assert relative(frame, REFLECTANCE * light[0] * np.outer(left, right)) < 1e-3
-
-
-@pytest.mark.slow
-def test_dots_by_a_mirror_that_casts_a_keystone(variant: str) -> None:
-    """Projector pixels lie askew on the sensor pixels. Coarse sensor pixels, each the mean of 64 x 64 parts."""
-    pixels, pitch, fine = 48, 0.125, 64
-    labels = parse_patterns("dots:7", N).lighting.labels
-    normal = tilted(2.0, -1.5)
-    devices, place = MirrorBench((60, 0, 0), 10.0), (30.0, 0.0, 400.0)
-    found = devices.frames(devices.scene(pixels=pixels, pitch=pitch, mirror=mirror(place, normal)), labels)
-    image = devices.mirrored((place, normal))
-    u = ((np.arange(pixels * fine) + 0.5) / fine - pixels / 2) * pitch
-    light, row, column = image.irradiance(u[:, None], u)
-    half = pitch / fine / 2
-    masks = [code_mean(image.shadow(u - half, axis), image.shadow(u + half, axis)) for axis in (0, 1)]
-    light = REFLECTANCE * light * np.outer(*masks)
-    label = labels[np.floor(row).astype(int) * N + np.floor(column).astype(int)]
-    expected = np.stack(
-        [(light * (label == c)).reshape(pixels, fine, pixels, fine).mean(axis=(1, 3)) for c in np.unique(label)]
-    )
-    assert found.classes.tolist() == np.unique(label).tolist()
-    # The points leave 1 / (64 sqrt(12)) of a sensor pixel at each edge of a projector pixel: with 48, 64, 128 of them
-    # the difference is 3.0e-3, 2.2e-3, 1.2e-3.
-    assert relative(found.irradiance, expected) < 3e-3
 
 
 def test_two_mirrors_make_a_periscope(variant: str) -> None:
@@ -497,28 +472,6 @@ def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) ->
     assert specular.sum() > 50 * error, "the reference is sharp enough to tell the specular chain from nothing"
     assert abs((whole - specular).sum() - board.sum()) < 5 * error + 2e-3 * board.sum()
     assert abs(whole.sum() - board.sum()) > 50 * error
-
-
-@pytest.mark.slow
-def test_the_shipped_mirror_in_wave_optics(shipped_bench, variant: str) -> None:
-    """A point source's shadow by its own propagated field, line by line; the mask separates, so does its field."""
-    bench = shipped_bench("mirror")
-    _, light = pipeline_light(bench, diffraction=True)
-    image, u = shipped_image(), centres()
-    irradiance, _, _ = image.irradiance(u[:, None], u)
-    geometry, depth = bench.geometry, float(image.place[2])
-    # Index coordinates of the source over its depth: rows run along -y, columns along -x.
-    taus = -image.place[1] / depth, -image.place[0] / depth
-    lines = zip((638.0, 520.0, 445.0), np.array([0.4757, 0.3348, 0.1895]) * [638.0, 520.0, 445.0], strict=True)
-    shadow, photons = np.zeros((512, 512)), 0.0
-    for nm, share in lines:
-        shadow += share * np.outer(*(by_point_source(geometry, tau, depth, nm=nm) for tau in taus))
-        photons += share
-    specular = SHIPPED * irradiance * shadow / photons
-    found = mirror_part(light)
-    assert relative(found, specular) < 3e-3
-    geometric = [code_mean(image.shadow(u - PITCH / 2, axis), image.shadow(u + PITCH / 2, axis)) for axis in (0, 1)]
-    assert relative(SHIPPED * irradiance * np.outer(*geometric), specular) > 0.1
 
 
 # ---- a projector of finite aperture

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.planner.planner import make_plan
-from tests.hard.hard_light import PLACE, SCALE, SPECULAR, gauss, glossy, lobe
+from tests.hard.hard_light import PLACE, SCALE, SPECULAR, glossy, lobe
 
 N, PIXELS, SIGMAS = 32, 64, 5.0
 ALONE = {"interreflection": False, "diffraction": False}
@@ -172,45 +171,6 @@ def cylinder(alpha: float, sensor: np.ndarray) -> Surface:
     return axis + RADIUS * normal, normal, normal, area
 
 
-def mesh(folder: Path, rings: int, mirror: int, flat: bool) -> Surface:
-    """A ball of 4 rings (rings - 1) triangles, written to ``folder``, each in 60^2 parts.
-
-    ``mirror``: number of that which mirrors the projector into the sensor; ``flat``: without vertex normals.
-    """
-    polar, azimuth = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.arange(2 * rings) * np.pi / rings, indexing="ij")
-    unit = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
-    number = np.arange(unit[..., 0].size).reshape(rings + 1, 2 * rings)
-    first, second = number[:-1], number[1:]
-    ring = [np.roll(each, -1, axis=1) for each in (first, second)]
-    faces = np.concatenate([np.stack([first, second, ring[1]], -1)[:-1], np.stack([first, ring[1], ring[0]], -1)[1:]])
-    faces, unit = faces.reshape(-1, 3), unit.reshape(-1, 3)
-    corners = unit[faces[mirror]]
-    middle = np.cross(corners[1] - corners[0], corners[2] - corners[0]) if flat else corners.mean(axis=0)
-    half = sum((place - BALL) / np.linalg.norm(place - BALL) for place in (np.array([PLACE, 0, 0]), np.zeros(3)))
-    unit = unit @ Rotation.align_vectors([half], [middle])[0].as_matrix().T
-    vertices = BALL + RADIUS * unit
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
-    if not flat:
-        lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in unit]
-    lines += ["f " + " ".join(f"{corner}" if flat else f"{corner}//{corner}" for corner in face + 1) for face in faces]
-    folder.mkdir(exist_ok=True)
-    (folder / "ball.obj").write_text("\n".join(lines) + "\n")
-    # Lobes end long before the others: the rest of the ball would add 1e-8 of their light.
-    faces = faces[unit[faces].mean(axis=1) @ half > 0.9 * np.linalg.norm(half)]
-    a, b = (np.arange(60)[:, None], np.arange(60)[None, :])
-    corners = [
-        np.stack([(a + part) / 60 * np.ones_like(b), (b + part) / 60 * np.ones_like(a)], -1)[a + b < 60 - k]
-        for k, part in ((0, 1 / 3), (1, 2 / 3))
-    ]
-    two = np.concatenate(corners)
-    weights = np.concatenate([1 - two.sum(axis=1, keepdims=True), two], axis=1)
-    across = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
-    normal = np.repeat(across / np.linalg.norm(across, axis=1)[:, None], len(weights), axis=0)
-    area = np.repeat(np.linalg.norm(across, axis=1) / 2 / len(weights), len(weights))
-    point, shading = (np.einsum("kc,fcx->fkx", weights, each[faces]).reshape(-1, 3) for each in (vertices, unit))
-    return point, normal if flat else shading / np.linalg.norm(shading, axis=1)[:, None], normal, area
-
-
 def check_against(
     traced: Callable[..., SampledLight], shape: str, judge: Callable[[np.ndarray], float]
 ) -> SampledLight:
@@ -237,115 +197,9 @@ def test_a_cylinder(traced: Callable[..., SampledLight], alpha: float) -> None:
     assert light.plan.settings.sharp is not None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("rings", "mirror", "flat"), [(18, 600, False), (5, 40, True)])
-def test_a_small_mesh(traced: Callable[..., SampledLight], tmp_path: Path, rings: int, mirror: int, flat: bool) -> None:
-    """1224 faces with vertex normals, and 80 flat ones, each of them a mirror for a part of the sensor or none.
-
-    A highlight near a projector pixel's edge sends its tails from the next one: seen from one anchor they left 8.7e-3
-    where 5e-3 was asked (an icosphere of 1280 faces).
-    """
-    alpha = 5e-3
-    surface = mesh(tmp_path / "scenes", rings, mirror, flat)
-    rough = f'<string name="distribution" value="ggx"/><float name="alpha" value="{alpha}"/>'
-    metal = f'<bsdf type="roughconductor"><string name="material" value="none"/>{rough}</bsdf>'
-    faces = f'<boolean name="face_normals" value="{str(flat).lower()}"/>'
-    shape = f'<shape type="obj"><string name="filename" value="ball.obj"/>{faces}{metal}</shape>'
-    light = check_against(traced, shape, lambda sensor: cast(alpha, sensor, surface))
-    # A flat face is a mirror of one brightness, which ordinary samples tell as cheaply (also at 0.5.0).
-    assert flat or light.plan.settings.sharp is not None
-
-
 # ---- what stands before a sharp lobe
 
 THICK, INDEX = 6.0, 1.5
-
-
-def card(opacity: str) -> str:
-    """A black card of 160 mm, which both ways cross."""
-    place = '<scale x="80" y="80"/><rotate y="1" angle="180"/><translate x="30" z="250"/>'
-    black = '<bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf>'
-    bsdf = f'<bsdf type="mask">{opacity}{black}</bsdf>'
-    return f'<shape type="rectangle"><transform name="to_world">{place}</transform>{bsdf}</shape>'
-
-
-@pytest.mark.slow
-def test_a_sharp_lobe_behind_a_half_open_card(traced: Callable[..., SampledLight]) -> None:
-    """The lobe's own light, a quarter of it (seen failing: where the first surface alone was looked at, 1e-4 of it)."""
-    plate = glossy(1e-3, sheet=False)
-    plate["extra"] += card('<float name="opacity" value="0.5"/>')
-    light = traced(1e-2, **plate)
-    index, place = points(light.bench, 6)
-    expected = 0.25 * np.array([[lobe(1e-3, row, column) for column in place] for row in place])
-    error = float(np.linalg.norm(frame(light)[np.ix_(index, index)] - expected) / np.linalg.norm(expected))
-    assert light.reached and not light.warnings and light.plan.settings.sharp is not None
-    assert error < SIGMAS * predicted(light) < 0.15
-
-
-def behind_panes(alpha: float, row: float, column: float) -> float:
-    """As :func:`lobe`, an upright pane in each way: a ray that is r away on the far side left at the slope that
-    (z - t) tan a + t tan b = r, sin a = n sin b.
-
-    Irradiance is pi scale dp dq / dA on the plate and d omega / dA on the sensor, both by dr / da; each face of glass
-    lets 1 - (R_s + R_p) / 2 through.
-    """
-    z, source = 395.0, np.array([PLACE, 0.0])
-    axes = []
-    for centre, low, high in ((PLACE, 0.0, 60.0), (0.0, -30.0, 30.0)):
-        shift = -column if centre else -row
-        middle = (shift + centre) / 2
-        s, ds = gauss(*(float(np.arcsinh((limit - middle) / z / alpha)) for limit in (low, high)), 200)
-        axes.append((middle + z * alpha * np.sinh(s), z * alpha * np.cosh(s) * ds))
-    (x, dx), (y, dy) = axes
-    point = np.stack(np.broadcast_arrays(x[:, None], y[None, :]), axis=-1)
-    into, dp, passed_in = _through_pane(point - source, z)
-    out, do, passed_out = _through_pane(point - np.array([-column, -row]), z)
-    normal = np.array([0, 0, 1.0])
-    h = (into + out) / np.linalg.norm(into + out, axis=-1)[..., None]
-    cos_i, cos_o, cos_h = (vector @ normal for vector in (into, out, h))
-    tan2 = lambda cosine: 1 / cosine**2 - 1  # noqa: E731
-    d = 1 / (np.pi * alpha**2 * cos_h**4 * (1 + tan2(cos_h) / alpha**2) ** 2)
-    g = [2 / (1 + np.sqrt(1 + alpha**2 * tan2(cosine))) for cosine in (cos_i, cos_o)]
-    f = d * g[0] * g[1] / (4 * cos_i * cos_o)
-    solid = do * cos_o**3  # d omega = cos^3 dp dq
-    return float(np.pi * SCALE * dx @ (f * cos_o * dp * solid * passed_in * passed_out) @ dy)
-
-
-def _through_pane(offset: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit directions back from the plate, tan-angles' area for each area of the plate, and transmittance."""
-    r = np.linalg.norm(offset, axis=-1)
-    slope = r / z
-    for _ in range(40):
-        sine = slope / np.sqrt(1 + slope**2) / INDEX
-        slope = (r - THICK * sine / np.sqrt(1 - sine**2)) / (z - THICK)
-    cosine = 1 / np.sqrt(1 + slope**2)
-    inside = np.sqrt(1 - sine**2)
-    grows = (z - THICK) + THICK * cosine**3 / (INDEX * inside**3)  # dr / d tan a
-    s, p = (cosine - INDEX * inside) / (cosine + INDEX * inside), (INDEX * cosine - inside) / (INDEX * cosine + inside)
-    direction = -offset * (slope / r * cosine)[..., None]
-    return np.concatenate([direction, cosine[..., None]], axis=-1), slope / r / grows, (1 - (s**2 + p**2) / 2) ** 2
-
-
-def pane(x: float) -> str:
-    """In one of the two ways, and beside the place that mirrors the projector into the sensor."""
-    place = f'<scale x="20" y="60" z="{THICK / 2}"/><translate x="{x}" z="100"/>'
-    glass = f'<bsdf type="dielectric"><float name="int_ior" value="{INDEX}"/><float name="ext_ior" value="1"/></bsdf>'
-    return f'<shape type="cube"><transform name="to_world">{place}</transform>{glass}</shape>'
-
-
-@pytest.mark.slow
-def test_a_sharp_lobe_behind_panes(traced: Callable[..., SampledLight], monkeypatch: pytest.MonkeyPatch) -> None:
-    """One pane in each way; without reflections inside of the glass, which are told as left out (some 1e-3)."""
-    monkeypatch.setitem(ALONE, "mirrors", False)
-    plate = glossy(1e-3, sheet=False)
-    plate["extra"] += pane(52) + pane(7.6)
-    light = traced(1e-2, **plate)
-    index, place = points(light.bench, 6)
-    expected = np.array([[behind_panes(1e-3, row, column) for column in place] for row in place])
-    assert expected.mean() == pytest.approx(0.96**4 * SPECULAR * (790 / 786) ** 2, rel=5e-3)
-    error = float(np.linalg.norm(frame(light)[np.ix_(index, index)] - expected) / np.linalg.norm(expected))
-    assert light.reached and light.plan.settings.sharp is not None
-    assert error < SIGMAS * predicted(light) < 0.15
 
 
 @pytest.mark.slow

@@ -8,23 +8,9 @@ from typing import Any
 
 import pytest
 
-from mitsim.devices.session import load_recipe
 from tests.system.refusals import Call, Refused, mentions
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
-
-
-@pytest.mark.slow
-def test_a_plan_prints_what_it_takes_and_writes_its_recipe(call: Call, lab: Any, tmp_path: Path) -> None:
-    options = "--plan", "--psnr", 20, "--patterns", "dots:4", "--json", "--quiet", "-o", tmp_path / "recipe.toml"
-    done = call("calibrate", *lab.arguments, *options)
-    assert done.code == 0, done.err
-    reported = done.payload
-    recipe = load_recipe(tmp_path / "recipe.toml")
-    assert (recipe.exposure_fraction, recipe.repeats) == (reported["exposure_fraction"], reported["repeats"])
-    assert reported["reached"] and 20 <= reported["psnr"] <= 21 < reported["psnr_ceiling"]
-    assert reported["exposure_total_s"] == pytest.approx(reported["frames"] * reported["exposure_s"])
-    assert reported["photons_a_pixel"] > reported["electrons_a_pixel"] > 0 and reported["simulation_s"] > 0
 
 
 def test_a_ceiling_ends_with_status_one_and_a_line(call: Call, lab: Any) -> None:

@@ -11,7 +11,6 @@ import pytest
 
 from mitsim.core.configuration import shipped_path
 from mitsim.core.exr import read_frame
-from tests.system.conftest import tree
 from tests.system.refusals import Call
 from tests.unit.transport.test_path_reuse import WALL
 
@@ -116,53 +115,6 @@ def test_each_line_is_what_a_mono_capture_of_it_gives(
         assert np.linalg.norm(ours - theirs) < 2 * expected * np.linalg.norm(theirs)
         truths = [read_frame(run / "truth.exr")[0]["reflectance"] for run in (tmp_path / "run" / f"{nm}nm", folder)]
         assert truths[0] == pytest.approx(truths[1], abs=2 * ACCURACY)
-
-
-@pytest.mark.slow
-def test_a_grey_lamp_is_in_every_line_what_a_mono_capture_has(
-    call: Call, shell: Call, coloured: Callable[[str], Path], tmp_path: Path
-) -> None:
-    """A flat spectrum has as many photons as its power has at 595 nm, the middle of 360 to 830 nm.
-
-    Frames of lamps alone, in electrons: within twice the errors that both state, but for fringes of other wavelengths,
-    so of the means of 8 x 8 pixels. A line that took its own photons for the lamp's would be off by 7 % and more.
-    """
-    whole, middle = projector(tmp_path / "all.toml", LINES), projector(tmp_path / "middle.toml", {595: 1.0})
-    common = "--patterns", "dots:2", "--accuracy", ACCURACY, "--exposure", 0.02, "-D", "albedo=0.5", "--json"
-    scene, run = coloured("lamp"), tmp_path / "run"
-    reported = shell("capture", scene, "-o", run, "--colour", "lines", "--projector", whole, *common).payload
-    mono = call("capture", scene, "-o", tmp_path / "mono", "--projector", middle, *common, "--seed", 1).payload
-
-    def lamp(folder: Path) -> np.ndarray:
-        return read_frame(folder / "ambient.exr")[0]["electrons"].astype(float).reshape(8, 8, 8, 8).mean(axis=(1, 3))
-
-    expected, frames = lamp(tmp_path / "mono"), electrons(tmp_path / "mono").mean()
-    for channel in reported["channels"]:
-        assert channel["ambient_frame"]["shots"] == 16 and 0.05 < channel["ambient_frame"]["part"] < 0.95
-        error = np.hypot(channel["mc_error"], mono["mc_error"]) * max(frames, electrons(run / channel["name"]).mean())
-        assert np.sqrt(np.square(lamp(run / channel["name"]) - expected).mean()) < 2 * error
-    manifest = json.loads((run / "638nm" / "manifest.json").read_text())
-    assert manifest["configuration"]["lamps_nm"] == [360, 830] and "lamps_nm" not in json.dumps(mono)
-
-
-@pytest.mark.slow
-def test_a_capture_in_colour_goes_on_where_it_stopped(
-    shell: Call, coloured: Callable[[str], Path], tmp_path: Path
-) -> None:
-    """Frames that are lost come back bit for bit, colour.json last; another configuration is refused before work."""
-    whole = projector(tmp_path / "all.toml", LINES)
-    common = "capture", coloured("sheet"), "--colour", "lines", "--projector", whole, "--patterns", "dots:2", "-o"
-    run = tmp_path / "run"
-    assert shell(*common, run, "--accuracy", 0.02).code == 0
-    before = {path: digest for path, digest in tree(run).items() if path.endswith(".exr")}
-    for lost in ("638nm/frame_00002.exr", "445nm/frame_00000.exr", "colour.json"):
-        (run / lost).unlink()
-    assert "holds files already" in shell(*common, run, "--accuracy", 0.02).refusal
-    assert "accuracy" in shell(*common, run, "--accuracy", 0.03, "--resume").refusal
-    assert not (run / "colour.json").exists()
-    assert shell(*common, run, "--accuracy", 0.02, "--resume").code == 0
-    assert {path: digest for path, digest in tree(run).items() if path.endswith(".exr")} == before
-    assert (run / "colour.json").exists()
 
 
 @pytest.mark.slow

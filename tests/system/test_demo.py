@@ -1,11 +1,9 @@
-"""`mitsim demo` on the small scene: it ends, the page stands alone, and the folder is its own."""
+"""`mitsim demo` on the small scene: it ends, and the folder is its own."""
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -15,33 +13,6 @@ from tests.system.refusals import Call
 
 LABELS = ("Uniform", "16 dots", "25 dots", "49 dots", "64 Hadamard")
 FAMILIES = ("uniform", "dots:4", "dots:5", "dots:7", "hadamard:8")
-LINKS = ("src", "href", "srcset", "data", "poster", "action", "xlink:href", "background")
-
-
-class Links(HTMLParser):
-    """Everything in a page that could make a browser fetch something."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-        self.tags: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.found += [value or "" for name, value in attrs if name in LINKS]
-
-
-def assert_self_contained(page: Path) -> str:
-    """The page refers to nothing outside itself; its text."""
-    text = page.read_text(encoding="utf-8")
-    links = Links()
-    links.feed(text)
-    assert not [link for link in links.found if not link.startswith(("data:image/", "#"))]
-    assert not {"script", "link", "iframe", "object", "embed"} & set(links.tags)
-    assert len([link for link in links.found if link.startswith("data:image/png;base64,")]) > 10
-    bare = re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", text)
-    assert not re.search(r"https?://|file://|url\(|@import", bare)
-    return bare
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +38,8 @@ def test_demo_compares_all_families(done: tuple[Path, dict[str, Any]]) -> None:
     assert report["report"] == str(folder / "report.html")
 
 
-def test_the_page_stands_alone_and_shows_every_family(done: tuple[Path, dict[str, Any]]) -> None:
-    text = assert_self_contained(done[0] / "report.html")
+def test_the_page_shows_every_family(done: tuple[Path, dict[str, Any]]) -> None:
+    text = (done[0] / "report.html").read_text(encoding="utf-8")
     for label in (*LABELS, "equal peak", "equal frame", "equal total", "Sensor noise", "Calibration", "Monte Carlo"):
         assert label.lower() in text.lower(), label
 
@@ -93,7 +64,7 @@ def test_a_second_demo_of_ones_own_devices_and_patterns_replaces_the_first(
     options = "--patterns", "dots:2", "-D", "albedo=0.4", "--seed", 1, "--quiet"
     second = call("demo", scene, *lab.electronics, "-o", folder, *options)
     assert second.code == 0 and "4 dots" in second.out and str(folder / "report.html") in second.out
-    page = assert_self_contained(folder / "report.html")
+    page = (folder / "report.html").read_text(encoding="utf-8")
     for words in ("test camera", "test projector", "albedo = 0.4", "4 dots", "exposure (4 dots)"):
         assert words in page, words
     reported = json.loads((folder / "demo.json").read_text())
@@ -104,12 +75,3 @@ def test_a_second_demo_of_ones_own_devices_and_patterns_replaces_the_first(
     gone = {Path("run", f"frame_{index:05d}.exr") for index in range(4, 49)}
     assert now == first - gone, "nothing of the first is left"
     assert json.loads((folder / "run" / "manifest.json").read_text())["configuration"]["seed"] == 1
-
-
-@pytest.mark.slow
-def test_the_shipped_demo(shell: Call, tmp_path: Path) -> None:
-    """The photograph at the default accuracy: 49 dots beat uniform light by at least 8 dB (issue 2)."""
-    outcome = shell("demo", "-o", "demo", "--json", cwd=tmp_path)
-    assert outcome.code == 0 and outcome.err == ""
-    assert outcome.payload["gain_db"] >= 8 and outcome.payload["mc_error"] <= 1e-3
-    assert_self_contained(tmp_path / "demo" / "report.html")

@@ -6,28 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from mitsim.bench.effects import SWITCHES
-from tests.system.refusals import Call, Refused
-
-
-@pytest.mark.parametrize(
-    "verb",
-    [
-        ("plan",),
-        ("capture", "-o", "new", "--patterns", "dots:4"),
-        ("render", "-o", "new.exr", "--estimator", "factored"),
-    ],
-    ids=lambda verb: verb[0],
-)
-@pytest.mark.parametrize("effects", ["fog", "+fog", "ambient", "+ambient,-ambient"])
-def test_effects_that_make_no_sense(refused: Refused, lab: Any, verb: tuple[str, ...], effects: str) -> None:
-    line = refused(*verb, lab.scene, "--effects", effects)
-    assert "--effects" in line and effects in line
-    assert ("both on and off" in line) == ("-ambient" in effects)
-    if "both" not in line:
-        assert all(name in line for name in SWITCHES)
+from tests.system.refusals import Call
 
 
 def test_a_plan_as_json(call: Call, lab: Any) -> None:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 
 from mitsim.core.exr import read_frame
@@ -46,28 +45,6 @@ def assert_resumed(call: Call, lab: Any, run: Path, whole: Path) -> None:
     assert_equal_runs(run, whole)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     assert not (run / LOCK).exists() and not list(run.glob(".*.part"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("how", "words"),
-    [(signal.SIGKILL, "out of memory, or killed from outside"), (signal.SIGABRT, "a crash in native code")],
-)
-def test_a_worker_that_dies_while_it_renders(
-    lab: Any, tmp_path: Path, whole: Path, how: signal.Signals, words: str
-) -> None:
-    """The kernel's out-of-memory killer, and an abort inside LLVM: the parent is left to say so."""
-    run = tmp_path / "run"
-    least = 30 if how == signal.SIGKILL else 0
-    process = running(least or "manifest.json", "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS)
-    (worker,) = psutil.Process(process.pid).children()
-    worker.send_signal(how)
-    done = ended(process)
-    assert done.returncode == 128 + how and done.stdout == ""
-    line = done.stderr.splitlines()[-1]
-    assert line.startswith(f"mitsim: the worker process was ended by {how.name} ({words})") and "--resume" in line
-    # That such a run is resumed is held above: a run that is killed leaves the same.
-    assert len(finished(run, whole)) >= least
 
 
 # ---- disks -----------------------------------------------------------------------------------------------------------
@@ -146,12 +123,6 @@ def test_resume_with_another_version_is_refused(
         assert "resume" in line and "another configuration (versions differ)" in line
 
 
-@pytest.mark.slow
-def test_resume_with_another_variant_is_refused(shell: Call, lab: Any, interrupted: Path) -> None:
-    options = "--patterns", PATTERNS, "--resume", "--variant", "llvm_ad_rgb"
-    assert "(variant differ)" in shell("capture", *lab.arguments, "-o", interrupted, *options).refusal
-
-
 def test_resume_with_another_texture_is_refused(refused: Refused, call: Call, lab: Any, tmp_path: Path) -> None:
     """The scene's XML is the same, the picture that it shows is not."""
     scene = Path(shutil.copytree(lab.scene.parent, tmp_path / "scenes")) / lab.scene.name
@@ -213,13 +184,6 @@ def test_resume_finishes_it(call: Call, lab: Any, interrupted: Path, whole: Path
     assert [path.name for path in interrupted.glob(".*")] == []
 
 
-def test_resume_of_a_finished_run_changes_nothing(call: Call, lab: Any, tmp_path: Path) -> None:
-    run = lab.copy("run", tmp_path / "run")
-    before = {path.name: path.read_bytes() for path in run.glob("*.exr")}
-    assert call("capture", *lab.arguments, "-o", run, "--patterns", "dots:4", "--resume").code == 0
-    assert {path.name: path.read_bytes() for path in run.glob("*.exr")} == before
-
-
 def test_resume_replaces_a_frame_that_was_changed(call: Call, lab: Any, tmp_path: Path) -> None:
     """`reconstruct` refuses such a frame and says: capture it again with --resume."""
     run = lab.copy("run", tmp_path / "run")
@@ -229,26 +193,6 @@ def test_resume_replaces_a_frame_that_was_changed(call: Call, lab: Any, tmp_path
     assert "resume" in call("reconstruct", run, "--calibration", lab.calibration).refusal
     assert call("capture", *lab.arguments, "-o", run, "--patterns", "dots:4", "--resume").code == 0
     assert_equal_runs(run, lab.run)
-
-
-@pytest.mark.parametrize(
-    ("options", "fragment"),
-    [
-        (["--seed", "1"], "seed"),
-        (["--patterns", "dots:2"], "patterns"),
-        (["--accuracy", "0.1"], "accuracy"),
-        (["--exposure", "0.01"], "exposure"),
-        (["--camera", "other.toml"], "sensor"),
-    ],
-    ids=lambda value: value[0] if isinstance(value, list) else None,
-)
-def test_resume_refuses_another_configuration(
-    refused: Refused, lab: Any, tmp_path: Path, options: list[str], fragment: str
-) -> None:
-    (tmp_path / "other.toml").write_text(lab.camera.read_text().replace("6.7", "7.6"))
-    lab.copy("run", tmp_path / "run")
-    line = refused("capture", *lab.arguments, "-o", "run", "--resume", "--patterns", "dots:4", *options)
-    assert "--resume: run holds a run of another configuration" in line and f"({fragment} differ)" in line
 
 
 @pytest.mark.parametrize("text", ['{"kind": "capt', "[]", "{}"])
@@ -278,10 +222,8 @@ def factors(call: Call, wide: tuple[object, ...], tmp_path_factory: pytest.TempP
 @pytest.mark.parametrize(
     ("how", "part"),
     [
-        pytest.param(signal.SIGKILL, "manifest.json", marks=pytest.mark.slow),
         pytest.param(signal.SIGKILL, "light.part.npz", marks=pytest.mark.slow),
         (signal.SIGINT, "stripes.part.npz"),
-        pytest.param(signal.SIGTERM, "stripes.part.npz", marks=pytest.mark.slow),
     ],
 )
 def test_a_calibration_that_is_stopped_loses_no_finished_part(
@@ -290,7 +232,7 @@ def test_a_calibration_that_is_stopped_loses_no_finished_part(
     """While light is traced, after it, and between stripes; `reconstruct` does not take it for a calibration."""
     calibration = tmp_path / "cal"
     done = cut_short(how, part, "calibrate", *wide, "-o", calibration)
-    reported = {signal.SIGINT: "mitsim: interrupted" + RESUME, signal.SIGTERM: "mitsim: ended by SIGTERM" + RESUME}
+    reported = {signal.SIGINT: "mitsim: interrupted" + RESUME}
     assert (done.returncode, done.stderr) == (-how if how == signal.SIGKILL else 128 + how, reported.get(how, ""))
     assert (calibration / part).is_file()
     assert "the calibration is incomplete" in call("reconstruct", lab.run, "--calibration", calibration).refusal

@@ -18,10 +18,6 @@ from tests.taken import RealBench
 from tests.test_docs import blocks, examples, figures
 
 PAGE = "docs/bench.md"
-WHOLE = Path(__file__).resolve().parents[3] / "shared" / "data"
-"""The captures as they are published, too large for the project."""
-OF_COPIES = ("--crop", "1,2,125,155", "--projector-pixels", "64")
-"""What the page's commands say of the reduced copies of FlatCam's captures."""
 
 
 def pictures(folder: Path) -> list[Path]:
@@ -116,29 +112,3 @@ def test_a_diffusercams_capture_leads_to_a_hand(call: Call, tmp_path: Path, monk
     assert np.corrcoef(middle.ravel(), image.ravel())[0, 1] > 0.8, "0.89 of the other solver's"
     shown = np.array(Image.open("hand/reconstruction/image.png"))
     assert shown.max() == 255 and np.median(shown) == 0
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not WHOLE.is_dir(), reason="published captures are not here")
-def test_whole_captures_lead_to_the_same_images(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the walks' commands, but for what is of copies: a FlatCam's planes as the page has them, and a hand that
-    is, with 4 x 4 pixels averaged, that of the copy."""
-    monkeypatch.chdir(tmp_path)
-    Path("captures").symlink_to(WHOLE)
-    for heading in figures.WALKS:
-        figures.put_inputs(heading, Path())
-        for example in examples(PAGE, heading):
-            words = [word for word in example.arguments if word not in OF_COPIES]
-            if "--psf" in words:
-                words += ["--reduce", "4"]
-            assert call(*words, "--quiet").code == example.status, words
-    found = figures.correlations(tmp_path)
-    for name, least in {"r": 0.97, "gb": 0.96, "gr": 0.95, "b": 0.92}.items():
-        assert found[name] > least, found
-    whole = read_frame(Path("hand/reconstruction/image.exr"))[0]["reflectance"]
-    shutil.rmtree("hand")
-    Path("captures").unlink()
-    walk(call, figures.WALKS[1])
-    small = read_frame(Path("hand/reconstruction/image.exr"))[0]["reflectance"]
-    halved = whole.reshape(small.shape[0], 2, small.shape[1], 2).mean(axis=(1, 3))
-    assert np.corrcoef(halved.ravel(), small.ravel())[0, 1] > 0.99

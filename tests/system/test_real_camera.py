@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from mitsim.acquire.exposure import Exposer
-from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import read_frame, write_frame
 from tests.real_session import RealSession, write_image
 from tests.system.refusals import Call, Refused, mentions
@@ -86,24 +83,6 @@ def test_a_folder_made_by_hand_reconstructs(call: Call, tmp_path: Path, signed: 
     assert text.code == 0 and "PSNR" not in text.out
 
 
-def test_files_of_another_program(call: Call, tmp_path: Path) -> None:
-    """Half floats and further channels are read as they are: whole numbers below 2048 are the same in eleven digits."""
-    import OpenEXR
-
-    bench = Bench3(tmp_path)
-    run, calibration = bench.run(False), bench.calibration()
-    path, images = run / "shot 000.exr", []
-    dn = read_frame(path)[0]["DN"]
-    assert 500 < dn.max() < 2048
-    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}
-    other = {"DN": dn.astype(np.float16), "preview": np.zeros(dn.shape, np.float32)}
-    for _ in range(2):
-        assert call("reconstruct", run, "--calibration", calibration, "--overwrite").code == 0
-        images.append(read_frame(run / "reconstruction" / "image.exr")[0]["reflectance"])
-        OpenEXR.File(header, other).write(str(path))
-    assert np.array_equal(*images)
-
-
 def test_the_example_of_the_documentation(call: Call, tmp_path: Path) -> None:
     """The manifest in docs/real_camera.md can be read."""
     text = (Path(__file__).parents[2] / "docs" / "real_camera.md").read_text(encoding="utf-8")
@@ -128,37 +107,6 @@ def test_the_example_of_the_documentation(call: Call, tmp_path: Path) -> None:
 
 
 # ---- a calibration from measured frames ------------------------------------------------------------------------------
-
-
-def test_frames_of_a_session_calibrate_as_the_session_did(
-    call: Call, lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Written as PNG with no more than a camera tells, they give the same image of the same run, to the bit."""
-    frames, shoot = tmp_path / "frames", Exposer.digital
-    frames.mkdir()
-
-    def kept(self: Exposer, electrons: FloatArray, *names: str | int) -> Any:
-        numbers = shoot(self, electrons, *names)
-        write_image(frames / f"{names[1]}_{names[2]}.png", numbers)
-        return numbers
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Exposer, "digital", kept)
-        assert call("calibrate", *lab.arguments, "-o", tmp_path / "simulated").code == 0
-    reported = json.loads((tmp_path / "simulated" / "manifest.json").read_text())
-    listed = {name: reported[name] for name in ("camera", "digital", "board_reflectance")}
-    (frames / "session.json").write_text(json.dumps({**listed, "n": 16, "signed_capture": "pair"}))
-    found = call("calibrate", "--frames", frames, "-o", tmp_path / "measured", "--json").payload
-    assert (found["frames"], found["n"], found["phi_error"]) == (64, 16, None)
-    assert found["predicted_phi_error"] == pytest.approx(reported["result"]["phi_error"], rel=0.3)
-    for name in ("left", "right"):
-        ours, theirs = (read_frame(tmp_path / cal / f"{name}.exr")[0]["factor"] for cal in ("measured", "simulated"))
-        assert np.array_equal(ours, theirs), name
-    for calibration in ("simulated", "measured"):
-        options = "--calibration", tmp_path / calibration, "-o", tmp_path / f"image of {calibration}"
-        assert call("reconstruct", lab.run, *options).code == 0
-    images = (read_frame(tmp_path / f"image of {cal}" / "image.exr")[0] for cal in ("simulated", "measured"))
-    assert np.array_equal(*(image["reflectance"] for image in images))
 
 
 def test_what_the_command_says_of_measured_frames(call: Call, tmp_path: Path) -> None:

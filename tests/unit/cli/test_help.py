@@ -157,16 +157,6 @@ def shown(function: Any) -> dict[str, Any]:
     return {each.name: each.annotation.__metadata__[0] for each in parameters if each.name != "context"}
 
 
-def test_variants_are_listed_by_verbs_that_open_a_scene() -> None:
-    """All other verbs accept the option. (Planted: shown by all.)"""
-    marks = {
-        name: next(each for each in verb.params if each.name == "variant") for name, verb in PROGRAM.commands.items()
-    }
-    opening = ["demo", "run", "view", "plan", "capture", "calibrate", "render", "study", "pairs", "transport", "doctor"]
-    assert {name for name, mark in marks.items() if not mark.hidden} >= {*opening}
-    assert all(marks[name].hidden for name in ("reconstruct", "sense", "characterise", "train", "export", "list"))
-
-
 def test_a_way_to_calibrate_has_a_line_with_its_command() -> None:
     """(Planted: the option of one of them misspelt, which the test of pages finds, too.)"""
     lines = [line for line in page("calibrate").splitlines() if re.match(r"  \w.* {2}mitsim calibrate ", line)]

@@ -39,15 +39,6 @@ def test_prepare_output_for_a_file(tmp_path: Path) -> None:
         files.prepare_output(tmp_path, kind="file")
 
 
-@pytest.mark.parametrize("kind", ["folder", "file"])
-def test_a_place_that_takes_no_files_is_refused(kind: str) -> None:
-    # /proc takes no new files from anyone, root included.
-    if not Path("/proc/self").is_dir():
-        pytest.skip("needs /proc")
-    with pytest.raises(MitsimError, match="output /proc/mitsim"):
-        files.prepare_output(Path("/proc/mitsim"), kind=kind)
-
-
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     path.write_text("old")

@@ -9,7 +9,6 @@ import json
 import os
 import shutil
 import struct
-import subprocess
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -326,32 +325,6 @@ def test_the_papers_variables_are_its_model(case: str, tmp_path: Path) -> None:
             expected = held["phi_left"] @ lit @ held["phi_right"].T
             # Shot and read noise of some 1e4 electrons: 40 DN at most; a wrong scale, sign or order is hundreds.
             assert np.abs(found - expected).mean() < 0.05 * np.abs(expected).mean() + 30
-
-
-OCTAVE = """
-a = load('all.mat');
-X = double(a.truth);
-found = a.data_coded(:,:,1,2) - a.measBg;
-expected = a.phi_left * ((a.PL(:,1) * a.PR(:,2)') .* X) * a.phi_right';
-printf('%.17g %.17g %d %d %s\\n', sum(found(:)), sum(expected(:)), size(found, 1), size(a.PR, 2),
-  class(a.run_manifest));
-"""
-
-
-@pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed")
-@pytest.mark.parametrize("case", ["signed", "ambient"])
-def test_octave_reads_what_is_written(case: str, tmp_path: Path) -> None:
-    bench = made(tmp_path, **CASES[case])
-    export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
-    call = ["octave-cli", "--quiet", "--norc", "--eval", OCTAVE]
-    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found, expected, rows, last, kind = done.stdout.split()
-    held = loadmat(tmp_path / "all.mat")
-    lit = np.outer(held["PL"][:, 0], held["PR"][:, 1]) * held["truth"].astype(np.float64)
-    assert float(found) == pytest.approx(np.sum(held["data_coded"][:, :, 0, 1] - held["measBg"]), rel=1e-12)
-    assert float(expected) == pytest.approx(np.sum(held["phi_left"] @ lit @ held["phi_right"].T), rel=1e-9)
-    assert (int(rows), int(last), kind) == (ROWS, held["PR"].shape[1], "char")
 
 
 def test_a_file_that_is_no_flatcams_is_refused_and_no_folder_is_left(tmp_path: Path) -> None:

@@ -7,10 +7,7 @@ libraries and against closed forms.
 
 from __future__ import annotations
 
-import io
 import json
-import re
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +28,7 @@ from mitsim.core.images import Preparer, read_image, read_images
 from mitsim.core.manifests import Digital
 from mitsim.core.picture_files import PLANES, Crop, Preparation, Wanted, planes_of
 from mitsim.devices.framelist import load_frames
-from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
+from mitsim.exchange.capture_list import load_capture_list
 from mitsim.exchange.packed import import_capture
 from mitsim.reconstruct.captured_session import calibrate_frames
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, made
@@ -305,20 +302,15 @@ LISTS = {
     "a camera's name": ("imx249", "no shipped list has that name; shipped lists are diffusercam, flatcam"),
     "a camera's file": ("full_well_e = 1e4\n", "is a camera's file; give it to --camera"),
     "a session's list": ('signed_capture = "pair"\n', "is the list of a calibration's frames"),
-    "a mistyped field": ('pattern = "dots:2"\n', "pattern: got 'dots:2', no such field; did you mean patterns"),
     "a mistyped field of prepare": ("[prepare]\nturn = 1.0\n", "list.toml: prepare.turn: .* did you mean turn_deg"),
     "no TOML": ("patterns = dots\n", "not valid TOML"),
     "a plane of no mosaic": ('[prepare]\nchannel = "green"\n', "prepare.channel: got 'green'; give 'r'"),
-    "a mosaic without a plane": ('[prepare]\nmosaic = "RGGB"\n', "prepare: mosaic is of planes; give channel too"),
     "a quarter turn": ("[prepare]\nturn_deg = 90.0\n", r"prepare.turn_deg: got 90.0; give a number from -45 to 45"),
-    "half a crop": ("[prepare]\ncrop = {row = -1}\n", r"prepare.crop.row: got -1; give a number at least 0, below"),
     "a flat's dark alone": ('[prepare]\nflat_dark = "a"\n', "flat_dark is taken off a flat; give flat too"),
-    "bits of nothing": ("bits = 12\n", "bits are of digital's numbers; give digital too"),
     "numbers of no camera": (
         "digital = {exposure_s = 1.0, gain_dn_per_e = 1.0, black_level_dn = 0.0, dark_current_e_per_s = 0.0}\n",
         "digital is of a camera; give camera, its name, too",
     ),
-    "an orientation": ("[prepare]\norientation = 9\n", "prepare.orientation: got 9; give 1, 2"),
 }  # fmt: skip
 
 
@@ -377,119 +369,3 @@ def test_a_list_says_what_options_do_not(tmp_path: Path) -> None:
     (folder / "list.json").write_text("\ufeff" + json.dumps(stated))
     result = CliRunner().invoke(app, f"{words} -o {tmp_path / 'run4'}".split())
     assert "its centre is false, and the list's true" in str(result.exception)
-
-
-# -------- Files of other programs
-
-
-# -------- Files that lie, or are of no use
-
-
-def tiff(**how: Any) -> bytes:
-    """A TIFF of 12 x 10 numbers in the high bits of 16."""
-    buffer = io.BytesIO()
-    values = how.pop("values", np.arange(300, 420, dtype=np.uint16).reshape(12, 10) * 16)
-    tifffile.imwrite(buffer, values, **{"photometric": "minisblack", **how})
-    return buffer.getvalue()
-
-
-def lied(tag: int, value: int) -> bytes:
-    """The same, one ``tag`` of whose first page claims another ``value``."""
-    data = bytearray(tiff())
-    start = int.from_bytes(data[4:8], "little")
-    entries = range(start + 2, start + 2 + 12 * int.from_bytes(data[start : start + 2], "little"), 12)
-    (place,) = (entry for entry in entries if int.from_bytes(data[entry : entry + 2], "little") == tag)
-    data[place + 2 : place + 12] = struct.pack("<HII", 4, 1, value)
-    return bytes(data)
-
-
-def picture(mode: str, kind: str, **how: Any) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(np.arange(120, dtype=np.uint8).reshape(12, 10)).convert(mode).save(buffer, kind, **how)
-    return buffer.getvalue()
-
-
-def npy(values: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, values)
-    return buffer.getvalue()
-
-
-NOT_FINITE = np.full((12, 10), np.nan, np.float32)
-HOSTILE = {
-    "palette.png": (picture("P", "png"), "is no grey PNG of 8 or 16 bits"),
-    "transparent.png": (picture("LA", "png"), "is no grey PNG"),
-    "animated.png": (
-        picture("L", "png", save_all=True, append_images=[Image.new("L", (10, 12), 9)]),
-        "is an animated PNG of several",
-    ),
-    "animated.gif": (picture("L", "gif"), "ends in .gif; read are"),
-    "lossy.jpg": (picture("L", "jpeg"), "ends in .jpg; read are"),
-    "demosaiced.png": (picture("RGB", "png"), "save one number a pixel, raw and not demosaiced"),
-    "demosaiced.tif": (
-        tiff(values=np.ones((12, 10, 3), np.uint16), photometric="rgb"),
-        "save one number a pixel, raw and not demosaiced",
-    ),
-    "demosaiced.npy": (npy(np.ones((12, 10, 3), np.uint16)), "holds 12 x 10 pixels of 3 numbers, as of red, green and"),
-    "lossy.tif": (picture("L", "tiff", compression="jpeg"), "cannot be read"),
-    "inks.tif": (picture("CMYK", "tiff"), "is no grey TIFF of 8, 16 or 32 bits"),
-    "transparent.tif": (tiff(values=np.ones((12, 10, 2), np.uint16), extrasamples=["unassalpha"]), "is no grey TIFF"),
-    "double.tif": (tiff(values=np.ones((12, 10))), "is no grey TIFF"),
-    "not finite.tif": (tiff(values=NOT_FINITE), "120 values are not finite"),
-    "no page.tif": (b"II*\0\0\0\0\0", "has 0 pages"),
-    "cut.tif": (tiff()[:-50], "cannot be read"),
-    "gigapixel.tif": (lied(256, 10**6), "gigapixel.tif: "),
-    "orientation 9.tif": (tiff(extratags=[(274, "H", 1, 9, True)]), "has the orientation 9"),
-    "a tiff.dng": (tiff(), "ends in .dng; read are"),
-}  # fmt: skip
-GOOD = {
-    "big-endian.tif": tiff(byteorder=">"),
-    "tiled.tif": tiff(tile=(16, 16)),
-    "tiled, packed.tif": tiff(tile=(16, 16), compression="zlib", predictor=True),
-    "columns first.npy": npy(np.asfortranarray(np.arange(300, 420, dtype=np.uint16).reshape(12, 10) * 16)),
-    "big.tif": tiff(bigtiff=True),
-    "signed.tif": tiff(values=np.arange(300, 420, dtype=np.int16).reshape(12, 10) * 16),
-    "real.tif": tiff(values=np.arange(300, 420, dtype=np.float32).reshape(12, 10) * 16),
-}
-
-
-@pytest.mark.parametrize("name", [*HOSTILE, *GOOD])
-def test_hostile_and_odd_files(name: str, tmp_path: Path) -> None:
-    """Refused with what is wrong, and nothing is left; or read to the number. (Seen: TIFF of JPEG's numbers taken, and
-    red, green and blue of 12 rows for 12 frames.)"""
-    path, output = tmp_path / name, tmp_path / "run"
-    content = HOSTILE[name][0] if name in HOSTILE else GOOD[name]
-    path.write_bytes(content)
-    listed = CaptureList(patterns="uniform", n=4)
-    about = RealCapture(listed, twelve(tmp_path), 0.02, black_level_dn=40.0)
-    if name in HOSTILE:
-        with pytest.raises(MitsimError, match=re.escape(HOSTILE[name][1])):
-            import_capture(path, output, about)
-        assert not output.exists()
-        return
-    result = import_capture(path, output, about)
-    expected = np.arange(300, 420).reshape(12, 10)
-    assert result["divided_by"] == 16
-    assert np.array_equal(ms.load_run(output).dn[0], expected)
-
-
-# -------- Published captures
-
-FLATCAM = Path(__file__).parents[4] / "shared" / "data" / "flatcam"
-
-
-@pytest.mark.skipif(not FLATCAM.is_dir(), reason="published captures are not here")
-@pytest.mark.parametrize("number", [6, 7])
-def test_captures_of_a_flatcam_are_prepared_as_its_authors_do(number: int, tmp_path: Path) -> None:
-    """Planes, turn and crop by skimage, as in their loader, to single precision; 10 bits in the high ones of 16."""
-    words = f"import {FLATCAM / f'fc_{number}.png'} --list flatcam -o {tmp_path / 'run'} --json"
-    result = CliRunner().invoke(app, words.split())
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["divided_by"] == 64
-    with Image.open(FLATCAM / f"fc_{number}.png") as capture:
-        stored = np.array(capture) / 64.0
-    for name, (row, column) in {"b": (0, 0), "gb": (0, 1), "gr": (1, 0), "r": (1, 1)}.items():
-        plane = warp(stored[row::2, column::2], SimilarityTransform(rotation=0.00174))[6:506, 10:630]
-        run = ms.load_run(tmp_path / "run" / name)
-        assert np.abs(run.dn[0] - plane).max() < 1e-3
-        assert run.manifest.camera == {"name": "FlatCam prototype", "channel": name}

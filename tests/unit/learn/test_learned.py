@@ -22,7 +22,7 @@ from mitsim import verbs
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
-from mitsim.learn import networks, requests
+from mitsim.learn import networks
 from mitsim.learn.networks import Data, Diagonal, LearnedSolver, Trained, UNet, train_network
 from mitsim.learn.requests import METHODS, Training
 from mitsim.metrics import psnr
@@ -440,18 +440,6 @@ def test_a_file_that_is_none_is_refused(damage: str, model: LearnedSolver, tmp_p
     with pytest.raises(MitsimError, match=r"m\.pt") as refused:
         verbs.load_network(path)
     assert "\n" not in str(refused.value)
-
-
-def test_without_torch_a_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(requests, "find_spec", lambda name: None)
-    (tmp_path / "m.pt").touch()
-    (tmp_path / "calibration").mkdir()
-    for work in (
-        lambda: verbs.load_network(tmp_path / "m.pt"),
-        lambda: verbs.train("unrolled", tmp_path, tmp_path / "n.pt"),
-    ):
-        with pytest.raises(MitsimError, match="torch is not installed, which networks need; type: pip install"):
-            work()
 
 
 def test_a_request_says_what_no_network_is_trained_by() -> None:

@@ -364,63 +364,6 @@ def test_drawn_pictures_are_as_natural_ones_are() -> None:
     assert (abs(np.diff(pictures, axis=1)) > 1 / 3).mean() < 0.01
 
 
-class Draws:
-    """Random numbers that are written down: each is a part of its range."""
-
-    def __init__(self, *parts: float | list[float]) -> None:
-        self._parts = list(parts)
-
-    def uniform(self, low: float, high: float, size: int | None = None) -> Any:
-        return low + (high - low) * np.array(self._parts.pop(0))
-
-    def random(self, size: int | None = None) -> Any:
-        return np.array(self._parts.pop(0)) * np.ones(size or ())
-
-    def integers(self, low: int, high: int, size: int) -> Any:
-        return np.zeros(size, int)
-
-
-@pytest.mark.parametrize(("kind", "area", "spread"), [(0.5, np.pi, 1 / 4), (0.2, 4, 1 / 3)], ids=["ellipse", "box"])
-def test_a_leaf_is_a_turned_ellipse_or_box_with_a_slope(
-    kind: float, area: float, spread: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The largest leaf of half the width, turned by 60 degrees: its area, its second moments and its shade.
-    (Planted: another power; rows for columns; a shade of one slope.)"""
-    monkeypatch.setattr(pairs_module, "_COVERED", 0)  # one leaf, as wide as the largest
-    side, place, turn, shape = 300, np.array([0.45, 0.55]), 1 / 3, 0.5
-    across, half = side * 0.35, np.array([0.75, 0.25])
-
-    def drawn(*slopes: float) -> np.ndarray:
-        canvas = np.zeros((side, side))
-        parts = (0.5, 0.0, 0.0, 1.0, list(place), (shape - 0.4) / 0.6, turn, kind, 1.0, list(slopes), 0.0)
-        pairs_module._lay_leaves(canvas, np.zeros((side, side)), cast(Any, Draws(*parts)))
-        return canvas
-
-    even = drawn(0.5, 0.5)
-    assert even.sum() == pytest.approx(area * shape * across**2, rel=0.01) and even.max() == 1.0
-    points = np.stack(np.mgrid[:side, :side], axis=-1) - place * side
-    turned = np.array([[np.cos(np.pi * turn), -np.sin(np.pi * turn)], [np.sin(np.pi * turn), np.cos(np.pi * turn)]])
-    moments = np.einsum("ij,ijk,ijl->kl", even, points, points) / even.sum()
-    expected = turned @ np.diag([1, shape**2]) @ turned.T * spread * across**2
-    assert moments == pytest.approx(expected, abs=0.02 * spread * across**2)
-    shades = 2 * 0.25 * (half - 0.5) / (2 * across)  # grey a point
-    assert drawn(*half) == pytest.approx(even * (1 + points @ shades), abs=1e-9)
-
-
-def test_stripes_have_edges_of_one_point() -> None:
-    """Of 9 points at 45 degrees in the smallest box, 90 points across: 14 edges along a row, as much dark as bright,
-    and one point of each stripe between them. (Planted: waves in place of stripes; a larger box; turned the other way;
-    stripes of another width.)"""
-    canvas = np.full((450, 450), 0.5)
-    pairs_module._lay_stripes(canvas, cast(Any, Draws([0.5, 0.0], 0.0, 0.0, 0.0, 0.25, [0.8, 0.2])))
-    box = canvas[112:202, :90].copy()
-    canvas[112:202, :90] = 0.5
-    assert np.all(canvas == 0.5) and box[1:, :-1] == pytest.approx(box[:-1, 1:], abs=1e-9)
-    assert box.mean() == pytest.approx(0.5, abs=0.01) and (box.min(), box.max()) == (0.2, 0.8)
-    assert np.count_nonzero(np.diff(box[0] > 0.5)) == 14
-    assert ((box > 0.2 + 1e-9) & (box < 0.8 - 1e-9)).mean() == pytest.approx(1 / 9, abs=0.02)
-
-
 def test_the_amplitude_of_texture_falls_as_one_over_the_frequency() -> None:
     """The mean over 30 fields, to 5 % in its slope. (Planted: the power, not the amplitude.)"""
     fields = np.array([pink_noise(SIDE, stream(0, "field", number)) for number in range(30)])

@@ -292,16 +292,6 @@ def test_a_flat_scene_needs_no_layers(small_scene: Callable[..., Path]) -> None:
     assert found.effects["interreflection"] == (0, 0) and "ambient" not in found.effects
 
 
-@pytest.mark.usefixtures("soon_dark")
-def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> None:
-    away = open_bench(small_scene(projector_turn='<rotate y="1" angle="180"/>'))
-    with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
-        measured(away, seed=0)
-    black = open_bench(small_scene("black"), albedo="0")
-    with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
-        measured(black, seed=0)
-
-
 def test_a_mask_that_is_closed_before_the_sensor_is_refused(small_scene: Callable[..., Path]) -> None:
     """Its features are wider than the sensor sees, and the middle one is closed: it was a division by zero."""
     with pytest.raises(MitsimError, match=r"no light of the projector passes the mask.* features are 40 mm wide"):

@@ -274,11 +274,6 @@ def test_readings_that_fit_alike_are_all_listed() -> None:
     assert any("transposed" in each for each in words) and any("column-major" in each for each in words)
 
 
-def test_exchanged_halves_of_all_pairs() -> None:
-    cause, words = reported("hadamard:4", lambda frames: [frames[number ^ 1] for number in range(len(frames))])
-    assert cause is Cause.READING and "halves-exchanged" in words[0]
-
-
 def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
     """Gloss and depth."""
     place = np.linspace(-1, 1, 96)

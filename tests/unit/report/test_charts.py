@@ -22,10 +22,9 @@ import mitsim as ms
 from mitsim.acquire.capture import Rendered
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import lightness, linear_light
-from mitsim.report import plots
 from mitsim.report.folder_page import Trust
 from mitsim.report.pages import Mean, round_to_error, scientific, typeset
-from mitsim.report.plots import curves, grouped_bars, image_grid
+from mitsim.report.plots import curves, grouped_bars
 from tests.exchanged import made
 from tests.unit.planner.test_choice import plan as invented_plan
 
@@ -52,16 +51,6 @@ def test_a_curve_without_points_keeps_its_colour_from_others() -> None:
     assert [text.get_text() for text in without.legends[0].get_texts()] == ["a", "c"]
 
 
-def test_a_grid_has_a_title_of_its_own_and_one_for_each_column() -> None:
-    """(Planted: the last column's for the whole.)"""
-    cells = [(np.full((4, 4), value), f"{value} dB") for value in (0.2, 0.8)]
-    figure = image_grid({"one": cells, "two": cells}, ["a", "b"], "all of them")
-    assert figure.get_suptitle() == "all of them"
-    assert [axes.get_title() for axes in figure.axes] == ["a", "b", "", ""]
-    assert [axes.get_xlabel() for axes in figure.axes] == ["0.2 dB", "0.8 dB"] * 2
-    assert [axes.get_ylabel() for axes in figure.axes] == ["one", "", "two", ""]
-
-
 def test_an_error_that_nobody_knows_is_no_bar_of_zero() -> None:
     """(Planted: zeros for what is not known, whose caps look like a sure number.)"""
     single, several = (
@@ -73,22 +62,6 @@ def test_an_error_that_nobody_knows_is_no_bar_of_zero() -> None:
     both = grouped_bars({"mask, 2 um": pair}, "lost [dB]")
     assert [container.has_xerr for container in both.axes[0].containers if hasattr(container, "has_xerr")] == [True]
     assert [tick.get_text() for tick in both.axes[0].get_yticklabels()] == ["mask, 2 \N{GREEK SMALL LETTER MU}m"]
-
-
-def test_what_an_image_has_lost_and_would_lose_are_told_apart() -> None:
-    """Each kind of bar has its colour. (Planted: one colour.)"""
-    groups = {
-        "noise": {"has lost": Mean(2.0, 0.1, 1)},
-        "b": {"would lose": Mean(3.0, 0.1, 1)},
-        "a": {"would lose": Mean(1.0, 0.1, 1)},
-    }
-    (axes,) = grouped_bars(groups, "lost [dB]").axes
-    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["noise", "b", "a"], "from the top"
-    legend = axes.get_legend()
-    assert legend and [text.get_text() for text in legend.get_texts()] == ["has lost", "would lose"]
-    assert len({patch.get_facecolor() for patch in axes.patches}) == 2
-    single = grouped_bars({"noise": groups["noise"]}, "lost [dB]").axes[0]
-    assert single.get_legend() is None
 
 
 def curve(*points: tuple[float, float]) -> dict[float, Mean]:
@@ -203,12 +176,6 @@ def test_stated_and_actual_errors_share_one_scale() -> None:
     assert np.abs(np.asarray(Image.open(BytesIO(stated.data))).astype(float) - colour).max() < 0.51
 
 
-def test_singular_values_are_sorted_and_relative_to_the_largest() -> None:
-    line = plots.singular_values({"a": [1.0, 4.0, 2.0, 0.0]}).axes[0].lines[0]
-    assert np.array_equal(np.asarray(line.get_ydata()), [1.0, 0.5, 0.25, 0.0])
-    assert np.array_equal(np.asarray(line.get_xdata()), [25.0, 50.0, 75.0, 100.0])
-
-
 def test_no_pyplot_is_loaded() -> None:
     program = (
         "import sys; from mitsim.report import plots; plots.singular_values({'a': [2.0, 1.0]});"
@@ -301,16 +268,6 @@ def test_a_drawing_for_a_paper_is_written_as_three_files(results: tuple[Any, Any
     (bar,) = (other for other in own.figure.axes if other is not own)
     assert bar.get_ylabel().replace("\n", " ") == "reflectance, 1 = board, shown by the sRGB curve"
     assert bar.yaxis.label.get_window_extent().height <= own.figure.bbox.height
-
-
-def test_a_wide_figure_for_a_paper_has_two_columns() -> None:
-    """(Planted: one column for all.)"""
-    grid = image_grid({"": [(np.zeros((2, 2)), "")] * 5}, list("abcde"))
-    plots.style_figure(grid, "paper")
-    lines = curves({"": {"a": {"1": Mean(1.0, 0.1, 2), "2": Mean(1.0, 0.1, 2)}}}, "x [mm]")
-    plots.style_figure(lines, "paper")
-    assert [round(25.4 * each.get_figwidth(), 3) for each in (grid, lines)] == [183, 89]
-    assert lines.axes[0].containers[0].lines[0].get_linewidth() == pytest.approx(0.99)
 
 
 def test_what_is_not_known_is_not_drawn(results: tuple[Any, Any, Any]) -> None:

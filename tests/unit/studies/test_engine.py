@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from mitsim.report import MODELS
 from mitsim.report.pages import Mean, Value
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework import claims
-from mitsim.studies.framework.campaign import Where, batches, run_experiment
+from mitsim.studies.framework.campaign import batches
 from mitsim.studies.framework.claims import (
     UNDECIDED,
     Gain,
@@ -34,7 +33,7 @@ from mitsim.studies.framework.claims import (
     with_intervals,
 )
 from mitsim.studies.framework.experiment import IMAGE, TRUTH, Axes, Claim, Results, Scope, Setup, find_experiment
-from mitsim.studies.framework.panels import Bars, Images, Lines, flag_warnings, section_of, write_page
+from mitsim.studies.framework.panels import Images, Lines, flag_warnings, section_of, write_page
 from mitsim.studies.framework.studio import flags_of
 from mitsim.studies.light_studies import ERROR_SOURCES
 from mitsim.verbs import StudyOptions, scope_of
@@ -206,19 +205,6 @@ def test_lines_have_a_figure_for_each_value_and_rows_that_begin_every_curve() ->
     assert Lines("count", "frames [1]", where={"kind": "none"}).draw(Results(rows)) == {}
 
 
-def test_bars_are_in_order_of_the_table_or_of_their_length() -> None:
-    rows = [
-        {"what": what, "model": model, "psnr_db": level}
-        for what, level in (("short", 10.0), ("long", 30.0))
-        for model in ("idealised", "rendered")
-    ]
-    for ordered, names in ((False, ["short", "long"]), (True, ["long", "short"])):
-        (figure,) = Bars("what", ordered=ordered).draw(Results(rows)).values()
-        axes = figure.axes[0]
-        assert [text.get_text() for text in axes.get_yticklabels()] == names
-        assert len(axes.patches) == 4 and axes.get_xlabel() == "PSNR [dB]"
-
-
 def test_images_of_several_arrays_stand_side_by_side() -> None:
     """Of the first row of each group that kept them; a caption without its number is empty. (Planted: the number of
     another row.)"""
@@ -353,14 +339,6 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
     ]  # fmt: skip
 
 
-def test_a_page_states_the_accuracy_that_light_was_traced_to() -> None:
-    """(Planted: that of the scope, three times as fine.)"""
-    experiment = find_experiment("reflectivity")
-    point = experiment.points(WHOLE)[0]
-    results = Results([{"point": point.key}])
-    assert "good to 0.003 " in section_of(experiment, "reflectivity", (), {}, replace(results, scope=WHOLE)).count
-
-
 def test_figures_of_gloss_have_each_image_under_its_title() -> None:
     """(Seen failing: the truths twice in a row, more images than titles.)"""
     names = ["matt paint", "apparent", "49 dots", *ERROR_SOURCES]
@@ -443,22 +421,3 @@ def test_the_means_of_a_sweep_have_student_intervals() -> None:
 def test_a_sweep_that_cannot_be_read_is_one_line(text: str) -> None:
     with pytest.raises(MitsimError, match=f"--over {re.escape(repr(text))}: "):
         StudyOptions(over=[text]).varied  # noqa: B018
-
-
-@pytest.mark.slow
-def test_a_sweep_of_a_small_scene(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
-    """A sheet at three depths under two families: six rows; misfit is least where the calibration was made. (Planted:
-    the parameter left at the scene's own.)"""
-    path = small_scene(sheet_z="$sheet_z", reflectance=np.random.default_rng(1).integers(20, 230, (48, 48)))
-    path.write_text(path.read_text().replace("<default", '<default name="sheet_z" value="400"/> <default', 1))
-    setup = Setup(str(path), variant=variant, accuracy=1e-2)
-    swept = (("patterns", ("dots:2", "dots:4")), ("sheet_z", ("380", "400", "420")))
-    scope = Scope(setup, (None,), sweep=swept, measures=("psnr", "misfit"))
-    found = run_experiment("sweep", scope, tmp_path / "out", where=Where(jobs=1))
-    assert found.figures == ("images.png", "psnr.png", "misfit.png") and found.points == 6
-    for patterns in ("dots:2", "dots:4"):
-        rows = {row["sheet_z"]: row for row in found.rows if row["patterns"] == patterns}
-        assert min(rows, key=lambda depth: rows[depth]["misfit"]) == "400"
-        assert max(rows, key=lambda depth: rows[depth]["psnr_db"]) == "400"
-    with pytest.raises(MitsimError, match="nothing is varied"):
-        run_experiment("sweep", Scope(setup, (None,)), tmp_path / "none")

@@ -19,7 +19,6 @@ from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.records import (
-    AMBIENT,
     DIRECT,
     INDIRECT,
     Bundle,
@@ -220,27 +219,6 @@ def grid(bench: Bench) -> CellGrid:
 
 def camera_tracer(bench: Bench, **followed: object) -> FromCameraTracer:
     return FromCameraTracer(bench.setup, grid(bench), Paths(**followed))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("interreflection", [False, True])
-def test_an_even_sky(outdoors: Bench, interreflection: bool) -> None:
-    """The sheet of albedo 0.5 shows half of the sky's radiance, and where the sheet ends is the sky itself.
-
-    With bounces a path finds the sky in two ways (by connecting and by running into it), which share the light.
-    """
-    stop, sheet = outdoors.geometry.tan_half_fov, 64 / 400
-    expected = 2 * seen(stop) - seen(sheet)
-    trace = camera_tracer(outdoors, interreflection=interreflection, emitters=outdoors.loaded.lamps)
-    found = [trace.trace(seed, 0, 128) for seed in range(SEEDS)]
-    assert all((one.kind == AMBIENT).all() and (one.pixel == N * N).all() for one in found)
-    total, error = mean(np.array([one.value.sum() / 128 for one in found]))
-    assert SIGMAS * error < 0.03 * expected
-    assert abs(total - expected) < SIGMAS * error
-    one = PathSamples.join(found)
-    on_sheet = (np.abs(one.row) < sheet) & (np.abs(one.column) < sheet)
-    assert one.value[on_sheet].sum() / (128 * SEEDS) == pytest.approx(seen(sheet), rel=0.02)
-    assert 1 / one.inverse_depth[on_sheet] == pytest.approx(np.full(on_sheet.sum(), 400.0), rel=1e-5)
 
 
 def test_light_that_the_projectors_side_finds_is_not_followed(hollow: Bench) -> None:
