@@ -130,17 +130,6 @@ def test_frames_do_not_depend_on_threads_or_process(
 
 
 @pytest.mark.slow
-def test_neither_do_large_ones(
-    small_scene: Callable[..., Path], tmp_path: Path, threads: Callable[[int], object]
-) -> None:
-    """Arrays of more than 10 000 numbers, which BLAS shares among its threads; 49 classes mixed."""
-    path = small_scene(extra=LAMP_AND_BOX, n=112, pixels=160)
-    found = runs(open_bench(path, for_render=True), "hadamard:4", 2e-2, tmp_path, threads)
-    for other in found[1:]:
-        assert {name for name in other if other[name] != found[0][name]} == set()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["photograph", "gift_card", "corner", "cookie_bag"])
 def test_neither_do_those_of_shipped_scenes(tmp_path: Path, threads: Callable[[int], object], name: str) -> None:
     """On a sensor of 128 pixels, with a cache of kernels and without."""

@@ -14,9 +14,9 @@ from mitsim.scene.check import DIRECTED, LIMITS
 from mitsim.transport.plugins import materials
 
 pytestmark = pytest.mark.usefixtures("variant")
-STEP = 0.0025
+STEP = 0.005
 ROUNDING = 1e-4
-"""A lobe of sigma 4 steps summed on the grid is right to 1e-6, the Lambertian disc to 1e-5; float32 adds some."""
+"""A lobe of sigma 2 steps summed on the grid is right to 1e-6, the Lambertian disc to 1e-5; float32 adds some."""
 WHITE = {"type": "diffuse", "reflectance": 1.0}
 CASES: dict[str, list[dict[str, Any]]] = {
     "mitsim_grating": [

@@ -316,38 +316,6 @@ def test_the_unchanged_light_gives_the_unchanged_frame(compare: Compare) -> None
     assert np.allclose(pair.of_changed_light(lambda light: light), pair.factored, rtol=1e-10)
 
 
-def one_layer_shifted(pair: Pair) -> np.ndarray:
-    """The nearest layer's light, and that alone, one cell to the right."""
-
-    def change(light: np.ndarray) -> np.ndarray:
-        if len(light) < len(pair.plan.settings.depths):  # light that is accumulated in one layer for all depths
-            return light
-        return np.concatenate([light[:-1], np.roll(light[-1:], 1, axis=4)])
-
-    return pair.of_changed_light(change)
-
-
-class NothingInTheWay:
-    """A scene in which nothing hides a lit surface from the camera."""
-
-    def __init__(self, scene: object) -> None:
-        self.scene = scene
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.scene, name)
-
-    def ray_test(self, ray: object, active: object = True) -> object:
-        import mitsuba as mi
-
-        return mi.Bool(False)
-
-
-def without_occlusion(pair: Pair) -> np.ndarray:
-    """Light as if the camera saw the far card through the near one."""
-    loaded = replace(pair.bench.loaded, scene=NothingInTheWay(pair.bench.loaded.scene))
-    return frame_of(replace(pair.bench, loaded=loaded), pair.plan, pair.shown)[0]
-
-
 def of_other_scene(pair: Pair, bench: Bench) -> np.ndarray:
     return frame_of(bench, pair.plan, pair.shown)[0]
 
@@ -371,30 +339,6 @@ def test_a_missing_lamp_is_seen(compare: Compare) -> None:
 def test_two_percent_are_seen(compare: Compare, case: Case, factor: float) -> None:
     pair = compare(case)
     _, z = worst(z_scores(pair, factor * pair.factored))
-    assert abs(z) > LIMIT
-
-
-@pytest.mark.slow
-def test_missing_occlusion_is_seen(compare: Compare) -> None:
-    pair = compare(CARDS)
-    _, z = worst(z_scores(pair, without_occlusion(pair)))
-    assert abs(z) > LIMIT
-
-
-@pytest.mark.parametrize("case", [LONG_CORNER, LONG_CARDS], ids=str)
-def test_a_layer_one_cell_off_is_seen(compare: Compare, case: Case) -> None:
-    pair = compare(case)
-    _, z = worst(z_scores(pair, one_layer_shifted(pair)))
-    assert abs(z) > LIMIT
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("card", ["front_z", "back_z"])
-def test_a_card_at_another_depth_is_seen(compare: Compare, shipped_bench: Open, card: str) -> None:
-    """The near card 20 mm nearer, the far one 20 mm farther."""
-    place = {"front_z": "350", "back_z": "450"}[card]
-    pair = compare(CARDS)
-    _, z = worst(z_scores(pair, of_other_scene(pair, shipped_bench("cards", **{card: place}))))
     assert abs(z) > LIMIT
 
 

@@ -5,10 +5,9 @@ equal). In a *corner* of two diffuse walls the radiosity equation is solved nume
 (:mod:`tests.physics.radiosity`). Inside a diffuse *sphere* light of two and more reflections has a closed form: it is
 the same everywhere, wherever the projector shines.
 
-An estimator is a function from a scene file to :class:`Measured`; ESTIMATORS lists those under test. Light of one
-reflection and of more are gated apart. Gates are SIGMAS standard errors of the estimator plus the judge's own error;
-five sigma is a chance of 6e-7 a comparison, of which there are some 70. Each test asserts that its gate is narrow
-enough to see the mistake it is there for. Seeds are fixed.
+Light of one reflection and of more are gated apart. Gates are SIGMAS standard errors of the estimator plus the judge's
+own error; five sigma is a chance of 6e-7 a comparison. Each test asserts that its gate is narrow enough to see the
+mistake it is there for. Seeds are fixed.
 """
 
 import re
@@ -51,30 +50,6 @@ class Measured:
     more_error: np.ndarray
 
 
-def path(scene: Path, spp: int, seed: int) -> Measured:
-    """Mitsuba's ``path``. Runs of one seed share each path's first reflection, so it cancels in total - direct."""
-    import mitsuba as mi
-
-    from mitsim.acquire.capture import show_pattern
-    from mitsim.api.bench import open_bench
-
-    bench = open_bench(scene, for_render=True)
-    family = bench.family(f"dots:{K}", 0)
-    integrators = [mi.load_dict({"type": "path", "max_depth": depth}) for depth in (2, -1)]
-    found = []
-    for index, capture in enumerate(family.shots):
-        with show_pattern(bench, family.light(capture)):
-            one, total = (
-                np.array(
-                    mi.render(bench.loaded.scene, integrator=i, sensor=bench.loaded.camera, spp=spp, seed=seed + index)
-                ).reshape(2, PIXELS // 2, 2, PIXELS // 2)
-                for i in integrators
-            )
-        # A box filter makes pixels independent, and falloff within a quadrant is far below their noise.
-        found.append([(f.mean(axis=(1, 3)), f.std(axis=(1, 3)) / (PIXELS // 2)) for f in (one, total - one)])
-    return Measured(*np.array(found, dtype=np.float64).transpose(1, 2, 0, 3, 4).reshape(4, K**2, 2, 2))
-
-
 def factored(scene: Path, spp: int, seed: int) -> Measured:
     """The factored estimator: light accumulated and made into frames as a capture does, in GROUPS independent parts.
 
@@ -108,9 +83,6 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
     values = np.reshape(quadrants, (GROUPS, 2, K**2, 2, 2))
     mean, error = values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(GROUPS)
     return Measured(mean[0], error[0], mean[1], error[1])
-
-
-ESTIMATORS: dict[str, Callable[[Path, int, int], Measured]] = {"path": path, "factored": factored}
 
 
 def write_scene(small_scene: Callable[..., Path], name: str, shapes: str) -> Path:
@@ -186,12 +158,9 @@ def test_radiance_of_one_reflection_is_that_of_its_irradiance() -> None:
 # ---- estimators
 
 
-@pytest.mark.parametrize(
-    ("name", "rho"),
-    [*(pytest.param(*case, marks=pytest.mark.slow) for case in (("path", 0.8), ("factored", 0.3))), ("factored", 0.8)],
-)
-def test_corner(small_scene: Callable[..., Path], name: str, rho: float) -> None:
-    found = ESTIMATORS[name](write_corner(small_scene, rho), 256, 7)
+@pytest.mark.parametrize("rho", [pytest.param(0.3, marks=pytest.mark.slow), 0.8])
+def test_corner(small_scene: Callable[..., Path], rho: float) -> None:
+    found = factored(write_corner(small_scene, rho), 256, 7)
     corner, places = Corner(rho, N, K), np.array([1, -1]) * HALF / 2
     expected = np.array([[corner.expected(x, y) for x in places] for y in places])  # row 0 at +y, column 0 at +x
     one, more = expected.transpose(2, 3, 0, 1)
@@ -200,12 +169,10 @@ def test_corner(small_scene: Callable[..., Path], name: str, rho: float) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "rho"), [("path", 0.5), ("path", 0.9), ("factored", 0.3), ("factored", 0.6), ("factored", 0.9)]
-)
-def test_furnace(small_scene: Callable[..., Path], name: str, rho: float) -> None:
+@pytest.mark.parametrize("rho", [0.3, 0.6, 0.9])
+def test_furnace(small_scene: Callable[..., Path], rho: float) -> None:
     scene = write_scene(small_scene, "furnace", SPHERE.format(rho=rho))
-    found, furnace = ESTIMATORS[name](scene, 256, 11), Furnace(rho)
+    found, furnace = factored(scene, 256, 11), Furnace(rho)
     tan_half = float(np.tan(np.radians(10)))
     share = np.outer([8, 7], [8, 7]).ravel() / N**2  # of the window's pixels: rows and columns 0, 2, ... and 1, 3, ...
     expected = furnace.indirect(tan_half) * np.broadcast_to(share[:, None, None], (K**2, 2, 2))

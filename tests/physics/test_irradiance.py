@@ -54,7 +54,7 @@ def mean_and_error(frame: np.ndarray) -> tuple[float, float]:
     return float(frame.mean()), float(frame.std(ddof=1) / np.sqrt(frame.size))
 
 
-@pytest.mark.parametrize("integrator", ["path", "direct", "volpath"])
+@pytest.mark.parametrize("integrator", ["path", "volpath"])
 def test_irradiance_of_a_lambertian_plane(small_scene: Callable[..., Path], integrator: str) -> None:
     options = "" if integrator == "direct" else '<integer name="max_depth" value="2"/>'
     path = small_scene(mask="open", integrator=integrator, integrator_options=options)

@@ -149,8 +149,8 @@ def tilted(x: float, y: float) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("turn", "normal"),
-    [(0.0, BACK), (0.0, tilted(2.0, -1.5)), (5.0, tilted(-1.0, 1.0))],
-    ids=["facing", "tilted", "projector turned as well"],
+    [(0.0, BACK), (5.0, tilted(-1.0, 1.0))],
+    ids=["facing", "both turned"],
 )
 def test_a_plane_mirror_shows_a_second_projector(turn: float, normal: np.ndarray) -> None:
     """Uniform light, all 512 x 512 pixels, through the mask."""
@@ -301,7 +301,7 @@ def test_a_ball_of_steel(variant: str) -> None:
     assert found.flux == pytest.approx(light.sum() * PITCH**2, rel=1e-3)
 
 
-@pytest.mark.parametrize("radius", [1.0, 0.2, 0.05])
+@pytest.mark.parametrize("radius", [1.0, 0.05])
 def test_small_balls(variant: str, radius: float) -> None:
     """Balls that lie between the rays of the first grid, 0.9 mm apart: each spreads E R r^2 / 4 evenly, to r / d.
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim import psnr, reconstruct
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
@@ -36,7 +35,6 @@ MIRROR = """<shape type="rectangle">
 </shape>"""
 PRINT = np.tile(np.linspace(20, 250, 64).astype(np.uint8), (64, 1))
 REGION = {"crop_offset_x": 5, "crop_offset_y": 20, "crop_width": 37, "crop_height": 30}
-LARGE_REGION = {"crop_offset_x": 5, "crop_offset_y": 10, "crop_width": 50, "crop_height": 40}
 TALL = '<float name="row_pitch" value="0.02344"/>'
 
 
@@ -144,33 +142,6 @@ def test_a_camera_file_states_pixels_that_are_not_square(small_scene: Write) -> 
     named = open_bench(square.loaded.path, camera=tall.devices.camera_file)
     assert named.sensor.superpixel_area_m2 == tall.sensor.superpixel_area_m2
     assert named.geometry.half_sides[0] == 2 * named.geometry.half_sides[1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("rows", "columns", "crop", "tall"),
-    [
-        pytest.param(40, 64, {}, False, id="rectangle"),
-        pytest.param(64, 64, LARGE_REGION, False, id="region"),
-        pytest.param(32, 64, {}, True, id="tall pixels"),
-    ],
-)
-def test_an_image_comes_of_a_factor_for_each_side(
-    small_scene: Write, tmp_path: Path, rows: int, columns: int, crop: dict[str, int], tall: bool
-) -> None:
-    """Captured, calibrated, saved, read and reconstructed; half the square sensor's pixels cost some 3 dB of its 61."""
-    from mitsim import load_calibration, load_run
-
-    square = bench_of(small_scene, 64, 64, {})
-    best = psnr(reconstruct(shots := square.capture("dots:4", seed=0), square.calibrate(seed=0)).image, shots.truth)
-    bench = bench_of(small_scene, rows, columns, crop, tall)
-    shape = bench.geometry.frame_shape
-    bench.capture("dots:4", seed=0).save(tmp_path / "run")
-    bench.calibrate(seed=0).save(tmp_path / "cal")
-    shots, factors = load_run(tmp_path / "run"), load_calibration(tmp_path / "cal")
-    assert factors.left.shape == (shape[0], 16) and factors.right.shape == (shape[1], 16)
-    image = reconstruct(shots, factors)
-    assert image.ok and psnr(image.image, shots.truth) > best - 4
 
 
 @pytest.mark.slow

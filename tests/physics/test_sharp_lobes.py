@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
@@ -120,86 +119,6 @@ def test_a_ball(traced: Callable[..., SampledLight], alpha: float, accuracy: flo
     assert light.plan.settings.sharp is not None and len(light.plan.settings.sharp.pixels) < 20
     error = float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
     assert error < SIGMAS * predicted(light) < 0.1
-
-
-Surface = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Points, shading and geometric normals (k, 3), and areas (k,) of parts of a surface."""
-
-
-def cast(alpha: float, sensor: np.ndarray, surface: Surface) -> float:
-    """Irradiance on a sensor point: the sum over parts of a metal surface that hides none of itself.
-
-    As :func:`on_ball`; f cos_s(i) cos_g(o) / cos_g(i) times the flux, g the geometric and s the shading normal.
-    """
-    point, shading, flat, area = surface
-    i, o = np.array([PLACE, 0, 0]) - point, sensor - point
-    r_i, r = np.linalg.norm(i, axis=-1), np.linalg.norm(o, axis=-1)
-    i, o = i / r_i[:, None], o / r[:, None]
-    h = (i + o) / np.linalg.norm(i + o, axis=-1)[:, None]
-    cos_i, cos_o, cos_h, flat_i, flat_o = (
-        (direction * normal).sum(-1)
-        for direction, normal in ((i, shading), (o, shading), (h, shading), (i, flat), (o, flat))
-    )
-    p, q = (point[:, 0] - PLACE) / point[:, 2], point[:, 1] / point[:, 2]
-    lit = (np.minimum.reduce([cos_i, cos_o, flat_i, flat_o]) > 1e-3) & (p > -0.3) & (p < 0) & (abs(q) < 0.15)
-    tan2 = lambda cosine: 1 / np.clip(cosine, 1e-3, 1) ** 2 - 1  # noqa: E731
-    d = 1 / (np.pi * alpha**2 * cos_h**4 * (1 + tan2(cos_h) / alpha**2) ** 2)
-    g = [2 / (1 + np.sqrt(1 + alpha**2 * tan2(cosine))) for cosine in (cos_i, cos_o)]
-    # dp dq = cos_g(i) r_i / z^3 dA, whose cosine the flux's divides by again.
-    emitted = d * g[0] * g[1] / (4 * cos_o) * flat_o * r_i / point[:, 2] ** 3 * np.abs(o[:, 2]) / r**2
-    return float(np.pi * SCALE * (np.where(lit, emitted, 0) * area).sum())
-
-
-def cylinder(alpha: float, sensor: np.ndarray) -> Surface:
-    """Of radius 20 mm about x = 10, z = 370, in steps that grow with the distance from the highlight in lobes."""
-
-    def astray(place: np.ndarray) -> float:
-        normal = np.array([np.sin(place[0]), 0, -np.cos(place[0])])
-        point = np.array([BALL[0], place[1], BALL[2]]) + RADIUS * normal
-        half = sum((other - point) / np.linalg.norm(other - point) for other in (np.array([PLACE, 0, 0]), sensor))
-        return float(np.square(np.cross(half / np.linalg.norm(half), normal)).sum())
-
-    steps = {"xatol": 1e-10, "fatol": 1e-18}
-    angle, y = minimize(astray, [0.07, 0.0], method="Nelder-Mead", options=steps).x
-    u = np.linspace(-6, 6, 600)
-    wide = np.sinh(u) / 2, np.cosh(u) / 2 * (u[1] - u[0])
-    turn, along = np.meshgrid(angle + alpha * wide[0], y + alpha * BALL[2] * wide[0], indexing="ij")
-    area = RADIUS * alpha**2 * BALL[2] * np.outer(wide[1], wide[1])
-    area = np.where((abs(turn) < np.pi / 2) & (abs(along - BALL[1]) < 150), area, 0).ravel()
-    normal = np.stack([np.sin(turn), 0 * turn, -np.cos(turn)], axis=-1).reshape(-1, 3)
-    axis = np.stack([np.full(along.size, BALL[0]), along.ravel(), np.full(along.size, BALL[2])], axis=-1)
-    return axis + RADIUS * normal, normal, normal, area
-
-
-def check_against(
-    traced: Callable[..., SampledLight], shape: str, judge: Callable[[np.ndarray], float]
-) -> SampledLight:
-    """Frames asked at 5e-3 are within it, over a few sensor points, for two seeds."""
-    for seed in range(2):
-        light = traced(5e-3, seed=seed, extra=shape)
-        index, centres = points(light.bench, 22)
-        expected = np.array([[judge(np.array([-column, -row, 0])) for column in centres] for row in centres])
-        error = np.linalg.norm(frame(light)[np.ix_(index, index)] - expected) / np.linalg.norm(expected)
-        assert light.reached and not light.warnings
-        assert error < 5e-3
-    return light
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("alpha", [2e-2, 5e-3])
-def test_a_cylinder(traced: Callable[..., SampledLight], alpha: float) -> None:
-    """Curved in one direction; of the part that lights the sensor a few pixels' rays meet a little each."""
-    ends = '<point name="p0" x="10" y="-145" z="370"/><point name="p1" x="10" y="155" z="370"/>'
-    rough = f'<string name="distribution" value="ggx"/><float name="alpha" value="{alpha}"/>'
-    metal = f'<bsdf type="roughconductor"><string name="material" value="none"/>{rough}</bsdf>'
-    shape = f'<shape type="cylinder">{ends}<float name="radius" value="20"/>{metal}</shape>'
-    light = check_against(traced, shape, lambda sensor: cast(alpha, sensor, cylinder(alpha, sensor)))
-    assert light.plan.settings.sharp is not None
-
-
-# ---- what stands before a sharp lobe
-
-THICK, INDEX = 6.0, 1.5
 
 
 @pytest.mark.slow

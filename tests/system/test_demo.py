@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -51,27 +49,3 @@ def test_the_folders_are_those_of_capture_and_calibrate(
     options = "--calibration", folder / "calibration", "-o", tmp_path / "image", "--json"
     found = call("reconstruct", folder / "run", *options).payload
     assert found["psnr"] == pytest.approx(report["psnr"]["dots:7"], abs=0.01)
-
-
-@pytest.mark.slow
-def test_a_second_demo_of_ones_own_devices_and_patterns_replaces_the_first(
-    call: Call, lab: Any, done: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
-    folder = Path(shutil.copytree(done[0], tmp_path / "demo"))
-    old = (folder / "report.html").stat().st_mtime_ns
-    (folder / "run" / "frame_99999.exr").write_text("of another family")
-    scene = lab.write_scene("grey_demo", reflectance=None)
-    options = "--patterns", "dots:2", "-D", "albedo=0.4", "--seed", 1, "--quiet"
-    second = call("demo", scene, *lab.electronics, "-o", folder, *options)
-    assert second.code == 0 and "4 dots" in second.out and str(folder / "report.html") in second.out
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    for words in ("test camera", "test projector", "albedo = 0.4", "4 dots", "exposure (4 dots)"):
-        assert words in page, words
-    reported = json.loads((folder / "demo.json").read_text())
-    assert tuple(reported["psnr"]) == ("uniform", "dots:4", "dots:5", "dots:2", "hadamard:8")
-    assert reported["verdict"].startswith("4 dots") and reported["verdict"] in page
-    assert (folder / "report.html").stat().st_mtime_ns > old
-    first, now = ({path.relative_to(place) for path in place.rglob("*")} for place in (done[0], folder))
-    gone = {Path("run", f"frame_{index:05d}.exr") for index in range(4, 49)}
-    assert now == first - gone, "nothing of the first is left"
-    assert json.loads((folder / "run" / "manifest.json").read_text())["configuration"]["seed"] == 1

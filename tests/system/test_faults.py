@@ -80,35 +80,6 @@ def test_a_disk_that_fills_up_during_a_run(call: Call, lab: Any, whole: Path, sm
     assert_resumed(call, lab, run, whole)
 
 
-# ---- the folder ------------------------------------------------------------------------------------------------------
-
-
-def test_damaged_frames_of_an_interrupted_run_are_made_again(
-    call: Call, lab: Any, interrupted: Path, whole: Path
-) -> None:
-    """No manifest holds checksums yet, so each frame carries that of its own pixels.
-
-    Flipped bits, frames cut by a full disk, of another place and of another run, a text, and a missing one.
-    """
-    flipped = {7: -64 * 64 * 8 + 64, 8: -1, 9: 300}  # a bit in the first pixels, in the last one, in the header
-    for index, spot in flipped.items():
-        path = interrupted / f"frame_{index:05d}.exr"
-        data = bytearray(path.read_bytes())
-        data[spot] ^= 4
-        path.write_bytes(data)
-    os.truncate(interrupted / "frame_00010.exr", 20000)
-    os.truncate(interrupted / "frame_00011.exr", 0)
-    shutil.copy(interrupted / "frame_00020.exr", interrupted / "frame_00012.exr")
-    shutil.copy(lab.run / "frame_00013.exr", interrupted)
-    (interrupted / "frame_00014.exr").write_text("DN")
-    (interrupted / "frame_00015.exr").unlink()
-    kept = {path: path.stat().st_mtime_ns for path in interrupted.glob("frame_*.exr")}
-    assert call("capture", *lab.arguments, "-o", interrupted, "--patterns", PATTERNS, "--resume").code == 0
-    assert_equal_runs(interrupted, whole)
-    written = {path.name for path, time in kept.items() if path.stat().st_mtime_ns != time}
-    assert written == {f"frame_{index:05d}.exr" for index in range(7, 15)}, "and no others"
-
-
 # ---- another configuration, version, variant -------------------------------------------------------------------------
 
 

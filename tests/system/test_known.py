@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,6 @@ import pytest
 
 from mitsim.core.exr import read_frame
 from tests.system.refusals import Call, Refused, mentions
-from tests.system.test_colour import LINES, projector
-from tests.system.test_mosaic import camera_behind_filters
-from tests.system.test_mosaic import sheet as coloured_sheet
 
 
 def frames_of(run: Path) -> dict[str, bytes]:
@@ -115,62 +111,3 @@ def test_what_python_warns_of_is_a_line_of_the_command_line(
     done = call(*known, tmp_path / "run")
     assert done.code == 0 and done.payload["frames"] == 4 and done.err == "mitsim: note: these frames are noisier\n"
     assert len(call(*known, tmp_path / "run").refusal.splitlines()) == 1
-
-
-# ---- in colour
-
-
-OF_COLOUR = "--patterns", "dots:2", "--accuracy", 0.05, "--json"
-
-
-@pytest.fixture(scope="module")
-def sheet(shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
-    """A scene with a coloured sheet, which two bands tell to the accuracy, and options of a projector of three
-    lines."""
-    lines = projector(tmp_path_factory.mktemp("devices") / "lines.toml", LINES)
-    return coloured_sheet(shared_scene("sheet of a plan")), "--projector", lines
-
-
-@pytest.fixture(scope="module")
-def filters(tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
-    """Options of a camera behind colour filters."""
-    return "--camera", camera_behind_filters(tmp_path_factory.mktemp("camera") / "filters.toml")
-
-
-def same_run(one: Path, other: Path) -> bool:
-    """Whether frames, truths and configurations are equal, of all lines."""
-    files = [sorted(path.relative_to(run) for path in run.rglob("*.exr")) for run in (one, other)]
-    assert files[0] and files[0] == files[1]
-    stated = [
-        [json.loads(path.read_text())["configuration"] for path in sorted(run.rglob("manifest.json"))]
-        for run in (one, other)
-    ]
-    equal = [read_frame(one / name)[0] for name in files[0]], [read_frame(other / name)[0] for name in files[0]]
-    return stated[0] == stated[1] and all(
-        np.array_equal(first[channel], second[channel])
-        for first, second in zip(*equal, strict=True)
-        for channel in first
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("colour", ["bands:2", "lines", "mosaic"])
-def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
-    shell: Call, sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path, colour: str
-) -> None:
-    """Frames of each line, and of all lines behind filters, are those of the capture that plans itself. Another word
-    of --colour, and light by pixel, of which none is told apart, are refused in a line before anything is written.
-    (Planted: lines of a plan not compared.)"""
-    file, options = tmp_path / "plan.json", (*OF_COLOUR, *(filters if colour == "mosaic" else ()))
-    assert shell("plan", *sheet, *options, "--colour", colour, "-o", file).code == 0
-    for name, more in (("run", ("--plan", file)), ("own", ())):
-        assert shell("capture", *sheet, *options, *more, "--colour", colour, "-o", tmp_path / name).code == 0
-    assert same_run(tmp_path / "run", tmp_path / "own")
-    for other in {"no", "bands:1", "lines", "mosaic"} - {colour}:
-        devices = filters if other == "mosaic" else ()
-        line = shell("capture", *sheet, "--plan", file, "--colour", other, *devices, "-o", tmp_path / "none").refusal
-        mentions(line, "--plan was made for another colour: ")
-    for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
-        line = shell("transport", *sheet, "--plan", file, "--variant", variant, "-o", tmp_path / "none").refusal
-        mentions(line, "--plan was made for another colour: ")
-    assert not (tmp_path / "none").exists()

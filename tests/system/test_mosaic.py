@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,10 +9,9 @@ import numpy as np
 import pytest
 
 from mitsim.core.exr import read_frame
-from tests.system.conftest import CAMERA, tree
+from tests.system.conftest import CAMERA
 from tests.system.refusals import Call
 from tests.system.test_colour import LINES, SHEET, electrons, projector, spectrum
-from tests.unit.bench.test_lamps import POSITION
 
 CURVES = {
     "R": {638: 0.4, 520: 0.1, 445: 0.05},
@@ -21,8 +19,6 @@ CURVES = {
     "B": {638: 0.05, 520: 0.2, 445: 0.4},
 }
 """Electrons per photon of pixels under each filter at the lines."""
-LAMP = {450: 0.0, 480: 2e4, 500: 2e4, 505: 8e4, 510: 2e4, 600: 2e4, 630: 0.0}
-"""Intensity of a lamp by wavelength: a spike between blue and green, nothing that the curves do not hold."""
 COMMON = "--patterns", "dots:2", "--accuracy", "1e-2", "--json"
 
 
@@ -36,14 +32,6 @@ def sheet(path: Path) -> Path:
 @pytest.fixture(scope="module")
 def scene(shared_scene: Callable[..., Path]) -> Path:
     return sheet(shared_scene("sheet behind filters"))
-
-
-@pytest.fixture(scope="module")
-def lit(shared_scene: Callable[..., Path]) -> Path:
-    """The same beside a lamp."""
-    value = ", ".join(f"{nm}:{intensity}" for nm, intensity in LAMP.items())
-    lamp = f'<emitter type="point">{POSITION}<spectrum name="intensity" value="{value}"/></emitter>'
-    return sheet(shared_scene("lit sheet behind filters", extra=lamp))
 
 
 @pytest.fixture(scope="module")
@@ -84,51 +72,6 @@ def test_a_pixel_sees_each_line_through_its_own_filter(
         assert np.array_equal(*truths)
     assert np.allclose(seen, expected, rtol=1e-5, atol=1e-5 * seen.max())
     assert reported["mc_error"] < 2e-2 and (run / "truth.exr").is_file()
-
-
-def counted(plane: str) -> float:
-    """Of the lamp's light that comes from the sheet, what pixels of a ``plane`` make electrons of."""
-    at = np.linspace(445, 638, 19301)
-    reflectance = np.interp(at, sorted(SHEET), [SHEET[nm] for nm in sorted(SHEET)])
-    efficiency = np.interp(at, sorted(CURVES[plane]), [CURVES[plane][nm] for nm in sorted(CURVES[plane])])
-    return float(np.trapezoid(np.interp(at, list(LAMP), list(LAMP.values())) * reflectance * efficiency * at, at))
-
-
-@pytest.mark.slow
-def test_a_run_behind_filters_goes_on_and_comes_apart(
-    shell: Call, scene: Path, lit: Path, devices: tuple[str, ...], tmp_path: Path
-) -> None:
-    """Lost frames come back bit for bit; images of the lines are their truths, though all share every frame, and a
-    lamp's light: of that each colour's pixels have what its integral says beside the others'.
-    """
-    run, cal = tmp_path / "run", tmp_path / "cal"
-    command = "capture", lit, "-o", run, "--colour", "mosaic", *devices, *COMMON
-    reported = shell(*command)
-    assert reported.code == 0 and reported.payload["ambient_frame"]["shots"] == 16
-    assert 0.1 < reported.payload["ambient_frame"]["part"] < 0.9
-    lamp = read_frame(run / "ambient.exr")[0]["electrons"].astype(float)
-    planes = {name: lamp[a::2, b::2].mean() for name, (a, b) in zip("GBR", ((0, 0), (0, 1), (1, 0)), strict=True)}
-    for name in "BR":
-        # On the same paths: what is left are fringes of other wavelengths at the edges of the frame.
-        assert planes[name] / planes["G"] == pytest.approx(counted(name) / counted("G"), rel=5e-3)
-    before = tree(run)
-    for lost in ("frame_00002.exr", "445nm/truth.exr", "colour.json"):
-        (run / lost).unlink()
-    assert "holds files already" in shell(*command).refusal
-    assert shell(*command, "--resume").code == 0
-    after = tree(run)
-    changed = {Path(name).name for name in before if before[name] != after[name]}
-    assert changed <= {"manifest.json"}, "whose seconds differ"
-    reported = shell("calibrate", scene, "-o", cal, "--colour", "mosaic", *devices, *COMMON[2:]).payload
-    assert reported["kind"] == "colour-calibration" and len(reported["channels"]) == 3
-    found = shell("reconstruct", run, "--calibration", cal, "-o", tmp_path / "image", "--json").payload
-    assert all(line["psnr"] > 25 for line in found["channels"]) and found["delta_e"] < 5
-    kept = json.loads((tmp_path / "image" / "colour.json").read_text())
-    assert kept["mosaic"] == "joint" and kept["psnr"] == pytest.approx(found["psnr"])
-    mono = shell("calibrate", scene, "-o", tmp_path / "mono", "--colour", "lines", *devices[2:], *COMMON[2:])
-    assert mono.code in (0, 1)
-    refused = shell("reconstruct", run, "--calibration", tmp_path / "mono", "-o", tmp_path / "other").refusal
-    assert "calibrate the run's camera" in refused and "sensor" in refused
 
 
 NONE = "imx249.toml has no mosaic of colour filters; give one"

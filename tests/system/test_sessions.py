@@ -104,19 +104,3 @@ def test_a_session_file_repeats_a_figure_bit_by_bit(call: Call, lab: Any, imaged
     assert "holds a run of another configuration (seed differ)" in other.refusal
     assert "seed = 1" not in (tmp_path / "out" / "session.toml").read_text()
     assert times == {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.exr")}
-
-
-@pytest.mark.slow
-def test_the_shipped_session_of_the_demo_repeats_the_demo(lab: Any, tmp_path: Path) -> None:
-    """Its frames and factors, on a small scene."""
-    devices = {"camera": str(lab.camera), "projector": str(lab.projector)}
-    ms.demo(lab.scene, tmp_path / "demo", patterns="dots:4", accuracy=0.01, **devices)
-    values = {"scene.scene": str(lab.scene), **{f"scene.{name}": each for name, each in devices.items()}}
-    values |= {"transport.patterns": "dots:5", "capture.patterns": "dots:4"}
-    values |= {f"{table}.accuracy": 0.01 for table in ("transport", "calibrate")}
-    ms.run("demo", tmp_path / "out", values, pictures=False)
-    for folder in ("run", "calibration"):
-        ours, theirs = numbers_in(tmp_path / "out" / folder), numbers_in(tmp_path / "demo" / folder)
-        assert ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in theirs)
-    told = ms.session_of(tmp_path / "demo" / "run").text
-    assert "[transport]\npatterns = " in told

@@ -9,10 +9,8 @@ What a calibration session is predicted to take, from sizes: worked out by hand;
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,13 +26,12 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.devices.camera import Devices
 from mitsim.devices.patterns import Lighting, hadamard_matrix
-from mitsim.devices.sensor import SensorModel, digital_of
+from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light import cost_model
 from mitsim.light.settings import Settings
 from mitsim.optics import frames
 from mitsim.optics.frames import Frame
-from mitsim.reconstruct.captured_session import calibrate_frames
 from mitsim.sensor.chain import Digital
 
 SENSOR = SensorModel(
@@ -318,36 +315,6 @@ def test_light_that_black_pixels_leak_is_in_both_shots_of_a_pair(shots: dict[tup
 
 
 # ---- frames on disk --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("repeats", [1, 3])
-@pytest.mark.parametrize("mode", ["pair", "uniform"])
-def test_frames_of_a_session_in_a_folder_give_its_factors_bit_for_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, repeats: int
-) -> None:
-    """Shots are numbered in the order that a folder's names have. (Planted: the exposure divided before the gain.)"""
-    lit, shoot = lit_session(mode=mode, devices=CLIPPED, repeats=repeats), Exposer.digital
-
-    def kept(self: Exposer, electrons: FloatArray, *names: str | int) -> Digital:
-        numbers = shoot(self, electrons, *names)
-        repeat = names[4] if len(names) > 3 else 0
-        np.save(tmp_path / f"{names[1]} {names[2]} {repeat}.npy", numbers)
-        return numbers
-
-    monkeypatch.setattr(Exposer, "digital", kept)
-    simulated, _ = estimate(lit, Job())
-    digital = digital_of(lit.session.bench.sensor, EXPOSURE_S).model_dump(mode="json")
-    listed = {"camera": "toy", "n": 7, "signed_capture": mode, "digital": digital, "repeats": repeats}
-    (tmp_path / "session.json").write_text(json.dumps(listed))
-    assert len(list(tmp_path.glob("*.npy"))) == lit.session.shots
-    found = calibrate_frames(tmp_path)
-    measured = found.estimate
-    assert found.manifest.result["saturated_frames"] == 0, "where they are read"
-    assert measured is not None and np.array_equal(measured.left, simulated.left)
-    assert np.array_equal(measured.right, simulated.right)
-    assert measured.separability_residual == simulated.separability_residual
-    # Here the noise is that of the light as it was measured, there the closed form.
-    assert measured.unexplained == pytest.approx(simulated.unexplained, abs=0.02)
 
 
 @pytest.mark.parametrize("mode", ["pair", "uniform"])

@@ -13,20 +13,18 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import Checkpoint
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.exr import checksum, read_frame
 from mitsim.core.job import Job
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.session import SIDES, SessionRecipe, load_recipe
-from mitsim.light.cost_model import FRAMES_AT_ONCE, frame_seconds
+from mitsim.devices.session import SessionRecipe, load_recipe
+from mitsim.light.cost_model import frame_seconds
 from mitsim.light.plan import Plan
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.captured_session import calibrate_frames
@@ -160,21 +158,6 @@ def test_the_scale_is_absolute(session: Callable[..., Done]) -> None:
     assert np.linalg.norm(rate - expected) < 0.03 * np.linalg.norm(expected)
 
 
-def test_the_folder(session: Callable[..., Done]) -> None:
-    bench, factors, calibration, folder = session("separable", "pair", 16)
-    assert sorted(path.name for path in folder.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
-    manifest = json.loads((folder / "manifest.json").read_text())
-    assert manifest["kind"] == "calibration" and manifest["centre"] is False
-    assert manifest["camera"] == json.loads(json.dumps(bench.identity()))
-    assert manifest["estimate"] == str(calibration.status) and manifest["warnings"] == list(factors.warnings)
-    assert not any("full well" in warning for warning in factors.warnings)
-    for name, factor in (("left", calibration.left), ("right", calibration.right)):
-        channels, metadata = read_frame(folder / f"{name}.exr")
-        assert np.array_equal(channels["factor"], factor.astype(np.float32))
-        assert metadata["unit"] == "sqrt(e-/s)"
-        assert manifest["checksums"][f"{name}.exr"] == checksum(folder / f"{name}.exr")
-
-
 def test_what_a_session_takes_is_predicted(session: Callable[..., Done]) -> None:
     """By stage, and in bytes; there is no truth to be traced, and frames of both sides count. (Planted: of one.)"""
     bench, factors, _, _ = session("separable", "pair", 16)
@@ -192,15 +175,6 @@ def test_seeds(shared_scene: Callable[..., Path]) -> None:
     bench = open_bench(shared_scene("separable16", n=16))
     one, again, other = (bench.calibrate(seed=seed, accuracy=2e-2, recipe=recipe("uniform")).left for seed in (1, 1, 2))
     assert np.array_equal(one, again) and not np.allclose(one, other, rtol=1e-6)
-
-
-def test_a_used_folder_is_refused_before_any_work(
-    session: Callable[..., Done], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench, *_, folder = session("separable", "pair", 16)
-    monkeypatch.setattr("mitsim.calibrate.board_session.make_plan", lambda *_: pytest.fail("work was done first"))
-    with pytest.raises(MitsimError, match="holds files already"):
-        bench.calibrate(output=folder)
 
 
 def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[..., Path]) -> None:
@@ -260,7 +234,7 @@ class Killed(BaseException):
 @pytest.fixture
 def geometric_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions of geometric shadows whose plan is made once for each scene, accuracy and seed: plans take most of their
-    time, and that the same seed makes the same plan is held by test_pilot.py."""
+    time, and that the same seed makes the same plan is held by hard/test_reproducibility.py."""
     plans: dict[tuple[object, ...], Plan] = {}
 
     def planned(board: Bench, lighting: Lighting, *request: object) -> Plan:
@@ -307,47 +281,6 @@ def assert_equal(ours: Factors, theirs: Factors) -> None:
 
 
 @pytest.mark.usefixtures("geometric_sessions")
-@pytest.mark.parametrize("mode", ["pair", pytest.param("uniform", marks=pytest.mark.slow)])
-def test_a_session_killed_at_every_checkpoint_gives_the_same_bits(
-    shared_scene: Callable[..., Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    kill_after: Callable[[int], None],
-    mode: str,
-) -> None:
-    """Each of the five processes but the last gets one checkpoint further; nothing that is kept is computed again."""
-    bench = open_bench(shared_scene("resumed16", n=16))
-    whole = bench.calibrate(recipe=recipe(mode), seed=3)
-    exposures: list[object] = []
-    digital = Exposer.digital
-
-    def counted(self: Exposer, *shot: object) -> object:
-        exposures.append(shot[1:])
-        return digital(self, *shot)
-
-    monkeypatch.setattr(Exposer, "digital", counted)
-    calibration = tmp_path / "cal"
-    for life in range(5):
-        kill_after(1)
-        with pytest.raises(Killed):
-            bench.calibrate(recipe=recipe(mode), seed=3, output=calibration, resume=True)
-        assert json.loads((calibration / "manifest.json").read_text())["status"] == "incomplete"
-        monkeypatch.setattr(Session, "trace", lambda *_: pytest.fail("light is traced again"))
-        assert [path.name for path in sorted(calibration.glob("*.npz"))] == [
-            name for name, since in zip(PARTS, (0, 1), strict=True) if life >= since
-        ]
-    kill_after(0)  # nothing is left to be saved
-    resumed = bench.calibrate(recipe=recipe(mode), seed=3, output=calibration, resume=True)
-    assert_equal(resumed, whole)
-    assert sorted(path.name for path in calibration.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
-    # Shots that were exposed with those of a checkpoint are exposed again, at most one chunk of each side a life.
-    assert set(exposures) == {
-        ("calibration", side, index) for side in SIDES for index in range(whole.manifest.result["frames"] // 2)
-    }
-    assert len(exposures) < whole.manifest.result["frames"] + 5 * FRAMES_AT_ONCE
-
-
-@pytest.mark.usefixtures("geometric_sessions")
 def test_damaged_and_foreign_parts_are_computed_again(
     shared_scene: Callable[..., Path],
     tmp_path: Path,
@@ -382,8 +315,12 @@ def test_damaged_and_foreign_parts_are_computed_again(
 
 @pytest.mark.usefixtures("geometric_sessions")
 def test_only_the_same_session_is_resumed(
-    shared_scene: Callable[..., Path], tmp_path: Path, kill_after: Callable[[int], None]
+    shared_scene: Callable[..., Path],
+    tmp_path: Path,
+    kill_after: Callable[[int], None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """And its light is not traced again."""
     bench = open_bench(shared_scene("other16", n=16))
     kill_after(1)
     with pytest.raises(Killed):
@@ -398,6 +335,10 @@ def test_only_the_same_session_is_resumed(
             bench.calibrate(**{"recipe": recipe("pair"), "output": tmp_path / "cal", "resume": True, **change})
     with pytest.raises(MitsimError, match="holds files already"):
         bench.calibrate(recipe=recipe("pair"), output=tmp_path / "cal")
+    monkeypatch.setattr(Session, "trace", lambda *_: pytest.fail("light is traced again"))
+    kill_after(1)
+    with pytest.raises(Killed):
+        bench.calibrate(recipe=recipe("pair"), output=tmp_path / "cal", resume=True)
     (tmp_path / "cal" / "manifest.json").write_text('{"kind": "capture"}')
     with pytest.raises(MitsimError, match=r"resume=True: .* is not that of a calibration"):
         bench.calibrate(recipe=recipe("pair"), output=tmp_path / "cal", resume=True)

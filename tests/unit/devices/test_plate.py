@@ -166,17 +166,10 @@ def test_drawings_are_squared_about_their_centre() -> None:
 
 
 BAD = {
-    "colour.png": lambda path: Image.new("RGB", (2, 2)).save(path),
-    "alpha.png": lambda path: Image.new("LA", (2, 2)).save(path),
-    "broken.png": lambda path: path.write_bytes(b"PNG"),
     "wide.png": lambda path: Image.new("1", (4097, 1)).save(path),
     "odd.png": lambda path: Image.new("1", (4096, 1)).save(path),  # margins of half a pixel would double its sides
-    "mask.gif": lambda path: Image.new("L", (2, 2)).save(path),
-    "cube.npy": lambda path: np.save(path, np.zeros((2, 2, 2))),
     "large.npy": lambda path: np.save(path, np.full((2, 2), 1.5)),
     "nan.npy": lambda path: np.save(path, np.full((2, 2), np.nan)),
-    "object.npy": lambda path: np.save(path, np.array([[{}]]), allow_pickle=True),
-    "absent.png": lambda path: None,
 }
 
 

@@ -133,23 +133,3 @@ def test_the_small_camera_does_the_main_job() -> None:
     image = mitsim.reconstruct(shots, factors)
     assert "every direction of the image is measured" in str(image.status)
     assert mitsim.psnr(image.image, shots.truth) > 38
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("camera", SENSORS, ids=lambda path: path.stem)
-def test_every_verb_of_a_camera(camera: Path, small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    from tests.system.conftest import shell
-
-    def code(*arguments: Any) -> int:
-        return shell(*arguments, cwd=tmp_path).code
-
-    verbs, scene = serves(camera), small_scene()
-    colour = ("--colour", "mosaic") if load_sensor(camera).mosaic else ()
-    captured = code(
-        "capture", scene, "--camera", camera, *colour, "--patterns", "dots:2", "--accuracy", "0.1", "-o", "run"
-    )
-    assert (captured in (0, 1)) == ("capture" in verbs)
-    quick = "--pixels", 32, "--steps", 20, "--frames", 4
-    assert code("characterise", camera, "-o", "figures", *quick) in (0, 1)
-    assert code("render", scene, "-o", "frame.exr", "--spp", 4) == 0
-    assert (code("sense", "frame.exr", "--camera", camera, "-o", "frame.png") in (0, 1)) == ("sense" in verbs)

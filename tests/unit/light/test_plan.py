@@ -316,33 +316,10 @@ def test_a_file_that_is_none_is_refused_in_a_line(file: Path, text: str, sentenc
     refused(file, sentence)
 
 
-def test_a_file_that_was_cut_or_is_huge_is_refused_in_a_line(file: Path, tmp_path: Path) -> None:
-    file.write_bytes(file.read_bytes()[:-200])
-    refused(file, "not valid JSON")
-    with file.open("wb") as huge:
-        huge.truncate(200 << 20)
-    refused(file, "has 209715200 bytes; at most")
-    refused(tmp_path, "Is a directory")
-    refused(tmp_path / "none.json", "No such file")
-
-
 def refused(file: Path, sentence: str) -> None:
     with pytest.raises(MitsimError, match=sentence) as refusal:
         Plan.load(file)
     assert len(str(refusal.value).splitlines()) == 1 and file.name in str(refusal.value)
-
-
-def test_a_file_is_written_whole_or_not_at_all(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = file.read_bytes()
-    with pytest.raises(MitsimError, match="decided without a request"):
-        invented_plan(1e-3).save(file)
-    monkeypatch.setattr("mitsim.light.plan.MOST_BYTES", 100)
-    with pytest.raises(MitsimError, match="and at most 100 are read"):
-        planned().save(file)
-    with pytest.raises(MitsimError, match="cannot be written"):
-        monkeypatch.undo()
-        planned().save(tmp_path / "none" / "plan.json")
-    assert file.read_bytes() == before and [*tmp_path.iterdir()] == [file]
 
 
 # ---- beside a request, and another bench

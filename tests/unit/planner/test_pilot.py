@@ -150,22 +150,6 @@ def test_anchors_come_true(bench: Bench, pilot_result: PilotResult) -> None:
     assert promised(pilot_result.ladders["anchors"][1].value, actual)
 
 
-@pytest.mark.slow
-def test_anchors_of_followed_light_come_true(bench: Bench, pilot_result: PilotResult) -> None:
-    """Light between the ball, the wall and the sheet differs over the sensor of 24 mm. (Planted: paths from the camera
-    that are accumulated as seen from their start.)"""
-    every = frozenset(effects.present(bench)) - {"speckle"}
-    base = Settings(depth=pilot_result.depth, subdivision=2, effects=every)
-    light = np.linalg.norm(frames(bench, base))
-    judge = frames(bench, replace(base, followed_anchors=5), 64, 96)
-    actual = np.linalg.norm(frames(bench, base, 64, 96) - judge) / light
-    found = pilot_result.ladders["followed_anchors"]
-    assert actual > 1e-3, "the scene has to call for it"
-    assert promised(found[1].value, actual)
-    few = np.linalg.norm(frames(bench, replace(base, followed_anchors=2), 64, 96) - judge) / light
-    assert few < actual / 2
-
-
 def test_wide_cells_of_followed_light_come_true(bench: Bench, pilot_result: PilotResult) -> None:
     """What anchors see beyond their mean, in cells of four pixels and one layer, against cells of half a pixel and two
     layers. (Planted: the mean accumulated in the cells of indirect light; cells twice as wide.)"""
@@ -275,15 +259,6 @@ def test_a_ladder_ends_where_its_last_step_leaves_little() -> None:
     tried.clear()
     pilot_direct.ladder((1, 2, 4, 8), step, 1, 1.6)
     assert tried == [1, 2]
-
-
-def test_the_pilot_is_reproducible(bench: Bench) -> None:
-    """Of few shots and at a loose accuracy: all parts of the pilot have their turn."""
-    lighting = parse_patterns("dots:2", N).lighting
-    one, again = (pilot.PilotRuns(bench, lighting, 0.1, 3).pilot_result for _ in range(2))
-    for name in ("depth", "layers", "effects", "ladders"):
-        assert getattr(again, name) == getattr(one, name)
-    assert np.array_equal(again.changes.products, one.changes.products)
 
 
 def test_a_flat_scene_needs_no_layers(small_scene: Callable[..., Path]) -> None:

@@ -7,6 +7,7 @@ A closing frame is compared with the frames before it, in ideal sessions.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -69,12 +70,16 @@ FAULTS: dict[str, Callable[[Frames], np.ndarray]] = {
 }
 
 
-@pytest.mark.parametrize("patterns", FAMILIES)
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    ("fault", "patterns"),
+    [
+        *(("black", "dots:4"), ("black", "hadamard:4"), ("dim", "random:4"), ("repeated", "random:4")),
+        *(("repeated", "dots:1x8"), ("half_lost", "dots:4"), ("half_lost", "hadamard:4"), ("shifted", "dots:1x8")),
+        *(("shifted", "hadamard:4"), ("clipped", "dots:4"), ("clipped", "random:4")),
+    ],
+)
 def test_a_faulty_frame_is_named(patterns: str, fault: str) -> None:
     """By its number and its file. (Planted: a leave-one-out energy without the part that the frame itself explains.)"""
-    if fault == "dim" and patterns.startswith("dots"):
-        pytest.skip("a picture of 16 x 16 pixels decides that powers differ, not whose")
     found = image(patterns, lambda frames: [*frames[:3], FAULTS[fault](frames), *frames[4:]])
     assert not found.ok and found.status.verdict is Verdict.MISFIT
     assert found.misfit.cause is Cause.FRAMES
@@ -86,7 +91,7 @@ def test_a_faulty_frame_is_named(patterns: str, fault: str) -> None:
     assert summary["cause"] == "frames" and summary["faults"] == [each.summary() for each in found.misfit.faults]
 
 
-@pytest.mark.parametrize("patterns", FAMILIES)
+@pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4"])
 def test_a_frame_that_is_clipped_where_noise_hides_it(patterns: str) -> None:
     """A few readings cut by a tenth of them, which no residual shows; noise alone ends in no number so often."""
     shots = bench(peak=800.0).run(patterns, picture(1), 1)
@@ -106,7 +111,7 @@ def test_a_dim_frame_of_dim_light() -> None:
     assert 3 in named_by(found)
 
 
-@pytest.mark.parametrize("patterns", FAMILIES)
+@pytest.mark.parametrize("patterns", ["hadamard:4", "dots:1x8"])
 def test_exchanged_frames_are_named(patterns: str) -> None:
     found = image(patterns, lambda frames: [*frames[:2], frames[5], *frames[3:5], frames[2], *frames[6:]])
     assert named_by(found) >= {2, 5}
@@ -133,7 +138,7 @@ def test_a_lamp_that_flickers_between_the_halves_of_pairs() -> None:
     assert image(patterns, list).ok
 
 
-@pytest.mark.parametrize("pair", [(6, 17), (3, 23), (4, 30), (10, 11)])
+@pytest.mark.parametrize("pair", [(6, 17), (10, 11)])
 def test_exchanged_halves_are_named(pair: tuple[int, int]) -> None:
     """Of two pairs, whose sums show it, and of one pair, whose difference contradicts the others."""
     one, other = pair
@@ -142,8 +147,13 @@ def test_exchanged_halves_are_named(pair: tuple[int, int]) -> None:
     assert named >= set(pair) and len(named) <= 4
 
 
-@pytest.mark.parametrize("patterns", ["uniform", *FAMILIES, "dots:2", "hadamard:2"])
-@pytest.mark.parametrize("print_", ["smooth", "stripes", "stars", "black"])
+@pytest.mark.parametrize(
+    ("print_", "patterns"),
+    [
+        *itertools.product(("smooth", "stars"), FAMILIES),
+        *itertools.product(("stripes", "black"), ("uniform", "dots:2", "dots:4", "hadamard:2")),
+    ],
+)
 def test_no_frame_of_a_fitting_run_is_named(patterns: str, print_: str) -> None:
     """Stripes as fine as the dots make half of the frames bright and half of them dark; stars, and a card before
     nothing, leave some without light."""
@@ -161,11 +171,10 @@ def test_no_frame_of_a_fitting_run_is_named(patterns: str, print_: str) -> None:
 
 
 @pytest.mark.parametrize("patterns", ["dots:1x8", "hadamard:4"])
-@pytest.mark.parametrize("seed", [1])
-def test_frames_of_gloss_are_not_at_fault(patterns: str, seed: int) -> None:
+def test_frames_of_gloss_are_not_at_fault(patterns: str) -> None:
     """Gloss is light that has no image. The run may be flagged for it, and no frame is named, because all frames were
     captured rightly. (Planted: the even pattern is at fault; windows are reported beside light that has no image.)"""
-    rng = np.random.default_rng(seed)
+    rng, seed = np.random.default_rng(1), 1
     code = rng.integers(0, 2, 511).astype(np.float64)
     y, x = np.mgrid[:64, :64] / 64
     scene = 0.45 + 0.3 * np.sin(2 * np.pi * (2 * x + rng.random())) * np.cos(2 * np.pi * (1.5 * y + rng.random()))

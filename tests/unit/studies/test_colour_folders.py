@@ -235,37 +235,6 @@ def test_a_camera_that_does_not_explain_the_frames_is_flagged(filtered: tuple[Pa
     assert not found.ok and "explained by no image of these lines" in found.warnings[0]
 
 
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ("--method tv", "--method tv: runs behind colour filters are solved by tikhonov"),
-        ("--focus auto", "--focus auto: runs behind colour filters"),
-        ("--lambda 0", "--lambda 0.0: behind colour filters give a finite number above 0"),
-    ],
-)
-def test_what_filters_do_not_allow_is_refused(
-    filtered: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, words: str
-) -> None:
-    run, calibration = map(str, filtered)
-    assert main(["reconstruct", run, "--calibration", calibration, "-o", str(tmp_path / "image"), *option.split()]) == 2
-    assert words in capsys.readouterr().err
-    assert not (tmp_path / "image").exists()
-
-
-def test_folders_that_do_not_fit_are_refused(filtered: tuple[Path, Path], tmp_path: Path) -> None:
-    run, calibration = filtered
-    shutil.copytree(calibration, tmp_path / "cal")
-    path = tmp_path / "cal" / "520nm" / "manifest.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "camera": {"sensor": {"mosaic": "RGGB"}}}))
-    with pytest.raises(MitsimError, match=r"520nm: sensor.* is .*; calibrate the run's camera"):
-        solved((run, tmp_path / "cal"), tmp_path / "image")
-    named = json.loads((calibration / "colour.json").read_text())
-    named["channels"].pop()
-    (tmp_path / "cal" / "colour.json").write_text(json.dumps(named))
-    with pytest.raises(MitsimError, match=r"its lines are 638nm, 520nm, but .* calibrate each line"):
-        solved((run, tmp_path / "cal"), tmp_path / "image")
-
-
 def test_a_manifest_has_a_weight_for_each_line(filtered: tuple[Path, Path], tmp_path: Path) -> None:
     shutil.copytree(filtered[0], tmp_path / "run")
     path = tmp_path / "run" / "colour.json"

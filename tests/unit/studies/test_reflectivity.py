@@ -101,19 +101,6 @@ def test_a_highlight_has_the_brightness_of_its_lobe(lit: Callable[..., LitScene]
     assert row in (7, 8) and column in (3, 4)
 
 
-@pytest.mark.slow
-def test_only_what_moves_over_the_sensor_is_gloss_over_it(lit: Callable[..., LitScene]) -> None:
-    """A lobe of alpha = 0.3 is 240 mm wide at the sensor, which is 5.8 mm wide; one of 0.01, 8 mm. (Planted: direct
-    light of the matt scene taken for the glossy one's.)"""
-    matt = lit(0.4 * 0.95)
-    parts = []
-    for alpha in (0.3, 0.01):
-        frames = frames_of(lit(bsdf=GLOSS.format(weight=0.05, alpha=alpha)))
-        parts.append(rms(split(frames, matt, frames.seconds(EQUAL_PEAK))[1]))
-    assert parts[0][SENSOR] < 1e-2 * parts[0][PIXELS] + 3e-3
-    assert parts[1][SENSOR] > 10 * parts[0][SENSOR]
-
-
 N = 32
 FACTOR = shadow(n=N)
 

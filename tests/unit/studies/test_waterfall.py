@@ -16,10 +16,10 @@ from mitsim.light.light import SampledLight, traced_again
 from mitsim.light.passes import GRIDS, Simulation
 from mitsim.light.settings import SharpPixels
 from mitsim.metrics import psnr
-from mitsim.report import IDEALISED, RENDERED
+from mitsim.report import IDEALISED
 from mitsim.report.lit_scene import LitScene
 from mitsim.studies import waterfall_study as waterfall
-from mitsim.studies.framework.experiment import Results, Scope, Setup
+from mitsim.studies.framework.experiment import Results, Setup
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.waterfall_study import EFFECTS, IN_ORDER, LEFT_OUT, STUDY, Ablation, Levels
 from mitsim.transport.records import DIRECT, PathSamples
@@ -70,22 +70,6 @@ def test_falloff_costs_what_it_takes_from_the_truth(levels: Levels) -> None:
     wanted = np.square(truth * (flux / flux.mean() - 1)).mean()
     noise, found = (np.square(image - truth).mean() for image in (without, having))
     assert found - noise == pytest.approx(wanted, rel=0.1) and wanted > 3 * noise
-
-
-@pytest.mark.slow
-def test_steps_add_up_to_the_whole(studio: Studio, setup: Setup) -> None:
-    """In order, of a real scene; what it does not call for changes nothing at all."""
-    scope = Scope(setup, (None,), seeds=(3,), quick=True)
-    points = [point for point in STUDY.points(scope) if point["way"] == IN_ORDER]
-    assert [point["effect"] for point in points] == list(EFFECTS)
-    rows = [row for point in points for row in STUDY.measure(studio, point).rows]
-    assert rows[0]["ideal_db"] + sum(row["change_db"] for row in rows) == pytest.approx(rows[-1]["with_db"], abs=1e-9)
-    quiet = [row["change_db"] for row in rows if not row["called_for"]]
-    assert len(quiet) > 5 and not any(quiet)
-    assert all(row["flagged"] == bool(row["reason"]) for row in rows)
-    assert any(row["flagged"] for row in rows)  # factors that no session gave
-    wanted = studio.image(setup, RENDERED, "dots:7", 3)
-    assert rows[-1]["calibrated_db"] == wanted.quality.psnr_db, "bit-equal to the rendered image of other studies"
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
@@ -259,20 +243,6 @@ def test_without_keystone_light_lies_in_its_pixel(turned: SampledLight) -> None:
     straight = waterfall._Place(turned.bench).move(path_samples, frozenset({waterfall.KEYSTONE}))
     assert np.array_equal(pixel_of(turned, straight), path_samples.pixel)
     assert np.array_equal(straight.inverse_depth, path_samples.inverse_depth)
-
-
-@pytest.mark.slow
-def test_light_that_moves_keeps_its_glare(shared_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
-    """Of a projector of ANSI contrast 10, a fifth of all light: without blur or render noise frames are as bright.
-    (Planted: glare among light that is followed further; the truth's whole flux for a pixel's own.)"""
-    device = tmp_path / "device.toml"
-    device.write_text(PROJECTOR + "ansi_contrast = 10.0\n")
-    path = shared_scene("glare", reflectance=PRINT)
-    light = ms.open_bench(path, variant, projector=device).light(FAMILY, accuracy=1e-2)
-    assert 0.15 < light.bench.projector.glare < 0.25
-    for effect in (waterfall.DEFOCUS, waterfall.RENDER_NOISE):
-        without = frames(Ablation(light).without(frozenset({effect})))
-        assert without.sum() == pytest.approx(frames(light).sum(), rel=0.02)
 
 
 def test_falloff_is_the_fourth_power_of_the_cosine(far: SampledLight) -> None:
