@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from string import Template
@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from mitsim.acquire.capture import expose
-from mitsim.acquire.exposure import Exposer
-from mitsim.acquire.spectral import SpectralBench, plan_request
-from mitsim.bench.request import Exposure, Request, SessionRequest, Task
+from mitsim.acquire.exposure import AmbientFrame, Exposer
+from mitsim.acquire.spectral import MosaicFrames, SpectralBench, plan_request
+from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.calibrate.calibrate import calibrate_lines
 from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import JOINT, RUN
@@ -35,12 +35,13 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import SensorModel
 from mitsim.light.light import trace_lines
 from mitsim.metrics import psnr
+from mitsim.optics.frames import Frame
 from mitsim.reconstruct.colour import ColourModel, behind, chart, daylight, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import Solution, prepare
 from mitsim.report import RENDERED
-from mitsim.report.lit_scene import LitScene
+from mitsim.report.lit_scene import LitScene, peak_time
 from mitsim.report.reconstruct_run import MosaicSolver
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.claims import Gain
@@ -144,17 +145,12 @@ def mosaic_images(lines: Sequence[LitLine], family: PatternFamily, seed: int) ->
 
     MitsimError for a line outside the filters' curves.
     """
-    devices, weights = lines[0].lit.bench.devices, filter_weights(lines)
-    # Light and noise of a shot are in electrons, so that any time and wavelength may lie between them.
-    one_second = [Exposer(line.lit.bench.devices, 1.0, 0) for line in lines]
-    expected = [line.lit.expected_frames(RENDERED, family) for line in lines]
-    passed = behind(weights, devices.camera.frame_shape)
-    rates = [
-        np.einsum("lij,lij->ij", passed, [unit.electrons(frame) for unit, frame in zip(one_second, shot, strict=True)])
-        for shot in zip(*expected, strict=True)
-    ]
-    exposer = Exposer(devices, _peak_seconds(devices.sensor, rates), integer(seed, "mosaic"))
-    return solve_mosaic(lines, family, _measured(exposer, family, rates))
+    bench = lines[0].lit.bench
+    units = [electrons_from_irradiance(1.0, 1.0, bench.sensor, line.wavelength_nm) for line in lines]
+    passed = behind(filter_weights(lines) * np.array(units) / units[0], bench.geometry.frame_shape)
+    expected = MosaicFrames([line.lit.expected_frames(RENDERED, family) for line in lines], passed)
+    exposer = Exposer(bench.devices, peak_time(bench, expected), integer(seed, "mosaic"))
+    return solve_mosaic(lines, family, exposer.measurements(family, expected))
 
 
 @single_threaded_blas()
@@ -187,31 +183,16 @@ def filter_weights(lines: Sequence[LitLine]) -> FloatArray:
 @single_threaded_blas()
 def daylit_image(line: LitLine, light: tuple[FloatArray, float], lux: float, patterns: str, seed: int) -> Solution:
     bench, family = line.lit.bench, line.lit.bench.family(patterns, seed)
-    lamp = lux / FULL_LX * electrons_from_irradiance(light[0], 1.0, bench.sensor, light[1])
-    unit = Exposer(bench.devices, 1.0, 0)
-    rates = [unit.electrons(frame) + lamp for frame in line.lit.expected_frames(RENDERED, family)]
-    exposer = Exposer(bench.devices, _peak_seconds(bench.sensor, rates), line.seed(seed))
-    off, count = np.zeros(()), 0 if family.signed else len(family.shots)
-    for shot in range(count):
-        off = off + exposer.rate(exposer.digital(lamp * exposer.exposure_s, "ambient", shot)) / count
+    units = [electrons_from_irradiance(1.0, 1.0, bench.sensor, each) for each in (light[1], line.wavelength_nm)]
+    lamp = Frame(lux / FULL_LX * units[0] / units[1] * light[0], 0.0, 0.0, 0.0)
+    of_line = line.lit.expected_frames(RENDERED, family)
+    expected = MosaicFrames([of_line], np.ones((1, *lamp.irradiance.shape)), lamp)
+    exposer = Exposer(bench.devices, peak_time(bench, expected), line.seed(seed))
+    shots = 0 if family.signed else len(family.shots)
+    off = exposer.rate(AmbientFrame.expose(exposer, expected, shots).digital) if shots else 0.0
     plain = prepare(*line.factors.sides, family.left, family.right, centre=line.factors.manifest.centre)
-    model = plain.with_correlation()
-    seen = _measured(exposer, family, rates)
+    model, seen = plain.with_correlation(), exposer.measurements(family, expected)
     return model.solve(model.accumulator((frame - off, row, column) for frame, row, column in seen), "auto")
-
-
-def _peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
-    brightest = max(float(rate.max()) for rate in rates) + sensor.superpixel_dark_current_e_per_s
-    return float(Exposure().fraction * sensor.superpixel_full_well_e / brightest)
-
-
-def _measured(
-    exposer: Exposer, family: PatternFamily, rates: Sequence[FloatArray]
-) -> Iterator[tuple[FloatArray, int, int]]:
-    shown = zip(family.shots, rates, strict=True)
-    return family.measurements(
-        exposer.rate(exposer.digital(rate * exposer.exposure_s, *shot.names)) for shot, rate in shown
-    )
 
 
 # -------- The study
