@@ -171,7 +171,6 @@ def _rms(values: FloatArray) -> FloatArray:
 
 _TOLD, _OF_HEAVY = 1.2, 0.55
 """Ratio of bound and error beyond which few heavy paths dominate both; the bound then falls with power 0.8 to 0.93."""
-_VIEW_SAMPLES = 64
 _LOST = 0.1
 """Part of the accuracy that light beyond all cells may use; a hundredth of the pixels may have all of it."""
 _BY_CHANCE = 1.5
@@ -655,23 +654,6 @@ def _shared_out(lights: Sequence[SampledPass], allowed: float) -> dict[str, int]
         if not resting or scale**2 * resting[-1].gain <= 1:
             return found | {light.name: math.ceil(scale * math.sqrt(light.gain) * light.done) for light in growing}
     return None
-
-
-# -------- A view for people
-
-
-def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> FloatArray:
-    """Return the apparent reflectance (rows, columns) of direct light seen from the sensor's centre, for a preview."""
-    settings = Settings(depth=bench.geometry.scene_distance)
-
-    def view(which: Apparatus) -> FloatArray:
-        simulation = Simulation(which, settings, pixels=2 * bench.n)
-        path_samples = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
-        light = simulation.accumulate("direct", path_samples, np.zeros(bench.n**2, dtype=np.int64), 1)["fine"]
-        return np.asarray(light[[0]].toarray()).reshape(simulation.grids["fine"].bundle.cells)
-
-    scene, board = view(bench), view(before_board(bench, board_reflectance))
-    return np.asarray(np.divide(scene, board, out=np.zeros(scene.shape), where=board > 0))
 
 
 # -------- Light by projector pixel in an HDF5 file, from which NumPy and SciPy form the frame of any pattern

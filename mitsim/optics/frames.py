@@ -628,23 +628,9 @@ class Beams:
         return -_slope(self.sensor, self.tangent)
 
 
-@dataclass(frozen=True, eq=False)
-class SpecularFrames(ClassFrames):
-    """Irradiance by mirrors, one frame for each class of projector pixels that reaches the sensor.
-
-    ``lit_pixels`` are the projector pixels whose light meets the sensor. ``flux`` is that on the sensor without the
-    mask [W m^-2 mm^2], ``unresolved`` the part that is left out, and ``error`` the standard error of the rest.
-    """
-
-    lit_pixels: IntArray
-    flux: float
-    unresolved: float
-    error: float
-
-
 def specular_frames(
     beams: Beams, geometry: CameraGeometry, terms: Sequence[SampledTerm], labels: IntArray, boxes_per_pixel: int = 2
-) -> SpecularFrames:
+) -> ClassFrames:
     """Form the frames of the classes that mirrors bring to the sensor.
 
     ``labels`` (n * n,) are the classes of projector pixels, and ``terms`` samplers of the mask; ``[]`` gives no light.
@@ -657,7 +643,6 @@ def specular_frames(
     classes = np.unique(labels[beams.pixel[reached]])
     shape = geometry.frame_shape
     frames = np.zeros((len(classes), *shape))
-    total, lit = 0.0, np.zeros(len(labels), dtype=bool)
     for those, a, b, size in _cuts(beams, reached, min(geometry.pitches) / boxes_per_pixel):
         # ---- Boxes that the sensor sees within the field stop: place, size and tangent at the middle, and flux
         corners, tangents = beams.sensor[those], beams.tangent[those]
@@ -674,8 +659,7 @@ def specular_frames(
         squared = np.square(tangent[:, 0]) + np.square(tangent[:, 1])
         light = light * (geometry.pixel_fill_factor * geometry.angular_response(squared))
         magnification = (1 + geometry.mask_distance * _slope(corners, tangents))[owner]
-        pixels = beams.pixel[those[owner]]
-        slot, within = np.searchsorted(classes, labels[pixels]), 0.0
+        slot = np.searchsorted(classes, labels[beams.pixel[those[owner]]])
 
         # ---- By axis, the two pixels that a box meets, its part in each, and its place and width on the mask
         both: list[list[tuple[IntArray, FloatArray, FloatArray, FloatArray]]] = [[], []]
@@ -702,18 +686,14 @@ def specular_frames(
         for i, (row, row_share, *_) in enumerate(rows):
             for j, (column, column_share, *_) in enumerate(columns):
                 flux = light * row_share * column_share
-                within += float(flux.sum())
                 met = np.flatnonzero(flux)
                 passed = np.zeros(len(met))
                 for weight, left, right in shadows:
                     passed = passed + weight * left[i][met] * right[j][met]
                 flat = (slot[met] * shape[0] + row[met]) * shape[1] + column[met]
                 np.add.at(frames.reshape(-1), flat, flux[met] * passed)
-        total += within
-        lit[pixels] = True
-    used, area = np.isin(classes, labels[lit]), math.prod(geometry.active_sides)
-    lit_classes, lit_frames = classes[used].astype(np.int64), frames[used] / area
-    return SpecularFrames(lit_classes, lit_frames, np.flatnonzero(lit), total, beams.unresolved, beams.error)
+    used, area = frames.any(axis=(1, 2)), math.prod(geometry.active_sides)
+    return ClassFrames(classes[used].astype(np.int64), frames[used] / area)
 
 
 def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:

@@ -74,39 +74,30 @@ class Prior:
         return math.isfinite(self.bounds[0]) or math.isfinite(self.bounds[1])
 
 
-def solve_tv(
-    prepared: Prepared,
-    frames: Accumulator,
-    weight: float | str = "auto",
-    iterations: int = 5000,
-    tolerance: float = 1e-4,
-    bounds: Bounds | None = None,
-) -> Solution:
-    problem = prepared.problem(frames)
-    if weight == "auto":
-        # With noise of variance v and slopes distributed as exp(-slope / b), the likeliest image has the weight v / b,
-        # and the root of v over Tikhonov's automatic lambda estimates b.
-        known = float(np.sqrt(noise_variance(problem) * automatic_lambda(problem)))
-    else:
-        known = check_lambda(weight)
-    prior = Prior(weight=known, bounds=bounds or Prior.bounds)
-    return _find_minimum(prepared, problem, prior, iterations, tolerance)
-
-
-def solve_nonnegative(
+def _solve_by_iterations(
     prepared: Prepared,
     frames: Accumulator,
     lam: float | str = "auto",
     iterations: int = 5000,
     tolerance: float = 1e-4,
     bounds: Bounds | None = None,
+    *,
+    variation: bool,
 ) -> Solution:
-    problem = prepared.problem(frames)
-    ridge = automatic_lambda(problem) if lam == "auto" else check_lambda(lam)
-    prior = Prior(ridge=ridge, bounds=bounds or (0.0, math.inf))
-    found = _find_minimum(prepared, problem, prior, iterations, tolerance)
-    flags = end_of_range(problem, ridge) if lam == "auto" else ()
-    return replace(found, status=replace(found.status, flags=flags))
+    problem, automatic = prepared.problem(frames), lam == "auto"
+    known = automatic_lambda(problem) if automatic else check_lambda(lam)
+    if not variation:
+        found = _find_minimum(prepared, problem, Prior(0.0, known, bounds or (0.0, math.inf)), iterations, tolerance)
+        flags = end_of_range(problem, known) if automatic else ()
+        return replace(found, status=replace(found.status, flags=flags))
+    if automatic:
+        # With noise of variance v and slopes distributed as exp(-slope / b), the likeliest image has the weight v / b,
+        # and the root of v over Tikhonov's automatic lambda estimates b.
+        known = float(np.sqrt(noise_variance(problem) * known))
+    return _find_minimum(prepared, problem, Prior(known, 0.0, bounds or Prior.bounds), iterations, tolerance)
+
+
+solve_tv, solve_nonnegative = (partial(_solve_by_iterations, variation=variation) for variation in (True, False))
 
 
 def _find_minimum(

@@ -699,10 +699,10 @@ def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
 def render_demo(report: Mapping[str, Any]) -> str:
     """Render the page; the same data give the same bytes, and a section without data is left out.
 
-    ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, row 0 at the top as seen along +z. ``main``
-    is the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in DN by
-    caption, and ``budget`` has name, relative rms of the expected frames (None: unknown) and meaning of each source of
-    error.
+    ``truth`` (n, n) is a reflectance, 1 = calibration board, row 0 at the top as seen along +z. ``render`` is light, 1
+    = white. ``main`` is the family whose errors are shown; the tiles compare the best family with the first.
+    ``frames`` are in DN by caption, and ``budget`` has name, relative rms of the expected frames (None: unknown) and
+    meaning of each source of error.
     """
     from mitsim.report.plots import singular_values
 

@@ -469,17 +469,7 @@ def frame_moments(expected_electrons: npt.ArrayLike, exposure_s: float, model: S
     light, dark = mean_electrons(expected_electrons, exposure_s, model)
     expected = np.asarray(light + dark)
     offset = reading_offset(expected.shape, model, None)
-    if offset is not None or model.linearity:
-        return _general(expected, None if offset is None else offset.reshape(expected.shape), model)
-    mean, variance = np.asarray(amplify(expected, model)), _linear_variance(expected, model)
-    first, last = _linear(model)
-    rest = (expected < first) | (expected > last)
-    if rest.any():
-        mean[rest], variance[rest] = _cut(expected[rest], model)
-    return mean, variance
-
-
-def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel) -> Moments:
+    offset = None if offset is None else offset.reshape(expected.shape)
     level, spread = bent_moments(expected, model)
     mean = np.asarray(amplify(level if offset is None else level + offset, model))
     noise = np.asarray(_linear_variance(spread, model))

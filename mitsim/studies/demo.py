@@ -13,6 +13,7 @@ import numpy as np
 
 from mitsim.acquire.capture import expose, trace_request
 from mitsim.api.bench import Bench
+from mitsim.bench.layout import layout_of, previews
 from mitsim.bench.request import Exposure, Request, Task
 from mitsim.calibrate.board_session import Session
 from mitsim.core.configuration import opening_words
@@ -24,7 +25,7 @@ from mitsim.core.headline import each_once, headline
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture, frame_name
 from mitsim.devices.session import load_recipe
-from mitsim.light.light import SampledLight, pinhole_view
+from mitsim.light.light import SampledLight
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.report import CONVENTIONS, EQUAL_PEAK, label
@@ -121,7 +122,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
     flags = {"the capture": shots.warnings, "the calibration": factors.warnings, "the image": doubts(main)}
     warnings = each_once(flags)
     with job.clock.stage("views"):
-        view = pinhole_view(bench, load_recipe().board_reflectance, request.seed)
+        view = previews(bench, layout_of(bench))[0].picture.mean(axis=-1)
         count = len(shots.manifest.patterns.captures)
         white = lit.rendered_frames(factors, bench.family("uniform"), light.seed)
         (shot,), (even,) = white.family.shots, white.expected
