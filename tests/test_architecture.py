@@ -486,7 +486,6 @@ SIZES = {
     "devices": (8, 1995),
     "exchange": (5, 1281),
     "learn": (5, 1191),
-<<<<<<< HEAD
     "light": (6, 1682),
     "optics": (7, 1757),
     "planner": (6, 1629),
@@ -496,17 +495,6 @@ SIZES = {
     "sensor": (4, 1118),
     "sessions": (4, 884),
     "studies": (23, 5178),
-=======
-    "light": (6, 1669),
-    "optics": (7, 1745),
-    "planner": (6, 1629),
-    "reconstruct": (16, 5520),
-    "report": (6, 1902),
-    "scene": (5, 1359),
-    "sensor": (4, 1110),
-    "sessions": (4, 860),
-    "studies": (23, 5150),
->>>>>>> f4f106dd (Format and sizes)
     "top level": (5, 501),
     "transport": (15, 3990),
 }
