@@ -325,6 +325,7 @@ class Simulation:
         self,
         bench: Apparatus,
         settings: Settings,
+        pixels: int | None = None,
         one_line: bool = False,
         places: Places | None = None,
         judging_cells: int = 0,
@@ -339,6 +340,7 @@ class Simulation:
             self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
         if one_line:
             self.physics = replace(self.physics, geometry=with_few_cells(self.physics.geometry, self.physics.spectrum))
+        self._pixels = pixels or bench.n
         self._counted_lamps = counted_lamps = bench.counted_lamps if self.physics.lamps else None
         self.lamp_rows = len(counted_lamps.bands) if counted_lamps else 1
         # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
@@ -370,7 +372,7 @@ class Simulation:
 
     def cells(self, subdivision: int = 1, width: int = 1, reach: float | None = None) -> CellGrid:
         depth, farthest = self.settings.depth, max(self.reach, reach or 0.0)
-        return aligned_grid(*self.bench.windows_at(depth), -(-self.bench.n // width), subdivision, farthest)
+        return aligned_grid(*self.bench.windows_at(depth), -(-self._pixels // width), subdivision, farthest)
 
     def mean_weights(self, anchors: int) -> FloatArray:
         edges = self.physics.geometry.pixel_edges
