@@ -227,7 +227,7 @@ def factors_of_sums(
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
     allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, 0.2 * float(np.sqrt(expected)))
-    n, predicted, rank = len(signs), list[float](), list[int]()
+    n, predicted, rank, dark = len(signs), list[float](), list[int](), list[int]()
     singular = [np.asarray(np.linalg.svd(factor, compute_uv=False)) for factor in phi]
     condition = max(squared_condition(factor, values) for factor, values in zip(phi, singular, strict=True))
     for factor, common, values, more in zip(phi, (v, a), singular, extra, strict=True):
@@ -236,6 +236,8 @@ def factors_of_sums(
             error = float(np.hypot(error, np.sqrt(more / count) / np.linalg.norm(factor)))
         predicted.append(error)
         rank.append(rank_above_noise(factor, error, values))
+        # Patterns resolve lines whose shadows are alike, but not a line without a shadow.
+        dark.append(int(np.count_nonzero(np.linalg.norm(factor, axis=0) <= _least(factor, error, values))))
     shown = f"rank {rank[0]} of {n} and {rank[1]} of {n}, condition {condition:.1e}"
     figures = f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, {shown}."
     if unexplained > allowed:
@@ -248,14 +250,14 @@ def factors_of_sums(
         remedy = f"average {times} times as many shots (repeats = {times} in the recipe)"
         words = f"Factors are mostly noise: an error of {max(predicted):.0%} is expected of them, allowed are "
         words += f"{LARGEST_ERROR:.0%}"
-    elif rank != [n, n]:
-        verdict = Verdict.RANK_DEFICIENT
-        words = f"Factors are rank deficient: {n - rank[0]} directions of scene rows and {n - rank[1]} of columns are"
-        words += " not above noise and rounding"
-        remedy = "capture with dots, which resolve more (--patterns dots:7), enlarge the gap from sensor to mask (-D "
-        remedy += "mask_distance=3), or average more shots (repeats = 4 in the recipe)"
+    elif any(dark):
+        verdict, remedy = Verdict.RANK_DEFICIENT, "check the projector, or average more shots (repeats = 4 in the recipe)"
+        words = f"Factors are rank deficient: {dark[0]} scene rows and {dark[1]} scene columns are not above noise"
     else:
         verdict, words, remedy = Verdict.CALIBRATED, "Calibrated: responses are separable", ""
+        if rank != [n, n]:
+            words += f"; uniform light alone leaves {n - rank[0]} directions of scene rows and {n - rank[1]} of columns"
+            words += " below noise and rounding, which dots resolve (--patterns dots:7)"
     status = Status(verdict, words, remedy, figures)
     errors, ranks = (predicted[0], predicted[1]), (rank[0], rank[1])
     return Estimate(phi[0], phi[1], residual, unexplained, condition, noise, errors, ranks, status)
@@ -313,16 +315,17 @@ def squared_condition(phi: FloatArray, values: FloatArray | None = None) -> floa
 
 
 def rank_above_noise(phi: FloatArray, error: float, values: FloatArray | None = None) -> int:
-    """Return the number of singular ``values`` of ``phi`` (m, n) above rounding and noise of a relative ``error``.
-
-    The limit is three standard deviations above the mean of chi-square of m degrees.
-    """
-    if not phi.any():
-        return 0
+    """Return the number of singular ``values`` of ``phi`` (m, n) above rounding and noise of a relative ``error``."""
     values = np.asarray(np.linalg.svd(phi, compute_uv=False)) if values is None else values
+    return int(np.count_nonzero(values > _least(phi, error, values)))
+
+
+def _least(phi: FloatArray, error: float, values: FloatArray) -> float:
+    if not phi.any():
+        return 0.0
+    # Three standard deviations above the mean of chi-square of m degrees.
     deviation, rows = error * np.linalg.norm(phi) / np.sqrt(phi.size), phi.shape[0]
-    noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
-    return int(np.count_nonzero(values > max(float(noise), _rounding(phi, values))))
+    return max(float(deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))), _rounding(phi, values))
 
 
 def _rounding(phi: FloatArray, values: FloatArray) -> float:

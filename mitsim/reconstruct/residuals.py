@@ -150,8 +150,8 @@ class NoiseTest:
         if not noise.stated:
             return self.gain_error < _SLOPE_KNOWN and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error
         chance = noise.chance(float(noise.light.size))
-        # The energy beside may be stated too large, because a few groups of paths estimate that of rendering.
-        little = whole - beside < (1 - _NOISE_OFF - chance) * stated
+        # The energy of rendering is not taken off, because its stated error is an upper bound.
+        little = whole - beside + noise.rendering < (1 - _NOISE_OFF - chance) * stated
         if little and self.ratio < 1 - _NOISE_OFF + CHANCE / 2 * self.error:
             return True
         white = whole < (1 + 0.5) * self.ratio * stated + beside

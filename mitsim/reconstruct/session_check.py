@@ -139,6 +139,7 @@ _LINE = 0.15
 _DARK, _LIT = (0.02, 0.3), 0.1
 _NAMED = 12
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
+_EVEN = "responses hold even light that changes from pattern to pattern; darken the room, and mount the mask straight"
 _PHOTONS = "photon noise of bright pixels; use more light"
 _LAMP = "the lamp's power changes; use a steadier one"
 _BENT = "numbers are not in proportion to light; switch gamma and other processing off, or use a shorter exposure"
@@ -314,12 +315,17 @@ class _Side:
         rest -= ratios[:, None] * responses
         values -= ratios[:, None] * parts
         squares, spare = np.square(rest).sum(axis=1), max(len(self.uniform) - len(shapes) - 1, 1)
-        noise = min(float(np.median(squares)) / spare, self.noise / len(self.vectors))
+        noise = min(float(np.median(squares)) / spare, self.peaked * self.noise / len(self.vectors))
+        self.add(_PHOTONS, (noise * len(self.vectors) - self.noise) * len(squares))
         noise = max(noise, 1e-13 * float(np.square(self.uniform).mean()))
         # Steady ambient light of any shape is in all sums, and not in the uniform response, which sets the zero.
         measured = *(values[:, :2] - values[0, :2] + (self.power, self.place)).T, ratios
-        shared = np.square(parts[:, :2].T) / sizes
-        variances = noise * np.stack([*(np.square(inverse[:, :2]).sum(axis=0)[:, None] + shared), 1 / sizes])
+        # Bright rows have more photon noise.
+        bright = np.median(np.square(rest), axis=0) + 1e-300
+        bright /= bright.mean()
+        of_ratio = np.maximum(np.square(responses) @ bright, 1e-30) / np.square(sizes)
+        of_shapes = (bright @ np.square(inverse[:, :2]))[:, None] + np.square(parts[:, :2].T) * of_ratio
+        variances = noise * np.stack([*of_shapes, of_ratio])
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
         beyond = squares - noise * spare * (1 + np.pi / 4 / len(squares))  # the usual sum is a median
         excess = beyond * (beyond.sum() > _SURE * noise * np.sqrt(2 * spare * len(squares)))
@@ -383,9 +389,7 @@ class _Check:
             self._refuse(self.sides[axis], 0, _UNEQUAL)
         self.judge()
         for axis, (own, good) in enumerate(zip(self.sides, self.good, strict=True)):
-            photons = min((own.peaked - 1) * own.noise * self.count, float(excess[axis][good].sum()))
-            own.add(_PHOTONS, photons)
-            own.add(_UNKNOWN_LIGHT, float(excess[axis][good].sum()) - photons)
+            own.add(_UNKNOWN_LIGHT, float(excess[axis][good].sum()))
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             words = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
             own.add(words, lag**2 * (0.75**2 + 0.5**2) * own.size)
@@ -425,7 +429,7 @@ class _Check:
             size, changed = float(np.square(effect).sum()), np.square(kept)[good]
             # In the uniform frames it changes the vector that all responses share.
             common = 2 * max(np.median(changed), good[0] * kept[0] ** 2) / np.square(own.uniform).sum() * own.size
-            own.add("ambient light changes between frames; darken the room", float(left.sum() + common) * size)
+            own.add(_EVEN, float(left.sum() + common) * size)
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.

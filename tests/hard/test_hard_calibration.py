@@ -113,7 +113,7 @@ def test_few_photons(measured: Recorder, power: float, seed: int) -> None:
     error = error_of(found, factor, factor)
     assert np.isfinite([*found.left.ravel(), *found.right.ravel(), found.separability_residual]).all()
     if found.ok:
-        assert error < 1.3 * LARGEST_ERROR and found.rank == (N, N)
+        assert error < 1.3 * LARGEST_ERROR and min(found.rank) > 0
     if error < 0.5:
         measured(abs(error / max(found.predicted_error) - 1), at_most=0.3, what="of the prediction")
     if power < 1:
@@ -181,12 +181,10 @@ def test_rank_deficient_factors(twins: set[int], dark: bool, noisy: bool, seed: 
     right[:, 3] *= not dark
     found = Camera(left, right).calibrate(1e9 if noisy else None, seed=seed)
     assert found.rank == (N - len(twins), N - dark)
-    assert found.ok == (not twins and not dark)
-    if not found.ok:
-        assert str(found.status).startswith(
-            f"Factors are rank deficient: {len(twins)} directions of scene rows and {dark:d}"
-        )
-    assert np.isfinite(found.condition) == (noisy or found.ok)
+    assert found.ok == (not dark)
+    words = f"rank deficient: 0 scene rows and {dark:d}" if dark else f"leaves {len(twins)} directions of scene rows"
+    assert (words in str(found.status)) == bool(dark or twins)
+    assert np.isfinite(found.condition) == (noisy or not (twins or dark))
 
 
 def test_a_mask_that_is_too_close(measured: Recorder) -> None:
@@ -196,7 +194,7 @@ def test_a_mask_that_is_too_close(measured: Recorder) -> None:
     for distance, rank in zip((0.02, 0.1, 0.5, 2.0), ranks, strict=True):
         measured(rank, what=f"rank of {N} at {distance} mm")
     assert ranks == sorted(ranks) and ranks[0] < N and ranks[-1] == N
-    assert [calibration.ok for calibration in found] == [rank == N for rank in ranks]
+    assert ["uniform light alone" in str(calibration.status) for calibration in found] == [rank < N for rank in ranks]
 
 
 # ---- the folders -----------------------------------------------------------------------------------------------------

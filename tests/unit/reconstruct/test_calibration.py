@@ -76,12 +76,15 @@ def test_error_under_noise_is_the_predicted_one():
     assert np.mean(estimates) == pytest.approx(noise, rel=0.01)
 
 
-def test_twin_pixels_are_reported_as_rank_deficient():
+def test_dark_lines_flag_factors_and_twins_that_patterns_resolve_do_not():
     left, right = factors()
     left[:, 1] = left[:, 0]
     got = estimate_factors(*responses(left, right), H)
-    assert got.condition == np.inf
-    assert str(got.status).startswith("Factors are rank deficient")
+    assert got.condition == np.inf and got.rank == (N - 1, N) and got.ok
+    assert "uniform light alone leaves 1 directions of scene rows" in str(got.status)
+    left[:, 1] = 0
+    got = estimate_factors(*responses(left, right), H)
+    assert not got.ok and str(got.status).startswith("Factors are rank deficient: 1 scene rows")
 
 
 def flatcam(pixel_mm, order=9):
