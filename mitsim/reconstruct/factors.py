@@ -251,7 +251,7 @@ def factors_of_sums(
         words = f"Factors are mostly noise: an error of {max(predicted):.0%} is expected of them, allowed are "
         words += f"{LARGEST_ERROR:.0%}"
     elif any(dark):
-        verdict, remedy = Verdict.RANK_DEFICIENT, "check the projector, or average more shots (repeats = 4 in the recipe)"
+        verdict, remedy = Verdict.RANK_DEFICIENT, "check the projector, or average more shots (repeats = 4)"
         words = f"Factors are rank deficient: {dark[0]} scene rows and {dark[1]} scene columns are not above noise"
     else:
         verdict, words, remedy = Verdict.CALIBRATED, "Calibrated: responses are separable", ""
