@@ -489,7 +489,7 @@ SIZES = {
     "light": (6, 1672),
     "optics": (7, 1745),
     "planner": (6, 1629),
-    "reconstruct": (16, 5524),
+    "reconstruct": (16, 5529),
     "report": (6, 1902),
     "scene": (5, 1359),
     "sensor": (4, 1110),
