@@ -531,13 +531,13 @@ def characterise(
             raise MitsimError(
                 "characterise: got no camera; name one to simulate, or give as frames the folder of a real one"
             )
-        asked.refuse(asked.given, "on frames of a real camera")
+        asked.refuse(asked.given.keys() - {"style"}, "on frames of a real camera")
         listed = load_flats(Path(frames))
         if output is not None:
             check_study_folder(output, "characterise")
         from mitsim.studies.characterise import characterise_frames
 
-        return characterise_frames(listed, output, job)
+        return characterise_frames(listed, output, job, asked.style)
     sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     if isinstance(frames, (str, Path)):
         raise ArgumentError("frames", f"{frames}: a folder is for a real camera; leave out either it or {camera}")

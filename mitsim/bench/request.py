@@ -17,7 +17,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from mitsim.bench.effects import parse_switches
 from mitsim.core import configuration
 from mitsim.core.colour_files import BANDS, LINES, bands_of
-from mitsim.core.configuration import CAMERA, PROJECTOR, QUALITY, FilePath, Options, option, shipped_names, validated_by
+from mitsim.core.configuration import (
+    CAMERA,
+    PROJECTOR,
+    QUALITY,
+    FilePath,
+    Options,
+    Styled,
+    option,
+    shipped_names,
+    validated_by,
+)
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
 from mitsim.core.files import check_plain
@@ -411,7 +421,7 @@ class Irradiance(Timed, Lit):
     channel: str | None = option(None, "channel to use, if the image has several", metavar="NAME")
 
 
-class Procedure(Lit, Seeded):
+class Procedure(Lit, Seeded, Styled):
     """Options of a characterisation on simulated frames.
 
     Below 32 rows a row's part is uncertain by a quarter; EMVA 1288 requires at least 50 steps and 16 frames.

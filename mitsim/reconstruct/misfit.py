@@ -485,6 +485,9 @@ GROSS, GROSS_CHI_SQUARE = 0.1, 4.0
 _SHOWN, _MOSTLY = 4, 0.5
 
 
+_FOCUS = "for a scene of other depths use `--focus auto` or `--focus map`, "
+
+
 class Cause(Enum):
     NOISE = "the frames' noise", "check gain, read noise and black level of the camera file, and that numbers are raw"
     READING = "another reading of the frames", "see which of the readings is true, and import the frames so"
@@ -495,8 +498,8 @@ class Cause(Enum):
         "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, "
         "gloss, indirect light, light of the room, print finer than a scene pixel, numbers that are not linear in the "
         "light, or another camera",
-        "try `--focus auto`, darken the room or take an ambient_frame, check that the camera is the calibrated one "
-        "and compare the misfit's map with the scene",
+        f"{_FOCUS}darken the room or take an ambient_frame, check that the camera is the calibrated one and compare "
+        "the misfit's map with the scene",
     )
 
 
@@ -580,13 +583,15 @@ class Misfit:
             "map": self.tiles.tolist(),
         }
 
-    def judge(self, status: Status) -> Status:
+    def judge(self, status: Status, focused: bool = False) -> Status:
+        """Return ``status`` with the misfit; one that is ``focused`` already is not told to look for depths."""
         if self.cause is None:
             return status
         times = f", {chi_square_text(self.chi_square)} times what its noise makes" if self.stated else ""
         head = f"Misfit: {self.unexplained:.1%} of the measurements fit no image{times}; "
         head = {Cause.NOISE: "Noise is not as stated: ", Cause.FRAMES: "Faulty frames: "}.get(self.cause, head)
         sentence, remedy = head + self.reason, self.cause.value[1]
+        remedy = remedy.removeprefix(_FOCUS) if focused else remedy
         if self.predicted:
             sentence += f"; its calibration foretells up to {self.predicted:.1%} ({decibels(self.predicted):.1f} dB)"
         if self.rendered:

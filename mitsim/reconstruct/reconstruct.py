@@ -11,6 +11,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Drawn, takes
+from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields
 from mitsim.core.exr import verify_files, write_frame
 from mitsim.core.files import output_folder, plain, read_json, remove_page, write_bytes, write_json
@@ -262,7 +263,8 @@ class Reconstruction(Solution):
         checksums[PICTURE_FILE] = write_bytes(folder / PICTURE_FILE, png(self.image / self.white))
         stated = {"inputs": self.inputs, "checksums": checksums}
         result = {**(more or {}), **self.summary(), **stated}
-        write_json(folder / RESULT_FILE, {"headline": image_headline(result, self.status.reasons), **result})
+        headline = image_headline(result, self.status.reasons)
+        write_json(folder / RESULT_FILE, {"headline": headline, "versions": versions(), **result})
         return folder
 
     @takes(Drawn)
@@ -416,7 +418,8 @@ def reconstruct_request(
             # Of a simulated run the lamp and the place of every frame are known.
             frames = misfit.picture.uncertainty(solution.image)
             uncertainties = replace(uncertainties, sources={**uncertainties.sources, "frames": frames})
-    status, image = misfit.judge(solution.status) if misfit else solution.status, solution.image
+    focused = request.focus is not None or factors.manifest.parallax is None
+    status, image = misfit.judge(solution.status, focused) if misfit else solution.status, solution.image
     doubts.append(uncertainties.loss(image) if uncertainties else "")
     inherited = each_once({"the capture": data.shots.warnings, "the calibration": factors.warnings})
     flags = (*status.flags, *filter(None, doubts), *inherited)

@@ -417,7 +417,7 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) 
 def noise_variance(problem: DiagonalProblem) -> float:
     spare = problem.data_count - np.count_nonzero(problem.sigma)
     if spare <= 0:
-        raise MitsimError("too few data to estimate the noise; give lambda as a number")
+        raise MitsimError("too few data to estimate the noise; use more patterns (dots:7), or give a number for lambda")
     inside = np.square(problem.projected[problem.sigma > 0]).sum()
     return max(problem.energy - float(inside), 0.0) / spare
 

@@ -313,7 +313,7 @@ def _of_image(folder: Path) -> Shown:
         tables={
             "Numbers": {key: value for key, value in numbers.items() if key != "misfit.reason"},  # a warning has it
             "Configuration": lines_of({"inputs": inputs, reconstruct.MADE_OF: result.get(reconstruct.MADE_OF) or {}}),
-            "Versions": {},
+            "Versions": result.get("versions") or {},
         },
     )
 

@@ -201,7 +201,8 @@ def run(
             from mitsim.report.pages import render_page, scene_name, subject
 
             opened = any(step.verb in session_file.OF_A_BENCH for step in read.steps)
-            about = (scene_name(steps.bench.loaded.path), steps.bench.sensor.name) if opened else ("", "")
+            made = ", ".join(step.output for step in read.steps)
+            about = (scene_name(steps.bench.loaded.path), steps.bench.sensor.name) if opened else (made, "")
             page = render_page(
                 "session.html",
                 title=f"Session {folder.name}: {subject(*about)}",

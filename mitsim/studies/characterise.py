@@ -522,11 +522,11 @@ def characterise(
         session = session_of(taken, frames.dark, frames.bright, True, sensor.bits is not None)
         rows = figure_rows(figures(session), frames.figures_set(), sensor.states_efficiency)
         done = Characterisation(sensor.name, session, rows, found, field_rows(found, sensor), procedure.stated)
-        return _write(done, folder)
+        return _write(done, folder, procedure.style)
 
 
 def characterise_frames(
-    listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
+    listed: FlatFrames, output: Path | str | None = None, job: Job | None = None, style: str = "screen"
 ) -> Characterisation:
     """Characterise a real camera by its listed frames; MitsimError for frames that show nothing of a camera."""
     job, facts, where = job or Job(), listed.listed, f"frames {listed.folder}"
@@ -555,16 +555,16 @@ def characterise_frames(
         rows, fields = figure_rows(figures(session), {}, efficient), field_rows(found, None)
         asked = {"folder": str(listed.folder), "shape": shape, "sets": len(taken)}
         done = Characterisation(facts.name, session, rows, found, fields, asked, True, remarks(listed, found))
-        return _write(done, folder)
+        return _write(done, folder, style)
 
 
-def _write(done: Characterisation, folder: Path | None) -> Characterisation:
+def _write(done: Characterisation, folder: Path | None, style: str) -> Characterisation:
     if folder is None:
         return done
     done = replace(done, output=str(folder))
     results = folder / "characterise.json"  # written last, so that a folder with it is complete
     results.unlink(missing_ok=True)
-    pictures = {name: page_figure(figure) for name, figure in write_figures(folder, figures_of(done)).items()}
+    pictures = {name: page_figure(figure) for name, figure in write_figures(folder, figures_of(done), style).items()}
     title, light = "Camera after EMVA 1288", "real frames" if done.real else "simulated even light"
     shown: dict[str, Any] = {"warnings": done.warnings, "scene": light, "camera": done.camera}
     section = Section("characterise", title, done.headline, done.where, pictures, done.parts, **shown)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,14 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import finite_channel, read_frame
 from mitsim.core.files import output_folder, write_json
 from mitsim.core.images import linear_light, own_end, read_image, size_of
+from mitsim.core.manifests import MANIFEST, RunManifest, read_manifest
 from mitsim.core.picture_files import Wanted
 from mitsim.metrics import Quality, summary_of
-from mitsim.reconstruct.reconstruct import POINT_SPREAD, read_result
+from mitsim.reconstruct.factors import camera_parts
+from mitsim.reconstruct.reconstruct import MADE_OF, POINT_SPREAD, read_result
 from mitsim.reconstruct.request import IMAGE_FILE
 from mitsim.report.folder_page import truth_of
-from mitsim.report.pages import DASH, page_figure, reflectance
+from mitsim.report.pages import DASH, Mean, page_figure, reflectance
 from mitsim.report.plots import image_grid, reflectance_norm
 from mitsim.studies.framework.campaign import is_earlier, write_figures
 from mitsim.studies.framework.panels import Part, Section, write_page
@@ -33,19 +36,21 @@ _SHOWN = 0.999
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One image [reflectance], the conversion of its numbers (``scale``), its warnings, and its truth if known."""
+    """One image [reflectance], the conversion of its numbers (``scale``), its warnings, and truth and run if known."""
 
     name: str
     values: FloatArray
     scale: str = STORED
     warnings: Sequence[str] = ()
     truth: FloatArray | None = None
+    run: Mapping[str, Any] = field(default_factory=dict)
 
 
 _COLUMNS = {
     "psnr": "PSNR to truth [dB]", "ssim": "SSIM to truth", "psnr_to_first": "PSNR to first [dB]",
     "ssim_to_first": "SSIM to first", "rms_difference": "rms difference to first",
 }  # fmt: skip
+_RUN = {"mask": "mask", "patterns": "patterns", "method": "method", "exposure_s": "exposure [s]", "seed": "seed"}
 
 
 @dataclass(frozen=True)
@@ -55,8 +60,12 @@ class Comparison:
     Attributes
     ----------
     images
-        For each image its name, the conversion of its numbers, whether it is flagged, PSNR and SSIM against the truth
-        and against the first image (None if unknown), and mean and rms difference to the first image [reflectance].
+        For each image its name, the conversion of its numbers, whether it is flagged, mask, patterns, method, exposure
+        and seed of its run, PSNR and SSIM against the truth and against the first image (None if unknown), and mean and
+        rms difference to the first image [reflectance].
+    means
+        For each mask, patterns and method with several seeds these, the number of images, and mean and half of the 95 %
+        interval of their PSNR.
     white, largest_difference
         Ends of the scales of the figures [reflectance].
     """
@@ -68,18 +77,63 @@ class Comparison:
     warnings: tuple[str, ...]
     output: str
     figures: tuple[str, ...]
+    means: tuple[dict[str, Any], ...] = ()
 
     def payload(self) -> dict[str, Any]:
         return asdict(self)
 
-    def table(self) -> Part:
-        cells = [[DASH if row[key] is None else f"{row[key]:.4g}" for key in _COLUMNS] for row in self.images]
-        rows = tuple((row["name"], *line) for row, line in zip(self.images, cells, strict=True))
+    def tables(self) -> tuple[Part, ...]:
+        """Return the quality of the images, and the facts on their runs if any is known."""
+        found = []
+        for columns in (_COLUMNS, _RUN):
+            cells = [[_cell(row[key]) for key in columns] for row in self.images]
+            found.append(tuple((row["name"], *line) for row, line in zip(self.images, cells, strict=True)))
         lead = f"Figures show differences up to {reflectance(self.largest_difference)} of the board's reflectance."
-        return Part("Quality", lead, ("image", *_COLUMNS.values()), rows, notes=self.notes)
+        means = [
+            f"{', '.join(map(str, mean['of']))}: PSNR {mean['psnr']:.2f} +- {mean['psnr_ci95']:.2f} dB "
+            f"(mean of {mean['images']} seeds and its 95 % interval)"
+            for mean in self.means
+        ]
+        quality = Part("Quality", lead, ("image", *_COLUMNS.values()), found[0], notes=(*means, *self.notes))
+        known = any(row["mask"] for row in self.images)
+        return (quality, *[Part("Runs", "", ("image", *_RUN.values()), found[1])] * known)
 
     def lines(self) -> list[str]:
-        return [*self.table().lines(), f"Figures and page: {self.output}"]
+        quality, *runs = (table.lines() for table in self.tables())
+        first = f"{len(self.images)} images, compared with {self.images[0]['name']}"
+        return [first, *(line for run in runs for line in [*run, ""]), *quality, f"Figures and page: {self.output}"]
+
+
+def _cell(value: Any) -> str:
+    return DASH if value is None else value if isinstance(value, str) else f"{value:.4g}"
+
+
+def _run_of(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return mask, patterns, method, exposure and seed of the run of an image; nothing if its folder is gone."""
+    place = Path(str((result.get(MADE_OF) or {}).get("run", "")))
+    if not (place / MANIFEST).is_file():
+        return {}
+    run = read_manifest(place, RunManifest)
+    known = {"mask": camera_parts(run.camera).get("geometry.mask"), "patterns": run.patterns.family}
+    known = {name: str(text).partition(",")[0] for name, text in known.items()}
+    how = {name: each for name, each in (result.get("inputs") or {}).items() if name not in ("run", "calibration")}
+    setting = json.dumps([{**run.configuration, "seed": None}, how], sort_keys=True)
+    known |= {"method": how.get("method"), "exposure_s": run.digital.exposure_s, "seed": run.configuration.get("seed")}
+    return {**known, "setting": setting}
+
+
+def means_over_seeds(images: Sequence[Image], rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], ...]:
+    """Return the mean PSNR, with half of its 95 % interval, of images that differ in the seed alone."""
+    groups: dict[str, dict[Any, Mapping[str, Any]]] = {}
+    for each, row in zip(images, rows, strict=True):
+        if row["psnr"] is not None and row["seed"] is not None:
+            groups.setdefault(each.run["setting"], {})[row["seed"]] = row
+    found = []
+    for same in (list(each.values()) for each in groups.values() if len(each) > 1):
+        mean = Mean.of_numbers([row["psnr"] for row in same], "psnr")
+        of = [same[0][name] for name in ("mask", "patterns", "method")]
+        found.append({"of": of, "images": mean.of, "psnr": mean.value, "psnr_ci95": mean.reach})
+    return tuple(found)
 
 
 def images_in(path: Path) -> list[Image]:
@@ -102,7 +156,8 @@ def images_in(path: Path) -> list[Image]:
         if POINT_SPREAD in (result.get("inputs") or {}):
             values, scale = values / result["white"], f"divided by its white, {result['white']:.3g} electrons/s"
         name = path.name if len(folders) == 1 else f"{path.name}/{folder.name}"
-        found.append(Image(name, values, scale, [*map(str, result.get("warnings") or ())], truth_of(result)))
+        warnings = [*map(str, result.get("warnings") or ())]
+        found.append(Image(name, values, scale, warnings, truth_of(result), _run_of(result)))
     return found
 
 
@@ -117,7 +172,8 @@ def compare(paths: Sequence[Path], output: Path | str, overwrite: bool = False, 
             sizes = f"has {size_of(each.values)} pixels, but {first.name} has {size_of(first.values)}"
             raise MitsimError(f"image {each.name}: {sizes}; compare images of one size")
     truths = [each.truth for each in images if each.truth is not None]
-    common = truths[0] if truths and all(np.array_equal(truths[0], each) for each in truths) else None
+    seeds = len({each.run.get("setting") for each in images}) == 1  # truths then differ by their sampling noise alone
+    common = truths[0] if truths and (seeds or all(np.array_equal(truths[0], each) for each in truths)) else None
     offs = [each.values - first.values for each in images]
     rows = []
     for each, off in zip(images, offs, strict=True):
@@ -125,6 +181,7 @@ def compare(paths: Sequence[Path], output: Path | str, overwrite: bool = False, 
         known = None if truth is None else summary_of(Quality.of(each.values, truth))
         beside = None if each is first else summary_of(Quality.of(each.values, first.values))
         row: dict[str, Any] = {"name": each.name, "scale": each.scale, "flagged": bool(each.warnings)}
+        row |= {key: each.run.get(key) for key in _RUN}
         for key in ("psnr", "ssim"):
             row |= {key: known and known[key], f"{key}_to_first": beside and beside[key]}
         row |= {"mean_difference": float(off.mean()), "rms_difference": float(np.sqrt(np.square(off).mean()))}
@@ -150,13 +207,19 @@ def compare(paths: Sequence[Path], output: Path | str, overwrite: bool = False, 
     titles = [f"{each.name} \N{MINUS SIGN} {first.name}" for each in others]
     figures = {"images.png": image_grid({"": shown}, names, scale=grey)}
     figures["differences.png"] = image_grid({"": signed}, titles, scale=colours)
-    warnings = tuple(f"{each.name} is flagged: {text}" for each in images for text in each.warnings)
+    reasons: dict[str, list[str]] = {}
+    for name, text in ((each.name, text) for each in images for text in each.warnings):
+        reasons.setdefault(text, []).append(name)
+    warnings = tuple(
+        f"{', '.join(names)} {'are' if len(names) > 1 else 'is'} flagged: {text}" for text, names in reasons.items()
+    )
     with output_folder(output, overwrite=overwrite and is_earlier(Path(output), "compare")) as folder:
         drawn = write_figures(folder, figures, style)
-        done = Comparison(tuple(rows), white, largest, notes, warnings, str(folder), tuple(drawn))
+        means = means_over_seeds(images, rows)
+        done = Comparison(tuple(rows), white, largest, notes, warnings, str(folder), tuple(drawn), means)
         pictures = {file: page_figure(figure) for file, figure in drawn.items()}
         title = f"{len(images)} images, compared with {first.name}"
-        section = Section("compare", title, title, title, pictures, (done.table(),), warnings=warnings)
+        section = Section("compare", title, title, title, pictures, done.tables(), warnings=warnings)
         write_page([section], folder / "compare.html", title)
         write_json(folder / "compare.json", {**done.payload(), "kind": "compare", "versions": versions()})
     return done

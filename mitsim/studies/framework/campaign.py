@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 # -------- Results of studies
 
+_SHOWN_ROWS = 16
+"""Longest table that the terminal shows."""
+
 
 @dataclass(frozen=True)
 class StudyResult:
@@ -82,7 +85,9 @@ class StudyResult:
             figures = zip(heads, (each.paper, each.idealised, each.rendered), strict=True)
             stated = ", ".join(f"{head.lower()} {figure}" for head, figure in figures if figure)
             lines.append(f"{each.verdict}: {each.claim} ({stated})")
-        return [self.headline, f"Table, figures and page: {self.output} (in {self.seconds:.0f} s)", *lines]
+        parts = self.section.parts if self.section and not self.claims else ()
+        tables = [line for part in parts if len(part.rows) <= _SHOWN_ROWS for line in (part.title, *part.lines())]
+        return [self.headline, f"Table, figures and page: {self.output} (in {self.seconds:.0f} s)", *lines, *tables]
 
     def to_pandas(self) -> Any:
         import pandas

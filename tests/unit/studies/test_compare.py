@@ -14,6 +14,7 @@ import mitsim as ms
 from mitsim.core.exr import read_frame
 from mitsim.core.files import read_json, write_json
 from mitsim.report.reconstruct_run import reconstruct
+from mitsim.studies.compare import Image, means_over_seeds
 from tests.exchanged import made
 
 
@@ -54,6 +55,15 @@ def test_the_quality_of_an_image_plus_a_constant_is_known(folder: Path, tmp_path
     assert {path.name for path in (tmp_path / "out").iterdir() if path.suffix in (".png", ".svg", ".pdf")} == {
         f"{name}.{kind}" for name in ("images", "differences") for kind in ("png", "svg", "pdf")
     }
+
+
+def test_images_of_several_seeds_have_a_mean_with_its_interval() -> None:
+    """Student's interval of two numbers in closed form. (Planted: images of another setting in the same mean.)"""
+    rows = [{"psnr": 30.0 + seed, "seed": seed, "mask": "open", "patterns": "", "method": ""} for seed in range(3)]
+    images = [Image("", np.zeros((1, 1)), run={"setting": setting}) for setting in "aab"]
+    (mean,) = means_over_seeds(images, rows)
+    assert (mean["images"], mean["psnr"], mean["of"][0]) == (2, 30.5, "open")
+    assert mean["psnr_ci95"] == pytest.approx(12.7062 / 2, rel=1e-4)
 
 
 def test_a_flagged_image_is_said_to_be(folder: Path, tmp_path: Path) -> None:
