@@ -87,6 +87,7 @@ calibration
 rare_light
 reconstruction
 convolutional
+error_budget
 validation
 ```
 

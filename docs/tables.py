@@ -69,8 +69,8 @@ def default_text(value: object) -> str:
 def allowed_text(rules: Mapping[str, Any]) -> str:
     """Return the values that a field may have, from the ``rules`` of its JSON schema."""
     if "anyOf" in rules:
-        choices = rules["anyOf"]
-        return ", ".join("null" if choice.get("type") == "null" else allowed_text(choice) for choice in choices)
+        # The default "none" already says that a value may be absent.
+        return ", ".join(allowed_text(choice) for choice in rules["anyOf"] if choice.get("type") != "null")
     if "const" in rules or "enum" in rules:
         return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
     if "$ref" in rules or rules.get("type") == "object":

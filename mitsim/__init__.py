@@ -1,4 +1,4 @@
-"""mitsim: coded light on a scene in, frames of a lensless camera and the images recovered from them out.
+"""mitsim simulates a lensless camera under coded light, and reconstructs images from its frames.
 
 >>> import mitsim as ms
 >>> bench = ms.open_bench("photograph")

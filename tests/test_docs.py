@@ -439,7 +439,7 @@ def test_the_house_stands_on_its_page_as_it_is_tested() -> None:
     assert len(path) == 12 and all((ROOT / name).is_file() for name in path)
     floors = [set(re.findall(r"\w+", rooms)) for rooms in re.findall(r"^\| \d+ \| ([\w, ]+) \|$", page, flags=re.M)]
     assert floors == [rooms for floor in FLOORS if (rooms := set(floor.split()) - alone)]
-    assert re.findall(r"^\| `(\w+)` \|", page.split("## The path")[0], flags=re.M) == [
+    assert re.findall(r"^\| `(\w+)` \|", page.split("## Passes of light")[0], flags=re.M) == [
         room for floor in FLOORS for room in floor.split() if room not in alone
     ]
 

@@ -1,7 +1,7 @@
-"""What is asked of a bench: one model for the command line's options, the arguments of Python, and the manifest.
+"""Models of requests to a bench, which serve the command line, Python and the manifest.
 
-Arguments that travel together are one value: :class:`Request` is what a capture is to show, :class:`SessionRequest`
-what a calibration is to find, and :class:`Task` where results go and who watches the work.
+Arguments that belong together are one value. :class:`Request` describes a capture and :class:`SessionRequest` a
+calibration; :class:`Task` states the output folder and the job that watches the work.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ MOST_SAMPLES = 2**20
 
 @dataclass(frozen=True)
 class Task:
-    """Where the results of a work go, and how it is watched; of no influence on them.
+    """Output folder and job of a piece of work, which do not influence its results.
 
     Attributes
     ----------
     output
         folder that is written; None keeps them in memory.
     resume
-        whether to go on with what an interrupted work left there.
+        True to continue interrupted work in that folder.
     job
         clock, progress and limits.
     """
@@ -83,7 +83,7 @@ class Task:
         Parameters
         ----------
         output, resume, job
-            as there.
+            as the attributes.
         """
         return cls(None if output is None else Path(output), resume, job or Job())
 
@@ -96,7 +96,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Exposure:
-    """One exposure for a whole session: ``seconds`` by hand, or the brightest pixel at ``fraction`` of full well."""
+    """One exposure for a whole session: ``seconds``, or the brightest pixel fills ``fraction`` of the full well."""
 
     seconds: float | None = None
     fraction: float = 0.8
@@ -182,17 +182,17 @@ Effects = Annotated[Any, validated_by(_switches)]
 
 
 class Accurate(Options):
-    """How well light is known."""
+    """Accuracy of the traced light."""
 
     accuracy: Accuracy = option(1e-3, "allowed relative rms error of the expected frames", panel=QUALITY)
 
 
 class Sampled(Seeded, Accurate):
-    """How finely light is sampled."""
+    """Options of sampling light."""
 
 
 class Timed(Seeded):
-    """How long the camera is exposed."""
+    """Exposure time of the camera."""
 
     exposure: float | Literal["auto"] = option("auto", "seconds for each frame, or auto", metavar="auto|SECONDS")
     exposure_fraction: float = option(0.8, "automatic exposure: brightest pixel as part of full well", metavar="PART")
@@ -214,7 +214,7 @@ class Timed(Seeded):
 
 
 class Planned(Sampled, Family):
-    """Which light is simulated, and how finely."""
+    """Options of a plan: simulated effects and their resolution."""
 
     seconds: float | None = option(
         None, "use the best accuracy reachable within S seconds", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
@@ -229,7 +229,7 @@ class Planned(Sampled, Family):
 
 
 class Request(Timed, Planned):
-    """Which shots of a scene are wanted, and how well."""
+    """Options of a capture."""
 
     ambient_frame: Literal["auto", "yes", "no"] = option(
         "auto", "record a frame with the projector off; auto: if lamps are on", metavar="auto|yes|no"
@@ -251,7 +251,7 @@ class Request(Timed, Planned):
 
 
 class SessionRequest(Sampled):
-    """Which factors a calibration is to find, and how well."""
+    """Options of a calibration."""
 
     recipe: SessionRecipe | None = option(
         None, "session recipe, a file of `mitsim new recipe`", metavar="FILE.toml", kind=Path, read=load_recipe
@@ -294,7 +294,7 @@ class Variant(Options):
 
 
 class LitScene(Variant):
-    """What opens a scene with the projector's light."""
+    """Scene and projector of a bench."""
 
     PANEL = configuration.DEVICES
 
@@ -308,7 +308,7 @@ class LitScene(Variant):
 
 
 class Opening(LitScene):
-    """What opens a bench, beside its scene."""
+    """Devices and options that open a bench."""
 
     camera: FilePath | None = option(
         None, "camera: shipped name, or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, CAMERA)
@@ -317,16 +317,16 @@ class Opening(LitScene):
     def check(
         self, scene: Path | str, patterns: str | None = None, timing: Exposure | None = None, colour: str = NO
     ) -> None:
-        """Refuse, before the renderer is imported, what the scene and its devices cannot have.
+        """Refuse options that scene and devices do not permit, before the renderer is imported.
 
         Parameters
         ----------
         scene, patterns
             Scene of the bench, and a family that its projector is to show; None for no family.
         timing
-            Exposure; None where nothing is exposed.
+            Exposure; None if nothing is exposed.
         colour
-            Which light is told apart.
+            Colours that are captured separately.
         """
         from mitsim.bench.apparatus import check_devices, check_scene
 
@@ -379,13 +379,13 @@ _COLOUR_WORDS = (
 
 
 class Coloured(Options):
-    """Which of the projector's light is told apart."""
+    """Colours of the projector that are captured separately."""
 
     colour: Annotated[str, validated_by(_known_colour)] = option(NO, _COLOUR_WORDS, metavar="no|lines|bands:K|mosaic")
 
 
 class AnyColour(Coloured):
-    """Which of the projector's light is told apart, or auto."""
+    """Colours of the projector that are captured separately, or auto."""
 
     colour: Annotated[str, validated_by(lambda colour: None if colour == AUTO else _known_colour(colour))] = option(
         NO,
@@ -409,7 +409,7 @@ class Lit(Options):
 
 
 class Irradiance(Timed, Lit):
-    """How an image's numbers are light on a sensor, and how the sensor is exposed to it."""
+    """Conversion of an image's numbers to light on a sensor, and the sensor's exposure."""
 
     VERB = "sense"
 
@@ -445,7 +445,7 @@ class Procedure(Lit, Seeded, Styled):
 
 
 def check_image(path: Path) -> None:
-    """Refuse a ``path`` that no image is read from."""
+    """Refuse a ``path`` whose file is no image that mitsim reads."""
     if path.suffix.lower() not in IMAGES:
         raise MitsimError(f"image {path}: give an OpenEXR (.exr) or NumPy (.npy) file")
     check_plain(path, "image")
@@ -459,7 +459,7 @@ def check_view(path: Path | str) -> Path:
 
 
 def check_ending(path: Path, sensor: SensorModel) -> None:
-    """Refuse a ``path`` that no frame is written to, or whose kind cannot hold the ``sensor``'s numbers."""
+    """Refuse a ``path`` of a kind that mitsim does not write, or that cannot hold the ``sensor``'s numbers."""
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         raise MitsimError(f"output {path}: give a name that ends in {', '.join(ENDINGS)}")

@@ -1,6 +1,7 @@
-"""`mitsim calibrate`: factors of a simulated session, of real frames, of known pictures, or of a fitted model.
+"""The verb `mitsim calibrate` computes factors.
 
-`--plan-session` only plans a session.
+They come from a simulated session, real frames, known pictures or a fitted model. `--plan-session` only plans a
+session.
 """
 
 from __future__ import annotations

@@ -297,9 +297,9 @@ _SPELLED = {"scene": "SCENE"}
 
 
 def command(function: Callable[[M], int]) -> Callable[..., int]:
-    """Make a ``function`` of one model of options a command of typer.
+    """Convert a ``function`` with one model as its argument to a command of typer.
 
-    The model is made of what the command line gives, so that ``model_fields_set`` names it.
+    The model receives only the given options, so that ``model_fields_set`` names them.
     """
     model: type[Options] = next(kind for name, kind in get_type_hints(function).items() if name != "return")
     first, hidden = (getattr(model, name, "").split() for name in ("FIRST", "HIDDEN"))

@@ -1,4 +1,4 @@
-"""`mitsim list` and `mitsim new`: the entries of a kind, and files to begin with."""
+"""The verb `mitsim list` prints the shipped entries of a kind; `mitsim new` writes a commented file to begin with."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _cameras() -> Iterator[Entry]:
         sensor = load_sensor(path)
         verbs = "capture, sense, characterise" if sensor.states_efficiency else "capture in colour, characterise"
         if sensor.sensor_only:
-            verbs = "sensor only, to characterise; its quantum efficiency is not known"
+            verbs = "sensor only, to characterise"
         yield Entry(name, verbs, f"{sensor.name}, pixels of {sensor.superpixel_pitch_um:g} um")
 
 
@@ -340,7 +340,7 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
 
 
 def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") -> Iterator[str]:
-    """Iterate over the lines of a file of a ``model`` with these ``values``, each below its meaning.
+    """Iterate over the lines of a file with a ``model``'s ``values``, each below its meaning.
 
     ``table`` is the name of the table that the fields are in; empty for none.
     """

@@ -19,12 +19,10 @@ def headline(made: str, reasons: Sequence[str] = ()) -> str:
 
 
 def frames_headline(runs: Sequence[Mapping[str, Any]], reasons: Sequence[str] = ()) -> str:
-    """Return the headline of a capture by the ``summary`` of each of its lines; frames of a camera are imported."""
+    """Return the headline of a capture from each line's ``summary``, with "Imported" for a real camera's frames."""
     (rows, columns), count = runs[0]["shape"][:2], runs[0]["frames"]
     errors = [run["total_error_bound"] for run in runs if run["total_error_bound"] is not None]
-    made = (
-        f"{'Captured' if errors else 'Imported'} {count} frame{'s' if count > 1 else ''} of {rows} x {columns} pixels"
-    )
+    made = f"{'Captured' if errors else 'Imported'} {count} frame{'s' * (count > 1)} of {rows} x {columns} pixels"
     made += f" in each of {len(runs)} lines" if len(runs) > 1 else ""
     return headline(made + (f", total error up to {max(errors):.1e}" if errors else ""), reasons)
 

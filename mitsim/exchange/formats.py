@@ -1,4 +1,4 @@
-"""Export of RUN and CAL folders to files of other programs, import of such files and of real frames, and pictures.
+"""RUN and CAL folders are exported to other programs' files here, and made from such files or real frames.
 
 Each format is a row of :data:`FORMATS`; its module is imported when it is used, after the request was checked.
 """

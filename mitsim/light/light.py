@@ -181,7 +181,7 @@ _BY_CHANCE = 1.5
 class Sampling:
     """Options of sampling; lights for two purposes share no random streams.
 
-    ``excess`` returns the ratio of the error of frames made of all lines to that of the lines' frames.
+    ``excess`` returns a ratio of errors: frames that contain all lines, over frames of single lines.
     """
 
     purpose: str = "scene"

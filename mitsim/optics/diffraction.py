@@ -1,10 +1,8 @@
-"""Wave-optical shadow of a mask as separable terms: scalar Fresnel diffraction.
+"""Compute the wave-optical shadow of a mask as separable terms, by scalar Fresnel diffraction.
 
-Goodman, Introduction to Fourier Optics, 4.2 and 4.5. Behind a mask whose amplitude is a sum of separable terms, the
-field
-of a term is a product of two 1-D functions of s = u (1 - d/z) + d tau, with the effective distance D = d (z - d) /
-z. A
-profile that jumps by J_k at e_k gives, relative to an unbounded open mask::
+The theory is Goodman's (Introduction to Fourier Optics, 4.2 and 4.5). If a mask's amplitude is a sum of separable
+terms, each term's field is a product of two 1-D functions of s = u (1 - d/z) + d tau, with the effective distance D = d
+(z - d) / z. A profile that jumps by J_k at e_k gives, relative to an unbounded open mask::
 
     U(s) = sum_k J_k E(s - e_k),    E(x) = 1/2 + (1 - i)/2 (C + i S)(x sqrt(2 / (lambda D)))
 
@@ -16,7 +14,7 @@ The intensity of ``t = sum_k w_k r_k c_k`` (real) is::
 
     |U|^2 = sum_k w_k^2 |R_k|^2 |C_k|^2 + sum_(k<l) 2 w_k w_l (Re[R_k R_l*] Re[C_k C_l*] - Im[R_k R_l*] Im[C_k C_l*])
 
-Behind a thick mask, the field is that of the clear aperture of both faces, propagated from the exit face.
+Behind a thick mask, the aperture that both faces leave clear is propagated from the exit face.
 """
 
 from __future__ import annotations
@@ -162,7 +160,7 @@ def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, sp
 def wave_profiles(
     shadow: ShadowGeometry, wavelength_nm: float, low_mm: float, high_mm: float, tau: float
 ) -> tuple[list[tuple[float, FloatArray]], float, float]:
-    """Return (weight, (cells,) profile) of each term of a point source's shadow, and start and step [mm] of the grid.
+    """Return (weight, (cells,) profile) for each term in a point source's shadow, and the grid's start and step [mm].
 
     The intensity is a function of the mask coordinate; ``tau`` matters for thick masks.
     """

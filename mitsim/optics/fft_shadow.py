@@ -2,9 +2,9 @@
 
 A sensor pixel as seen on the mask is a whole number of cells, whose values are means. A point at depth z and tan-angle
 tau shades sensor point u by the raster's value at s = u (1 - d/z) + d tau. Means over cells add a variance of h^2 / 6
-to an edge. A twelfth of the second difference along each axis is subtracted, which corrects half of it. Waves behind a
-sum of terms are sums of products of the 1-D fields of :mod:`mitsim.optics.diffraction`, and |U|^2 is averaged over
-points in each cell and over the lines of the light.
+to an edge. A twelfth of the second difference along each axis is subtracted, which corrects half of it. The field
+behind a mask of several terms is a sum: each term contributes the product of two 1-D fields
+(:mod:`mitsim.optics.diffraction`). Its |U|^2 is averaged over points in each cell, and over the spectral lines.
 """
 
 from __future__ import annotations

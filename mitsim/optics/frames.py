@@ -1,8 +1,8 @@
 """Expected irradiance of every shot of a pattern family, with its Monte Carlo error.
 
 Frames of mixtures of light are formed by the closed form of :mod:`mitsim.optics.image_formation`. A *basis* is a matrix
-(b, rows) of mixtures of rows of light. *Replicates*, the frames of single groups of the light, are only multiplied by
-probing vectors and never formed.
+(b, rows) whose rows mix rows of light. *Replicates*, which are frames from single groups of the light, are only
+multiplied by probing vectors and never formed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Factors of a camera from a folder with the frames of a real calibration session.
+"""Compute a camera's factors from a folder with the frames of a real calibration session.
 
 Frames of a simulated session, written to such a folder, give its factors bit for bit.
 

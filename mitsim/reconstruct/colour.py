@@ -1,11 +1,11 @@
-"""Images of spectral lines from frames behind colour filters, and the colours of such images.
+"""Separate the spectral lines in frames behind colour filters, and compute colours of images.
 
-*Mosaics.* Every shot shows all lines at once, and each pixel of a 2 x 2 cell sees them through its own filter. With
-the pixels (a::2, b::2) of plane p, and their response w_pl to line l,
+*Mosaics.* Every shot shows all lines at once, and each pixel of a 2 x 2 cell sees them through its own filter. Plane p
+has the pixels (a::2, b::2), whose response to line l is w_pl. Therefore
 
     Y_ij[a::2, b::2] = sum_l w_pl  Phi_Ll[a::2] (P_ij o X_l) Phi_Rl[b::2]^T,
 
-exactly, because factors are sub-sampled and nothing is interpolated. :class:`JointMosaic` minimises
+which is exact, because factors are sub-sampled and nothing is interpolated. :class:`JointMosaic` minimises
 
     sum_ij,p ||Y_ij,p - model||^2 + lambda sum_l ||X_l||^2
 

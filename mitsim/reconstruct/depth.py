@@ -1,6 +1,8 @@
-"""Factors of another depth, and depth of the scene or of each projector pixel by the least unexplained energy.
+"""Factors for another depth, and a search for the depth that leaves the least energy unexplained.
 
-*Factors of another depth.* A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate
+The search finds one depth for the whole scene, or one for each projector pixel.
+
+*Factors for another depth.* A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate
 s = u (1 - d/z) + d tau, and projector pixel i lights it at tau = A_i + B_i / z, B_i being the baseline. So the factor
 of depth z is the calibrated one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_i - u)(1/z
 - 1/z_0) at the board. Beyond the window, sensor pixels further on saw the same part of the mask in a column within, at

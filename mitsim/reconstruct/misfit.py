@@ -1,13 +1,13 @@
-"""Misfit of a run: the residual of the factorised model, compared with the noise of the measurements.
+"""Compare the residual of the factorised model with the noise of the measurements.
 
-A run either fits its model at the level of its noise, or it is flagged, with the place and with the readings of the
-data that restore the fit. Four measurements decide, in this order:
+If a run does not fit its model to within its noise, it is flagged. The flag names the place of the misfit, and readings
+of the data that restore the fit. Four measurements decide, in this order:
 
 1. Noise: second differences of the residuals (:mod:`mitsim.reconstruct.residuals`).
 2. Energy: the residuals' energy beyond that of noise, calibration error, rendering and print finer than a scene pixel,
    for the whole sensor, its tiles, rows, columns and pixels.
 3. Frames: each frame against the prediction of the others (:class:`FrameCheck`).
-4. Readings, if one of these is off: turned frames and shots in another order.
+4. Readings, if one of the first three fails: turned frames and shots in another order.
 
 *Defective pixels.* A defective pixel is off in every frame, and its neighbours are not. A separable solver cannot
 weigh single pixels, so their readings are replaced by the prediction from all others: setting y - r / (1 - h) at a
@@ -17,17 +17,17 @@ datum of leverage h leaves an image as if it had not been measured. Pixels that 
 the difference, in closed form. The halves of every signed pattern add up to the same light. A closing frame repeats the
 first pattern, or all pixels lit, at the end of the session.
 
-*Picture.* Under shifting dots every scene pixel is in one frame only, so that a frame of another scene, of another
-lamp power or of a moved camera fits the model as well as a right one. The only redundancy is the picture: a symmetric
-stencil of neighbours, fitted to the run itself, predicts each pixel from other frames. Three measurements follow from
+*Picture.* Under shifting dots every scene pixel is in one frame only. Therefore a frame from another scene, or one that
+was taken after lamp or camera changed, fits the model as well as a right frame. The only redundancy is the picture: a
+symmetric stencil of neighbours, fitted to the run itself, predicts each pixel from other frames. Three measurements use
 the differences r between pixels and predictions:
 
 1. the mean of log(1 + u^2) over a frame, u being r over its robust scale, detects a foreign frame;
-2. least squares of the power and then of the shift of all frames, because a frame of power 1 + a adds a X at its own
-   pixels and changes the predictions of its neighbours;
+2. least squares estimate the power and then the shift of all frames, because a frame of power 1 + a adds a X at its
+   own pixels and changes the predictions of its neighbours;
 3. the mean of 1 over windows of a few dots and one to four consecutive shots detects a hand in a few frames.
 
-The undecided rest is stated as a standard error of the power and of the place of single frames.
+If power and place of single frames remain undecided, their standard errors are stated.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _CLIPPED, _FIXED = 3.0, 1e12
 
 
 class PictureCheck:
-    """Comparison of each of the K frames of a run of shifting dots with the picture that the others show.
+    """Comparison of each frame of shifting dots with the picture that the other frames show.
 
     ``frame_of`` (n, n') is the number of the shot that lights each pixel; ``foreign`` and ``disturbed`` (K,) are
     robust deviations of the whole frame and of its worst window. Results exist only if the picture is large enough
@@ -118,7 +118,7 @@ class PictureCheck:
         return place.reshape(2, -1), error.reshape(2, -1)
 
     def uncertainty(self, image: FloatArray) -> FloatArray:
-        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames.
+        """Return the (n, n') standard uncertainty that power and place of single frames cause in an ``image``.
 
         The scatter over the frames beyond its own error is stated, and at least its standard error, because a flicker
         as small as the errors is not seen.
@@ -316,7 +316,7 @@ class FrameFault:
 
 
 class FrameCheck:
-    """Tests of single frames of a run; under shifting dots with the ``picture`` that they show together."""
+    """Tests of single frames; under shifting dots they use the ``picture`` that all frames show together."""
 
     def __init__(self, data: Accumulation, sums: Residuals, lam: float, ratio: float, beside: float) -> None:
         self._data, self._sums, self._beside = data, sums, beside
@@ -507,10 +507,10 @@ class Cause(Enum):
 class Misfit:
     """Part of the measurements that the model does not explain, and its cause.
 
-    ``chi_square`` is the residual's energy over the expected one, by tile in ``tiles``; ``unexplained`` is the rms of
-    the excess beyond print, relative to the measurements, of which the calibration predicts ``predicted``. A
-    simulation that is stated to be coarse has the relative error ``rendered``. Without ``stated`` noise only gross
-    misfit is flagged. ``noise`` is measured over stated noise, ``gain`` the camera's stated gain [DN per electron].
+    ``chi_square`` is the residual's energy over the expected one, and ``tiles`` has it by tile. ``unexplained`` is the
+    rms excess beyond print, relative to the measurements; the calibration predicts the part ``predicted``. A coarse
+    simulation states its relative error ``rendered``. Without ``stated`` noise only gross misfit is flagged. ``noise``
+    is measured over stated noise, and ``gain`` is the camera's stated gain [DN per electron].
     """
 
     chi_square: float

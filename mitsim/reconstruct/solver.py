@@ -29,8 +29,9 @@ frames, lambda minimises an unbiased estimate of the image's error. Elsewhere th
 changes.
 
 *Noise by halves of the sensor.* With G = U_0^T U_0 of half of the sensor's rows, W_0 - G W contains no image: white
-noise of variance v gives its number i the variance v (G (I - G))_ii. An error of the left factor that is independent
-from sensor row to row adds to all numbers of a column of W; halves of the columns show errors of the right factor.
+noise of variance v gives its number i the variance v (G (I - G))_ii. If the left factor's errors are independent
+between sensor rows, each error changes a whole column of W. Halves of the sensor's columns show errors of the right
+factor in the same way.
 """
 
 from __future__ import annotations

@@ -380,16 +380,16 @@ def _of_colours(lines: SpectralFolder) -> Shown:
         both = np.stack([chart().xyz, image.chart.means(image.xyz)], axis=1)
         levels = np.rint(255 * lightness(linear_srgb(both))).astype(np.uint8)
         swatches = [[f"#{bytes(each).hex()}" for each in pair] for pair in levels]
-    size = f"in sRGB under D65, {images.shape[0]} x {images.shape[1]} projector pixels"
+    quality = f"PSNR {data['psnr']:.1f} dB in all lines, " if isinstance(data.get("psnr"), float) else ""
+    size = f"{quality}sRGB under D65, {images.shape[0]} x {images.shape[1]} projector pixels"
     ideal, pictures = "image that a perfect camera would recover of the same lines, by the same matrix", list[Picture]()
     for name, xyz, about in (("image", image.xyz, size), ("truth", image.truth_xyz, ideal)):
         if xyz is not None:
             caption = f"{about}; white is a perfect reflector; colours beyond the screen's are clipped"
             pictures.append(Picture(name, f"The {name}", caption, png(linear_srgb(xyz), LARGEST, SMALLEST)))
     if image.delta_e is not None:
-        about = "an eye sees a difference of 1 side by side"
         ends = 0.0, max(float(np.percentile(image.delta_e, 99)), 1.0)
-        title, unit = "Colour difference of image and truth", "CIE Delta E 2000"
+        title, unit, about = "Colour difference of image and truth", "CIE Delta E 2000", "an eye sees a difference of 1"
         pictures.append(Picture.of("error", title, image.delta_e, about, unit, ends, quantity="error"))
     for number, line in enumerate(colours.channels):
         title, own, quality_of_line = f"{line.wavelength_nm:g} nm", images[..., number], image.qualities[line.name]

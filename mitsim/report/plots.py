@@ -1,4 +1,4 @@
-"""Matplotlib figures with one message each, units on every axis, and colours for the colour-blind.
+"""Draw figures with matplotlib: one message each, units on every axis, colours for the colour-blind.
 
 A figure is drawn for the screen. :func:`style_figure` gives it the sizes of a paper, and :func:`save_figure` writes it.
 No state of pyplot is touched.
@@ -101,6 +101,7 @@ def curves(
         label_axes(axes, fill(x, TITLE_LETTERS) if axes is places[-1, 0] else "", fill(y, _UPRIGHT_LETTERS))
         if log or spans_decades(every[:, 0]):
             axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter("")  # the labels of minor ticks overlap
         if spans_decades(every[:, 1]):
             axes.set_yscale("log")
     if labels := [name for name in names if name and name in shown_by_name]:
@@ -166,7 +167,7 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
         own = [(place, bars[kind]) for place, bars in zip(places, groups.values(), strict=True) if kind in bars]
         shift = (slots / 2 - 0.5 - index) * height if slots > 1 else 0.0
         values, errors = (np.array([getattr(mean, part) for _, mean in own]) for part in ("value", "error"))
-        colour = (PALE, BLUE, ORANGE, GREEN)[index % 4] if len(kinds) > 1 else BLUE
+        colour = (PALE, BLUE, ORANGE, GREEN, PURPLE)[index % 5] if len(kinds) > 1 else BLUE
         style = {"xerr": _bar_errors(errors), "color": colour, "capsize": 3, "label": kind}
         drawn = axes.barh([place + shift for place, _ in own], values, 0.92 * height, **style)
         axes.bar_label(drawn, [scientific(float(value)) for value in values], fontsize=FONT - 2, padding=3)
@@ -177,7 +178,7 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
         axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     if title:
         figure.suptitle(fill(title, TITLE_LETTERS + 10), fontsize=FONT)
-    axes.margins(x=0.14)
+    axes.margins(x=0.2)
     label_axes(axes, x, "", grid="x")
     return figure
 
@@ -224,6 +225,7 @@ def panels_of(
     for axes in places.flat:
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=FONT - 1)
+        axes.locator_params("x", nbins=6)  # more labels overlap
     return figure, places
 
 

@@ -1,4 +1,4 @@
-"""Loading a scene file: a Mitsuba scene with its camera geometry and projector grid, or a refusal in one line."""
+"""Scene files are loaded here as Mitsuba scenes with camera geometry and projector grid, or refused in one line."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class Tag:
 
 
 class Outline:
-    """Positions of the tags of a scene and of its includes.
+    """Positions of all tags in a scene file and its includes.
 
     ``defines`` precede the values of ``<default>``; files become absolute paths. ``files`` records includes.
     ``projected`` are files that objects inside the projectors name.

@@ -47,7 +47,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Stack:
-    """Mean [DN] of averaged frames, and spatial variances [DN^2] of pixels, of the means of rows and of columns."""
+    """Mean [DN] and spatial variances [DN^2] of averaged frames: by pixel, by row mean and by column mean."""
 
     mean: FloatArray
     total: FloatArray

@@ -1,1 +1,1 @@
-"""Sessions: one file with the options of several verbs, one folder with their results, and the way back."""
+"""A session file has the options of several verbs; this room runs it into one folder, and writes it from a folder."""

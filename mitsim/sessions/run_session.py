@@ -1,4 +1,4 @@
-"""`mitsim run`: a session file in; the folders of its steps, and a page that links them, out.
+"""The verb `mitsim run` reads a session file, and writes the folders of its steps and a page that links them.
 
 Nothing is written before all steps have been checked. A folder of a finished step of the same request is left alone.
 """
@@ -70,7 +70,7 @@ class StepResult:
 
 @dataclass(frozen=True)
 class SessionResult:
-    """Results of a session's ``steps``, in order; its folder ``output``, and the ``page`` in it (None without)."""
+    """Results of a session's ``steps``, in order, with its folder ``output`` and its ``page`` (None without one)."""
 
     steps: tuple[StepResult, ...]
     output: str
@@ -247,7 +247,7 @@ class _Steps:
     # ---- Files that are there already ----
 
     def inputs(self, step: session_file.Step) -> str:
-        """Return the SHA-256 of all that decides the files of a ``step``: values, files that it reads, steps before."""
+        """Return the SHA-256 of all inputs of a ``step``: its values, its input files, and the steps before it."""
         read = "run", "calibration"
         values = {name: _contents(value) for name, value in step.values.items() if name not in read}
         asked: dict[str, Any] = {"versions": deciding_versions(), step.verb: values}
@@ -260,7 +260,7 @@ class _Steps:
         return hashlib.sha256(json.dumps(files.plain(asked), sort_keys=True).encode()).hexdigest()
 
     def is_finished(self, step: session_file.Step) -> bool:
-        """Return True if an earlier run made the ``step``'s files from the same inputs and they have not changed."""
+        """Return True if an earlier run wrote this ``step``'s files from the same inputs and they have not changed."""
         if step.verb == "transport":  # whose light is in no file
             capture = self.session.step("capture")
             return step.output in self.earlier and capture is not None and self.is_finished(capture)
@@ -413,7 +413,7 @@ class _Steps:
 
 
 def _checksums(place: Path) -> dict[str, str]:
-    """Return the SHA-256 of a file, or of each file of a folder by name, without pages and unfinished files."""
+    """Return SHA-256 by file name: for one file, or for all files in a folder except pages and unfinished files."""
     found = {}
     for path in sorted(place.rglob("*")) if place.is_dir() else [place] if place.is_file() else []:
         name = path.relative_to(place)

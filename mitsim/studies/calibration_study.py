@@ -181,7 +181,7 @@ def session_rendering(flux: FloatArray, flux_error: FloatArray, factors: tuple[F
 
 
 def entry_variances(lit: LitSession, factors: tuple[FloatArray, FloatArray], side: str) -> dict[str, FloatArray]:
-    """Return the predicted variance (m, n) of the entries of the factor of a ``side``, by source.
+    """Return the predicted variance (m, n) of the entries in one ``side``'s factor, by source.
 
     u_i = Y_i v / |v|^2 has the variance sum_c V_rc v_c^2 / |v|^4 in row r, V being that of a response's pixels, and U
     H^T / N averages N of them with signs. Noise that all responses share enters column p by the mean of its signs:

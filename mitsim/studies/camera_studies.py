@@ -1,4 +1,4 @@
-"""Studies of the paper on the camera: the mask's distance, the sensor's pixels, the resolution, and depth.
+"""The paper's studies of the camera vary the mask's distance, the sensor's pixels, the resolution, and the depth.
 
 *distance*, section IV-C and figure 5: the mask at 500 to 2000 um, and on to where diffraction ends the shadow.
 *binning*, section V-D: frames averaged after capture to 512 to 64 pixels a side. *resolution*, section V-C and figure

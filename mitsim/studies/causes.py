@@ -1,6 +1,6 @@
-"""Expected image of changed frames, its noise, and the scatter of its squared error (:class:`LinearImage`).
+"""Predict the image of changed frames, its noise, and the scatter of its squared error.
 
-With lambda fixed the solver is linear, so that the expected squared error follows from the factors. With B_L = [Phi_L
+:class:`LinearImage` uses that the solver is linear if lambda is fixed. With B_L = [Phi_L
 diag(p_i)]_i = U_L S_L V_L^T (row blocks U_Li of U_L), and likewise on the right, the image of frames Y_ij is
 
     X^ = V_L [F o W] V_R^T,  W = sum_ij U_Li^T Y_ij U_Rj,  F = s_L s_R^T / (s_L^2 s_R^2^T + lambda).
@@ -65,14 +65,14 @@ class Axis:
         return np.asarray(self.slabs.sum(axis=0))
 
     def terms_of(self, factor: FloatArray, even: bool = False) -> FloatArray:
-        """Return the terms of G (K, r, n) of a ``factor``, under the patterns or in ``even`` light."""
+        """Return the (K, r, n) terms of a ``factor``'s G, under the patterns or in ``even`` light."""
         if even:
             return np.asarray(np.einsum("kmr,mn->krn", self.slabs, factor, optimize=True))
         return np.asarray(np.einsum("kmr,mn,nk->krn", self.slabs, factor, self.patterns, optimize=True))
 
     @cached_property
     def noise(self) -> FloatArray:
-        """Return the (r, n) variance of G for unit variance of each number of the factor."""
+        """Return the (r, n) variance of G if each number in the factor has unit variance."""
         mixed = np.einsum("nk,kmr->nmr", self.patterns, self.slabs, optimize=True)
         return np.asarray(np.square(mixed).sum(axis=1).T)
 
@@ -91,7 +91,7 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Changed:
-    """Differences of a scene's frames from those of the solver's factors; by default none.
+    """Changes of a scene's frames relative to frames by the solver's factors; none by default.
 
     Attributes
     ----------
@@ -224,7 +224,7 @@ class LinearImage:
         return self._energy(sum((getattr(noise, name) * unit for name, unit in units.items()), np.zeros((1, 1))))
 
     def units(self, scene: FloatArray) -> dict[str, FloatArray]:
-        """Return the variance (r, r') of the numbers of W by unit variance of each :class:`Noise`."""
+        """Return the (r, r') variance of W that unit variance of each :class:`Noise` causes."""
         left, right = self.axes
         of_left, of_right = np.square(left.basis * left.singular).T, np.square(right.basis * right.singular)
         seen_right = np.square(scene @ (right.basis * right.singular))

@@ -1,7 +1,7 @@
-"""Characterise a camera after EMVA 1288 release 4.0: figures, the camera that explains the frames, a page and plots.
+"""Characterise a camera by EMVA 1288 release 4.0: figures, the fitted camera, a page and plots.
 
-Frames are simulated, or those of a real camera. The fields of the camera found have standard errors; for simulated
-frames they are compared with the camera file.
+Frames are simulated, or come from a real camera. The fitted camera's fields have standard errors; for simulated frames
+they are compared with the camera file.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _FILLED_BY_DARK = 0.01
 
 
 class Frames:
-    """Frames of a simulated camera in S sets of frames that are taken alike; `dark` and `bright` are stacks.
+    """Frames of a simulated camera in S sets with equal settings; `dark` and `bright` are stacks.
 
     ``light`` and ``electrons`` (S,) are photons and photoelectrons of a pixel; 0 in the dark. MitsimError if no light
     saturates the camera.
@@ -243,7 +243,7 @@ def _altered(flats: FlatFrames, taken: Sequence[Alike], used: Sequence[Alike]) -
 
 
 def remarks(flats: FlatFrames, found: FoundCamera) -> tuple[str, ...]:
-    """Return what the frames of a real camera show beside it, each with what is not to be trusted."""
+    """Return findings about the frames of a real camera, each with the numbers that it makes doubtful."""
     transfer, pixels = found.transfer, found.pixels
     used = [
         (name, abs(off), taken)
@@ -307,7 +307,7 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Row:
-    """A figure, or a field of the camera found with its standard error; `set` is None for frames of a real camera."""
+    """A figure, or a fitted field with its standard error; `set` is None for a real camera's frames."""
 
     name: str
     symbol: str
@@ -528,7 +528,7 @@ def characterise(
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None, style: str = "screen"
 ) -> Characterisation:
-    """Characterise a real camera by its listed frames; MitsimError for frames that show nothing of a camera."""
+    """Characterise a real camera by its listed frames; MitsimError for frames without a camera's noise."""
     job, facts, where = job or Job(), listed.listed, f"frames {listed.folder}"
     stated = {name: getattr(facts, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
     efficient = facts.photons_per_s is not None

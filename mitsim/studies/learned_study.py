@@ -1,8 +1,9 @@
-"""Learned methods: their gain over the best classical image, their loss on another bench, and real captures.
+"""Measure the gain of learned methods over the best classical image, and their loss on another bench.
 
-Paper, section "Deep Network-based Denoising vs Reconstruction": on frames like their own learned methods look best, and
-"catastrophic results in case of any mismatch". A gain is of each print, over the classical image of the same frames
-with the highest PSNR, each method at its best weight; to choose it takes the truth, so that no user has it.
+The paper's section "Deep Network-based Denoising vs Reconstruction" states that learned methods are best on frames like
+those of their training, with "catastrophic results in case of any mismatch". The gain is computed for each print, over
+the classical image from the same frames with the highest PSNR. Each method has its best weight, which a user cannot
+choose, because the choice needs the truth.
 
 The bench is the middle of the shipped photograph, 64 x 64 projector pixels, so that a training step takes a quarter of
 the time. Networks are trained on pairs of this bench, or of benches whose mask and exposure vary, and tested on the
@@ -72,7 +73,7 @@ FULL, QUICK = {"pairs": 256, "steps": 800, "groups": 16}, {"pairs": 16, "steps":
 
 
 def middle(studio: Studio, setup: Setup, place: str = SAME) -> Setup:
-    """Return the ``setup`` of the middle of the shipped photograph, with its sheet at a place."""
+    """Return the ``setup`` with the middle of the shipped photograph, whose sheet is at a place."""
 
     def write(folder: Path) -> None:
         folder.mkdir()
@@ -117,7 +118,7 @@ def network_of(studio: Studio, point: Point, training: str, method: str, pattern
 
 
 def images_of(studio: Studio, point: Point) -> Found:
-    """Return a row and an image of the best classical method and of each network, of one print at one place."""
+    """Return a row and an image for the best classical method and for each network; one print at one place."""
     patterns, noise = str(point["patterns"]), int(point["noise"])
     lit = studio.lit_scene(middle(studio, point.setup, str(point["place"])))
     factors = studio.factors(middle(studio, replace(point.setup, picture=None)), noise)
@@ -182,8 +183,8 @@ def twin_sums(prepared: Prepared, noise: tuple[float, float], truths: FloatArray
 def transfer(data: str, held_out: str, seed: int) -> Found:
     """Return rows and images of a capture ``held_out``, by codes and a network of the others in the folder ``data``.
 
-    White noise that teaches lies between that of the known frames and all that the codes leave of them, so that what
-    the twin does not explain is white noise to the network. MitsimError for files that are no captures.
+    The training noise lies between the noise of the known frames and everything that the codes leave unexplained, so
+    that the network treats the unexplained part as white noise. MitsimError for files that are no captures.
     """
     import torch
 

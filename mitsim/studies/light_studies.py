@@ -1,15 +1,15 @@
-"""Studies of light: the patterns, their exposure, ambient light, gloss, and light over several surfaces.
+"""The paper's studies of light vary the patterns, their exposure, ambient light, gloss and interreflection.
 
-*patterns*: section IV-B and figure 4 of the paper. *ambient*: supplement, with a lamp from a hundredth of the
-projector's light to a hundred times.
+*patterns* repeats section IV-B and figure 4. *ambient* repeats the supplement: the lamp has from 1/100 to 100 times
+the projector's light.
 
-*exposure*, section V-B, figure 9, and the supplement's error analysis: for a least-squares image x' of a scene x, ||x||
-/ ||x - x'|| = ||x|| / (s rho), with rho^2 = Tr (A^T A)^-1 = sum 1 / s_i^2 over the singular values of the model A of
-all frames, and s the noise of a datum. (The paper writes SER = sqrt(T) SNR / rho for T equal frames.)
+*exposure* repeats section V-B, figure 9, and the supplement's error analysis. A least-squares image x' of a scene x has
+||x|| / ||x - x'|| = ||x|| / (s rho), where rho^2 = Tr (A^T A)^-1 = sum 1 / s_i^2 over the singular values of A, the
+model of all frames, and s is the noise of a datum. (The paper writes SER = sqrt(T) SNR / rho for T equal frames.)
 
-*reflectivity*, supplement. *Gloss*: every scene has a matt twin (``finish=matt``), whose reflectance L is the truth. At
-one lambda an image R(Y) is linear in the frames Y. Therefore its error is a sum of differences, with t the apparent
-reflectance of the glossy scene, its mean over the sensor:
+*reflectivity* repeats the supplement. *Gloss*: every scene has a matt twin (``finish=matt``), whose reflectance L is
+the truth. At one lambda an image R(Y) is linear in the frames Y. Therefore its error is a sum of differences, with t
+the apparent reflectance of the glossy scene, its mean over the sensor:
 
     pixels           = t - L                         brightness that differs from the matt one
     sensor           = R(Y_direct) - R(Y_even)       light of a projector pixel that changes over the sensor

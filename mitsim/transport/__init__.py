@@ -1,1 +1,1 @@
-"""Light from the projector to the camera: Mitsuba plugins and the light-transport estimator."""
+"""Mitsuba plugins are provided here, and tracers that follow light from the projector to the camera."""

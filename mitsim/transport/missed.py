@@ -210,7 +210,7 @@ _ON_BALL = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Highlights:
-    """Light of glossy balls; ``moments`` are those of the light of one ray of every projector pixel [W^2 m^-4]."""
+    """Light that glossy balls send; ``moments`` [W^2 m^-4] are for one ray from every projector pixel."""
 
     pixels: Labels
     irradiance: FloatArray

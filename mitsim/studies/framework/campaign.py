@@ -67,7 +67,8 @@ class StudyResult:
         from mitsim.studies.framework.claims import tally
 
         claims = f", {tally(self.claims)}" if self.claims else ""
-        return headline(f"Measured {self.points} points of the study {self.study}{claims}", self.warnings)
+        made = f"Measured {self.points} point{'s' * (self.points != 1)} of the study {self.study}{claims}"
+        return headline(made, [reason.replace(" are flagged", "") for reason in self.warnings])
 
     def payload(self) -> dict[str, Any]:
         names = ("headline", "study", "output", "points", "missing", "seconds", "rows", "claims", "figures", "warnings")

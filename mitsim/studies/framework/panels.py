@@ -342,7 +342,7 @@ class Part:
     @property
     def numeric(self) -> tuple[bool, ...]:
         columns = zip(*self.rows, strict=True)
-        begins = re.compile(r"[+-]?\d|nothing$")
+        begins = re.compile(rf"[+-]?\d|nothing$|{DASH}$")
         return tuple(any(cells) and all(not cell or begins.match(cell) for cell in cells) for cells in columns)
 
     def lines(self) -> list[str]:
@@ -417,11 +417,11 @@ def section_of(
         warnings=flag_warnings(study.name, results),
         note=study.note,
         about=study.about,
-        count=f"{len(results.rows)} measurements{of}{good}",
+        count=f"{len(results.rows)} measurement{'s' * (len(results.rows) > 1)}{of}{good}",
         command=" ".join(["mitsim study", name, *([] if any(scope.pictures) else [setup.scene]), *options]),
         quick=scope.quick,
         prints=len(prints),
-        scene=f"{len(prints)} test images on {scene}" if prints else scene,
+        scene=f"{len(prints)} test image{'s' * (len(prints) > 1)} on {scene}" if prints else scene,
         camera=Path(setup.camera).stem if setup.camera else "the scene's camera",
     )
 
@@ -434,11 +434,9 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     if not found:
         return ()
     reasons = Counter(reason for each in found for reason in each.split("; ") if reason)
-    counts = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
-    return (
-        f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, but "
-        f"included in the means (column flagged of {name}.csv){': ' if counts else ''}{counts}.",
-    )
+    counted = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
+    flagged = f"{len(found)} of {len(rows)} images are flagged: {counted or 'no reason is stated'}"
+    return (f"{flagged}; the means include them (column flagged of {name}.csv)",)
 
 
 def write_page(sections: Sequence[Section], path: Path, title: str, message: str = "") -> Path:

@@ -1,4 +1,4 @@
-"""A projector of finite aperture for the reference estimator: from a stock pinhole projector to a lens that blurs.
+"""Provide a projector with a lens of finite aperture for the reference estimator.
 
 Plugin ``mitsim_projector``
 ---------------------------
@@ -7,7 +7,7 @@ focus plane, at distance ``focus`` along the axis, in a point that the pinhole p
 view and bitmap) would light with some texel; the ray carries that texel's light. So the picture is sharp on the focus
 plane, and elsewhere each of its points is a disk, of radius a |z - focus| / focus on the plane at z.
 
-Radiance, with A the aperture's area and theta the angle of the ray itself to the axis::
+The aperture has the area A, and a ray at the angle theta to the axis has the radiance::
 
     L(q, w) = pi scale texture / (A cos(theta)^4)
 

@@ -307,8 +307,9 @@ def test_a_page_says_how_many_images_are_flagged_and_what_for() -> None:
         {"point": "d", "square": 1.0},
     ]
     (text,) = flag_warnings("toy", Results(rows))
-    assert text.startswith("2 of 4 images are flagged") and "toy.csv" in text
-    assert text.endswith(f": 2 {TIMES} misfit, likely cause: depth; 1 {TIMES} The capture was flagged: dim.")
+    assert text.startswith("2 of 4 images are flagged") and text.endswith("(column flagged of toy.csv)")
+    counts = f": 2 {TIMES} misfit, likely cause: depth; 1 {TIMES} The capture was flagged: dim; the means include them"
+    assert counts in text
     assert not flag_warnings("toy", Results(rows[-2:]))
 
 
