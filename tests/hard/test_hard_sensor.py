@@ -363,7 +363,7 @@ models = st.builds(
 FEW, SOME = (st.floats(*ends).map(lambda x: 10**x) for ends in ((-6, math.log10(63.9)), (math.log10(64.1), 3.99)))
 
 
-@settings(max_examples=400, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(models, FEW | SOME)
 def test_moments_of_few_electrons_are_exact_behind_any_adc(model: SensorModel, mean: float) -> None:
     """1 to 12 bits, wells of 0.5 to 3000 electrons, read noise of 0 to 30: 1e-5 of the variance, 1e-4 DN of the mean.

@@ -2,7 +2,7 @@
 
 The gate everywhere is an error of 10 eps / sqrt(lambda_rel), relative: eps ||Y|| sigma / (sigma^2 + lambda) is at most
 eps ||Y|| / (2 sqrt(lambda)), and twenty units in the last place are left to SVD and products of this size. Then the
-solver where the model is short, dark, close or repeated, in any unit, and what its sums are adjoint to.
+solver where the model is short, dark, close or repeated, in any unit, and centring.
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.terms import centre_terms as centred_terms
-from mitsim.reconstruct.solver import ROUNDING_LIMIT, Prepared, Solution, centre_frame, pattern_blocks, prepare
+from mitsim.reconstruct.solver import ROUNDING_LIMIT, Prepared, Solution, centre_frame, prepare
 from mitsim.reconstruct.solvers import solve_tv
 from tests.robustness import Recorder
 from tests.shadow_factor import scene_factor
@@ -290,22 +289,6 @@ def test_full_size_masks_from_2_mm_to_20_um(measured: Recorder, distance: float)
     assert (prepared.rank == 128**2) == (distance > 0.1)
 
 
-@pytest.mark.parametrize("n", [12, 13])
-def test_dots_of_every_pitch(measured: Recorder, n: int) -> None:
-    """k = 1 to n, whether it divides n or not: exact frames give the image back within the stated rounding."""
-    factor, image = shadow(2.0, 4 * n, n), np.random.default_rng(2).random((n, n))
-    conditions = []
-    for k in range(1, n + 1):
-        P = dots(n, k)
-        prepared = prepare(factor, factor, P, P)
-        solution = prepared.solve(summed(prepared, frames_of(factor, factor, P, P, image)), 0.0)
-        assert solution.ok and prepared.rank == n * n and len(pattern_blocks(P)) == k
-        error = np.linalg.norm(solution.image - image) / np.linalg.norm(image)
-        measured(error, at_most=solution.rounding)
-        conditions.append(prepared.condition)
-    assert conditions[0] > 1e3 and conditions[-1] < 2, "n dots are n separate pixels"
-
-
 @pytest.mark.parametrize(("pixels", "k"), [(512, 1), (256, 1), (128, 1), (64, 1), (32, 1), (512, 7), (64, 7), (32, 7)])
 def test_binned_sensors(measured: Recorder, pixels: int, k: int) -> None:
     """512 to 32 pixels for 128 scene pixels: what is not measured is named, what is measured is right.
@@ -457,20 +440,6 @@ def test_units_change_nothing(shifts: tuple[int, ...], family: str, lam: float |
     assert re.sub("lambda above \\S+", "", str(other.status)) == re.sub("lambda above \\S+", "", str(one.status))
 
 
-@pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e6, 1e12])
-def test_signed_patterns_in_any_unit(measured: Recorder, scale: float) -> None:
-    """Hadamard stripes that are no whole numbers fall into one block instead of four: the same image to rounding."""
-    factor, image = shadow(2.0, 32, 8), np.random.default_rng(0).random((8, 8))
-    P = np.tile(hadamard(4), (2, 1)).astype(float)
-    frames = frames_of(factor, factor, P, P, image)
-    plain, other = prepare(factor, factor, P, P), prepare(factor, factor, scale * P, scale * P)
-    one = plain.solve(summed(plain, frames), 0.0)
-    two = other.solve(summed(other, frames), 0.0)
-    error = np.linalg.norm(two.image * scale**2 - one.image) / np.linalg.norm(image)
-    measured(error, at_most=2 * one.rounding)
-    assert other.condition == pytest.approx(plain.condition, rel=1e-9)
-
-
 @pytest.mark.parametrize("size", [1e-150, 1e-31, 1e31, 1e150])
 def test_units_whose_squares_leave_double_precision_are_refused(size: float) -> None:
     """sigma^2 of 1e-600 is 0, of 1e600 infinite: one line says so before either can spoil an image."""
@@ -502,54 +471,7 @@ def test_the_largest_and_smallest_allowed_units(size: float) -> None:
         assert np.linalg.norm(solution.image - expected) <= solution.rounding * np.linalg.norm(image / size**2)
 
 
-# ---- Adjoints, and total variation at its minimum ----
-
-
-@settings(max_examples=40, deadline=None, derandomize=True)
-@given(data=st.data())
-def test_adjoints(data) -> None:
-    """<A x, y> = <x, A^T y> for the basis, for the sum over frames, and for the whole model, centred or not.
-
-    Frames come from an independent dense forward model. Tolerance: eps times the norms times the number of terms.
-    """
-    n, n2 = data.draw(st.integers(2, 7)), data.draw(st.integers(2, 7))
-    rng = np.random.default_rng(data.draw(st.integers(0, 999)))
-    left, right = rng.normal(size=(n + 2, n)), rng.normal(size=(n2 + 3, n2))
-    P_L, P_R = rng.normal(size=(n, 2)), rng.normal(size=(n2, 3))
-    centre = data.draw(st.booleans())
-    prepared = prepare(left, right, P_L, P_R, centre=centre)
-    image, spectrum = rng.normal(size=(n, n2)), rng.normal(size=(n, n2))
-
-    def close(one: float, other: float, size: float) -> bool:
-        return abs(one - other) <= 100 * EPS * n * n2 * size
-
-    norms = float(np.linalg.norm(image) * np.linalg.norm(spectrum))
-    assert close(np.vdot(prepared.image(spectrum), image), np.vdot(spectrum, prepared.coefficients(image)), norms)
-
-    data_frames = {(i, j): rng.normal(size=(n + 2, n2 + 3)) for i in range(2) for j in range(3)}
-    sums = summed(prepared, data_frames)
-    modelled = frames_of(left, right, P_L, P_R, image)
-    if centre:
-        modelled = {key: centre_frame(frame) for key, frame in modelled.items()}
-    forward = sum(float(np.vdot(modelled[key], data_frames[key])) for key in modelled)
-    taken = [centre_frame(frame) if centre else frame for frame in data_frames.values()]
-    assert sums.energy == pytest.approx(sum(np.square(frame).sum() for frame in taken), rel=1e-12)
-    found = prepared.problem(sums)
-    gradient = prepared.image(found.sigma * found.projected)
-    size = np.sqrt(found.scale * found.energy) * np.linalg.norm(image)
-    assert close(forward, np.vdot(gradient, image), size)
-    synthesis = {
-        (i, j): _wide(prepared.left, i) @ spectrum @ _wide(prepared.right, j).T for i in range(2) for j in range(3)
-    }
-    both = sum(float(np.vdot(synthesis[key], data_frames[key])) for key in synthesis)
-    assert close(both, np.vdot(sums.sum, spectrum), np.sqrt(found.energy) * np.linalg.norm(spectrum))
-
-
-def _wide(side, index: int) -> np.ndarray:
-    """Slab ``index`` with its columns in their places in W, (m, r)."""
-    matrix = np.zeros((side.sensor_size, len(side.singular)))
-    matrix[:, side.slabs[index].columns] = side.slabs[index].matrix
-    return matrix
+# ---- Centring ----
 
 
 def test_centring_is_its_own_adjoint() -> None:

@@ -27,8 +27,8 @@ JUDGE_ERROR = (
 )
 N, K, PIXELS, PITCH = 15, 2, 64, 0.09375  # a sensor of 6 mm
 HALF = PIXELS * PITCH / 2
-GROUPS = 48
-"""Independent parts whose spread is the factored estimator's error; five sigma of a t with 47 degrees: 8e-6."""
+GROUPS = 32
+"""Independent parts whose spread is the factored estimator's error; five sigma of a t with 31 degrees: 2e-5."""
 WALL = """<shape type="rectangle">
     <transform name="to_world"><matrix value="{x} 0 {nx} {cx}  0 80 0 0  {z} 0 {nz} {cz}  0 0 0 1"/></transform>
     <bsdf type="diffuse"><spectrum name="reflectance" value="{rho}"/></bsdf></shape>"""

@@ -8,7 +8,6 @@ mask dims it at s = X + (P - X) d / P_z. There is nothing random: tolerances are
 by 0.6 % relatively), or stated.
 """
 
-import copy
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -18,11 +17,8 @@ import pytest
 from scipy.signal import max_len_seq
 
 from mitsim.devices.patterns import Lighting, parse_patterns
-from mitsim.light.light import Sampling, trace_light
-from mitsim.light.passes import expected_of
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.frames import specular_frames
-from mitsim.planner.planner import make_plan
 from mitsim.transport import plugins
 from mitsim.transport.connect import ProjectorOptics
 from mitsim.transport.specular import SpecularRays, trace_specular_chains
@@ -422,60 +418,6 @@ def test_rays_are_better_than_float32(variant: str) -> None:
         flat = -(devices.place[:2] + 800 * tangent)[:, ::-1]
         exact = flat if shape is not ball_shape else ball(tangent, devices.place, centre, radius)[0]
         assert np.abs(found.sensor - exact).max() < off
-
-
-# ---- the whole pipeline on the shipped scene
-
-
-SHIPPED, ANGLE = 0.9, np.radians(4.2654)
-"""Reflectance and turn of the mirror in scenes/mirror, which stands at (0, 0, 400)."""
-
-
-def shipped_image() -> "MirrorBench":
-    return MirrorBench((60, 0, 0)).mirrored(((0.0, 0.0, 400.0), np.array([np.sin(ANGLE), 0.0, -np.cos(ANGLE)])))
-
-
-def pipeline_light(bench, diffraction: bool):
-    """The plan with mirrors and the light it collects, under uniform light."""
-    forced = {"diffraction": diffraction, "black-level": False, "mirrors": True}
-    plan = make_plan(bench, LIT, 2e-3, seed=3, switches=forced)
-    return plan, trace_light(bench, plan, LIT, 3, Sampling(by_pixel=False))
-
-
-def mirror_part(light) -> np.ndarray:
-    """What the frame holds beyond the light that camera paths found."""
-    whole = next(iter(light.frames(LIT, 0))).irradiance
-    without = copy.copy(light.simulation)
-    without.specular_frames = lambda labels: None
-    traced = expected_of([(without, light.groups)], np.zeros(1, np.int64), LIT, 0)
-    return whole - next(iter(traced)).irradiance
-
-
-@pytest.mark.slow
-def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) -> None:
-    """Ray optics. What is left of the frame without the analytic specular chain is what the reference sees: the board
-    alone."""
-    bench = shipped_bench("mirror")
-    plan, light = pipeline_light(bench, diffraction=False)
-    assert "mirrors" in plan.settings.effects
-    image, u = shipped_image(), centres()
-    irradiance, row, column = image.irradiance(u[:, None], u)
-    assert ((row > 0) & (row < N) & (column > 0) & (column < N)).all()
-    masks = [code_mean(image.shadow(u - PITCH / 2, axis), image.shadow(u + PITCH / 2, axis)) for axis in (0, 1)]
-    specular = SHIPPED * irradiance * np.outer(*masks)
-    assert relative(mirror_part(light), specular) < 2e-3
-
-    whole = next(iter(light.frames(LIT, 0))).irradiance
-    board = np.zeros_like(whole)
-    squares = np.zeros_like(whole)
-    passes = 8
-    for seed in range(passes):
-        one = np.array(mi.render(bench.loaded.scene, spp=4, seed=50 + seed), np.float64)[..., 0]
-        board, squares = board + one / passes, squares + one**2 / passes
-    error = np.sqrt(((squares - board**2) / (passes - 1)).sum())
-    assert specular.sum() > 50 * error, "the reference is sharp enough to tell the specular chain from nothing"
-    assert abs((whole - specular).sum() - board.sum()) < 5 * error + 2e-3 * board.sum()
-    assert abs(whole.sum() - board.sum()) > 50 * error
 
 
 # ---- a projector of finite aperture

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import mitsim as ms
 from mitsim.acquire.exposure import Exposer, ambient_shots
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.exr import checksum, read_frame
@@ -22,9 +21,6 @@ from mitsim.core.runs import Capture
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light.light import SampledLight
 from mitsim.light.passes import Simulation
-from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.solver import prepare
 from mitsim.sensor.chain import frame_moments
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -62,11 +58,6 @@ def light(bench: Bench) -> SampledLight:
 @pytest.fixture(scope="module")
 def captured(light: SampledLight, tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return light.expose("dots:4", tmp_path_factory.mktemp("ambient") / "run")
-
-
-@pytest.fixture(scope="module")
-def factors(bench: Bench) -> Factors:
-    return bench.calibrate(seed=1, accuracy=1e-2)
 
 
 def test_the_folder_carries_it(captured: Capture) -> None:
@@ -192,68 +183,3 @@ def test_a_dark_room_needs_none(shared_scene: Callable[..., Path], variant: str)
     assert taken.ambient is not None and taken.manifest.ambient_frame.part == 0
     noise = np.sqrt(taken.ambient.variance) * taken.exposure_s
     assert np.abs(taken.ambient.rate * taken.exposure_s).max() < 6 * noise.max()
-
-
-# ---- what noise and full well allow ----------------------------------------------------------------------------------
-
-
-def allowed(shots: Capture, factors: Factors, light: SampledLight) -> tuple[float, float]:
-    """Best PSNR [dB] that the noise of frames and ambient frame allows, and the latter's part of the image's noise.
-
-    In the solver's basis the data are W = sum_ij U_i^T Y_ij U_j, and the image is filtered by s / (s^2 + lambda). With
-    variances v_ij of the frames and v of the ambient frame, which all frames share,
-
-        Var W = sum_ij (U_i^2)^T v_ij U_j^2 + ((sum_i U_i)^2)^T v (sum_j U_j)^2
-
-    and the filter loses lambda / (s^2 + lambda) of the truth. The best lambda is taken, as a judge who knows the truth.
-    """
-    model = prepare(factors.left, factors.right, *shots.patterns)
-    sides = [_embedded(side) for side in (model.left, model.right)]
-    sigma = np.outer(model.left.singular, model.right.singular)
-    sensor, truth = light.bench.sensor, light.truth
-    unit = (sensor.gain_dn_per_e * shots.exposure_s) ** 2
-    own = sum(
-        (sides[0][shot.row] ** 2).T
-        @ (frame_moments(electrons, shots.exposure_s, sensor)[1] / unit)
-        @ sides[1][shot.column] ** 2
-        for shot, electrons in zip(shots.manifest.patterns.captures, shots.electrons, strict=True)
-    )
-    shared = (sum(sides[0]) ** 2).T @ shots.ambient.variance @ sum(sides[1]) ** 2
-    coefficients = np.square(model.left.basis.T @ truth @ model.right.basis)
-    errors, parts = [], []
-    for lam in np.geomspace(1e-10, 1e2, 61) * sigma.max() ** 2:
-        noise, lost = np.square(sigma / (sigma**2 + lam)), np.square(lam / (sigma**2 + lam))
-        errors.append(((noise * (own + shared)).sum() + (lost * coefficients).sum()) / truth.size)
-        parts.append((noise * shared).sum() / (noise * own).sum())
-    best = int(np.argmin(errors))
-    return -10 * np.log10(errors[best]), parts[best]
-
-
-def _embedded(side) -> list[np.ndarray]:  # type: ignore[no-untyped-def]
-    """U_i of each pattern i of a side, (sensor, r), with zeros where the pattern lights nothing."""
-    found = []
-    for slab in side.slabs:
-        full = np.zeros((side.sensor_size, len(side.singular)))
-        full[:, slab.columns] = slab.matrix
-        found.append(full)
-    return found
-
-
-@pytest.mark.parametrize("patterns", ["uniform", "dots:2", "dots:4", "random:4"])
-def test_the_image_is_as_good_as_noise_allows(light: SampledLight, factors: Factors, patterns: str) -> None:
-    """Within 1.5 dB of what photons and read noise allow with exact factors, in the median of seven seeds; and the
-    ambient frame brings at most a sixteenth of the noise. An exposure of a millisecond makes noise the only limit that
-    counts here.
-
-    Single images of 16 x 16 numbers scatter; under uniform light two of 150 are below by more than that, where noise
-    has the solver choose too small a lambda.
-
-    (Planted: nothing taken off; one shot instead of 16.)
-    """
-    apart = []
-    for seed in range(7):
-        shots = light.expose(patterns, exposure=1e-3, seed=seed)
-        bound, part = allowed(shots, factors, light)
-        apart.append(ms.psnr(reconstruct(shots, factors).image, light.truth) - bound)
-        assert part < 1 / 16
-    assert abs(np.median(apart)) < 1.5

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from collections.abc import Callable
 from itertools import product
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -92,26 +87,6 @@ def test_verdicts_are_on_what_is_added_to_the_floor() -> None:
     bad = STUDY.judge(results(own=1.3, one=1.01, dim=1.3, bright=1.01, joint=0.9))
     assert [claim.verdict for claim in bad[:3]] == ["not confirmed", "not confirmed", "confirmed"]
     assert {claim.verdict for claim in bad[3:]} == {"not confirmed"}
-
-
-@pytest.mark.slow
-def test_a_small_scene_is_studied_whole(small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    """A grey that rises with wavelength, in a process of its own: the variant knows wavelengths. Beside 60 lx of
-    daylight images lose little, because its frame is subtracted. (Planted: the frame not subtracted.)"""
-    path = small_scene(n=32)
-    text = path.read_text(encoding="utf-8").replace("$albedo", "380:0.2, 780:0.6")
-    path.write_text(text, encoding="utf-8")
-    boxes = [[8 * i + 1, 8 * i + 7, 5 * j + 1, 5 * j + 4] for i in range(4) for j in range(6)]
-    (path.parent / "chart.json").write_text(json.dumps({"spectra": "ColorChecker N Ohta", "patches": boxes}))
-    command = ["study", "colour", str(path), "-o", str(tmp_path / "out"), "--quick", "--jobs", "1", "--json", "--quiet"]
-    done = subprocess.run([sys.executable, "-m", "mitsim", *command], capture_output=True, text=True)
-    reported = json.loads(done.stdout)
-    judged = [row for row in reported["rows"] if row["way"] in (OWN, ONE, D65, "mosaic, joint")]
-    assert all(isinstance(row["flagged"], bool) for row in judged)
-    assert done.returncode == any(row["flagged"] for row in judged) == bool(reported["warnings"]), done.stderr
-    levels = {row["way"]: row["psnr_db"] for row in reported["rows"]}
-    assert {OWN, "mosaic, joint", D65} <= set(levels)
-    assert levels[OWN] > 25 and levels[D65] > 20
 
 
 # -------- Frames behind filters, spectra as numbers, lent factors
