@@ -243,7 +243,7 @@ def test_frames_of_pilot_runs_are_those_that_a_capture_forms(bench: Bench, monke
 
 
 def test_stripes_of_a_hadamard_family_are_looked_at() -> None:
-    """Without diffraction they are 7.7 % off, and other shots 1.3 %. (Planted: four even shots, none of them stripes.)"""
+    """Without diffraction they are 7.7 % off, other shots 1.3 %. (Planted: four even shots, none of them stripes.)"""
     family = parse_patterns("hadamard:8", 32)
     shown = pilot_direct.Sample.of(family.lighting, (64, 64), False).lighting.weights
     rows = shown.reshape(len(shown), 8, 8)
