@@ -488,7 +488,7 @@ SIZES = {
     "learn": (5, 1191),
     "light": (6, 1672),
     "optics": (7, 1745),
-    "planner": (6, 1629),
+    "planner": (6, 1630),
     "reconstruct": (16, 5534),
     "report": (6, 1904),
     "scene": (5, 1359),
