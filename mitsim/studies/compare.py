@@ -17,7 +17,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import finite_channel, read_frame
 from mitsim.core.files import output_folder, write_json
 from mitsim.core.images import linear_light, own_end, read_image, size_of
-from mitsim.core.manifests import MANIFEST, RunManifest, read_manifest
+from mitsim.core.manifests import RunManifest, read_manifest
 from mitsim.core.picture_files import Wanted
 from mitsim.metrics import Quality, summary_of
 from mitsim.reconstruct.factors import camera_parts
@@ -84,19 +84,19 @@ class Comparison:
 
     def tables(self) -> tuple[Part, ...]:
         """Return the quality of the images, and the facts on their runs if any is known."""
-        found = []
-        for columns in (_COLUMNS, _RUN):
-            cells = [[_cell(row[key]) for key in columns] for row in self.images]
-            found.append(tuple((row["name"], *line) for row, line in zip(self.images, cells, strict=True)))
+        quality, runs = (
+            tuple((row["name"], *(_cell(row[key]) for key in columns)) for row in self.images)
+            for columns in (_COLUMNS, _RUN)
+        )
         lead = f"Figures show differences up to {reflectance(self.largest_difference)} of the board's reflectance."
         means = [
             f"{', '.join(map(str, mean['of']))}: PSNR {mean['psnr']:.2f} +- {mean['psnr_ci95']:.2f} dB "
             f"(mean of {mean['images']} seeds and its 95 % interval)"
             for mean in self.means
         ]
-        quality = Part("Quality", lead, ("image", *_COLUMNS.values()), found[0], notes=(*means, *self.notes))
+        first = Part("Quality", lead, ("image", *_COLUMNS.values()), quality, notes=(*means, *self.notes))
         known = any(row["mask"] for row in self.images)
-        return (quality, *[Part("Runs", "", ("image", *_RUN.values()), found[1])] * known)
+        return (first, *[Part("Runs", "", ("image", *_RUN.values()), runs)] * known)
 
     def lines(self) -> list[str]:
         quality, *runs = (table.lines() for table in self.tables())
@@ -110,16 +110,17 @@ def _cell(value: Any) -> str:
 
 def _run_of(result: Mapping[str, Any]) -> dict[str, Any]:
     """Return mask, patterns, method, exposure and seed of the run of an image; nothing if its folder is gone."""
-    place = Path(str((result.get(MADE_OF) or {}).get("run", "")))
-    if not (place / MANIFEST).is_file():
+    try:
+        run = read_manifest(Path(result[MADE_OF]["run"]), RunManifest)
+    except (MitsimError, KeyError, TypeError):
         return {}
-    run = read_manifest(place, RunManifest)
-    known = {"mask": camera_parts(run.camera).get("geometry.mask"), "patterns": run.patterns.family}
-    known = {name: str(text).partition(",")[0] for name, text in known.items()}
-    how = {name: each for name, each in (result.get("inputs") or {}).items() if name not in ("run", "calibration")}
-    setting = json.dumps([{**run.configuration, "seed": None}, how], sort_keys=True)
-    known |= {"method": how.get("method"), "exposure_s": run.digital.exposure_s, "seed": run.configuration.get("seed")}
-    return {**known, "setting": setting}
+    mask = camera_parts(run.camera).get("geometry.mask")
+    how = {name: each for name, each in result["inputs"].items() if name not in ("run", "calibration")}
+    return {
+        "mask": mask and str(mask).partition(",")[0], "patterns": run.patterns.family, "method": how["method"],
+        "exposure_s": run.digital.exposure_s, "seed": run.configuration.get("seed"),
+        "setting": json.dumps([{**run.configuration, "seed": None}, how], sort_keys=True),
+    }  # fmt: skip
 
 
 def means_over_seeds(images: Sequence[Image], rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], ...]:

@@ -319,8 +319,7 @@ def _points(scope: experiment.Scope) -> Sequence[experiment.Point]:
     for seed in scope.choose(range(first, first + _SEEDS), scope.seeds):
         for kind, amount in amounts:
             (unit, words), shared = DRIFTS[kind], {"recipe": scope.recipe, "patterns": scope.patterns, "kind": kind}
-            size = f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"
-            setup, what = lamp if kind in _LAMPS else sheet, f"{words}, {size}"
+            setup, what = lamp if kind in _LAMPS else sheet, f"{words}, {_size(amount, unit)}"
             found.append(experiment.Point.of(setup, **shared, unit=unit, amount=amount, seed=seed, what=what))
     return experiment.group_by_setup(found)
 
@@ -364,10 +363,12 @@ def three_decibels(rows: DataFrame) -> str:
     added = 10 ** (mean_of(rows, "lost_db").value / 10) - 1
     if added < _LEAST:
         return ", too little to say when 3 dB are lost"
-    amount, unit = float(rows["amount"].iloc[0]), str(rows["unit"].iloc[0])
-    size, unit = (100, f"%{unit[1:]}") if unit.startswith("1") else (1, unit)
-    until = float(f"{abs(amount) * size * ((10**0.3 - 1) / added) ** 0.5:.2g}")
-    return f", 3 dB at about {until:g} {unit}"
+    amount = abs(float(rows["amount"].iloc[0])) * ((10**0.3 - 1) / added) ** 0.5
+    return f", 3 dB at about {_size(float(f'{amount:.2g}'), str(rows['unit'].iloc[0]))}"
+
+
+def _size(amount: float, unit: str) -> str:
+    return f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"
 
 
 STUDY = experiment.Study(
