@@ -158,7 +158,7 @@ def _explain(accuracy: float, look: _Look, taken: choose.Candidate, started: flo
     (runs, candidates, notes), bench = look, look.runs.bench
     simulation, switches = Simulation(bench, taken.settings), candidates.switches
     pace = _measure_pace(runs.pilot_result, simulation, runs.lighting.labels, integer(runs.seed, "pilot", "paces"))
-    plan = explain_plan(accuracy, runs.pilot_result, SceneFacts.of(bench, switches), switches, taken, pace)
+    plan = explain_plan(accuracy, runs.pilot_result, taken, SceneFacts.of(bench, switches), switches, pace)
     if simulation.physics.mirrors:
         # The pilot formed the frames of other shots, or of fewer effects, from the same beams.
         plan = plan.taking(optics=plan.predicted["optics"] + bench.specular.seconds)
@@ -215,15 +215,12 @@ _REMEDIES = {
 def explain_plan(
     accuracy: float,
     pilot_result: PilotResult,
+    chosen: choose.Candidate,
     facts: SceneFacts,
-    switches: Mapping[str, bool] | None = None,
-    chosen: choose.Candidate | None = None,
-    pace: float = 1.0,
+    switches: Mapping[str, bool],
+    pace: float,
 ) -> Plan:
     """Return the plan of a choice, with its reasons; a path takes ``pace`` times as long as its fixed cost."""
-    check_accuracy(accuracy)
-    switches = switches or {}
-    chosen = chosen or choose.Candidates(pilot_result, switches).choice(accuracy)
     stages = _stages(pilot_result, chosen.settings, pace)
     return Plan(
         accuracy=accuracy,

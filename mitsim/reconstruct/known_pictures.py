@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -80,7 +80,7 @@ class Exposure:
     plane: str = ""
     offset: tuple[float, float] = (0.0, 0.0)
 
-    def turn_scene(self, orientation: str) -> Exposure:
+    def turn_scene(self, orientation: str) -> Self:
         return replace(self, scene=TURNS[orientation](self.scene))
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,15 +37,6 @@ _QUIET = 0.99
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Mean [DN], temporal variance [DN^2] and its part shared by rows, of frames under the same light, all (...)."""
-
-    mean: FloatArray
-    variance: FloatArray
-    rows: FloatArray
-
-
-@dataclass(frozen=True)
 class Stack:
     """Mean [DN] and spatial variances [DN^2] of averaged frames: by pixel, by row mean and by column mean."""
 
@@ -68,7 +59,7 @@ class Session:
     Attributes
     ----------
     photons, exposure_s : (S,) photons on a pixel, or light in any unit, and exposure [s].
-    pairs : (..., S) means and temporal variances.
+    mean, variance, rows : (..., S) mean [DN], temporal variance [DN^2] and its part shared by rows.
     dark, bright : sets for nonuniformity, in the dark and near half of saturation.
     saturates, rounded : True if the brightest set is saturated, and if the frames are whole numbers.
     """
@@ -76,7 +67,9 @@ class Session:
     shape: tuple[int, int]
     photons: FloatArray
     exposure_s: FloatArray
-    pairs: Pair
+    mean: FloatArray
+    variance: FloatArray
+    rows: FloatArray
     dark: int
     bright: int
     dark_stack: Stack
@@ -98,8 +91,8 @@ class Session:
         """Return photons (L,) of lit sets, and their signal and variance (..., L) less the dark of their exposure."""
         lit, unlit = self.lit, np.array([self.dark, *(index for index in self.unlit if index != self.dark)])
         dark = unlit[np.abs(self.exposure_s[unlit] - self.exposure_s[lit][:, None]).argmin(axis=1)]
-        mean, variance = self.pairs.mean, self.pairs.variance
-        return self.photons[lit], mean[..., lit] - mean[..., dark], variance[..., lit] - variance[..., dark]
+        signal, noise = (each[..., lit] - each[..., dark] for each in (self.mean, self.variance))
+        return self.photons[lit], signal, noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,10 +204,6 @@ def _comb(codes: FloatArray, noise: float) -> tuple[float, float]:
     return float(waves[strongest]), len(codes) / (first + strongest)
 
 
-def pairs_of(pairs: Sequence[Pair | Alike]) -> Pair:
-    return Pair(*(np.array([getattr(pair, name) for pair in pairs]) for name in ("mean", "variance", "rows")))
-
-
 def figures(session: Session) -> dict[str, FloatArray]:
     """Compute the figures (...) of a session by name.
 
@@ -223,7 +212,7 @@ def figures(session: Session) -> dict[str, FloatArray]:
     Figures that the frames do not determine are left out.
     """
     photons, signal, noise = session.transfer()
-    means, variance, unlit = session.pairs.mean, session.pairs.variance, session.unlit
+    variance, unlit = session.variance, session.unlit
     full = np.full(1, np.inf)
     peak = variance[..., session.lit].argmax(axis=-1)
     if session.saturates:
@@ -234,7 +223,7 @@ def figures(session: Session) -> dict[str, FloatArray]:
     times = session.exposure_s[unlit]
     about = times - times.mean()
     current, rise = ((each[..., unlit] * about).sum(axis=-1) / max(np.square(about).sum(), 1e-300)
-                     for each in (means, variance))  # fmt: skip
+                     for each in (session.mean, variance))  # fmt: skip
     still = variance[..., session.dark]
     if len(np.unique(session.exposure_s[session.lit])) >= LINE:
         still = variance[..., unlit].mean(axis=-1) - rise * times.mean()
@@ -243,7 +232,7 @@ def figures(session: Session) -> dict[str, FloatArray]:
         "system_gain": gain,
         "quantum_efficiency": efficiency,
         "dark_noise": np.sqrt(still) / gain,
-        "row_noise": session.pairs.rows[..., session.dark] / gain**2,
+        "row_noise": session.rows[..., session.dark] / gain**2,
     }
     if session.saturates:
         found |= {"saturation_capacity": efficiency * photons[peak], "full_well": signal[..., -1] / gain}

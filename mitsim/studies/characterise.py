@@ -35,7 +35,7 @@ from mitsim.report.pages import Mean, page_figure, round_to_error, typeset
 from mitsim.report.plots import curves
 from mitsim.sensor.camera_fit import FoundCamera, Pixels, Places, nonuniform, saturation_of
 from mitsim.sensor.chain import dark_current_variance, expose, mean_dark_current, response_variance
-from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, MOST_FITTED, SPLIT, Alike, Session, alike, figures, pairs_of
+from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, MOST_FITTED, SPLIT, Alike, Session, alike, figures
 from mitsim.studies.framework.campaign import study_folder, write_figures
 from mitsim.studies.framework.panels import Part, Section, write_page
 
@@ -119,9 +119,9 @@ class Frames:
 
 
 def session_of(taken: Sequence[Alike], dark: int, bright: int, saturates: bool, rounded: bool) -> Session:
-    light, exposure_s = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
-    stacks = taken[dark].stack, taken[bright].stack
-    return Session(taken[0].shape, light, exposure_s, pairs_of(taken), dark, bright, *stacks, saturates, rounded)
+    names, stacks = ("light", "exposure_s", "mean", "variance", "rows"), (taken[dark].stack, taken[bright].stack)
+    light, time, *pairs = (np.array([getattr(each, name) for each in taken]) for name in names)
+    return Session(taken[0].shape, light, time, pairs[0], pairs[1], pairs[2], dark, bright, *stacks, saturates, rounded)
 
 
 # -------- A real camera's frames
@@ -495,7 +495,7 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
         times = session.exposure_s[session.unlit]
         current = done.found.sensor.superpixel_dark_current_e_per_s
         charts["dark_current.png"] = chart(
-            times, {"camera found": current * times, "frames": (session.pairs.mean[session.unlit] - black) / gain},
+            times, {"camera found": current * times, "frames": (session.mean[session.unlit] - black) / gain},
             f"EMVA 1288 finds a dark current of {rows['dark_current']:.4g} e-/s", "exposure time [s]",
             "dark signal less black level [e-]",
         )  # fmt: skip

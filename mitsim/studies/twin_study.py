@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from string import Template
@@ -60,27 +60,20 @@ _BLOCK, _SMOOTH = 48, 31
 """Side of the blocks of noise, and of the square of a pixel's mean light [pixels]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """One plane of a capture: ``level`` and ``noise`` (m, m') [DN], the authors' image ``scene`` (n, n'), 0 to 1."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured(Exposure):
+    """One plane of a capture: ``level`` and ``noise`` (m, m') [DN]; ``scene`` is the authors' image, 0 to 1.
+
+    Row and column means are off the frame and the noise.
+    """
 
     capture: str
-    plane: str
-    offset: tuple[float, float]
     level: FloatArray
     noise: FloatArray
-    scene: FloatArray
 
     @property
     def name(self) -> str:
         return f"{self.capture} {self.plane}"
-
-    @cached_property
-    def frame(self) -> FloatArray:
-        return centre_frame(self.level)
-
-    def exposure(self, group: int = 0) -> Exposure:
-        return Exposure(self.scene, self.frame, group, self.plane, self.offset)
 
 
 @cache
@@ -126,7 +119,8 @@ def read_captures(files: Captures, seed: int) -> list[Measured]:
                 preparer.frame(files[name][0], each).astype(np.float64)
                 for each in (draws * np.sqrt(gain * light + dark), whole)
             )
-            found.append(Measured(name, plane, offsets[plane], level, centre_frame(noise), scene))
+            place = scene, centre_frame(level), 0, plane, offsets[plane]
+            found.append(Measured(*place, capture=name, level=level, noise=centre_frame(noise)))
     return found
 
 
@@ -159,13 +153,13 @@ class Learned:
     @classmethod
     def of(cls, planes: Sequence[Measured]) -> Learned:
         names = list(dict.fromkeys(each.capture for each in planes))
-        exposures = [each.exposure(names.index(each.capture)) for each in planes]
+        exposures = [replace(each, group=names.index(each.capture)) for each in planes]
         pose = find_pose(exposures)
         turned = [each.turn_scene(pose.orientation) for each in exposures]
         return cls(pose, fit_codes(turned, Shape(pose.scales, 1, True)))
 
     def see(self, measured: Measured) -> Measured:
-        return replace(measured, scene=measured.exposure().turn_scene(self.pose.orientation).scene)
+        return measured.turn_scene(self.pose.orientation)
 
 
 # -------- The simulated camera
@@ -234,7 +228,7 @@ def compare(measured: Measured, codes: Codes, electrons: FloatArray, other: Floa
     # Codes that are fitted to this frame alone take noise with them, a datum's for each number that they determine.
     # Two numbers are none: the scale of one side over the other, and of both, which `expected` has taken.
     shape = Shape((codes.sides[0].scale, codes.sides[1].scale), 1, True)
-    better = fit_codes([measured.exposure()], shape, codes.codes[1][0])
+    better = fit_codes([measured], shape, codes.codes[1][0])
     left, right = better.factors(measured.offset, measured.plane)
     taken = noise / frame.size * (sum(better.told) - 2)
     whole, rest = energy(measured.level - measured.level.mean()), energy(frame - left @ measured.scene @ right.T)

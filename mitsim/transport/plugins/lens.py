@@ -195,7 +195,6 @@ class Diffuser:
         held["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
         held["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
         held.update()
-        # Wider than the relief by the shift of tilted light.
         side, top = 2 * relief.side_mm, self.distance_mm + _THICKNESS_MM
         flat = mi.ScalarTransform4f().translate([0, 0, top]).scale([side, side, 1])
         return mi.load_dict(
@@ -204,25 +203,16 @@ class Diffuser:
 
 
 def point_spread(
-    diffuser: Diffuser,
-    shape: tuple[int, int],
-    pitch_mm: float,
-    tilt: tuple[float, float] = (0.0, 0.0),
-    rays: int = 4096,
-    seed: int = 0,
+    diffuser: Diffuser, shape: tuple[int, int], pitch_mm: float, rays: int = 4096, seed: int = 0
 ) -> FloatArray:
     """Return the irradiance (rows, columns) of a distant point behind a diffuser, over that before it.
 
-    ``tilt`` has tangents of the light's direction; ``rays`` is the number along an axis.
+    ``rays`` is the number along an axis.
     """
     scene, side = diffuser.scene(), diffuser.relief.side_mm
     rows, columns = shape
-    inner = np.array(tilt) / np.sqrt(diffuser.index**2 * (1 + np.dot(tilt, tilt)) - np.dot(tilt, tilt))
-    above = _THICKNESS_MM + 1.0
-    # Where light must meet the flat face to reach the relief's middle, and a millimetre before that.
-    start = -inner * _THICKNESS_MM - np.array(tilt)
-    along = np.array([*tilt, -1.0])
-    unit = mi.Vector3f(*(along / np.linalg.norm(along)).tolist())
+    above = diffuser.distance_mm + _THICKNESS_MM + 1.0
+    unit = mi.Vector3f(0, 0, -1)
     # Light instead of radiance, and only its refracted part.
     context = mi.BSDFContext(mi.TransportMode.Importance, mi.BSDFFlags.DeltaTransmission)
     light = np.zeros(rows * columns)
@@ -232,7 +222,7 @@ def point_spread(
         jitter = stream(integer(seed, "diffuser rays"), first).random((2, count, rays))
         x = ((np.arange(first, first + count)[:, None] + jitter[0]) / rays - 0.5) * side
         y = ((np.arange(rays)[None, :] + jitter[1]) / rays - 0.5) * side
-        places = np.stack([x.ravel() + start[0], y.ravel() + start[1], np.full(x.size, diffuser.distance_mm + above)])
+        places = np.stack([x.ravel(), y.ravel(), np.full(x.size, above)])
         ray, part, active = mi.Ray3f(mi.Point3f(places.astype(np.float32)), unit), mi.Float(1), mi.Bool(True)
         for _ in range(2):
             crossing = scene.ray_intersect(ray, active)

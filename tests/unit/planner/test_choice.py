@@ -125,7 +125,8 @@ def plan(
     facts: SceneFacts = FACTS,
     pace: float = 1.0,
 ) -> Plan:
-    return explain_plan(accuracy, pilot_result, facts, parse_switches(effects), pace=pace)
+    switches = parse_switches(effects)
+    return explain_plan(accuracy, pilot_result, cheapest(accuracy, pilot_result, switches), facts, switches, pace)
 
 
 def rows(found: Plan) -> dict[str, PlanRow]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.seeds import stream
-from mitsim.sensor.emva import Pair, Session, Stack, alike, figures
+from mitsim.sensor.emva import Session, Stack, alike, figures
 
 
 def test_a_pair_s_variance_is_free_of_what_is_fixed_and_of_drift() -> None:
@@ -104,16 +104,13 @@ def test_figures_of_an_ideal_camera_are_its_numbers() -> None:
         rows, columns = each["row"] + pixel / 200, each["column"] + pixel / 100
         return Stack(np.asarray(100 + light), np.asarray(rows + columns + left), np.asarray(rows), np.asarray(columns))
 
-    pairs = Pair(
-        np.concatenate([100 + gain * light, 100 + gain * dark * times]),
-        np.concatenate([variance, still + gain**2 * dark * times]),
-        np.concatenate([np.zeros(50), [rows], np.zeros(5)]),
-    )
     session = Session(
         shape=(100, 200),
         photons=np.concatenate([electrons / efficiency, np.zeros(6)]),
         exposure_s=np.concatenate([np.zeros(50), times]),
-        pairs=pairs,
+        mean=np.concatenate([100 + gain * light, 100 + gain * dark * times]),
+        variance=np.concatenate([variance, still + gain**2 * dark * times]),
+        rows=np.concatenate([np.zeros(50), [rows], np.zeros(5)]),
         dark=50,
         bright=25,
         dark_stack=stack(0.0),
@@ -139,7 +136,7 @@ def test_linearity_is_the_least_and_the_largest_relative_deviation() -> None:
     zero = Stack(*(np.ones(()) for _ in range(4)))
     sets = [np.append(part, 0.0) for part in (photons, 0 * photons, signal, variance, 0 * signal)]
     bright = Stack(np.full((), 2.0), np.ones(()), np.ones(()), np.ones(()))
-    session = Session((9, 9), sets[0], sets[1], Pair(*sets[2:]), 50, 25, zero, bright)
+    session = Session((9, 9), sets[0], sets[1], *sets[2:], 50, 25, zero, bright)
     found = figures(session)
     used = (signal >= 0.05 * signal[48]) & (signal <= 0.95 * signal[48])
     line = np.polynomial.polynomial.polyfit(photons[used], signal[used], 1, w=1 / signal[used])

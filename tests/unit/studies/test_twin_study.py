@@ -73,7 +73,9 @@ def frame_of(codes: Codes, scene: FloatArray) -> FloatArray:
 def made(seed: int, codes: Codes) -> Measured:
     """A frame of a made scene without noise."""
     scene = np.clip(0.3 + 0.3 * smooth(np.random.default_rng(seed), SCENE, SCENE, width=1.0), 0, 1)
-    return Measured(f"fc_{seed}", PLANE, OFFSETS[PLANE], LIGHT + frame_of(codes, scene), np.zeros(SENSOR), scene)
+    level, none = LIGHT + frame_of(codes, scene), np.zeros(SENSOR)
+    place = scene, centre_frame(level), 0, PLANE, OFFSETS[PLANE]
+    return Measured(*place, capture=f"fc_{seed}", level=level, noise=none)
 
 
 def capture(folder: Path, values: np.ndarray, name: str = "fc_6") -> tuple[Path, Path]:
@@ -181,7 +183,7 @@ def parts_of(measured: Measured, codes: Codes, frame: FloatArray, noise: float, 
     draws = np.random.default_rng(seed)
     level = LIGHT + frame + noise * draws.standard_normal(SENSOR)
     drawn = centre_frame(noise * np.random.default_rng(seed + 1000).standard_normal(SENSOR))
-    shown = replace(measured, level=level, noise=drawn)
+    shown = replace(measured, frame=centre_frame(level), level=level, noise=drawn)
     row = compare(shown, codes, 1000 + frame_of(codes, measured.scene), measured.scene)
     found = {name: float(str(row[column])) for name, column in zip(CAUSES, COLUMNS, strict=True)}
     assert sum(found.values()) == pytest.approx(1)

@@ -187,25 +187,6 @@ def test_without_crossing_rays_the_light_is_one_over_the_jacobian() -> None:
     assert figures[0] < 3e-2 and figures[1] < 3e-3
 
 
-def test_a_flat_sheet_moves_tilted_light_by_snell_s_law() -> None:
-    """The shadow of the sheet's square, d times the tangent from where light left it; all of it, less two reflections.
-
-    The middle of 0.02 mm pixels: exact by symmetry where edges fall on pixels' edges, else to a fraction of a pixel.
-    """
-    flat, tilt = np.zeros((3, 3)), (0.15, 0.1)
-    light = point_spread(Diffuser(Relief(0.4, flat, flat, flat), INDEX, DISTANCE), (400, 400), 0.02, tilt, rays=128)
-    rows, columns = np.nonzero(light)
-    weight = light[rows, columns]
-    middle_x = -((columns + 0.5 - 200) * weight).sum() / weight.sum() * 0.02
-    middle_y = -((rows + 0.5 - 200) * weight).sum() / weight.sum() * 0.02
-    assert (middle_x, middle_y) == pytest.approx((DISTANCE * tilt[0], DISTANCE * tilt[1]), abs=2e-3)
-    size = np.hypot(*tilt)
-    cosine = 1 / np.sqrt(1 + size**2)
-    inside = np.sqrt(1 - (1 - cosine**2) / INDEX**2)
-    s, p = (cosine - INDEX * inside) / (cosine + INDEX * inside), (INDEX * cosine - inside) / (INDEX * cosine + inside)
-    assert light.sum() * (0.02 / 0.4) ** 2 == pytest.approx((1 - (s**2 + p**2) / 2) ** 2, rel=1e-4)
-
-
 def test_a_random_relief_has_the_slope_and_correlation_that_were_asked_for() -> None:
     """Slopes of a surface with correlation c have the autocorrelation (1 - r^2 / c^2) exp(-r^2 / (2 c^2)) along r.
 
