@@ -488,15 +488,15 @@ SIZES = {
     "learn": (5, 1191),
     "light": (6, 1672),
     "optics": (7, 1745),
-    "planner": (6, 1630),
+    "planner": (6, 1627),
     "reconstruct": (16, 5534),
     "report": (6, 1904),
     "scene": (5, 1359),
-    "sensor": (4, 1110),
+    "sensor": (4, 1105),
     "sessions": (4, 885),
-    "studies": (23, 5217),
+    "studies": (23, 5210),
     "top level": (5, 501),
-    "transport": (15, 3990),
+    "transport": (15, 3982),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
 another, and says which code went."""
