@@ -47,7 +47,7 @@ numpydoc_show_class_members = False
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"mitsim {version}"
-html_static_path = ["site.css"]
+html_static_path = ["site.css", "math.woff2"]
 html_css_files = ["site.css"]
 
 CONTENTS = """
@@ -172,12 +172,25 @@ def add_contents(_: Sphinx, page: str, source: list[str]) -> None:
         source[0] += notebooks()
 
 
+PRIME = r'<mo class="prime" lspace="0" rspace="0">\2</mo>'
+BAR = r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>'
+
+
 def add_formula(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
     """A formula as MathML: no script is needed to show it."""
     alone = isinstance(node, nodes.math_block)
     formula = convert(node.astext(), display="block" if alone else "inline")
     # A prime is raised by its font; as a superscript it would be raised and made smaller twice.
-    formula = re.sub(r"<mi>(&#x0203[2-4];)</mi>", r'<mi class="prime">\1</mi>', formula)
+    letter, prime = r"(<m[io]>[^<]*</m[io]>)", r"<mi>(&#x0203[2-4];)</mi>"
+    formula = re.sub(rf"<msup>{letter}{prime}</msup>", rf"<mrow>\1{PRIME}</mrow>", formula)
+    formula = re.sub(
+        rf"<msup>{letter}<mrow>{prime}(.*?)</mrow></msup>",
+        rf"<msup><mrow>\1{PRIME}</mrow><mrow>\3</mrow></msup>",
+        formula,
+    )
+    formula = re.sub(prime, r'<mi class="prime">\1</mi>', formula)
+    # Bars of a norm do not know their partner, so that each would stretch to the height of the formula.
+    formula = re.sub(r"<mo(?: stretchy=\"false\")?>(&#x02016;|&#x0007C;)</mo>", BAR, formula)
     writer.body.append(f'<div class="formula">{formula}</div>' if alone else formula)
     raise nodes.SkipNode
 

@@ -15,6 +15,7 @@ import pytest
 from mitsim.core.exr import read_frame, write_frame
 from tests.real_session import RealSession, write_image
 from tests.system.refusals import Call, Refused, mentions
+from tests.system.test_contract import assert_said_once
 
 CAMERA = {"name": "bench 3"}
 DIGITAL = {"exposure_s": 0.02, "black_level_dn": 160, "gain_dn_per_e": 0.125, "dark_current_e_per_s": 4000}
@@ -118,8 +119,9 @@ def test_what_the_command_says_of_measured_frames(call: Call, tmp_path: Path) ->
     full = session.frame(np.ones((4, 4)))
     full[0, 0] = 4095
     write_image(frames / "f_0.png", full)
-    flagged = call("calibrate", "--frames", "frames", "-o", "other", cwd=tmp_path)
+    flagged = call("calibrate", "--frames", "frames", "-o", "other", cwd=tmp_path, pictures=True)
     assert flagged.code == 1 and "warning: saturation: 1 of 16 frames" in flagged.err
+    assert_said_once(flagged, tmp_path / "other")
 
 
 @pytest.mark.parametrize(
