@@ -165,6 +165,7 @@ def test_reconstruct(call: Call, lab: Any, tmp_path: Path) -> None:
     assert written.pop("inputs").keys() == {"run", "calibration", "lambda", "method"}
     assert written.pop("made_of") == {"run": str(lab.run), "calibration": str(lab.calibration)}
     assert written.pop("checksums").keys() == {"image.exr", "image.png", "uncertainty.exr"}
+    assert written.pop("versions").keys() >= {"mitsim", "mitsuba"}
     assert written.pop("command").startswith(f"mitsim reconstruct {lab.run} --calibration")
     assert number(found.pop("memory_bytes"), 0)  # of the process, which may do more than this
     assert written == found
