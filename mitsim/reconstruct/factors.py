@@ -492,13 +492,14 @@ class Factors:
             own, other = ours.get(name), theirs.get(name)
             if own == other or (name in _LIGHT and None in (own, other)):
                 continue
-            which = "the run's camera, with its scene, --camera, --projector and -D"
+            which = "calibrate the run's camera, with its scene, --camera, --projector and -D"
             if name in _LIGHT:
-                which = "in this light: its diffraction at the mask differs"
-            if own is None and shots.manifest.plan is None:
-                which = f"again, or import the frames again with --calibration {self.name}"
-            both = f"{cut(name)} is {cut(str(other))}, but {shots.name} has {cut(str(own))}"
-            raise MitsimError(f"calibration {self.name}: {both}; calibrate {which}")
+                which = "calibrate in this light: its diffraction at the mask differs"
+            if None in (own, other) and shots.manifest.plan is None:
+                which = f"if it is the same camera, import the frames again with --calibration {self.name}"
+            theirs_is, ours_is = ("not stated" if each is None else cut(str(each)) for each in (other, own))
+            both = f"{cut(name)} is {theirs_is}, but in {shots.name} it is {ours_is}"
+            raise MitsimError(f"calibration {self.name}: {both}; {which}")
         for side, pattern, factor in zip(("P_L", "P_R"), shots.patterns, (self.left, self.right), strict=True):
             if len(pattern) != factor.shape[1]:
                 own = f"patterns.{side} has {len(pattern)} scene pixels"

@@ -130,11 +130,11 @@ def test_solvers_prepare_once_and_solve_any_number_of_scenes(shots: Capture, fac
 def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors) -> None:
     """Sizes fit, so that nothing else would say it."""
     manifest = factors.manifest.model_copy(update={"camera": {"name": "other"}})
-    with pytest.raises(MitsimError, match=r"name is other, but .* has bench; calibrate the run's camera"):
+    with pytest.raises(MitsimError, match=r"name is other, but in .* it is bench; calibrate the run's camera"):
         reconstruct(shots, Factors(factors.left, factors.right, manifest, factors.status))
     geometry = {"mask": "plate", "mask_plate": "MURA of 101"}
     masked = manifest.model_copy(update={"camera": {**shots.manifest.camera, "geometry": geometry}})
-    with pytest.raises(MitsimError, match=r"mask is MURA of 101, but"):
+    with pytest.raises(MitsimError, match=r"mask is MURA of 101, but in .* it is not stated; .* --calibration"):
         reconstruct(shots, Factors(factors.left, factors.right, masked, factors.status))
 
 
