@@ -477,11 +477,11 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
 SIZES = {
-    "acquire": (5, 1214),
-    "api": (2, 214),
-    "bench": (5, 1150),
-    "calibrate": (5, 1198),
-    "cli": (6, 1496),
+    "acquire": (5, 1210),
+    "api": (2, 182),
+    "bench": (5, 1157),
+    "calibrate": (5, 1184),
+    "cli": (6, 1498),
     "core": (17, 3073),
     "devices": (8, 1995),
     "exchange": (5, 1281),
@@ -491,11 +491,11 @@ SIZES = {
     "planner": (6, 1627),
     "reconstruct": (16, 5535),
     "report": (6, 1904),
-    "scene": (5, 1359),
+    "scene": (5, 1353),
     "sensor": (4, 1105),
     "sessions": (4, 885),
-    "studies": (23, 5210),
-    "top level": (5, 501),
+    "studies": (23, 5207),
+    "top level": (5, 487),
     "transport": (15, 3982),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
