@@ -414,7 +414,8 @@ def test_a_line_behind_closed_features_is_not_dead(feature: float, gap: float) -
     exact, rng = [scene_factor(mls_mask().terms[0][1], feature, *edges, gap, 400.0)] * 2, np.random.default_rng(3)
     shown = {half: light(half, exact) for half in ORDER}
     top = max(frame.max() for frame in shown.values())
-    assert not checked({half: each / top + 1e-3 * rng.standard_normal(each.shape) for half, each in shown.items()}).doubts
+    noisy = {half: each / top + 1e-3 * rng.standard_normal(each.shape) for half, each in shown.items()}
+    assert not checked(noisy).doubts
 
 
 def test_a_sign_is_turned_without_pairs() -> None:
