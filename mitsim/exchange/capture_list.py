@@ -124,9 +124,21 @@ class RealCapture:
     @property
     def patterns(self) -> str:
         """Return the name of the family, or the file of patterns; ArgumentError if none is stated."""
-        if self.listed.patterns is None:
-            raise ArgumentError("patterns", "is not given, and frames do not say it; give it")
+        self.check_facts()
+        assert self.listed.patterns is not None
         return self.listed.patterns
+
+    def check_facts(self) -> None:
+        """Raise ArgumentError that names all facts that neither options nor the list state."""
+        listed, named = self.listed, self.camera is None and self.listed.camera is not None
+        known = {
+            "patterns": listed.patterns is not None,
+            "camera": self.camera is not None or (named and listed.digital is not None),
+            "exposure": self.exposure_s is not None or (named and listed.digital is not None),
+        }
+        if missing := [name for name, stated in known.items() if not stated]:
+            others = "".join(f", nor is {name}" for name in missing[1:])
+            raise ArgumentError(missing[0], f"is not given{others}; frames do not state this, so give all of it, or a list")
 
     @property
     def wanted(self) -> Wanted:
@@ -142,24 +154,23 @@ class RealCapture:
 
     def electronics(self) -> tuple[Electronics, Preparation]:
         """Return camera and preparation with its mosaic; MitsimError if neither file nor list has them."""
+        self.check_facts()
         listed = self.listed
         prepare = listed.prepare
         if self.camera is not None:
-            if self.exposure_s is None:
-                raise ArgumentError("exposure", "is not given, and frames do not say it; give it")
+            assert self.exposure_s is not None
             sensor = load_sensor(configuration.locate(self.camera, "calibration", ".toml", configuration.CAMERA))
             digital, name, largest = digital_of(sensor, check_exposure(self.exposure_s)), sensor.name, sensor.largest_dn
             if prepare.mosaic is None and prepare.channel is not None and sensor.mosaic is not None:
                 prepare = prepare.model_copy(update={"mosaic": sensor.mosaic})
             identity = {"name": name}
             stated = {"sensor": sensor.model_dump(mode="json", exclude={"full_well_e"})}
-        elif listed.digital is not None and listed.camera is not None:
+        else:
+            assert listed.digital is not None and listed.camera is not None
             seconds = check_exposure(self.exposure_s or listed.digital.exposure_s)
             digital, identity = listed.digital.model_copy(update={"exposure_s": seconds}), dict(listed.camera)
             name, largest = str(identity.get("name", "named")), None if listed.bits is None else 2**listed.bits - 1
             stated = {"sensor": {"name": name, "digital": listed.digital.model_dump(mode="json"), "bits": listed.bits}}
-        else:
-            raise ArgumentError("camera", "is not given, and frames do not say it; give it")
         if self.black_level_dn is not None:
             changed = {**digital.model_dump(), "black_level_dn": self.black_level_dn}
             digital = validate(Digital, changed, "black_level")

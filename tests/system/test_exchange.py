@@ -56,7 +56,7 @@ def test_refusals(refused: Refused, lab: Any) -> None:
     mentions(refused("export", lab.run, "--format", "hdf5", "-o", "new", "--projector", "mp_cl1"), "--projector")
     frames = "import", lab.run.parent
     mentions(refused(*frames), "give -o RUN")
-    mentions(refused(*frames, "-o", "new"), "--patterns is not given")
+    mentions(refused(*frames, "-o", "new"), "--patterns is not given, nor is camera, nor is exposure")
     given = "--patterns", "dots:4", "--camera", lab.camera
     mentions(refused(*frames, "-o", "new", *given), "--exposure is not given")
     mentions(refused(*frames, "-o", "new", *given, "--exposure", 0), "--exposure 0")
