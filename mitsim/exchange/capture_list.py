@@ -138,7 +138,7 @@ class RealCapture:
         }
         if missing := [name for name, stated in known.items() if not stated]:
             others = "".join(f", nor is {name}" for name in missing[1:])
-            raise ArgumentError(missing[0], f"is not given{others}; frames do not state this, so give all of it, or a list")
+            raise ArgumentError(missing[0], f"is not given{others}; frames do not state this, so give it, or a list")
 
     @property
     def wanted(self) -> Wanted:
