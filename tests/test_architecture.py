@@ -484,7 +484,7 @@ SIZES = {
     "cli": (6, 1498),
     "core": (17, 3073),
     "devices": (8, 1995),
-    "exchange": (5, 1281),
+    "exchange": (5, 1290),
     "learn": (5, 1191),
     "light": (6, 1672),
     "optics": (7, 1745),
