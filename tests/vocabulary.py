@@ -198,7 +198,7 @@ def outcome(path: Path, variant: str) -> dict[str, str]:
 
     def rendered(estimator: str) -> None:
         bench = open_bench(path, variant, for_render=True)
-        frame = bench.render(estimator, 4, 0.1)
+        frame = bench.render(estimator, 4, accuracy=0.1)
         assert np.isfinite(frame.mean).all(), "not finite"
         assert frame.mean.any(), f"dark {frame.warnings}"
 

@@ -474,7 +474,7 @@ def test_a_session_behind_a_slanted_bar_is_refused_for_its_mask(
     along = np.arange(16) - 7.5
     path = camera_file(tmp_path, "bar", (np.abs(along[:, None] - along) < 2).astype(float))
     bench = open_bench(small_scene(mask_order=8), variant, path)
-    sentence = r"^the mask \(drawing bar.npy\) is not separable: [^\n]*use a mask of the kind separable"
+    sentence = r'^the mask \(drawing bar.npy\) is not separable: [^\n]*use kind = "separable" in its table \[mask\]'
     recipe = load_recipe().model_copy(update={"depths": (380.0, 400.0)})
     for refused in (
         lambda: bench.calibrate(output=tmp_path / "cal"),

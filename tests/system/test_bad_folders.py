@@ -143,7 +143,7 @@ def test_a_run_manifest_with_a_mistake(
     [
         (put("status", value="incomplete"), ["incomplete"]),
         (put("camera"), ["camera: is missing"]),
-        (put("camera", "sensor"), ["sensor", "None"]),
+        (put("camera", "sensor"), ["sensor.name is not stated", "calibrate the run's camera"]),
         (put("checksums", "left.exr", value="0" * 64), ["left.exr", "checksum"]),
     ],
 )

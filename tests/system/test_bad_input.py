@@ -142,12 +142,14 @@ def test_binary_files_where_text_is_expected(refused: Refused, lab: Any, tmp_pat
 def test_faults_of_the_machine_are_one_line(
     refused: Refused, monkeypatch: pytest.MonkeyPatch, error: Exception, fragment: str
 ) -> None:
-    monkeypatch.setattr("mitsim.core.environment.doctor", Mock(side_effect=error))
+    monkeypatch.setattr("mitsim.core.environment.run_child", Mock(side_effect=error))
     mentions(refused("doctor"), fragment)
 
 
 def test_a_fault_of_ours_is_not_dressed_up(refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsim.core.environment.doctor", Mock(side_effect=OSError(errno.EINVAL, "Invalid argument")))
+    monkeypatch.setattr(
+        "mitsim.core.environment.run_child", Mock(side_effect=OSError(errno.EINVAL, "Invalid argument"))
+    )
     mentions(refused("doctor"), "a fault of mitsim's own, OSError: [Errno 22] Invalid argument")
 
 

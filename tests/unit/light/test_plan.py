@@ -7,19 +7,20 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from mitsim.bench.effects import EFFECTS, SWITCHES
-from mitsim.bench.request import Request, check_accuracy
+from mitsim.bench.request import Request
 from mitsim.core.environment import deciding_versions
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Cost
 from mitsim.light.passes import even
 from mitsim.light.plan import Plan
 from mitsim.light.settings import REPLICATES, Approximation, Drawn, ErrorCovariance, Estimate, SampleCost, SharpPixels
+from mitsim.planner.planner import make_plan
 from tests.unit.planner.test_choice import ACCURACIES, ONE_CLASS, PILOT_RESULT, SIZES, changes, plan, rows
 from tests.unit.planner.test_choice import plan as invented_plan
 
@@ -156,9 +157,9 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
 @pytest.mark.parametrize("accuracy", [0.0, -1e-3, 1e-7, 0.5, math.nan, math.inf])
 def test_accuracies_that_cannot_be_promised(accuracy: float) -> None:
     with pytest.raises(MitsimError, match=r"^accuracy"):
-        check_accuracy(accuracy)
+        Request.of(accuracy=accuracy)
     with pytest.raises(MitsimError, match=r"^accuracy"):
-        plan(accuracy)
+        make_plan(cast(Any, None), cast(Any, None), accuracy, 0)
 
 
 # -------- Changes that effects make in the frames

@@ -110,7 +110,7 @@ def test_a_calibration_of_another_line_is_refused(
     image = ["-o", str(tmp_path / "image")]
     assert main(["reconstruct", str(run / "638nm"), "--calibration", str(calibration / "520nm"), *image]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "projector.lines_nm is [520.0], but" in line and "638nm has [638.0]; calibrate in this light" in line
+    assert "projector.lines_nm is [520.0], but" in line and "638nm it is [638.0]; calibrate in this light" in line
     assert not (tmp_path / "image").exists()
     shutil.copytree(run / "638nm", tmp_path / "old")
     path = tmp_path / "old" / "manifest.json"
@@ -127,7 +127,7 @@ def test_one_calibration_for_all_lines_is_taken_where_it_is_asked_for(pair: tupl
     served = serving(red, green)
     served.check_fit(load_run(pair[0] / "638nm"))
     assert np.allclose(served.left @ served.left.T, green.factors.left @ green.factors.left.T / 3, rtol=1e-3)
-    with pytest.raises(MitsimError, match=r"lines_nm is \[638.0\], but .* has \[520.0\]"):
+    with pytest.raises(MitsimError, match=r"lines_nm is \[638.0\], but in .* it is \[520.0\]"):
         served.check_fit(load_run(pair[0] / "520nm"))
 
 

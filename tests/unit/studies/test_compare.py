@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +76,11 @@ def test_a_flagged_image_is_said_to_be(folder: Path, tmp_path: Path) -> None:
     assert [row["flagged"] for row in found.images] == [False, True]
 
 
-def test_files_are_the_same_each_time_and_replaced_if_asked(folder: Path, tmp_path: Path) -> None:
-    """(Planted: a folder of something else replaced.)"""
+def test_files_are_the_same_each_time_and_replaced_if_asked(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The title's date apart. (Planted: a folder of something else replaced.)"""
+    monkeypatch.setattr(time, "localtime", lambda *_: time.gmtime(0))
     both: list[Any] = [folder / "one", folder / "plus.npy"]
     kept = []
     for overwrite in (False, True):
