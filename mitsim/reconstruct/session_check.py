@@ -320,9 +320,9 @@ class _Side:
         noise = max(noise, 1e-13 * float(np.square(self.uniform).mean()))
         # Steady ambient light of any shape is in all sums, and not in the uniform response, which sets the zero.
         measured = *(values[:, :2] - values[0, :2] + (self.power, self.place)).T, ratios
-        # Bright rows have more photon noise.
+        # Bright rows have more photon noise; few patterns hardly show that of a single row.
         bright = np.median(np.square(rest), axis=0) + 1e-300
-        bright /= bright.mean()
+        bright = np.maximum((bright / bright.mean() - 1) @ inverse @ shapes + 1, 1e-3)
         of_ratio = np.maximum(np.square(responses) @ bright, 1e-30) / np.square(sizes)
         of_shapes = (bright @ np.square(inverse[:, :2]))[:, None] + np.square(parts[:, :2].T) * of_ratio
         variances = noise * np.stack([*of_shapes, of_ratio])
@@ -527,7 +527,8 @@ class _Check:
             self._refuse(own, index, f"they show light that no {own.side} stripes cast")
         light = np.square(own.vectors).sum(axis=1)
         lower, upper = np.sort([np.roll(light, 1), np.roll(light, -1)], axis=0)
-        dark = light < (0.3 * lower if own.sums.centre else 3 * own.noise * self.count / len(light))
+        noise = 3 * own.noise * self.count / len(light)
+        dark = light < (0.3 * lower if own.sums.centre else np.minimum(0.02 * lower, noise))
         # Light of lines alternates from pattern to pattern, and that of a hot pixel does not.
         hot = (_LIT * light > upper) & (np.square(own.vectors.mean(axis=1)) * self.count > 0.2 * light)
         strange = dark & (lower > _LIT * np.median(light)) | hot
