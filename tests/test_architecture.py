@@ -489,7 +489,7 @@ SIZES = {
     "light": (6, 1672),
     "optics": (7, 1745),
     "planner": (6, 1627),
-    "reconstruct": (16, 5541),
+    "reconstruct": (16, 5542),
     "report": (6, 1904),
     "scene": (5, 1353),
     "sensor": (4, 1105),
