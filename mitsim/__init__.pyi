@@ -20,6 +20,7 @@ from mitsim.core.runs import Capture as Capture
 from mitsim.core.runs import MosaicCapture as MosaicCapture
 from mitsim.core.runs import load_mosaic as load_mosaic
 from mitsim.core.runs import load_run as load_run
+from mitsim.design.predict import Prediction as Prediction
 from mitsim.devices.session import Modelling as Modelling
 from mitsim.devices.session import load_recipe as load_recipe
 from mitsim.exchange.formats import export as export
@@ -52,6 +53,7 @@ from mitsim.verbs import doctor as doctor
 from mitsim.verbs import load_network as load_network
 from mitsim.verbs import make_pairs as make_pairs
 from mitsim.verbs import pairs as pairs
+from mitsim.verbs import predict as predict
 from mitsim.verbs import scenes as scenes
 from mitsim.verbs import sense as sense
 from mitsim.verbs import study as study

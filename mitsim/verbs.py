@@ -20,6 +20,7 @@ from mitsim.bench.request import (
     Irradiance,
     Opening,
     Planned,
+    PredictRequest,
     Procedure,
     Request,
     Sampled,
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
     from mitsim.api.bench import Bench
     from mitsim.core.arrays import FloatArray
     from mitsim.core.runs import Capture
+    from mitsim.design.predict import Prediction
     from mitsim.learn.networks import LearnedSolver, Trained
     from mitsim.learn.pair_store import PairStore
     from mitsim.light.plan import Plan
@@ -178,6 +180,35 @@ def calibrate_in(bench: Bench, colour: str, request: SessionRequest, task: Task)
     if request.recipe is not None and request.recipe.depths:
         return {f"{depth:g}": each for depth, each in bench.calibrate_depths(**where).items()}
     return {"": bench.calibrate(**where)}
+
+
+class Predicted(PredictRequest, Opening):
+    """A prediction, and what opens its bench."""
+
+    VERB = "predict"
+
+
+@takes(Predicted, without="patterns")
+def predict(scene: Path | str, patterns: str = "dots:7", job: Job | None = None, **options: Any) -> Prediction:
+    """Open a bench, and predict the PSNR of an image and its errors by cause; see :meth:`mitsim.Bench.predict`.
+
+    Parameters
+    ----------
+    scene
+        name of a shipped one, or a path.
+    patterns
+        name of a family.
+    job
+        clock and progress.
+
+    Raises
+    ------
+    MitsimError
+        for files that cannot be used, a request that cannot be served, and a mask without factors.
+    """
+    asked, job = Predicted(patterns=patterns, **options), job or Job()
+    asked.check(scene, asked.patterns, asked.timing)
+    return open_as(scene, asked, job).predict(job=job, **asked.part(PredictRequest).given)
 
 
 # ---- the demo --------------------------------------------------------------------------------------------------------

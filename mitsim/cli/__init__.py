@@ -16,7 +16,7 @@ import typer
 
 import mitsim
 from mitsim.cli import frame_verbs
-from mitsim.cli.bench_verbs import capture, demo, doctor, pairs, plan, render, run_, study, transport, view
+from mitsim.cli.bench_verbs import capture, demo, doctor, pairs, plan, predict, render, run_, study, transport, view
 from mitsim.cli.calibrate_verb import calibrate
 from mitsim.cli.commands import Program, Verb, help_of, message_of
 from mitsim.cli.shelf_verbs import list_, new
@@ -97,7 +97,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 
 _VERBS = {
-    "Main steps": (demo, run_, view, plan, capture, calibrate, frame_verbs.reconstruct),
+    "Main steps": (demo, run_, view, plan, predict, capture, calibrate, frame_verbs.reconstruct),
     "Light and sensor alone": (render, frame_verbs.sense, frame_verbs.characterise),
     "Experiments": (study, frame_verbs.compare),
     "Neural networks": (pairs, frame_verbs.train),

@@ -52,7 +52,7 @@ from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.requests import PairOptions, PairsRequest
 from mitsim.studies import ALL, EXPERIMENTS
-from mitsim.verbs import DemoRequest, RunOptions, StudyOptions, capture_in, open_as, plan_in
+from mitsim.verbs import DemoRequest, Predicted, RunOptions, StudyOptions, capture_in, open_as, plan_in
 
 if TYPE_CHECKING:
     from mitsim.light.plan import Plan, PlanRow
@@ -303,6 +303,25 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
         lines.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
     return lines
+
+
+class Predicting(OfScene, Predicted, Common):
+    """Options of `mitsim predict`."""
+
+    FIRST = "scene patterns"
+
+
+@command
+def predict(asked: Predicting) -> int:
+    """Predict the PSNR of an image by cause, without frames.
+
+    A short trace of the scene's light and closed forms take seconds. Causes that the prediction lacks are named.
+
+    $ mitsim predict photograph --patterns dots:7
+    $ mitsim predict photograph --exposure-total 1 --recipe session.toml
+    $ mitsim predict photograph --prior 0.4,0.03,8 --json
+    """
+    return asked.call(mitsim.predict, asked.scene, **asked.given_of(Predicted))
 
 
 # ---- capture ---------------------------------------------------------------------------------------------------------

@@ -38,6 +38,7 @@ from mitsim.core.files import PAIRS, check_plain, output_folder, plain, write_js
 from mitsim.core.images import read_reflectance
 from mitsim.core.job import Cost
 from mitsim.core.manifests import other_request
+from mitsim.core.picture_files import picture_files
 from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import digital_of
@@ -53,7 +54,7 @@ from mitsim.learn.pair_store import (
     read_pairs_manifest,
     write_shard,
 )
-from mitsim.learn.requests import PairsRequest, picture_files
+from mitsim.learn.requests import PairsRequest
 from mitsim.light.cost_model import first_shadow, frames_cost
 from mitsim.light.light import SampledLight, traced_again
 from mitsim.light.passes import Simulation, emission
