@@ -1,0 +1,237 @@
+"""Expected error of a camera as a function of its separable mask code, with its gradient.
+
+Shadows of geometric optics are linear in the code: a factor is F = T a with a sparse T, whose rows are pairs of sensor
+pixel and projector pixel. Its derivative F' by the position of a projector pixel is linear in a likewise. Therefore the
+gradient of :func:`mitsim.design.expected.expected_error` with respect to the code is exact.
+
+A scene is a mean and stationary detail with the covariance sigma^2 rho^(|p - p'| + |q - q'|) of the solver ``markov``.
+Between its pixels such a scene is an Ornstein-Uhlenbeck process. Its first moment inside a pixel of unit width has the
+variance sigma^2 (1 - rho) / 60 to first order in 1 - rho.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from mitsim.core.arrays import FloatArray
+from mitsim.design.expected import Cause, ExpectedError, expected_error
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.projector import Spectrum
+from mitsim.optics.diffraction import ComplexArray, edge_wave
+from mitsim.optics.shadow import Directions, ShadowGeometry, trapezoid_weights
+
+_MOMENT = 1 / 60
+_CELLS = 16
+"""Grid cells in sqrt(lambda D)."""
+_STEP = 0.25
+"""Part of a projector pixel by which directions move for a derivative."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Mean and standard deviation of a scene's reflectance, and correlation of neighbouring pixels."""
+
+    mean: float = 0.4
+    deviation: float = 0.2
+    correlation: float = 0.95
+
+    def covariance(self, n: int) -> FloatArray:
+        return self.correlation ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light and electronics of a capture and of its calibration session.
+
+    ``gain`` is in electrons per second from a projector pixel on a sensor pixel without a mask, for a reflectance of 1.
+    ``frame_s`` and ``session_frame_s`` are exposure times of one frame.
+    """
+
+    gain: float
+    frame_s: float
+    session_frame_s: float
+    read_noise_e: float
+    dark_e_per_s: float
+    board: float = 0.99
+    pairs: bool = True
+
+
+class CodedSide:
+    """One axis of a camera as a function of a mask code (N,), and patterns (n, k) along that axis.
+
+    The light behind the mask is the code itself, in features, or for waves sum_l w_l |H_l a|^2 on a grid, with the lines
+    l of a ``spectrum``. Pixels take means of that light.
+    """
+
+    def __init__(
+        self,
+        camera: CameraGeometry,
+        axis: int,
+        directions: Directions,
+        features: int,
+        patterns: FloatArray,
+        spectrum: Spectrum | None = None,
+    ) -> None:
+        shadow = ShadowGeometry.of(camera, camera.scene_distance).along(axis)
+        self.shape, self.features = (len(shadow.pixel_centres_mm), len(directions.centres)), features
+        squared = np.square(directions.centres - shadow.pixel_centres_mm[:, None] / camera.scene_distance)
+        loss = (1 + squared) ** -2.0 * camera.angular_response(squared) * camera.pixel_fill_factor
+        own, seen = shadow.from_mask(directions, axis)
+        reach = float(np.abs(own.crossings(seen)).max()) + own.half_pixel + 2 * own.half_cell(seen)
+        lines = (np.arange(features + 1) - features / 2) * camera.mask_feature
+        self._waves = list[tuple[float, ComplexArray]]()
+        cell, count = camera.mask_feature, features
+        if spectrum is not None:
+            products = spectrum.wavelengths_nm * 1e-6 * shadow.distance_mm * shadow.shrink
+            cell = float(products.min() ** 0.5 / _CELLS)
+            count = 2 * int(np.ceil(reach / cell))
+            places = (np.arange(count) + 0.5 - count / 2) * cell
+            for product, weight in zip(products, spectrum.weights, strict=True):
+                steps = _step_fields(places[:, None] - lines, float(product), cell)
+                self._waves.append((float(weight), steps[:, :-1] - steps[:, 1:]))
+
+        def means(shift: float) -> csr_array:
+            moved = Directions(directions.centres + shift * directions.width, directions.width)
+            own, seen = shadow.from_mask(moved, axis)
+            boxes = (np.asarray(each / cell) for each in (own.crossings(seen), own.half_pixel, own.half_cell(seen)))
+            every = zip(*trapezoid_weights(*boxes, count), strict=True)
+            places, values = (np.stack(each, axis=-1).reshape(loss.size, -1) for each in every)
+            values = values * loss.ravel()[:, None]
+            rows = np.broadcast_to(np.arange(loss.size)[:, None], places.shape)
+            inside = (places >= 0) & (places < count) & (values != 0)
+            return csr_array((values[inside], (rows[inside], places[inside])), shape=(loss.size, count))
+
+        self._means = means(0.0)
+        self._moved = (means(_STEP) - means(-_STEP)) / (2 * _STEP)
+        self.patterns = patterns
+        self.gram = patterns @ patterns.T
+        self.squared = self.gram @ self.gram
+        self.used = np.flatnonzero(np.abs(lines[:-1] + camera.mask_feature / 2) < reach + camera.mask_feature / 2)
+
+    def __call__(self, code: FloatArray) -> Factor:
+        fields = [(weight, matrix, matrix @ code) for weight, matrix in self._waves]
+        light = sum((weight * (u.real**2 + u.imag**2) for weight, _, u in fields), 0.0) if fields else code
+
+        def back(by_factor: FloatArray, by_derivative: FloatArray) -> FloatArray:
+            by_light = self._means.T @ by_factor.ravel() + self._moved.T @ by_derivative.ravel()
+            if not fields:
+                return np.asarray(by_light)
+            parts = (2 * weight * np.real((u.conj() * by_light) @ matrix) for weight, matrix, u in fields)
+            return np.asarray(sum(parts, np.zeros(len(code))))
+
+        values, slopes = ((each @ light).reshape(self.shape) for each in (self._means, self._moved))
+        return Factor(values, slopes, back)
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """Factor (m, n), its derivative by the position of a projector pixel, and the gradient of both by the code."""
+
+    values: FloatArray
+    moved: FloatArray
+    back: Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def _step_fields(x: FloatArray, product: float, cell: float) -> ComplexArray:
+    """Return the field behind an edge at distances ``x`` [mm], as :class:`mitsim.optics.diffraction.EdgeWaves`."""
+    fade = product / (2 * cell)
+    wave = edge_wave(np.maximum(np.abs(x), 1e-9) * (2 / product) ** 0.5)
+    wave *= np.square(np.cos(np.pi / 2 * np.clip(4 * np.abs(x) / fade - 3, 0, 1)))
+    return np.asarray(np.where(x > 0, 1 + wave, -wave))
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """Expected mean squared error of images of scenes of a ``prior``, as a function of the codes of both sides."""
+
+    sides: tuple[CodedSide, CodedSide]
+    light: Light
+    prior: Prior
+
+    @cached_property
+    def _covariances(self) -> tuple[FloatArray, FloatArray]:
+        rows, columns = (self.prior.covariance(side.shape[1]) for side in self.sides)
+        return rows, columns
+
+    def __call__(self, codes: Sequence[FloatArray], lam: float | None = None, slopes: bool = False) -> Value:
+        light, prior, sides = self.light, self.prior, self.sides
+        made = [side(code) for side, code in zip(sides, codes, strict=True)]
+        factors, derivatives = [each.values for each in made], [each.moved for each in made]
+        crosses = [factor.T @ factor for factor in factors]
+        moments = [factor.T @ moved for factor, moved in zip(factors, derivatives, strict=True)]
+        details = [moment * side.gram for moment, side in zip(moments, sides, strict=True)]
+        grams = [cross * side.gram for cross, side in zip(crosses, sides, strict=True)]
+        even = [np.ones_like(gram) for gram in grams]
+        ones = [np.eye(len(gram)) for gram in grams]
+        covariances = self._covariances
+        second = [prior.mean**2 * j + prior.deviation**2 * k for j, k in zip(even, covariances, strict=True)]
+        reused = [cross * side.squared for cross, side in zip(crosses, sides, strict=True)]
+        inside = [detail @ detail.T for detail in details]
+
+        electrons, session = light.gain * light.frame_s, light.gain * light.session_frame_s
+        means = [factor.mean(axis=0) for factor in factors]
+        lit = [float(mean @ side.patterns.mean(axis=1)) for mean, side in zip(means, sides, strict=True)]
+        noise = (light.read_noise_e**2 + light.dark_e_per_s * light.frame_s) / electrons**2
+        noise += prior.mean * lit[0] * lit[1] / electrons
+        full = [float(mean.sum()) for mean in means]
+        response = (light.read_noise_e**2 + light.dark_e_per_s * light.session_frame_s) / session**2
+        response = (response + light.board / 2 * full[0] * full[1] / session) * (2 if light.pairs else 1)
+        common = [factor.sum(axis=1) for factor in factors]
+        norms = [float(each @ each) for each in common]
+        scale = [1 / (light.board**2 * gram.shape[0]) for gram in grams]
+        errors = [response * scale[0] / norms[1], response * scale[1] / norms[0]]
+        moment = prior.deviation**2 * (1 - prior.correlation) * _MOMENT
+        causes = [
+            Cause("noise", (1, 1), (ones[0], ones[1]), noise),
+            Cause("regularisation_bias", (0, 0), (even[0], even[1]), prior.mean**2, bias=True),
+            Cause("regularisation_bias", (0, 0), covariances, prior.deviation**2, bias=True),
+            Cause("calibration_noise", (0, 2), (reused[0], second[1]), errors[0]),
+            Cause("calibration_noise", (2, 0), (second[0], reused[1]), errors[1]),
+            Cause("print_detail", (0, 2), (inside[0], covariances[1]), moment),
+            Cause("print_detail", (2, 0), (covariances[0], inside[1]), moment),
+        ]
+        found = expected_error((grams[0], grams[1]), causes, lam, slopes)
+        pixels = grams[0].shape[0] * grams[1].shape[0]
+        value = Value({name: part / pixels for name, part in found.parts.items()}, found.lam)
+        if not slopes:
+            return value
+        by_weight = found.per_weight
+        gradients = []
+        for own, other in ((0, 1), (1, 0)):
+            side, factor, moved = sides[own], factors[own], derivatives[own]
+            of = found.of_matrices
+            by_cross = found.of_gram[own] * side.gram + of[3 + own][own] * side.squared
+            by_detail = 2 * of[5 + own][own] @ details[own] * side.gram
+            by_factor = 2 * factor @ by_cross + moved @ by_detail.T
+            by_derivative = factor @ by_detail
+            rows = len(factor)
+            by_noise = by_weight[0] * prior.mean / electrons * lit[other]
+            by_factor += by_noise / rows * side.patterns.mean(axis=1)
+            by_response = sum(by_weight[3 + k] * errors[k] for k in (0, 1)) / response
+            by_factor += by_response * (2 if light.pairs else 1) * light.board / 2 / session * full[other] / rows
+            # The error of the other factor falls with the norm of this side's common response.
+            by_factor += (-2 * by_weight[3 + other] * errors[other] / norms[own]) * common[own][:, None]
+            gradients.append(made[own].back(by_factor, by_derivative) / pixels)
+        return Value(value.parts, found.lam, (gradients[0], gradients[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """Expected mean squared error by cause, lambda, and the gradients (N,) with respect to both codes."""
+
+    parts: dict[str, float]
+    lam: float
+    slopes: tuple[FloatArray, ...] = ()
+
+    @property
+    def total(self) -> float:
+        return sum(self.parts.values())
+
+    @property
+    def psnr_db(self) -> float:
+        return float(-10 * np.log10(self.total))
