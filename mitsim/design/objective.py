@@ -146,6 +146,31 @@ def _step_fields(x: FloatArray, product: float, cell: float) -> ComplexArray:
 
 
 @dataclass(frozen=True, eq=False)
+class _Stack:
+    """Factor of a side, its light (m, k) under each pattern, and the matrices (n, n) of the causes of error."""
+
+    factor: Factor
+    bright: FloatArray
+    gram: FloatArray
+    detail: FloatArray
+    inside: FloatArray
+    reused: FloatArray
+    shot: FloatArray
+
+    @classmethod
+    def of(cls, side: CodedSide, code: FloatArray) -> _Stack:
+        made = side(code)
+        factor, cross = made.values, made.values.T @ made.values
+        bright, shot = factor @ side.patterns, np.zeros_like(cross)
+        for pattern, light in zip(side.patterns.T, bright.T, strict=True):
+            lit = np.flatnonzero(pattern)
+            stack = factor[:, lit] * pattern[lit]
+            shot[np.ix_(lit, lit)] += (stack * light[:, None]).T @ stack
+        detail = (factor.T @ made.moved) * side.gram
+        return cls(made, bright, cross * side.gram, detail, detail @ detail.T, cross * side.squared, shot)
+
+
+@dataclass(frozen=True, eq=False)
 class Objective:
     """Expected mean squared error of images of scenes of a ``prior``, as a function of the codes of both sides."""
 
@@ -160,25 +185,17 @@ class Objective:
 
     def __call__(self, codes: Sequence[FloatArray], lam: float | None = None, slopes: bool = False) -> Value:
         light, prior, sides = self.light, self.prior, self.sides
-        made = [side(code) for side, code in zip(sides, codes, strict=True)]
-        factors, derivatives = [each.values for each in made], [each.moved for each in made]
-        crosses = [factor.T @ factor for factor in factors]
-        moments = [factor.T @ moved for factor, moved in zip(factors, derivatives, strict=True)]
-        details = [moment * side.gram for moment, side in zip(moments, sides, strict=True)]
-        grams = [cross * side.gram for cross, side in zip(crosses, sides, strict=True)]
-        even = [np.ones_like(gram) for gram in grams]
-        ones = [np.eye(len(gram)) for gram in grams]
+        first = _Stack.of(sides[0], codes[0])
+        alike = sides[0] is sides[1] and codes[0] is codes[1]
+        stacks = first, (first if alike else _Stack.of(sides[1], codes[1]))
+        factors = [stack.factor.values for stack in stacks]
+        grams = [stack.gram for stack in stacks]
+        even, ones = ([form(len(gram)) for gram in grams] for form in (lambda n: np.ones((n, n)), np.eye))
         covariances = self._covariances
         second = [prior.mean**2 * j + prior.deviation**2 * k for j, k in zip(even, covariances, strict=True)]
-        reused = [cross * side.squared for cross, side in zip(crosses, sides, strict=True)]
-        inside = [detail @ detail.T for detail in details]
-
         electrons, session = light.gain * light.frame_s, light.gain * light.session_frame_s
-        means = [factor.mean(axis=0) for factor in factors]
-        lit = [float(mean @ side.patterns.mean(axis=1)) for mean, side in zip(means, sides, strict=True)]
         noise = (light.read_noise_e**2 + light.dark_e_per_s * light.frame_s) / electrons**2
-        noise += prior.mean * lit[0] * lit[1] / electrons
-        full = [float(mean.sum()) for mean in means]
+        full = [float(factor.mean(axis=0).sum()) for factor in factors]
         response = (light.read_noise_e**2 + light.dark_e_per_s * light.session_frame_s) / session**2
         response = (response + light.board / 2 * full[0] * full[1] / session) * (2 if light.pairs else 1)
         common = [factor.sum(axis=1) for factor in factors]
@@ -187,13 +204,14 @@ class Objective:
         errors = [response * scale[0] / norms[1], response * scale[1] / norms[0]]
         moment = prior.deviation**2 * (1 - prior.correlation) * _MOMENT
         causes = [
-            Cause("noise", (1, 1), (ones[0], ones[1]), noise),
+            Cause("dark_and_read_noise", (1, 1), (ones[0], ones[1]), noise),
+            Cause("shot_noise", (0, 0), (stacks[0].shot, stacks[1].shot), prior.mean / electrons),
             Cause("regularisation_bias", (0, 0), (even[0], even[1]), prior.mean**2, bias=True),
             Cause("regularisation_bias", (0, 0), covariances, prior.deviation**2, bias=True),
-            Cause("calibration_noise", (0, 2), (reused[0], second[1]), errors[0]),
-            Cause("calibration_noise", (2, 0), (second[0], reused[1]), errors[1]),
-            Cause("print_detail", (0, 2), (inside[0], covariances[1]), moment),
-            Cause("print_detail", (2, 0), (covariances[0], inside[1]), moment),
+            Cause("calibration_noise", (0, 2), (stacks[0].reused, second[1]), errors[0]),
+            Cause("calibration_noise", (2, 0), (second[0], stacks[1].reused), errors[1]),
+            Cause("print_detail", (0, 2), (stacks[0].inside, covariances[1]), moment),
+            Cause("print_detail", (2, 0), (covariances[0], stacks[1].inside), moment),
         ]
         found = expected_error((grams[0], grams[1]), causes, lam, slopes)
         pixels = grams[0].shape[0] * grams[1].shape[0]
@@ -203,20 +221,22 @@ class Objective:
         by_weight = found.per_weight
         gradients = []
         for own, other in ((0, 1), (1, 0)):
-            side, factor, moved = sides[own], factors[own], derivatives[own]
+            stack = stacks[own]
+            side, factor, moved = sides[own], factors[own], stack.factor.moved
             of = found.of_matrices
-            by_cross = found.of_gram[own] * side.gram + of[3 + own][own] * side.squared
-            by_detail = 2 * of[5 + own][own] @ details[own] * side.gram
+            by_cross = found.of_gram[own] * side.gram + of[4 + own][own] * side.squared
+            by_detail = 2 * of[6 + own][own] @ stack.detail * side.gram
             by_factor = 2 * factor @ by_cross + moved @ by_detail.T
             by_derivative = factor @ by_detail
+            for pattern, light_of in zip(side.patterns.T, stack.bright.T, strict=True):
+                seen = factor * pattern @ of[1][own] * pattern
+                by_factor += 2 * light_of[:, None] * seen + np.einsum("ij,ij->i", factor, seen)[:, None] * pattern
             rows = len(factor)
-            by_noise = by_weight[0] * prior.mean / electrons * lit[other]
-            by_factor += by_noise / rows * side.patterns.mean(axis=1)
-            by_response = sum(by_weight[3 + k] * errors[k] for k in (0, 1)) / response
+            by_response = sum(by_weight[4 + k] * errors[k] for k in (0, 1)) / response
             by_factor += by_response * (2 if light.pairs else 1) * light.board / 2 / session * full[other] / rows
             # The error of the other factor falls with the norm of this side's common response.
-            by_factor += (-2 * by_weight[3 + other] * errors[other] / norms[own]) * common[own][:, None]
-            gradients.append(made[own].back(by_factor, by_derivative) / pixels)
+            by_factor += (-2 * by_weight[4 + other] * errors[other] / norms[own]) * common[own][:, None]
+            gradients.append(stack.factor.back(by_factor, by_derivative) / pixels)
         return Value(value.parts, found.lam, (gradients[0], gradients[1]))
 
 
