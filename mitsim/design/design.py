@@ -1,0 +1,295 @@
+"""Design of a mask for a goal: search, proof by rendered images beside simple masks, and files to make it with."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import Configuration, load_model
+from mitsim.core.environment import versions
+from mitsim.core.errors import MitsimError
+from mitsim.core.files import output_folder, read_json, write_bytes, write_json, write_text
+from mitsim.core.job import Job
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.design.objective import CodedSide, Light, Objective, Prior
+from mitsim.design.predict import Stand
+from mitsim.design.search import Found, Search
+from mitsim.devices.session import load_recipe
+from mitsim.metrics import psnr, truth_for
+from mitsim.optics.shadow import Directions
+from mitsim.reconstruct.reconstruct import reconstruct
+
+if TYPE_CHECKING:
+    from mitsim.api.bench import Bench
+
+GOAL, DESIGN, STATE = "goal.toml", "design.json", "search.json"
+_SHORT_DB = 0.5
+"""Shortfall of a rendered image from its prediction that flags a design."""
+_EDGE_FEATURES = 8
+"""Features beyond those that the sensor sees: a mask is mounted with some play."""
+Positive = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class Goal(Configuration):
+    """What is searched, within which limits, and what counts."""
+
+    scene: str
+    """Name or path of the scene; its camera and its reflectance are where the search begins."""
+    camera: str | None = None
+    """Camera file or name; none: the scene's. Its mask is replaced."""
+    patterns: tuple[str, ...] = Field(default=("dots:7",), strict=False, min_length=1)
+    """Pattern families to choose from."""
+    exposure_total_s: Positive
+    """Seconds of all frames of a capture together; frames of a family share them evenly."""
+    exposures: Literal["time", "peak"] = "time"
+    """Time: all masks have the same seconds. Peak is refused: a single pinhole would be exposed fifty times as long."""
+    doses: tuple[Positive, ...] = Field(default=(1.0,), strict=False, min_length=1)
+    """Parts of these seconds over which the design is judged."""
+    scene_distances_mm: tuple[Positive, ...] = Field(default=(), strict=False)
+    """Distances of the scene over which it is judged; none: the aligned plane."""
+    judge: Literal["mean", "worst"] = "mean"
+    """Mean of the errors in dB over doses and distances, or the worst."""
+    feature_um: tuple[Positive, ...] = Field(default=(60.0,), strict=False, min_length=1)
+    """Least features to choose from."""
+    mask_distance_mm: tuple[Positive, ...] = Field(default=(), strict=False)
+    """Distances of the mask to choose from; none: the scene's."""
+    open_part: tuple[float, float] = Field(default=(0.0, 1.0), strict=False)
+    """Least and largest part of a side's features that are open."""
+    prior: tuple[float, float, float] | None = Field(default=None, strict=False)
+    """Mean, standard deviation and correlation of neighbouring pixels of reflectance; none: those of the scene."""
+    wanted_psnr_db: float | None = Field(default=None, ge=1, le=100)
+    """Also state the seconds of exposure that this PSNR needs."""
+    starts: int = Field(default=4, ge=1, le=10_000)
+    """Starts of the search for each feature size, distance and family."""
+    evaluations: int = Field(default=400, ge=10, le=1_000_000)
+    """Codes that a start may try."""
+    time_limit_s: Positive | None = None
+    """Seconds after which no further start begins."""
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    """Root of all random numbers."""
+    seeds: int = Field(default=3, ge=2, le=100)
+    """Captures of the proof, whose scatter decides what is better."""
+    accuracy: float = Field(default=1e-4, ge=1e-6, le=0.1)
+    """Accuracy of the frames of the proof."""
+
+    @model_validator(mode="after")
+    def _can_be_compared(self) -> Goal:
+        if self.exposures == "peak":
+            raise ValueError(
+                "exposures: got 'peak'; masks of equal peak are exposed for different times, so that the mask with the "
+                "least light wins (a single pinhole by exposing 53 times as long); give 'time'"
+            )
+        low, high = self.open_part
+        if not 0 <= low <= high <= 1:
+            raise ValueError(f"open_part: got {low:g} to {high:g}; give two parts from 0 to 1, the smaller one first")
+        return self
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Options of a design that are not its code."""
+
+    feature_mm: float
+    distance_mm: float
+    patterns: str
+
+    @property
+    def words(self) -> str:
+        return f"features of {self.feature_mm * 1e3:g} um, {self.distance_mm:g} mm from the sensor, {self.patterns}"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A mask with its predicted and rendered PSNR [dB]: by cause, mean and scatter over seeds."""
+
+    name: str
+    choice: Choice
+    found: Found
+    predicted: float = math.nan
+    causes: Mapping[str, float] | None = None
+    rendered: float = math.nan
+    scatter: float = math.nan
+    session_s: float = math.nan
+    warnings: tuple[str, ...] = ()
+
+    def payload(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "feature_um": self.choice.feature_mm * 1e3,
+            "mask_distance_mm": self.choice.distance_mm,
+            "patterns": self.choice.patterns,
+            "origin": self.found.origin,
+            "code": _text(self.found.code),
+            "evaluations": self.found.evaluations,
+            "psnr_of_search": self.found.psnr_db,
+            "psnr_predicted": self.predicted,
+            "causes": self.causes,
+            "psnr_rendered": self.rendered,
+            "psnr_scatter": self.scatter,
+            "session_exposure_s": self.session_s,
+            "warnings": self.warnings,
+        }
+
+
+@dataclass(frozen=True)
+class Design:
+    """Result of a design: candidates with the found one first, bounds that it has reached, and sensitivities [dB]."""
+
+    candidates: tuple[Candidate, ...]
+    bounds: tuple[str, ...]
+    sensitivity: Mapping[str, float]
+    seconds_for_psnr: float | None
+    complete: bool
+    seconds: Mapping[str, float]
+    output: str
+    warnings: tuple[str, ...]
+
+    def payload(self) -> dict[str, Any]:
+        return {**vars(self), "candidates": [each.payload() for each in self.candidates]}
+
+    @property
+    def headline(self) -> str:
+        best = self.candidates[0]
+        rest = max((each for each in self.candidates[1:]), key=lambda each: each.rendered, default=best)
+        gain = f", {best.rendered - rest.rendered:+.1f} dB over the best simple mask ({rest.name})"
+        return f"Found a mask with PSNR {best.rendered:.1f} dB rendered, {best.predicted:.1f} dB predicted{gain}"
+
+
+def load_goal(path: Path | str) -> Goal:
+    """Return the goal of a file; MitsimError names each field that breaks a rule."""
+    return load_model(path, Goal)
+
+
+# -------- Search
+
+
+@single_threaded_blas()
+def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> list[Objective]:
+    """Return the objectives of a ``choice``, one for each dose and distance."""
+    bench, sensor = stand.bench, stand.bench.sensor
+    family, prior = bench.family(choice.patterns), prior_of(stand, goal)
+    update = {"mask_feature": choice.feature_mm, "mask_distance": choice.distance_mm}
+    found = []
+    for depth in goal.scene_distances_mm or (bench.geometry.scene_distance,):
+        camera = bench.geometry.model_copy(update=update | {"scene_distance": depth, "mask": "separable", "mask_plate": None})
+        seen = camera.half_width + choice.distance_mm * (camera.tan_half_fov + camera.half_width / depth)
+        features = 2 * (math.ceil(seen / choice.feature_mm) + _EDGE_FEATURES) + 1
+        directions = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows_at(depth)]
+        shown = [side.astype(np.float64) for side in (family.left, family.right)]
+        each = zip((0, 1), directions, shown, strict=True)
+        rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves)
+        alike = camera.axes_alike and directions[0] == directions[1] and np.array_equal(*shown)
+        columns = rows if alike else CodedSide(camera, 1, directions[1], features, shown[1], bench.waves)
+        for dose in goal.doses:
+            light = Light(
+                gain=stand.unit * (bench.geometry.scene_distance / depth) ** 2,
+                frame_s=goal.exposure_total_s * dose / len(family.shots),
+                session_frame_s=session_s,
+                read_noise_e=sensor.superpixel_read_noise_e,
+                dark_e_per_s=sensor.superpixel_dark_current_e_per_s,
+                board=1.0,
+            )
+            found.append(Objective((rows, columns), light, prior))
+    return found
+
+
+def prior_of(stand: Stand, goal: Goal) -> Prior:
+    """Return the goal's prior, or mean, deviation and correlation of the scene's apparent reflectance."""
+    if goal.prior is not None:
+        return Prior(*goal.prior)
+    truth = stand.truth
+    off, variance = truth - truth.mean(), float(truth.var())
+    if not variance:
+        return Prior(float(truth.mean()), 0.0, 0.5)
+    neighbours = (off[1:] * off[:-1]).mean(), (off[:, 1:] * off[:, :-1]).mean()
+    return Prior(float(truth.mean()), variance**0.5, float(np.clip(np.mean(neighbours) / variance, 0.0, 0.999)))
+
+
+def searches(stand: Stand, goal: Goal, session_s: float) -> Iterator[tuple[Choice, Search]]:
+    """Yield each choice of feature size, distance and family with its search."""
+    distances = goal.mask_distance_mm or (stand.bench.geometry.mask_distance,)
+    for feature, distance, patterns in itertools.product(goal.feature_um, distances, goal.patterns):
+        choice = Choice(feature * 1e-3, distance, patterns)
+        own = objectives(stand, goal, choice, session_s)
+        yield choice, Search(own, goal.open_part, goal.judge == "worst", goal.seed)
+
+
+def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: float) -> tuple[list[Candidate], bool]:
+    """Return the best masks: the found one, then simple ones; and whether all starts were made.
+
+    Starts that are done are in ``search.json``, from which a search that was stopped goes on.
+    """
+    path = folder / STATE
+    done: dict[str, Any] = read_json(path) if path.is_file() else {}
+    began, best, complete = time.monotonic(), dict[str, tuple[Choice, Found, Search]](), True
+
+    def keep(name: str, choice: Choice, found: Found | None, search: Search) -> None:
+        if found is not None and (name not in best or found.score < best[name][1].score):
+            best[name] = choice, found, search
+
+    every = list(searches(stand, goal, session_s))
+    for number, (choice, search) in enumerate(every):
+        own: list[dict[str, Any]] = done.setdefault(choice.words, [])
+        spent = 0
+        for index, (origin, start) in enumerate(itertools.islice(search.starts(), goal.starts)):
+            if index == len(own):
+                if goal.time_limit_s is not None and time.monotonic() - began > goal.time_limit_s:
+                    complete = False
+                    break
+                found = search.improve(origin, start, goal.evaluations)
+                own.append({"origin": origin, "code": _text(found.code), "evaluations": found.evaluations})
+                write_json(path, done)
+            known = own[index]
+            code = _code(known["code"])
+            found = Found(known["origin"], code, search.score(code).score, known["evaluations"])
+            spent += found.evaluations
+            keep("design", choice, found, search)
+            job.progress("search", (number + (index + 1) / goal.starts) / len(every))
+        keep("random", choice, search.best_random(spent), search)
+        keep("pinholes", choice, search.best_pinholes(), search)
+        order = max(math.ceil(math.log2(search.features + 1)), 2)
+        keep("maximum length sequence", choice, search.maximum_length(min(order, 16)), search)
+    return [Candidate(name, choice, found) for name, (choice, found, _) in best.items()], complete
+
+
+# -------- Proof
+
+
+def prove(goal: Goal, candidate: Candidate, bench: Bench, job: Job) -> Candidate:
+    """Predict, capture, calibrate and reconstruct with the camera of a ``candidate``, once for each seed."""
+    patterns, frames = candidate.choice.patterns, len(bench.family(candidate.choice.patterns).shots)
+    predicted = bench.predict(patterns, exposure_total=goal.exposure_total_s, job=job)
+    factors = bench.calibrate(accuracy=goal.accuracy, seed=goal.seed, job=job)
+    light = bench.light(patterns=patterns, accuracy=goal.accuracy, seed=goal.seed, job=job)
+    found, warnings = [], list(predicted.warnings)
+    for seed in range(goal.seeds):
+        shots = light.capture(patterns, exposure=goal.exposure_total_s / frames, seed=goal.seed + seed)
+        image = reconstruct(shots, factors)
+        found.append(psnr(image.image, truth_for(shots, factors.manifest.board_reflectance)))
+        warnings += image.warnings
+    return replace(
+        candidate,
+        predicted=predicted.psnr_db,
+        causes=dict(predicted.errors.causes),
+        rendered=float(np.mean(found)),
+        scatter=float(np.std(found, ddof=1)),
+        session_s=predicted.session_exposure_s,
+        warnings=tuple(dict.fromkeys(map(str, warnings))),
+    )
+
+
+def _text(code: FloatArray) -> str:
+    return "".join(str(int(each)) for each in code)
+
+
+def _code(text: str) -> FloatArray:
+    return np.array([float(each) for each in text])
