@@ -5,28 +5,38 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+import tomli_w
 from pydantic import Field, model_validator
+from scipy.optimize import brentq
 
+from mitsim.bench.layout import before_board
+from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, load_model
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import output_folder, read_json, write_bytes, write_json, write_text
+from mitsim.core.files import output_folder, read_json, write_json, write_text
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 from mitsim.design.objective import CodedSide, Light, Objective, Prior
-from mitsim.design.predict import Stand
+from mitsim.design.predict import Stand, TracedLight
 from mitsim.design.search import Found, Search
 from mitsim.devices.session import load_recipe
+from mitsim.exchange.other_programs import write_png
 from mitsim.metrics import psnr, truth_for
 from mitsim.optics.shadow import Directions
 from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.report.pages import Mean, page_figure
+from mitsim.report.plots import grouped_bars, image_grid
+from mitsim.studies.framework.campaign import write_figures
+from mitsim.studies.framework.panels import Part, Section, write_page
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
@@ -34,6 +44,8 @@ if TYPE_CHECKING:
 GOAL, DESIGN, STATE = "goal.toml", "design.json", "search.json"
 _SHORT_DB = 0.5
 """Shortfall of a rendered image from its prediction that flags a design."""
+_SHOWN = 1e-2
+"""Part of the error from which a cause is drawn."""
 _EDGE_FEATURES = 8
 """Features beyond those that the sensor sees: a mask is mounted with some play."""
 Positive = Annotated[float, Field(gt=0, le=1e6)]
@@ -172,22 +184,32 @@ def load_goal(path: Path | str) -> Goal:
 # -------- Search
 
 
+def stand_of(bench: Bench, seed: int) -> tuple[Stand, float]:
+    """Trace the light of a scene and of its white board, and return them with the session's exposure time [s]."""
+    recipe = load_recipe().of_one_depth()
+    board = TracedLight.of(before_board(bench, recipe.board_reflectance), seed)
+    stand = Stand(bench, TracedLight.of(bench, seed), board)
+    return stand, stand.session_noise(Session(bench, recipe, seed))[1]
+
+
 @single_threaded_blas()
 def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> list[Objective]:
     """Return the objectives of a ``choice``, one for each dose and distance."""
     bench, sensor = stand.bench, stand.bench.sensor
     family, prior = bench.family(choice.patterns), prior_of(stand, goal)
-    update = {"mask_feature": choice.feature_mm, "mask_distance": choice.distance_mm}
+    update: dict[str, Any] = {"mask_feature": choice.feature_mm, "mask_distance": choice.distance_mm}
+    update |= {"mask": "separable", "mask_plate": None}
     found = []
     for depth in goal.scene_distances_mm or (bench.geometry.scene_distance,):
-        camera = bench.geometry.model_copy(update=update | {"scene_distance": depth, "mask": "separable", "mask_plate": None})
+        camera = bench.geometry.model_copy(
+            update=update | {"scene_distance": depth, "mask": "separable", "mask_plate": None}
+        )
         seen = camera.half_width + choice.distance_mm * (camera.tan_half_fov + camera.half_width / depth)
         features = 2 * (math.ceil(seen / choice.feature_mm) + _EDGE_FEATURES) + 1
         directions = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows_at(depth)]
-        shown = [side.astype(np.float64) for side in (family.left, family.right)]
-        each = zip((0, 1), directions, shown, strict=True)
+        shown = family.left.astype(np.float64), family.right.astype(np.float64)
         rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves)
-        alike = camera.axes_alike and directions[0] == directions[1] and np.array_equal(*shown)
+        alike = camera.axes_alike and directions[0] == directions[1] and np.array_equal(shown[0], shown[1])
         columns = rows if alike else CodedSide(camera, 1, directions[1], features, shown[1], bench.waves)
         for dose in goal.doses:
             light = Light(
@@ -269,13 +291,15 @@ def prove(goal: Goal, candidate: Candidate, bench: Bench, job: Job) -> Candidate
     patterns, frames = candidate.choice.patterns, len(bench.family(candidate.choice.patterns).shots)
     predicted = bench.predict(patterns, exposure_total=goal.exposure_total_s, job=job)
     factors = bench.calibrate(accuracy=goal.accuracy, seed=goal.seed, job=job)
-    light = bench.light(patterns=patterns, accuracy=goal.accuracy, seed=goal.seed, job=job)
     found, warnings = [], list(predicted.warnings)
     for seed in range(goal.seeds):
-        shots = light.capture(patterns, exposure=goal.exposure_total_s / frames, seed=goal.seed + seed)
+        exposed: dict[str, Any] = {"exposure": goal.exposure_total_s / frames, "accuracy": goal.accuracy}
+        shots = bench.capture(patterns, job=job, seed=goal.seed + seed, **exposed)
         image = reconstruct(shots, factors)
-        found.append(psnr(image.image, truth_for(shots, factors.manifest.board_reflectance)))
-        warnings += image.warnings
+        truth = truth_for(shots, factors.manifest.board_reflectance)
+        assert truth is not None
+        found.append(psnr(image.image, truth))
+        warnings += image.status.flags
     return replace(
         candidate,
         predicted=predicted.psnr_db,
@@ -293,3 +317,167 @@ def _text(code: FloatArray) -> str:
 
 def _code(text: str) -> FloatArray:
     return np.array([float(each) for each in text])
+
+
+# -------- Files to make a mask with
+
+
+def write_camera(folder: Path, bench: Bench, candidate: Candidate) -> Path:
+    """Write a camera file with the mask as a drawing, its PNG, and an SVG in millimetres; return the camera file."""
+    code, feature = candidate.found.code > 0.5, candidate.choice.feature_mm
+    folder.mkdir(exist_ok=True)
+    write_png(folder / "mask.png", (255 * np.outer(code, code)).astype(np.uint8))
+    starts, ends = (np.flatnonzero(np.diff(code, prepend=False, append=False) != 0)[k::2] * feature for k in (0, 1))
+    side = len(code) * feature
+    rows = (
+        f'<rect x="{x0:.6g}" y="{y0:.6g}" width="{x1 - x0:.6g}" height="{y1 - y0:.6g}"/>'
+        for y0, y1 in zip(starts, ends, strict=True)
+        for x0, x1 in zip(starts, ends, strict=True)
+    )
+    size, title = f"{side:.6g}", "Openings, as seen from the sensor; units are mm"
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" width="{size}mm" height="{size}mm" viewBox="0 0 {size} {size}">'
+    write_text(folder / "mask.svg", "\n".join([head, f"<title>{title}</title>", *rows, "</svg>", ""]))
+    sensor = bench.counting.model_dump(mode="json", exclude_defaults=True)
+    mask = {"kind": "drawing", "feature_mm": feature, "file": "mask.png", "distance_mm": candidate.choice.distance_mm}
+    write_text(folder / "camera.toml", tomli_w.dumps({**sensor, "mask": mask}))
+    return folder / "camera.toml"
+
+
+# -------- The design as a whole
+
+
+def design(
+    goal: Goal | Path | str, output: Path | str, job: Job | None = None, resume: bool = False, overwrite: bool = False
+) -> Design:
+    """Search a mask for a ``goal``, prove it by rendered images, and write its files; see :func:`mitsim.design`."""
+    from mitsim.api.bench import open_bench
+
+    job, asked = job or Job(), goal if isinstance(goal, Goal) else load_goal(goal)
+    earlier = Path(output) / GOAL
+    same = resume and earlier.is_file()
+    if same and load_goal(earlier) != asked:
+        raise MitsimError(f"output {output}: was begun for another goal; give its own goal, or another folder")
+    with output_folder(output, overwrite=same or (overwrite and (Path(output) / STATE).is_file())) as folder:
+        if overwrite and not same:
+            (folder / STATE).unlink(missing_ok=True)
+        write_text(folder / GOAL, tomli_w.dumps(asked.model_dump(mode="json", exclude_none=True)))
+        with job.clock.stage("open scene"):
+            bench = open_bench(asked.scene, camera=asked.camera)
+        with job.clock.stage("transport"):
+            stand, session_s = stand_of(bench, asked.seed)
+        with job.clock.stage("search"):
+            candidates, complete = run_search(stand, asked, folder, job, session_s)
+        proved = []
+        for number, each in enumerate(candidates):
+            job.progress("proof", number / len(candidates))
+            file = write_camera(folder / each.name.replace(" ", "_"), bench, each)
+            with job.clock.stage("proof"):
+                proved.append(prove(asked, each, open_bench(asked.scene, camera=str(file)), job.apart(f"{each.name} ")))
+        best, *simple = proved
+        own = next(search for choice, search in searches(stand, asked, session_s) if choice == best.choice)
+        warnings = [f"{each.name}: {text}" for each in proved for text in each.warnings]
+        if best.rendered < best.predicted - _SHORT_DB:
+            warnings.append(
+                f"The rendered image has {best.predicted - best.rendered:.1f} dB less than predicted; a cause that the "
+                "search lacks matters in this scene"
+            )
+        rival = max(simple, key=lambda each: each.rendered)
+        scatter = math.hypot(best.scatter, rival.scatter) / math.sqrt(asked.seeds)
+        if best.rendered - rival.rendered <= 2 * scatter:
+            warnings.append(
+                f"The design is not better than a simple mask ({rival.name}, {rival.rendered:.2f} dB) by more than the "
+                f"scatter of seeds (two standard errors are {2 * scatter:.2f} dB); take the simple mask"
+            )
+        found = Design(
+            candidates=tuple(proved),
+            bounds=tuple(own.active_bounds(best.found.code)),
+            sensitivity=sensitivity(own, best.found.code),
+            seconds_for_psnr=None if asked.wanted_psnr_db is None else seconds_for(own, best.found.code, asked),
+            complete=complete,
+            seconds=job.clock.seconds(),
+            output=str(folder),
+            warnings=tuple(warnings),
+        )
+        write_json(folder / DESIGN, {**found.payload(), "kind": "design", "versions": versions()})
+        draw(found, folder, bench)
+    return found
+
+
+def sensitivity(search: Search, code: FloatArray) -> dict[str, float]:
+    """Return the expected change [dB] by a hundredth of the features made wrongly, and by a tenth of the light."""
+    here, random = search.score(code).score, stream(search.seed, "flaws")
+    worse = []
+    for _ in range(8):
+        made = code.copy()
+        places = random.choice(search.used, max(round(len(search.used) / 100), 1), replace=False)
+        made[places] = 1 - made[places]
+        worse.append(search.score(made).score)
+    dim = [replace(each, light=replace(each.light, frame_s=each.light.frame_s / 10)) for each in search.objectives]
+    dark = Search(dim, search.open_part, search.worst, search.seed).score(code).score
+    return {
+        "one feature in a hundred wrong": -10 * math.log10(float(np.mean(worse)) / here),
+        "a tenth of the light": -10 * math.log10(dark / here),
+    }
+
+
+def seconds_for(search: Search, code: FloatArray, goal: Goal) -> float | None:
+    """Return the seconds of all frames after which the wanted PSNR is expected; None if no exposure reaches it."""
+    assert goal.wanted_psnr_db is not None
+
+    def short(log: float) -> float:
+        objectives = [
+            replace(each, light=replace(each.light, frame_s=each.light.frame_s * 10**log)) for each in search.objectives
+        ]
+        score = Search(objectives, search.open_part, search.worst, search.seed).score(code).score
+        return -10 * math.log10(score) - float(goal.wanted_psnr_db or 0)
+
+    if short(-6.0) > 0 or short(4.0) < 0:
+        return None
+    return float(goal.exposure_total_s * 10 ** brentq(short, -6.0, 4.0, xtol=1e-3))
+
+
+def draw(found: Design, folder: Path, bench: Bench) -> None:
+    """Write figures and the page of a design."""
+    names = [each.name for each in found.candidates]
+    masks = {"": [(np.outer(each.found.code, each.found.code), each.found.origin) for each in found.candidates]}
+    causes = dict[str, dict[str, Mean]]()
+    for each in found.candidates:
+        least = _SHOWN * 10 ** (-each.predicted / 10)
+        shown = {name: Mean(square, 0.0, 1) for name, square in (each.causes or {}).items() if square > least}
+        causes[each.name] = shown
+    figures = {
+        "masks.png": image_grid(masks, names),
+        "causes.png": grouped_bars(causes, "expected squared error of reflectance"),
+    }
+    rows = tuple(
+        (
+            each.name,
+            f"{each.predicted:.2f}",
+            f"{each.rendered:.2f}",
+            f"{each.scatter:.2f}",
+            f"{each.found.code.mean():.2f}",
+            f"{each.session_s:.3g}",
+            str(each.found.evaluations),
+        )
+        for each in found.candidates
+    )
+    head = (
+        "mask",
+        "predicted [dB]",
+        "rendered [dB]",
+        "scatter of seeds [dB]",
+        "open part a side",
+        "session [s a frame]",
+        "codes tried",
+    )
+    notes = [f"Expected change by {name}: {change:+.1f} dB." for name, change in found.sensitivity.items()]
+    notes += [f"The design has reached a bound: {name}." for name in found.bounds]
+    if found.seconds_for_psnr is not None:
+        notes.append(f"The wanted PSNR needs {found.seconds_for_psnr:.3g} s of exposure.")
+    part = Part("PSNR", found.candidates[0].choice.words, head, rows, notes=tuple(notes))
+    drawn = write_figures(folder, figures)
+    pictures = {file: page_figure(figure) for file, figure in drawn.items()}
+    title = "Design of a mask"
+    section = Section("design", title, found.headline, found.headline, pictures, (part,), warnings=found.warnings)
+    section = replace(section, scene=bench.loaded.path.parent.name, camera=bench.counting.name)
+    write_page([section], folder / "report.html", title)

@@ -66,7 +66,9 @@ class ExpectedError:
         return sum(self.parts.values())
 
 
-def expected_error(grams: Pair, causes: Sequence[Cause], lam: float | None = None, slopes: bool = False) -> ExpectedError:
+def expected_error(
+    grams: Pair, causes: Sequence[Cause], lam: float | None = None, slopes: bool = False
+) -> ExpectedError:
     """Compute the expected squared error of an image, summed over its pixels.
 
     Parameters
@@ -90,7 +92,10 @@ def expected_error(grams: Pair, causes: Sequence[Cause], lam: float | None = Non
         inverse = 1 / np.square(np.outer(mu, nu) + value)
         scales = (value**2 if cause.bias else 1.0 for cause in causes)
         both = zip(causes, seen, scales, strict=True)
-        return [scale * float((a * mu ** each.powers[0]) @ inverse @ (b * nu ** each.powers[1])) for each, (a, b), scale in both]
+        return [
+            scale * float((a * mu ** each.powers[0]) @ inverse @ (b * nu ** each.powers[1]))
+            for each, (a, b), scale in both
+        ]
 
     weights = [cause.weight for cause in causes]
     if lam is None:

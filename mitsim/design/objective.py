@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from mitsim.core.arrays import FloatArray
-from mitsim.design.expected import Cause, ExpectedError, expected_error
+from mitsim.design.expected import Cause, expected_error
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import ComplexArray, edge_wave
@@ -64,8 +64,8 @@ class Light:
 class CodedSide:
     """One axis of a camera as a function of a mask code (N,), and patterns (n, k) along that axis.
 
-    The light behind the mask is the code itself, in features, or for waves sum_l w_l |H_l a|^2 on a grid, with the lines
-    l of a ``spectrum``. Pixels take means of that light.
+    The light behind the mask is the code itself, in features, or for waves sum_l w_l |H_l a|^2 on a grid, with the
+    lines l of a ``spectrum``. Pixels take means of that light.
     """
 
     def __init__(
@@ -98,8 +98,8 @@ class CodedSide:
         def means(shift: float) -> csr_array:
             moved = Directions(directions.centres + shift * directions.width, directions.width)
             own, seen = shadow.from_mask(moved, axis)
-            boxes = (np.asarray(each / cell) for each in (own.crossings(seen), own.half_pixel, own.half_cell(seen)))
-            every = zip(*trapezoid_weights(*boxes, count), strict=True)
+            half = np.asarray(own.half_pixel / cell), np.asarray(own.half_cell(seen) / cell)
+            every = zip(*trapezoid_weights(own.crossings(seen) / cell, *half, count), strict=True)
             places, values = (np.stack(each, axis=-1).reshape(loss.size, -1) for each in every)
             values = values * loss.ravel()[:, None]
             rows = np.broadcast_to(np.arange(loss.size)[:, None], places.shape)

@@ -69,10 +69,10 @@ class Search:
                 "the sensor sees no whole number of at least 1 lies between; give a wider range or smaller features"
             )
 
-    def score(self, code: FloatArray, slopes: bool = False, lams: Sequence[float] | None = None) -> Scored:
+    def score(self, code: FloatArray, slopes: bool = False, lams: Sequence[float | None] = ()) -> Scored:
         """Return the score of a code for rows and columns alike, and with ``slopes`` its gradient."""
         self.evaluations += 1
-        known = lams or [None] * len(self.objectives)
+        known = lams or (None,) * len(self.objectives)
         values = [each((code, code), lam, slopes) for each, lam in zip(self.objectives, known, strict=True)]
         logs = np.log([value.total for value in values])
         weights = np.full(len(logs), 1 / len(logs))
@@ -88,8 +88,10 @@ class Search:
         return Scored(math.exp(mean), slope, [value.lam for value in values])
 
     def starts(self) -> Iterator[tuple[str, FloatArray]]:
-        """Yield starts without end: random codes of rising open part and pinholes of random period in turn."""
+        """Yield starts without end: the best pinholes, then random codes and pinholes of random period in turn."""
         number = 0
+        if (best := self.best_pinholes()) is not None:
+            yield best.origin, best.code
         while True:
             random, code = stream(self.seed, "mask search", number), np.zeros(self.features)
             part = _PARTS[number // 2 % len(_PARTS)]
@@ -153,7 +155,12 @@ class Search:
         """Return the maximum length sequence of an ``order``, cut or repeated to the features, whatever its open part."""
         sequence = mls_code(order).astype(np.float64)
         places = np.arange(self.features) - self.features // 2 + len(sequence) // 2
-        return Found(f"maximum length sequence of order {order}", code := sequence[places % len(sequence)], self.score(code).score, 1)
+        return Found(
+            f"maximum length sequence of order {order}",
+            code := sequence[places % len(sequence)],
+            self.score(code).score,
+            1,
+        )
 
     def allows(self, code: FloatArray) -> bool:
         """Return True if a code of 0 and 1 has an allowed open part."""
@@ -174,7 +181,9 @@ class Search:
 
         bounds, options = [(0.0, 1.0)] * len(self.used), {"maxiter": _RELAXED}
         code = np.zeros(self.features)
-        code[self.used] = minimize(cost, start[self.used], jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+        code[self.used] = minimize(
+            cost, start[self.used], jac=True, method="L-BFGS-B", bounds=bounds, options=options
+        ).x
         return code
 
     def _round(self, code: FloatArray) -> FloatArray:

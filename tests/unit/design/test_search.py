@@ -91,7 +91,7 @@ def test_bounds_hold_and_are_reported(objective: Objective) -> None:
 
 
 def test_an_impossible_bound_is_refused_by_name(objective: Objective) -> None:
-    with pytest.raises(MitsimError, match="open_part: got 0.01 to 0.011"):
+    with pytest.raises(MitsimError, match=r"open_part: got 0\.01 to 0\.011"):
         Search([objective], open_part=(0.01, 0.011))
 
 
