@@ -69,6 +69,8 @@ if TYPE_CHECKING:
     from mitsim.api.bench import Bench
     from mitsim.core.arrays import FloatArray
     from mitsim.core.runs import Capture
+    from mitsim.design.design import Design
+    from mitsim.design.goal import Goal
     from mitsim.design.predict import Prediction
     from mitsim.learn.networks import LearnedSolver, Trained
     from mitsim.learn.pair_store import PairStore
@@ -460,6 +462,53 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     from mitsim.devices.projector import ProjectorModel  # last: it imports numpy
 
     load_model(projector, ProjectorModel)
+
+
+class DesignOptions(Options):
+    """How a design is run."""
+
+    VERB = "design"
+
+    resume: bool = option(False, "continue a search that was stopped, for the same goal", panel=OUTPUT)
+    overwrite: bool = option(False, "replace an earlier design in the folder", panel=OUTPUT)
+
+
+@takes(DesignOptions)
+def design(
+    goal: Path | str | Goal, output: Path | str = "design-output", job: Job | None = None, **options: Any
+) -> Design:
+    """Search the mask with the least expected error, and prove it by rendered images beside simple masks.
+
+    Parameters
+    ----------
+    goal
+        Goal file, as `mitsim new goal` writes one, or a :class:`mitsim.design.goal.Goal`.
+    output
+        Folder of design.json, page, figures, and a camera file with the drawing of each mask.
+    job
+        Clock, progress and limits.
+
+    Raises
+    ------
+    MitsimError
+        for a goal that no code meets, which is named, files that cannot be used, and a folder that holds something
+        else.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> ms.design("goal.toml", "design").headline  # doctest: +SKIP
+    """
+    asked = DesignOptions(**options)
+    if asked.resume and asked.overwrite:
+        raise ArgumentError("overwrite", "replaces the work that resume continues; give one of both")
+    from mitsim.design.goal import Goal, load_goal
+
+    checked = goal if isinstance(goal, Goal) else load_goal(goal)
+    Opening(camera=checked.camera).check(checked.scene, checked.patterns[0])
+    from mitsim.design.design import design as run_design  # only now: it takes seconds to import
+
+    return run_design(checked, output, job, asked.resume, asked.overwrite)
 
 
 class CompareOptions(Styled):

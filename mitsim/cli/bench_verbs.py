@@ -52,7 +52,7 @@ from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.requests import PairOptions, PairsRequest
 from mitsim.studies import ALL, EXPERIMENTS
-from mitsim.verbs import DemoRequest, Predicted, RunOptions, StudyOptions, capture_in, open_as, plan_in
+from mitsim.verbs import DemoRequest, DesignOptions, Predicted, RunOptions, StudyOptions, capture_in, open_as, plan_in
 
 if TYPE_CHECKING:
     from mitsim.light.plan import Plan, PlanRow
@@ -197,6 +197,27 @@ def study(asked: Studying) -> int:
     $ mitsim study accuracy cookie_bag -o accuracy
     """
     return asked.call(mitsim.study, asked.name, asked.scenes, asked.output, **asked.given_of(StudyOptions))
+
+
+class Designing(DesignOptions, Common):
+    """Options of `mitsim design`."""
+
+    goal: Path = argument(..., "goal file, as `mitsim new goal NAME` writes one", "GOAL.toml")
+    output: Path = to_make(Path("design-output"), "folder to make for camera files, page and design.json", "DIR")
+
+
+@command
+def design(asked: Designing) -> int:
+    """Search the mask with the least expected error, and prove it by rendered images.
+
+    Simple masks (random, pinholes, maximum length sequence) stand beside it with as many tries. `mitsim design predict`
+    is `mitsim predict`.
+
+    $ mitsim new goal mine
+    $ mitsim design mine.toml -o design
+    $ mitsim capture photograph --camera design/design/camera.toml -o run
+    """
+    return asked.call(mitsim.design, asked.goal, asked.output, **asked.given_of(DesignOptions))
 
 
 class Checking(Variant, Common):

@@ -8,23 +8,22 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomli_w
-from pydantic import Field, model_validator
 from scipy.optimize import brentq
 
 from mitsim.bench.layout import before_board
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import Configuration, load_model
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import output_folder, read_json, write_json, write_text
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
+from mitsim.design.goal import Goal, load_goal
 from mitsim.design.objective import CodedSide, Light, Objective, Prior
 from mitsim.design.predict import Stand, TracedLight
 from mitsim.design.search import Found, Search
@@ -48,62 +47,6 @@ _SHOWN = 1e-2
 """Part of the error from which a cause is drawn."""
 _EDGE_FEATURES = 8
 """Features beyond those that the sensor sees: a mask is mounted with some play."""
-Positive = Annotated[float, Field(gt=0, le=1e6)]
-
-
-class Goal(Configuration):
-    """What is searched, within which limits, and what counts."""
-
-    scene: str
-    """Name or path of the scene; its camera and its reflectance are where the search begins."""
-    camera: str | None = None
-    """Camera file or name; none: the scene's. Its mask is replaced."""
-    patterns: tuple[str, ...] = Field(default=("dots:7",), strict=False, min_length=1)
-    """Pattern families to choose from."""
-    exposure_total_s: Positive
-    """Seconds of all frames of a capture together; frames of a family share them evenly."""
-    exposures: Literal["time", "peak"] = "time"
-    """Time: all masks have the same seconds. Peak is refused: a single pinhole would be exposed fifty times as long."""
-    doses: tuple[Positive, ...] = Field(default=(1.0,), strict=False, min_length=1)
-    """Parts of these seconds over which the design is judged."""
-    scene_distances_mm: tuple[Positive, ...] = Field(default=(), strict=False)
-    """Distances of the scene over which it is judged; none: the aligned plane."""
-    judge: Literal["mean", "worst"] = "mean"
-    """Mean of the errors in dB over doses and distances, or the worst."""
-    feature_um: tuple[Positive, ...] = Field(default=(60.0,), strict=False, min_length=1)
-    """Least features to choose from."""
-    mask_distance_mm: tuple[Positive, ...] = Field(default=(), strict=False)
-    """Distances of the mask to choose from; none: the scene's."""
-    open_part: tuple[float, float] = Field(default=(0.0, 1.0), strict=False)
-    """Least and largest part of a side's features that are open."""
-    prior: tuple[float, float, float] | None = Field(default=None, strict=False)
-    """Mean, standard deviation and correlation of neighbouring pixels of reflectance; none: those of the scene."""
-    wanted_psnr_db: float | None = Field(default=None, ge=1, le=100)
-    """Also state the seconds of exposure that this PSNR needs."""
-    starts: int = Field(default=4, ge=1, le=10_000)
-    """Starts of the search for each feature size, distance and family."""
-    evaluations: int = Field(default=400, ge=10, le=1_000_000)
-    """Codes that a start may try."""
-    time_limit_s: Positive | None = None
-    """Seconds after which no further start begins."""
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    """Root of all random numbers."""
-    seeds: int = Field(default=3, ge=2, le=100)
-    """Captures of the proof, whose scatter decides what is better."""
-    accuracy: float = Field(default=1e-4, ge=1e-6, le=0.1)
-    """Accuracy of the frames of the proof."""
-
-    @model_validator(mode="after")
-    def _can_be_compared(self) -> Goal:
-        if self.exposures == "peak":
-            raise ValueError(
-                "exposures: got 'peak'; masks of equal peak are exposed for different times, so that the mask with the "
-                "least light wins (a single pinhole by exposing 53 times as long); give 'time'"
-            )
-        low, high = self.open_part
-        if not 0 <= low <= high <= 1:
-            raise ValueError(f"open_part: got {low:g} to {high:g}; give two parts from 0 to 1, the smaller one first")
-        return self
 
 
 @dataclass(frozen=True)
@@ -166,7 +109,38 @@ class Design:
     warnings: tuple[str, ...]
 
     def payload(self) -> dict[str, Any]:
-        return {**vars(self), "candidates": [each.payload() for each in self.candidates]}
+        """Return the values of the command line's JSON."""
+        candidates = [each.payload() for each in self.candidates]
+        return {"headline": self.headline, **vars(self), "candidates": candidates}
+
+    @property
+    def table(self) -> Part:
+        """Return predicted and rendered PSNR of all masks."""
+        head = ("mask", "predicted [dB]", "rendered [dB]", "scatter of seeds [dB]", "open part a side",
+                "session [s a frame]", "codes tried")  # fmt: skip
+        rows = tuple(
+            (
+                each.name,
+                f"{each.predicted:.2f}",
+                f"{each.rendered:.2f}",
+                f"{each.scatter:.2f}",
+                f"{each.found.code.mean():.2f}",
+                f"{each.session_s:.3g}",
+                str(each.found.evaluations),
+            )
+            for each in self.candidates
+        )
+        notes = [f"Expected change by {name}: {change:+.1f} dB." for name, change in self.sensitivity.items()]
+        notes += [f"The design has reached a bound: {name}." for name in self.bounds]
+        if self.seconds_for_psnr is not None:
+            notes.append(f"The wanted PSNR needs {self.seconds_for_psnr:.3g} s of exposure.")
+        if not self.complete:
+            notes.append("The time limit ended the search; --resume makes the remaining starts.")
+        return Part("PSNR", self.candidates[0].choice.words, head, rows, notes=tuple(notes))
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        return [self.headline, *self.table.lines(), f"Camera file: {self.output}/design/camera.toml"]
 
     @property
     def headline(self) -> str:
@@ -174,11 +148,6 @@ class Design:
         rest = max((each for each in self.candidates[1:]), key=lambda each: each.rendered, default=best)
         gain = f", {best.rendered - rest.rendered:+.1f} dB over the best simple mask ({rest.name})"
         return f"Found a mask with PSNR {best.rendered:.1f} dB rendered, {best.predicted:.1f} dB predicted{gain}"
-
-
-def load_goal(path: Path | str) -> Goal:
-    """Return the goal of a file; MitsimError names each field that breaks a rule."""
-    return load_model(path, Goal)
 
 
 # -------- Search
@@ -449,35 +418,11 @@ def draw(found: Design, folder: Path, bench: Bench) -> None:
         "masks.png": image_grid(masks, names),
         "causes.png": grouped_bars(causes, "expected squared error of reflectance"),
     }
-    rows = tuple(
-        (
-            each.name,
-            f"{each.predicted:.2f}",
-            f"{each.rendered:.2f}",
-            f"{each.scatter:.2f}",
-            f"{each.found.code.mean():.2f}",
-            f"{each.session_s:.3g}",
-            str(each.found.evaluations),
-        )
-        for each in found.candidates
-    )
-    head = (
-        "mask",
-        "predicted [dB]",
-        "rendered [dB]",
-        "scatter of seeds [dB]",
-        "open part a side",
-        "session [s a frame]",
-        "codes tried",
-    )
-    notes = [f"Expected change by {name}: {change:+.1f} dB." for name, change in found.sensitivity.items()]
-    notes += [f"The design has reached a bound: {name}." for name in found.bounds]
-    if found.seconds_for_psnr is not None:
-        notes.append(f"The wanted PSNR needs {found.seconds_for_psnr:.3g} s of exposure.")
-    part = Part("PSNR", found.candidates[0].choice.words, head, rows, notes=tuple(notes))
     drawn = write_figures(folder, figures)
     pictures = {file: page_figure(figure) for file, figure in drawn.items()}
     title = "Design of a mask"
-    section = Section("design", title, found.headline, found.headline, pictures, (part,), warnings=found.warnings)
+    section = Section(
+        "design", title, found.headline, found.headline, pictures, (found.table,), warnings=found.warnings
+    )
     section = replace(section, scene=bench.loaded.path.parent.name, camera=bench.counting.name)
     write_page([section], folder / "report.html", title)

@@ -27,7 +27,7 @@ _THRESHOLDS = 0.2, 0.35, 0.5, 0.65, 0.8
 _PARTS = 0.05, 0.1, 0.15, 0.2, 0.3, 0.5
 """Open parts of random codes, in turn."""
 _SHARPNESS = 20.0
-"""Exponent of the mean that stands for the largest error: a code whose errors differ by 1 dB is judged by the larger."""
+"""Exponent of the mean that stands for the largest error, which decides where errors differ by 1 dB."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Search:
         return best and Found(best.origin, best.code, best.score, self.evaluations - begun)
 
     def maximum_length(self, order: int) -> Found:
-        """Return the maximum length sequence of an ``order``, cut or repeated to the features, whatever its open part."""
+        """Return the maximum length sequence of an ``order``, cut or repeated to the features."""
         sequence = mls_code(order).astype(np.float64)
         places = np.arange(self.features) - self.features // 2 + len(sequence) // 2
         return Found(
