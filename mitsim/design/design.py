@@ -64,17 +64,19 @@ class Choice:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A mask with its predicted and rendered PSNR [dB]: by cause, mean and scatter over seeds."""
+    """A mask with its predicted and rendered PSNR [dB], by cause, mean and scatter over seeds, and one image."""
 
     name: str
     choice: Choice
     found: Found
+    exposure_total_s: float
     predicted: float = math.nan
     causes: Mapping[str, float] | None = None
     rendered: float = math.nan
     scatter: float = math.nan
     session_s: float = math.nan
     warnings: tuple[str, ...] = ()
+    image: FloatArray | None = None
 
     def payload(self) -> dict[str, Any]:
         return {
@@ -85,6 +87,7 @@ class Candidate:
             "origin": self.found.origin,
             "code": _text(self.found.code),
             "evaluations": self.found.evaluations,
+            "exposure_total_s": self.exposure_total_s,
             "psnr_of_search": self.found.psnr_db,
             "psnr_predicted": self.predicted,
             "causes": self.causes,
@@ -117,7 +120,7 @@ class Design:
     def table(self) -> Part:
         """Return predicted and rendered PSNR of all masks."""
         head = ("mask", "predicted [dB]", "rendered [dB]", "scatter of seeds [dB]", "open part a side",
-                "session [s a frame]", "codes tried")  # fmt: skip
+                "exposure [s]", "session [s a frame]", "codes tried")  # fmt: skip
         rows = tuple(
             (
                 each.name,
@@ -125,6 +128,7 @@ class Design:
                 f"{each.rendered:.2f}",
                 f"{each.scatter:.2f}",
                 f"{each.found.code.mean():.2f}",
+                f"{each.exposure_total_s:.3g}",
                 f"{each.session_s:.3g}",
                 str(each.found.evaluations),
             )
@@ -168,13 +172,12 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
     family, prior = bench.family(choice.patterns), prior_of(stand, goal)
     update: dict[str, Any] = {"mask_feature": choice.feature_mm, "mask_distance": choice.distance_mm}
     update |= {"mask": "separable", "mask_plate": None}
-    found = []
-    for depth in goal.scene_distances_mm or (bench.geometry.scene_distance,):
-        camera = bench.geometry.model_copy(
-            update=update | {"scene_distance": depth, "mask": "separable", "mask_plate": None}
-        )
-        seen = camera.half_width + choice.distance_mm * (camera.tan_half_fov + camera.half_width / depth)
-        features = 2 * (math.ceil(seen / choice.feature_mm) + _EDGE_FEATURES) + 1
+    depths = goal.scene_distances_mm or (bench.geometry.scene_distance,)
+    camera, found = bench.geometry.model_copy(update=update), list[Objective]()
+    seen = camera.half_width + choice.distance_mm * (camera.tan_half_fov + camera.half_width / min(depths))
+    features = 2 * (math.ceil(seen / choice.feature_mm) + _EDGE_FEATURES) + 1
+    for depth in depths:
+        camera = camera.model_copy(update={"scene_distance": depth})
         directions = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows_at(depth)]
         shown = family.left.astype(np.float64), family.right.astype(np.float64)
         rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves)
@@ -190,6 +193,9 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
                 board=1.0,
             )
             found.append(Objective((rows, columns), light, prior))
+    if goal.exposures == "light":
+        code = Search(found).maximum_length().code
+        found = [each.of_equal_light((code, code)) for each in found]
     return found
 
 
@@ -247,9 +253,13 @@ def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: floa
             job.progress("search", (number + (index + 1) / goal.starts) / len(every))
         keep("random", choice, search.best_random(spent), search)
         keep("pinholes", choice, search.best_pinholes(), search)
-        order = max(math.ceil(math.log2(search.features + 1)), 2)
-        keep("maximum length sequence", choice, search.maximum_length(min(order, 16)), search)
-    return [Candidate(name, choice, found) for name, (choice, found, _) in best.items()], complete
+        keep("maximum length sequence", choice, search.maximum_length(), search)
+    candidates = []
+    for name, (choice, found, search) in best.items():
+        seconds = search.objectives[0].frame_s((found.code, found.code)) / goal.doses[0]
+        frames = len(stand.bench.family(choice.patterns).shots)
+        candidates.append(Candidate(name, choice, found, frames * seconds))
+    return candidates, complete
 
 
 # -------- Proof
@@ -258,11 +268,11 @@ def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: floa
 def prove(goal: Goal, candidate: Candidate, bench: Bench, job: Job) -> Candidate:
     """Predict, capture, calibrate and reconstruct with the camera of a ``candidate``, once for each seed."""
     patterns, frames = candidate.choice.patterns, len(bench.family(candidate.choice.patterns).shots)
-    predicted = bench.predict(patterns, exposure_total=goal.exposure_total_s, job=job)
+    predicted = bench.predict(patterns, exposure_total=candidate.exposure_total_s, job=job)
     factors = bench.calibrate(accuracy=goal.accuracy, seed=goal.seed, job=job)
     found, warnings = [], list(predicted.warnings)
     for seed in range(goal.seeds):
-        exposed: dict[str, Any] = {"exposure": goal.exposure_total_s / frames, "accuracy": goal.accuracy}
+        exposed: dict[str, Any] = {"exposure": candidate.exposure_total_s / frames, "accuracy": goal.accuracy}
         shots = bench.capture(patterns, job=job, seed=goal.seed + seed, **exposed)
         image = reconstruct(shots, factors)
         truth = truth_for(shots, factors.manifest.board_reflectance)
@@ -277,6 +287,7 @@ def prove(goal: Goal, candidate: Candidate, bench: Bench, job: Job) -> Candidate
         scatter=float(np.std(found, ddof=1)),
         session_s=predicted.session_exposure_s,
         warnings=tuple(dict.fromkeys(map(str, warnings))),
+        image=image.image,
     )
 
 
@@ -344,7 +355,8 @@ def design(
                 proved.append(prove(asked, each, open_bench(asked.scene, camera=str(file)), job.apart(f"{each.name} ")))
         best, *simple = proved
         own = next(search for choice, search in searches(stand, asked, session_s) if choice == best.choice)
-        warnings = [f"{each.name}: {text}" for each in proved for text in each.warnings]
+        texts = dict.fromkeys(text for each in proved for text in each.warnings)
+        warnings = [f"{', '.join(each.name for each in proved if text in each.warnings)}: {text}" for text in texts]
         if best.rendered < best.predicted - _SHORT_DB:
             warnings.append(
                 f"The rendered image has {best.predicted - best.rendered:.1f} dB less than predicted; a cause that the "
@@ -409,14 +421,21 @@ def draw(found: Design, folder: Path, bench: Bench) -> None:
     """Write figures and the page of a design."""
     names = [each.name for each in found.candidates]
     masks = {"": [(np.outer(each.found.code, each.found.code), each.found.origin) for each in found.candidates]}
+    rendered = ((each.image, f"PSNR {each.rendered:.1f} dB") for each in found.candidates)
+    images = [(image, caption) for image, caption in rendered if image is not None]
     causes = dict[str, dict[str, Mean]]()
     for each in found.candidates:
         least = _SHOWN * 10 ** (-each.predicted / 10)
-        shown = {name: Mean(square, 0.0, 1) for name, square in (each.causes or {}).items() if square > least}
+        shown = {
+            name.replace("_", " "): Mean(square**0.5, 0.0, 1)
+            for name, square in (each.causes or {}).items()
+            if square > least
+        }
         causes[each.name] = shown
     figures = {
         "masks.png": image_grid(masks, names),
-        "causes.png": grouped_bars(causes, "expected squared error of reflectance"),
+        "images.png": image_grid({"": images}, names),
+        "causes.png": grouped_bars(causes, "expected rms error of reflectance"),
     }
     drawn = write_figures(folder, figures)
     pictures = {file: page_figure(figure) for file, figure in drawn.items()}

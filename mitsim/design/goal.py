@@ -23,8 +23,9 @@ class Goal(Configuration):
     """Pattern families to choose from."""
     exposure_total_s: Positive
     """Seconds of all frames of a capture together; frames of a family share them evenly."""
-    exposures: Literal["time", "peak"] = "time"
-    """Time: all masks have the same seconds. Peak is refused: a single pinhole would be exposed fifty times as long."""
+    exposures: Literal["time", "light", "peak"] = "time"
+    """Time: all masks have the same seconds. Light: the same mean light, so that a mask that transmits less is exposed
+    for longer than these seconds, which are those of the scene's own mask. Peak is refused."""
     doses: tuple[Positive, ...] = Field(default=(1.0,), strict=False, min_length=1)
     """Parts of these seconds over which the design is judged."""
     scene_distances_mm: tuple[Positive, ...] = Field(default=(), strict=False)
@@ -59,7 +60,7 @@ class Goal(Configuration):
         if self.exposures == "peak":
             raise ValueError(
                 "exposures: got 'peak'; masks of equal peak are exposed for different times, so that the mask with the "
-                "least light wins (a single pinhole by exposing 53 times as long); give 'time'"
+                "least light wins (a single pinhole by exposing 53 times as long); give 'time' or 'light'"
             )
         low, high = self.open_part
         if not 0 <= low <= high <= 1:

@@ -12,7 +12,7 @@ variance sigma^2 (1 - rho) / 60 to first order in 1 - rho.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -49,7 +49,8 @@ class Light:
     """Light and electronics of a capture and of its calibration session.
 
     ``gain`` is in electrons per second from a projector pixel on a sensor pixel without a mask, for a reflectance of 1.
-    ``frame_s`` and ``session_frame_s`` are exposure times of one frame.
+    ``frame_s`` and ``session_frame_s`` are exposure times of one frame. With ``signal_e``, the mean electrons of a pixel
+    and frame, exposures are of equal light instead: a mask that transmits less is exposed for longer.
     """
 
     gain: float
@@ -59,6 +60,7 @@ class Light:
     dark_e_per_s: float
     board: float = 0.99
     pairs: bool = True
+    signal_e: float | None = None
 
 
 class CodedSide:
@@ -183,6 +185,24 @@ class Objective:
         rows, columns = (self.prior.covariance(side.shape[1]) for side in self.sides)
         return rows, columns
 
+    def frame_s(self, codes: Sequence[FloatArray]) -> float:
+        """Return the exposure time of a frame [s]."""
+        made = (side(code).values.mean(axis=0) for side, code in zip(self.sides, codes, strict=True))
+        return self._frame_s(
+            [float(mean @ side.patterns.mean(axis=1)) for mean, side in zip(made, self.sides, strict=True)]
+        )
+
+    def _frame_s(self, lit: Sequence[float]) -> float:
+        light = self.light
+        if light.signal_e is None:
+            return light.frame_s
+        return light.signal_e / (light.gain * self.prior.mean * lit[0] * lit[1])
+
+    def of_equal_light(self, codes: Sequence[FloatArray]) -> Objective:
+        """Return the objective for exposures with as much light as a mask of these codes has."""
+        scale = replace(self, light=replace(self.light, signal_e=1.0)).frame_s(codes)
+        return replace(self, light=replace(self.light, signal_e=self.light.frame_s / scale))
+
     def __call__(self, codes: Sequence[FloatArray], lam: float | None = None, slopes: bool = False) -> Value:
         light, prior, sides = self.light, self.prior, self.sides
         first = _Stack.of(sides[0], codes[0])
@@ -193,8 +213,10 @@ class Objective:
         even, ones = ([form(len(gram)) for gram in grams] for form in (lambda n: np.ones((n, n)), np.eye))
         covariances = self._covariances
         second = [prior.mean**2 * j + prior.deviation**2 * k for j, k in zip(even, covariances, strict=True)]
-        electrons, session = light.gain * light.frame_s, light.gain * light.session_frame_s
-        noise = (light.read_noise_e**2 + light.dark_e_per_s * light.frame_s) / electrons**2
+        shown = [side.patterns.mean(axis=1) for side in sides]
+        lit = [float(factor.mean(axis=0) @ pattern) for factor, pattern in zip(factors, shown, strict=True)]
+        electrons, session = light.gain * self._frame_s(lit), light.gain * light.session_frame_s
+        noise = light.read_noise_e**2 / electrons**2 + light.dark_e_per_s / light.gain / electrons
         full = [float(factor.mean(axis=0).sum()) for factor in factors]
         response = (light.read_noise_e**2 + light.dark_e_per_s * light.session_frame_s) / session**2
         response = (response + light.board / 2 * full[0] * full[1] / session) * (2 if light.pairs else 1)
@@ -232,6 +254,10 @@ class Objective:
                 seen = factor * pattern @ of[1][own] * pattern
                 by_factor += 2 * light_of[:, None] * seen + np.einsum("ij,ij->i", factor, seen)[:, None] * pattern
             rows = len(factor)
+            if light.signal_e is not None:
+                by_exposure = by_weight[0] * (noise + (light.read_noise_e / electrons) ** 2)
+                by_exposure += by_weight[1] * prior.mean / electrons
+                by_factor += by_exposure / lit[own] / rows * shown[own]
             by_response = sum(by_weight[4 + k] * errors[k] for k in (0, 1)) / response
             by_factor += by_response * (2 if light.pairs else 1) * light.board / 2 / session * full[other] / rows
             # The error of the other factor falls with the norm of this side's common response.

@@ -123,13 +123,13 @@ class Search:
             if not better:
                 break
             here = self.score(code, slopes=True)
-        return Found(origin, code, self.score(code).score, self.evaluations - begun)
+        return Found(f"found from {origin}", code, self.score(code).score, self.evaluations - begun)
 
     def best_random(self, evaluations: int) -> Found:
         """Return the best of that many random codes."""
         random, best, begun = stream(self.seed, "random masks"), None, self.evaluations
         while self.evaluations - begun < evaluations or best is None:
-            part, code = _PARTS[self.evaluations % len(_PARTS)], np.zeros(self.features)
+            part, code = _PARTS[(self.evaluations - begun) % len(_PARTS)], np.zeros(self.features)
             code[self.used] = random.random(len(self.used)) < part
             if not self.allows(code):
                 code = self._bounded(code, random.random(self.features))
@@ -151,16 +151,13 @@ class Search:
         best = min(found, key=lambda each: each.score, default=None)
         return best and Found(best.origin, best.code, best.score, self.evaluations - begun)
 
-    def maximum_length(self, order: int) -> Found:
-        """Return the maximum length sequence of an ``order``, cut or repeated to the features."""
+    def maximum_length(self) -> Found:
+        """Return the shortest maximum length sequence that covers the features, cut to them."""
+        order = min(max(math.ceil(math.log2(self.features + 1)), 2), 16)
         sequence = mls_code(order).astype(np.float64)
         places = np.arange(self.features) - self.features // 2 + len(sequence) // 2
-        return Found(
-            f"maximum length sequence of order {order}",
-            code := sequence[places % len(sequence)],
-            self.score(code).score,
-            1,
-        )
+        code = sequence[places % len(sequence)]
+        return Found(f"maximum length sequence of order {order}", code, self.score(code).score, 1)
 
     def allows(self, code: FloatArray) -> bool:
         """Return True if a code of 0 and 1 has an allowed open part."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -50,12 +51,12 @@ def test_a_factor_is_that_of_the_modelled_camera(spectrum: Spectrum | None, erro
     assert np.linalg.norm(scale * found - left) < error * np.linalg.norm(left)
 
 
-@pytest.mark.parametrize("spectrum", [None, LINES])
-def test_the_gradient_of_a_code_agrees_with_differences(spectrum: Spectrum | None) -> None:
+@pytest.mark.parametrize(("spectrum", "signal_e"), [(None, None), (LINES, None), (None, 2e3)])
+def test_the_gradient_of_a_code_agrees_with_differences(spectrum: Spectrum | None, signal_e: float | None) -> None:
     """Two codes and sides of other patterns, grey codes: 1e-6 is the issue's bound, 1e-8 is usual."""
     random, small = np.random.default_rng(4), 1e-5
     sides = side(spectrum), side(spectrum, 1 - DOTS)
-    objective = Objective(sides, LIGHT, Prior())
+    objective = Objective(sides, replace(LIGHT, signal_e=signal_e), Prior())
     codes = random.random((2, FEATURES))
     found = objective(codes, slopes=True)
     for which in (0, 1):
@@ -96,7 +97,7 @@ def test_an_impossible_bound_is_refused_by_name(objective: Objective) -> None:
 
 
 def test_the_worst_of_two_exposures_counts(objective: Objective) -> None:
-    dim = Objective(objective.sides, Light(**{**vars(LIGHT), "frame_s": 0.05}), Prior())
+    dim = Objective(objective.sides, replace(LIGHT, frame_s=0.05), Prior())
     worst, mean = (Search([objective, dim], worst=worst).score(CODE).score for worst in (True, False))
     alone = [Search([each]).score(CODE).score for each in (objective, dim)]
     assert mean == pytest.approx(np.sqrt(alone[0] * alone[1]), rel=1e-9)
