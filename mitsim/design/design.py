@@ -45,6 +45,8 @@ _SHORT_DB = 0.5
 """Shortfall of a rendered image from its prediction that flags a design."""
 _SHOWN = 1e-2
 """Part of the error from which a cause is drawn."""
+_ALIKE = 1e-3
+"""Part of a projector pixel within which rows and columns are searched as one."""
 _EDGE_FEATURES = 8
 """Features beyond those that the sensor sees: a mask is mounted with some play."""
 
@@ -181,7 +183,8 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
         directions = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows_at(depth)]
         shown = family.left.astype(np.float64), family.right.astype(np.float64)
         rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves)
-        alike = camera.axes_alike and directions[0] == directions[1] and np.array_equal(shown[0], shown[1])
+        near = np.allclose(directions[0].centres, directions[1].centres, rtol=0, atol=_ALIKE * directions[0].width)
+        alike = camera.axes_alike and near and np.array_equal(shown[0], shown[1])
         columns = rows if alike else CodedSide(camera, 1, directions[1], features, shown[1], bench.waves)
         for dose in goal.doses:
             light = Light(

@@ -85,7 +85,15 @@ def expected_error(
     mu, left = np.linalg.eigh(grams[0])
     nu, right = (mu, left) if grams[1] is grams[0] else np.linalg.eigh(grams[1])
     mu, nu = np.maximum(mu, 0.0), np.maximum(nu, 0.0)
-    turned = [(a @ left, b @ right) for a, b in (cause.matrices for cause in causes)]
+    products = dict[tuple[int, int], FloatArray]()  # causes share matrices
+
+    def times(matrix: FloatArray, basis: FloatArray) -> FloatArray:
+        key = id(matrix), id(basis)
+        if key not in products:
+            products[key] = matrix @ basis
+        return products[key]
+
+    turned = [(times(a, left), times(b, right)) for a, b in (cause.matrices for cause in causes)]
     seen = [((left * a).sum(axis=0), (right * b).sum(axis=0)) for a, b in turned]
 
     def sums(value: float) -> list[float]:

@@ -26,6 +26,8 @@ _RELAXED = 40
 _THRESHOLDS = 0.2, 0.35, 0.5, 0.65, 0.8
 _PARTS = 0.05, 0.1, 0.15, 0.2, 0.3, 0.5
 """Open parts of random codes, in turn."""
+_WIDEST = 4
+"""Features of the widest pinholes."""
 _SHARPNESS = 20.0
 """Exponent of the mean that stands for the largest error, which decides where errors differ by 1 dB."""
 
@@ -108,7 +110,11 @@ class Search:
     def improve(self, origin: str, start: FloatArray, evaluations: int = 400) -> Found:
         """Return the best code near a ``start``, after at most about that many evaluations."""
         begun = self.evaluations
-        code = start if set(np.unique(start)) <= {0.0, 1.0} and self.allows(start) else self._round(self._relax(start))
+        code = (
+            start
+            if set(np.unique(start)) <= {0.0, 1.0} and self.allows(start)
+            else self._round(self._relax(start, evaluations // 2))
+        )
         here = self.score(code, slopes=True)
         while self.evaluations - begun < evaluations:
             change = (here.slope * (1 - 2 * code))[self.used]
@@ -142,7 +148,7 @@ class Search:
         """Return the best array of equal pinholes, None if no array is within the bounds."""
         found, begun = [], self.evaluations
         for period in range(2, len(self.used) // 2):
-            for width in range(1, period // 2 + 1):
+            for width in range(1, min(period // 2, _WIDEST) + 1):
                 code = np.zeros(self.features)
                 code[self.used] = pinholes(len(self.used), period, width)
                 if self.allows(code):
@@ -169,18 +175,18 @@ class Search:
         both = (self._fewest, "smallest open_part"), (self._most, "largest open_part")
         return [name for bound, name in both if count == bound]
 
-    def _relax(self, start: FloatArray) -> FloatArray:
+    def _relax(self, start: FloatArray, evaluations: int) -> FloatArray:
         def cost(inside: FloatArray) -> tuple[float, FloatArray]:
             code = np.zeros(self.features)
             code[self.used] = inside
             found = self.score(code, slopes=True)
             return math.log(found.score), found.slope[self.used]
 
-        bounds, options = [(0.0, 1.0)] * len(self.used), {"maxiter": _RELAXED}
+        options = {"maxiter": _RELAXED, "maxfun": evaluations}
+        bounds = [(0.0, 1.0)] * len(self.used)
+        found = minimize(cost, start[self.used], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         code = np.zeros(self.features)
-        code[self.used] = minimize(
-            cost, start[self.used], jac=True, method="L-BFGS-B", bounds=bounds, options=options
-        ).x
+        code[self.used] = found.x
         return code
 
     def _round(self, code: FloatArray) -> FloatArray:

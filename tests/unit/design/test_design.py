@@ -1,0 +1,112 @@
+"""A design from a goal to files: refusals, resuming, the mask as it is drawn, and equal light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.design.design import Candidate, Choice, objectives, run_search, stand_of, write_camera
+from mitsim.design.goal import Goal, load_goal
+from mitsim.design.predict import Stand
+from mitsim.design.search import Found, Search
+from mitsim.optics.terms import ModelledCamera
+
+GOAL: dict[str, Any] = {
+    "scene": "photograph",
+    "camera": "small",
+    "exposure_total_s": 4.0,
+    "evaluations": 12,
+    "feature_um": (120.0,),
+}
+CHOICE = Choice(0.06, 2.0, "dots:3")
+
+
+@pytest.fixture(scope="module")
+def stand() -> Stand:
+    return stand_of(ms.open_bench("photograph", camera="small"), 0)[0]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('exposures = "peak"', "equal peak"),
+        ("open_part = [0.5, 0.2]", "open_part: got 0.5 to 0.2"),
+        ("exposure_total_s = -1", "exposure_total_s"),
+        ("patterns = []", "patterns"),
+        ("feature = 60", "feature_um"),
+        ('judge = "best"', "judge"),
+    ],
+)
+def test_a_goal_names_what_it_cannot_have(tmp_path: Path, line: str, words: str) -> None:
+    name = line.partition(" ")[0]
+    values = {"scene": '"photograph"', "exposure_total_s": "1.0"}
+    text = "\n".join([*(f"{key} = {value}" for key, value in values.items() if key != name), line])
+    (tmp_path / "goal.toml").write_text(text)
+    with pytest.raises(MitsimError) as refused:
+        load_goal(tmp_path / "goal.toml")
+    assert words in str(refused.value)
+
+
+def test_patterns_and_scenes_that_do_not_exist_are_refused_before_the_search(tmp_path: Path) -> None:
+    for change in ({"scene": "nosuch"}, {"patterns": ("dots:0",)}, {"camera": "nosuch"}):
+        with pytest.raises(MitsimError):
+            ms.design(Goal(**(GOAL | change)), tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_resumed_search_ends_as_one_without_a_stop(stand: Stand, tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    whole, _ = run_search(stand, Goal(**GOAL, starts=2, patterns=("dots:3",)), tmp_path / "whole", Job(), 0.01)
+    for starts in (1, 2):
+        found, complete = run_search(stand, Goal(**GOAL, starts=starts, patterns=("dots:3",)), tmp_path, Job(), 0.01)
+    assert complete
+    for one, other in zip(whole, found, strict=True):
+        assert one.name == other.name and one.found.score == other.found.score
+        assert np.array_equal(one.found.code, other.found.code)
+
+
+def test_the_drawn_mask_casts_the_shadow_of_the_code(stand: Stand, tmp_path: Path) -> None:
+    """An asymmetric code, so that a mirrored or shifted drawing is seen; the waves' grid errs by 5e-3."""
+    (objective,) = objectives(stand, Goal(**GOAL), CHOICE, 0.01)
+    side = objective.sides[0]
+    code = np.zeros(side.features)
+    code[side.used] = np.random.default_rng(1).random(len(side.used)) < 0.3
+    file = write_camera(tmp_path / "mask", stand.bench, Candidate("one", CHOICE, Found("drawn", code, 1.0, 0), 4.0))
+    bench = ms.open_bench("photograph", camera=str(file))
+    modelled = ModelledCamera(bench.geometry, bench.windows, bench.n, bench.waves)
+    left, _ = modelled.factors(modelled.built)
+    found = side(code).values
+    scale = float(np.vdot(found, left) / np.vdot(found, found))
+    assert np.linalg.norm(scale * found - left) < 1e-2 * np.linalg.norm(left)
+    assert (tmp_path / "mask" / "mask.svg").read_text().count("<rect") == np.count_nonzero(np.diff(code) == 1) ** 2
+
+
+def test_equal_light_exposes_a_darker_mask_for_longer(stand: Stand) -> None:
+    (objective,) = objectives(stand, Goal(**GOAL, exposures="light"), CHOICE, 0.01)
+    search = Search([objective])
+    full, half = search.maximum_length().code, np.zeros(search.features)
+    half[search.used[::4]] = 1
+    signals = []
+    for code in (full, half):
+        factor, pattern = objective.sides[0](code).values, objective.sides[0].patterns
+        signals.append(objective.frame_s((code, code)) * (factor.mean(axis=0) @ pattern.mean(axis=1)) ** 2)
+    assert signals[0] == pytest.approx(signals[1], rel=1e-6)
+    assert objective.frame_s((full, full)) == pytest.approx(4.0 / 9, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_a_design_is_as_good_as_predicted(tmp_path: Path) -> None:
+    """Two seeds, frames good to 1e-3: all four masks within 0.5 dB, and the design is the best of them."""
+    goal = Goal(**(GOAL | {"evaluations": 60}), starts=1, seeds=2, accuracy=1e-3)
+    found = ms.design(goal, tmp_path / "out")
+    for each in found.candidates:
+        assert abs(each.rendered - each.predicted) < 0.5, each.name
+    assert all(found.candidates[0].rendered > each.rendered for each in found.candidates[1:])
+    for name in ("design.json", "report.html", "masks.png", "images.png", "design/camera.toml", "design/mask.svg"):
+        assert (tmp_path / "out" / name).stat().st_size > 0
