@@ -69,7 +69,6 @@ if TYPE_CHECKING:
     from mitsim.api.bench import Bench
     from mitsim.core.arrays import FloatArray
     from mitsim.core.runs import Capture
-    from mitsim.design.design import Design
     from mitsim.design.goal import Goal
     from mitsim.design.predict import Prediction
     from mitsim.learn.networks import LearnedSolver, Trained
@@ -81,6 +80,7 @@ if TYPE_CHECKING:
     from mitsim.studies.demo import DemoResult
     from mitsim.studies.framework.campaign import StudyResult
     from mitsim.studies.framework.experiment import Scope
+    from mitsim.studies.mask_design import Design
 
 
 # ---- this machine, and what is shipped -------------------------------------------------------------------------------
@@ -506,7 +506,7 @@ def design(
 
     checked = goal if isinstance(goal, Goal) else load_goal(goal)
     Opening(camera=checked.camera).check(checked.scene, checked.patterns[0])
-    from mitsim.design.design import design as run_design  # only now: it takes seconds to import
+    from mitsim.studies.mask_design import design as run_design  # only now: it takes seconds to import
 
     return run_design(checked, output, job, asked.resume, asked.overwrite)
 

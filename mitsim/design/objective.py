@@ -49,8 +49,8 @@ class Light:
     """Light and electronics of a capture and of its calibration session.
 
     ``gain`` is in electrons per second from a projector pixel on a sensor pixel without a mask, for a reflectance of 1.
-    ``frame_s`` and ``session_frame_s`` are exposure times of one frame. With ``signal_e``, the mean electrons of a pixel
-    and frame, exposures are of equal light instead: a mask that transmits less is exposed for longer.
+    ``frame_s`` and ``session_frame_s`` are exposure times of one frame. With ``signal_e``, the mean electrons of a
+    pixel and frame, exposures are of equal light instead: a mask that transmits less is exposed for longer.
     """
 
     gain: float

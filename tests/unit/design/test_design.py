@@ -11,8 +11,8 @@ import pytest
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.design.design import Candidate, Choice, objectives, run_search, stand_of, write_camera
 from mitsim.design.goal import Goal, load_goal
+from mitsim.design.masks import Candidate, Choice, objectives, run_search, stand_of, write_camera
 from mitsim.design.predict import Stand
 from mitsim.design.search import Found, Search
 from mitsim.optics.terms import ModelledCamera
