@@ -439,8 +439,8 @@ def scope_of(
             others = "measure is for sweep; over for drift, sweep; patterns for accuracy, calibration, drift, sweep"
             raise MitsimError(f"study {name}: measures its own points; {others}")
         return scope
-    read_name(patterns)
-    return replace(scope, sweep=tuple(varied), patterns=patterns)
+    sweep = ((name, tuple(map(read_name, texts)) if name == "patterns" else texts) for name, texts in varied)
+    return replace(scope, sweep=tuple(sweep), patterns=read_name(patterns))
 
 
 def _check_setup(scope: Scope, scene: str | None) -> None:

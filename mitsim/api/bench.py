@@ -128,7 +128,7 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            Name of a family (:func:`mitsim.devices.patterns.parse_patterns`).
+            Name of a family, or own patterns (:func:`mitsim.devices.patterns.parse_patterns`).
 
         Raises
         ------

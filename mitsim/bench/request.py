@@ -160,9 +160,8 @@ def _switches(effects: object) -> dict[str, bool]:
 
 
 def family_of(patterns: str) -> str:
-    """Return the ``patterns``, the name of a family; ArgumentError for another name."""
-    read_name(patterns)
-    return patterns
+    """Return the ``patterns``, a family's name, or a file with its SHA-256; ArgumentError for another name."""
+    return read_name(patterns)
 
 
 class Seeded(Options):

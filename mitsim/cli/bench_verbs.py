@@ -49,7 +49,7 @@ from mitsim.core.headline import each_once, frames_headline
 from mitsim.core.job import compiled_kernels, memory_from_here, memory_since, running_seconds
 from mitsim.core.manifests import MANIFEST, resumable
 from mitsim.core.worker import RESUME, advise
-from mitsim.devices.patterns import pattern_names
+from mitsim.devices.patterns import pattern_names, short_name
 from mitsim.learn.requests import PairOptions, PairsRequest
 from mitsim.studies import ALL, EXPERIMENTS
 from mitsim.verbs import DemoRequest, DesignOptions, Predicted, RunOptions, StudyOptions, capture_in, open_as, plan_in
@@ -555,7 +555,7 @@ def transport(asked: Tracing) -> int:
     lines = [
         f"Light of {payload['n']}x{payload['n']} projector pixels to {shape[0]}x{shape[1]} of the sensor in "
         f"{taken['total']:.1f} s, {payload['entries']} numbers, {size / 2**20:.3g} MiB: {output}",
-        f"Monte Carlo error {payload['mc_error']:.1e} of the frames of {patterns}, total error up to "
+        f"Monte Carlo error {payload['mc_error']:.1e} of the frames of {short_name(patterns)}, total error up to "
         f"{payload['total_error_bound']:.1e}",
     ]
     return asked.finish(payload, lines, payload["warnings"])

@@ -22,6 +22,7 @@ from mitsim.core import configuration
 from mitsim.core.errors import MitsimError, near_name
 from mitsim.core.files import output_file, whole_folder, write_bytes, write_text
 from mitsim.design.goal import Goal
+from mitsim.devices.pattern_files import OWN
 from mitsim.devices.patterns import FAMILIES
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
@@ -94,7 +95,13 @@ KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
         Entry(*each) for each in {**DISCRETISED, **{name: effect.what for name, effect in EFFECTS.items()}}.items()
     ),
     "methods": _methods,
-    "patterns": lambda: (Entry(", ".join(each.forms), _clause(str(each.factor.__doc__))) for each in FAMILIES.values()),
+    "patterns": lambda: (
+        Entry(*each)
+        for each in [
+            *((", ".join(each.forms), _clause(str(each.factor.__doc__))) for each in FAMILIES.values()),
+            ("PATH", f"own patterns: {OWN}"),
+        ]
+    ),
 }
 """Entries of each kind that `mitsim list` knows, as the files and modules state them."""
 

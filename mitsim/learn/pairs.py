@@ -40,7 +40,7 @@ from mitsim.core.job import Cost
 from mitsim.core.manifests import other_request
 from mitsim.core.picture_files import picture_files
 from mitsim.core.seeds import integer, stream
-from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.patterns import PatternFamily, is_own
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import Drift
 from mitsim.learn.pair_store import (
@@ -337,6 +337,7 @@ def make_pairs(bench: Bench, asked: PairsRequest, task: Task) -> tuple[PairStore
             m=bench.geometry.frame_shape,
             frames=sum(shot.sign != -1 for shot in family.shots),
             patterns=capture.patterns,
+            own_patterns=(family.left.tolist(), family.right.tolist()) if is_own(capture.patterns) else None,
             exposure_s=1.0,
             camera=plain(bench.identity()),
             sensor=json.dumps(bench.sensor.model_dump(exclude_none=True)),

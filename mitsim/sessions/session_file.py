@@ -46,6 +46,7 @@ from mitsim.core.errors import (
 )
 from mitsim.core.files import PAGE, PICTURES, plain, read_json, resolve, write_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
+from mitsim.devices.patterns import is_own
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, Exported, check_format
@@ -350,6 +351,8 @@ def _whole(table: str, key: str, value: Any, base: Path) -> Any:
     path, fields = Path(value), fields_of(table)
     if key not in fields:  # a parameter of the scene
         is_file = bool(path.suffix) and os.path.isfile(base / path)
+    elif key == "patterns":
+        is_file = is_own(value, base)
     elif not (key == "recipe" or "Path" in str(fields[key].annotation)) or key == "output":
         is_file = key == "method" and path.suffix == MODEL
     else:

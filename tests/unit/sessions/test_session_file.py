@@ -117,12 +117,14 @@ def test_names_of_others_are_refused(write: Callable[[str], Path], output: str) 
 
 
 def test_paths_are_written_as_seen_from_the_file(write: Callable[[str], Path], tmp_path: Path) -> None:
-    """And read again from there; a bare name is no shipped one. (Planted: `photograph` for `./photograph`.)"""
+    """And read again from there; a bare name is no shipped one. (Planted: `photograph` for `./photograph`; own patterns
+    seen from the working folder.)"""
     (tmp_path / "s").mkdir()
-    for name in ("photograph", "s/camera.toml"):
+    for name in ("photograph", "s/camera.toml", "s/own.npy"):
         (tmp_path / name).touch()
     tables = {
         "scene": {"scene": str(tmp_path / "s" / "photograph"), "camera": str(tmp_path / "s" / "camera.toml")},
+        "capture": {"patterns": str(tmp_path / "s" / "own.npy")},
         "reconstruct": [{"run": str(tmp_path / "run"), "calibration": "/elsewhere/cal"}],
     }
     text = session_text(tables, tmp_path / "s")
