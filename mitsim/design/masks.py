@@ -31,6 +31,8 @@ from mitsim.devices.session import load_recipe
 from mitsim.optics.shadow import Directions
 
 STATE = "search.json"
+_FULL = 0.8
+"""Part of the full well that the brightest pixel of a frame may reach, as in a capture by default."""
 _ALIKE = 1e-3
 """Part of a projector pixel within which rows and columns are searched as one."""
 _EDGE_FEATURES = 8
@@ -124,6 +126,7 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
                 read_noise_e=sensor.superpixel_read_noise_e,
                 dark_e_per_s=sensor.superpixel_dark_current_e_per_s,
                 board=1.0,
+                most_e=_FULL * sensor.superpixel_full_well_e,
             )
             found.append(Objective((rows, columns), light, prior))
     if goal.exposures == "light":

@@ -11,6 +11,7 @@ variance sigma^2 (1 - rho) / 60 to first order in 1 - rho.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,6 +29,8 @@ from mitsim.optics.shadow import Directions, ShadowGeometry, trapezoid_weights
 _MOMENT = 1 / 60
 _CELLS = 16
 """Grid cells in sqrt(lambda D)."""
+_BRIGHT = 0.5
+"""Standard deviations by which the scene about the brightest pixel of a frame is brighter than its mean."""
 _STEP = 0.25
 """Part of a projector pixel by which directions move for a derivative."""
 
@@ -50,7 +53,8 @@ class Light:
 
     ``gain`` is in electrons per second from a projector pixel on a sensor pixel without a mask, for a reflectance of 1.
     ``frame_s`` and ``session_frame_s`` are exposure times of one frame. With ``signal_e``, the mean electrons of a
-    pixel and frame, exposures are of equal light instead: a mask that transmits less is exposed for longer.
+    pixel and frame, exposures are of equal light instead: a mask that transmits less is exposed for longer. No pixel
+    gets more than ``most_e``: a mask that transmits more is exposed for a shorter time.
     """
 
     gain: float
@@ -61,6 +65,7 @@ class Light:
     board: float = 0.99
     pairs: bool = True
     signal_e: float | None = None
+    most_e: float = math.inf
 
 
 class CodedSide:
@@ -187,16 +192,27 @@ class Objective:
 
     def frame_s(self, codes: Sequence[FloatArray]) -> float:
         """Return the exposure time of a frame [s]."""
-        made = (side(code).values.mean(axis=0) for side, code in zip(self.sides, codes, strict=True))
-        return self._frame_s(
-            [float(mean @ side.patterns.mean(axis=1)) for mean, side in zip(made, self.sides, strict=True)]
-        )
+        made = [_Stack.of(side, code) for side, code in zip(self.sides, codes, strict=True)]
+        return self._exposure((made[0], made[1]))[0]
 
-    def _frame_s(self, lit: Sequence[float]) -> float:
-        light = self.light
-        if light.signal_e is None:
-            return light.frame_s
-        return light.signal_e / (light.gain * self.prior.mean * lit[0] * lit[1])
+    def _exposure(self, stacks: tuple[_Stack, _Stack]) -> tuple[float, list[FloatArray] | None]:
+        """Return the exposure time [s], and the derivatives of its logarithm by both factors, None if it is fixed."""
+        light, seconds, slopes = self.light, self.light.frame_s, None
+        if light.signal_e is not None:
+            shown = [side.patterns.mean(axis=1) for side in self.sides]
+            lit = [float(stack.factor.values.mean(axis=0) @ c) for stack, c in zip(stacks, shown, strict=True)]
+            seconds = light.signal_e / (light.gain * self.prior.mean * lit[0] * lit[1])
+            each = zip(stacks, shown, lit, strict=True)
+            slopes = [np.broadcast_to(-c / (len(s.bright) * at), s.factor.values.shape) for s, c, at in each]
+        places = [np.unravel_index(np.argmax(stack.bright), stack.bright.shape) for stack in stacks]
+        peaks = [float(stack.bright[place]) for stack, place in zip(stacks, places, strict=True)]
+        bright = light.gain * (self.prior.mean + _BRIGHT * self.prior.deviation) * peaks[0] * peaks[1]
+        if seconds * bright <= light.most_e:
+            return seconds, slopes
+        slopes = [np.zeros(stack.factor.values.shape) for stack in stacks]
+        for slope, side, (row, pattern), peak in zip(slopes, self.sides, places, peaks, strict=True):
+            slope[row] = -side.patterns[:, pattern] / peak
+        return light.most_e / bright, slopes
 
     def of_equal_light(self, codes: Sequence[FloatArray]) -> Objective:
         """Return the objective for exposures with as much light as a mask of these codes has."""
@@ -213,9 +229,8 @@ class Objective:
         even, ones = ([form(len(gram)) for gram in grams] for form in (lambda n: np.ones((n, n)), np.eye))
         covariances = self._covariances
         second = [prior.mean**2 * j + prior.deviation**2 * k for j, k in zip(even, covariances, strict=True)]
-        shown = [side.patterns.mean(axis=1) for side in sides]
-        lit = [float(factor.mean(axis=0) @ pattern) for factor, pattern in zip(factors, shown, strict=True)]
-        electrons, session = light.gain * self._frame_s(lit), light.gain * light.session_frame_s
+        seconds, exposed = self._exposure(stacks)
+        electrons, session = light.gain * seconds, light.gain * light.session_frame_s
         noise = light.read_noise_e**2 / electrons**2 + light.dark_e_per_s / light.gain / electrons
         full = [float(factor.mean(axis=0).sum()) for factor in factors]
         response = (light.read_noise_e**2 + light.dark_e_per_s * light.session_frame_s) / session**2
@@ -254,10 +269,9 @@ class Objective:
                 seen = factor * pattern @ of[1][own] * pattern
                 by_factor += 2 * light_of[:, None] * seen + np.einsum("ij,ij->i", factor, seen)[:, None] * pattern
             rows = len(factor)
-            if light.signal_e is not None:
+            if exposed is not None:
                 by_exposure = by_weight[0] * (noise + (light.read_noise_e / electrons) ** 2)
-                by_exposure += by_weight[1] * prior.mean / electrons
-                by_factor += by_exposure / lit[own] / rows * shown[own]
+                by_factor -= (by_exposure + by_weight[1] * prior.mean / electrons) * exposed[own]
             by_response = sum(by_weight[4 + k] * errors[k] for k in (0, 1)) / response
             by_factor += by_response * (2 if light.pairs else 1) * light.board / 2 / session * full[other] / rows
             # The error of the other factor falls with the norm of this side's common response.

@@ -51,14 +51,17 @@ def test_a_factor_is_that_of_the_modelled_camera(spectrum: Spectrum | None, erro
     assert np.linalg.norm(scale * found - left) < error * np.linalg.norm(left)
 
 
-@pytest.mark.parametrize(("spectrum", "signal_e"), [(None, None), (LINES, None), (None, 2e3)])
-def test_the_gradient_of_a_code_agrees_with_differences(spectrum: Spectrum | None, signal_e: float | None) -> None:
-    """Two codes and sides of other patterns, grey codes: 1e-6 is the issue's bound, 1e-8 is usual."""
+@pytest.mark.parametrize(
+    ("spectrum", "exposure"), [(None, {}), (LINES, {}), (None, {"signal_e": 2e3}), (LINES, {"most_e": 2e4})]
+)
+def test_the_gradient_of_a_code_agrees_with_differences(spectrum: Spectrum | None, exposure: dict[str, float]) -> None:
+    """Two codes and sides of other patterns, grey codes, exposures by time, light and full well: 1e-8 is usual."""
     random, small = np.random.default_rng(4), 1e-5
     sides = side(spectrum), side(spectrum, 1 - DOTS)
-    objective = Objective(sides, replace(LIGHT, signal_e=signal_e), Prior())
+    objective = Objective(sides, replace(LIGHT, **exposure), Prior())
     codes = random.random((2, FEATURES))
     found = objective(codes, slopes=True)
+    assert (objective.frame_s(codes) == LIGHT.frame_s) != bool(exposure)
     for which in (0, 1):
         step = np.zeros((2, FEATURES))
         step[which] = random.standard_normal(FEATURES)
