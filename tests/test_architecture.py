@@ -483,7 +483,7 @@ SIZES = {
     "calibrate": (5, 1205),
     "cli": (6, 1536),
     "core": (17, 3081),
-    "design": (8, 1208),
+    "design": (8, 1221),
     "devices": (9, 2209),
     "exchange": (5, 1290),
     "learn": (5, 1190),
