@@ -27,6 +27,7 @@ from mitsim.bench.request import (
     Seeded,
     SessionRequest,
     Task,
+    Working,
     by_line,
     check_image,
     family_of,
@@ -51,7 +52,6 @@ from mitsim.core.configuration import (
     takes,
     validated_by,
 )
-from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, is_path, short_text
 from mitsim.core.files import PAIRS, check_apart, check_output, check_plain, output_file
 from mitsim.core.job import Job
@@ -86,17 +86,7 @@ if TYPE_CHECKING:
 # ---- this machine, and what is shipped -------------------------------------------------------------------------------
 
 
-@check_arguments
-def doctor(variant: str = DEFAULT_VARIANT) -> list[Check]:
-    """Check this machine in about five seconds; each check has ``ok``, a finding, and the command that mends it.
-
-    Parameters
-    ----------
-    variant
-        Variant of Mitsuba in which a test image is rendered.
-    """
-    environment.check_variant(variant)
-    return environment.doctor(variant)
+doctor = check_arguments(environment.doctor)
 
 
 def scenes() -> dict[str, str]:
@@ -159,18 +149,19 @@ def capture_in(
     task, light
         Where frames go; and light that is traced already, of whose patterns ``what`` is one.
     """
-    where = task.output, task.resume, task.job
+    where: dict[str, Any] = {"output": task.output, "resume": task.resume, "job": task.job, **request}
     if light is not None:
         from mitsim.acquire.capture import expose
 
         return expose(light, str(what), task, **request)
     if colour == AUTO:
         chosen = bench.choose_colour(str(what), **request)
-        bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
+        bench, what, colour = chosen.bench, chosen.plan, NO if chosen.mono else LINES
+        where = {name: value for name, value in where.items() if name not in request}
     if by_line(colour):
-        return in_colour(bench, colour).capture_lines(what, *where, **request)
+        return in_colour(bench, colour).capture_lines(what, **where)
     take: Any = bench.capture_mosaic if colour == MOSAIC else bench.capture
-    return take(what, *where, **request)  # type: ignore[no-any-return]
+    return take(what, **where)  # type: ignore[no-any-return]
 
 
 def calibrate_in(bench: Bench, colour: str, request: SessionRequest, task: Task) -> Mapping[str, Factors]:
@@ -222,10 +213,8 @@ class DemoRequest(Opening, Sampled, Family):
     VERB = "demo"
 
 
-@takes(DemoRequest)
-def demo(
-    scene: Path | str = "photograph", output: Path | str = "demo-output", job: Job | None = None, **options: Any
-) -> DemoResult:
+@takes(DemoRequest, Working, without="resume")
+def demo(scene: Path | str = "photograph", output: Path | str = "demo-output", **options: Any) -> DemoResult:
     """Plan, capture, calibrate and reconstruct one scene under five pattern families, and write report.html.
 
     Parameters
@@ -234,8 +223,6 @@ def demo(
         name of a shipped one, or a path.
     output
         folder that is made, or of an earlier demo, which is replaced.
-    job
-        clock, progress and limits.
 
     Raises
     ------
@@ -245,7 +232,7 @@ def demo(
     """
     from mitsim.studies.framework.campaign import check_study_folder
 
-    asked, job = DemoRequest(**options), job or Job()
+    job, asked = Task.taken(None, options).job, DemoRequest(**options)
     request = Request(patterns=asked.patterns, accuracy=asked.accuracy, seed=asked.seed)
     check_study_folder(output, "demo")
     asked.check(scene, asked.patterns, request.timing)
@@ -312,12 +299,11 @@ class StudyOptions(Styled, Opening, Seeded):
         return tuple((_KNOBS.get(name, name), tuple(map(spelling, values))) for name, values in lists)
 
 
-@takes(StudyOptions)
+@takes(StudyOptions, Working, without="resume")
 def study(
     name: str,
     scene: Path | str | Sequence[Path | str] | None = None,
     output: Path | str = "study-output",
-    job: Job | None = None,
     **options: Any,
 ) -> StudyResult:
     """Run an experiment, and write its figures, CSV and JSON to a folder.
@@ -330,8 +316,6 @@ def study(
         name of a shipped one, or a path; None: the photograph, or the study's own. Of ``merge`` folders of parts.
     output
         folder that is made, or of an earlier run of the study, which goes on or is replaced.
-    job
-        clock, progress and limits.
 
     Returns
     -------
@@ -350,11 +334,12 @@ def study(
     >>> found = ms.study("sweep", "photograph", "sweep", over={"sheet_z": [390, 400, 410]})  # doctest: +SKIP
     >>> [(row["sheet_z"], row["psnr_db"]) for row in found.rows]  # doctest: +SKIP
     """
+    job = Task.taken(None, options).job
     return prepare_study(name, scene, output, StudyOptions(**options), job)()
 
 
 def prepare_study(
-    name: str, scene: Path | str | Sequence[Path | str] | None, output: Path | str, asked: StudyOptions, job: Job | None
+    name: str, scene: Path | str | Sequence[Path | str] | None, output: Path | str, asked: StudyOptions, job: Job
 ) -> Callable[[], StudyResult]:
     """Check a study as :func:`study` does before the renderer is imported, and return the function that runs it.
 
@@ -409,7 +394,7 @@ def prepare_study(
         asked.refuse(["jobs"], "with a scheduler, whose machines have processes of their own")
     where = Where(shard_of(asked.shard), asked.jobs, asked.scheduler)
     _check_setup(scope, place)
-    return partial(run_experiment, name, scope, Path(output), job or Job(), where)
+    return partial(run_experiment, name, scope, Path(output), job, where)
 
 
 def scope_of(
@@ -570,12 +555,11 @@ class RunOptions(Options):
 # ---- a camera's sensor alone -----------------------------------------------------------------------------------------
 
 
-@takes(Procedure, without="frames")
+@takes(Procedure, Working, without="resume frames")
 def characterise(
     camera: Path | str | None = None,
     output: Path | str | None = None,
     frames: int | Path | str = 100,
-    job: Job | None = None,
     **options: Any,
 ) -> Characterisation:
     """Measure a camera after EMVA 1288: on simulated frames, beside what its file sets, or on real frames.
@@ -589,8 +573,6 @@ def characterise(
         writes nothing.
     frames
         Frames of each stack; without a camera, the folder of a real one's frames under even light and in the dark.
-    job
-        Clock, progress and limits.
 
     Raises
     ------
@@ -605,7 +587,7 @@ def characterise(
     """
     from mitsim.studies.framework.campaign import check_study_folder
 
-    asked = Procedure(**options)
+    job, asked = Task.taken(None, options).job, Procedure(**options)
     if camera is None:
         if not isinstance(frames, (str, Path)):
             raise MitsimError(
@@ -675,16 +657,8 @@ def sense(
 # ---- networks, which need torch, an extra that is imported when it is used -------------------------------------------
 
 
-@takes(PairOptions, Request)
-def make_pairs(
-    bench: Bench,
-    output: Path | str,
-    count: int,
-    patterns: str = "dots:7",
-    resume: bool = False,
-    job: Job | None = None,
-    **options: Any,
-) -> PairStore:
+@takes(PairOptions, Working, Request)
+def make_pairs(bench: Bench, output: Path | str, count: int, patterns: str = "dots:7", **options: Any) -> PairStore:
     """Make pairs to learn from: pictures on a scene's print, and the frames that the camera takes of them.
 
     Parameters
@@ -695,10 +669,6 @@ def make_pairs(
         Number of pairs.
     patterns
         Name of the pattern family.
-    resume
-        True to continue interrupted work of the same request.
-    job
-        Limits, and the receiver of progress.
 
     Raises
     ------
@@ -706,11 +676,11 @@ def make_pairs(
         For a request that cannot be served, a scene that is no flat diffuse sheet with a print, pictures that cannot be
         read, an output that cannot be written or holds something else, and more memory, disk or time than is allowed.
     """
-    output = Path(output)
+    output, task = Path(output), Task.taken(output, options)
     own = {name: options.pop(name) for name in ("pictures", "vary") if name in options}
     asked = PairsRequest(capture=Request(patterns=patterns, **options), count=count, **own)
-    check_output(output, overwrite=resume and (output / PAIRS).is_file())
-    with Task.of(output, resume, job).importing() as task:
+    check_output(output, overwrite=task.resume and (output / PAIRS).is_file())
+    with task.importing():
         from mitsim.learn.pairs import make_pairs
     return make_pairs(bench, asked, task)[0]
 
@@ -741,14 +711,12 @@ def load_network(path: Path | str, device: str = "cpu") -> LearnedSolver:
     return read_network(path, device)
 
 
-@takes(Schedule)
+@takes(Working, Schedule)
 def train(
     method: str,
     pairs: Path | str,
     output: Path | str,
     calibration: Path | str | None = None,
-    resume: bool = False,
-    job: Job | None = None,
     overwrite: bool = False,
     **options: Any,
 ) -> Trained:
@@ -762,10 +730,6 @@ def train(
         Folder of `mitsim pairs`, and the file, which ends in ``.pt``.
     calibration
         CAL folder of the pairs' camera; None takes the folder ``calibration`` in that of the pairs.
-    resume
-        True to continue an interrupted training of the same options.
-    job
-        Limits, and the receiver of progress.
     overwrite
         True to replace an existing file.
 
@@ -775,6 +739,7 @@ def train(
         If torch is not installed, for options that no network is trained by, folders that cannot be read or do not
         fit each other, a file that is there, and more time or memory than is allowed.
     """
+    task = Task.taken(output, options)
     request = Training(method=method, **options)
     place = Path(pairs) / "calibration" if calibration is None else Path(calibration)
     if calibration is None and not place.is_dir():
@@ -788,4 +753,4 @@ def train(
         store, factors = PairStore.open(Path(pairs)), load_calibration(place)
         from mitsim.learn.networks import train_network  # only now, because torch takes seconds to import
 
-        return train_network(store, factors, request, file, job, resume)
+        return train_network(store, factors, request, file, task.job, task.resume)

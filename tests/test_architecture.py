@@ -477,11 +477,11 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
 SIZES = {
-    "acquire": (5, 1214),
-    "api": (2, 219),
-    "bench": (5, 1188),
-    "calibrate": (5, 1205),
-    "cli": (6, 1536),
+    "acquire": (5, 1210),
+    "api": (2, 187),
+    "bench": (5, 1195),
+    "calibrate": (5, 1191),
+    "cli": (6, 1538),
     "core": (17, 3081),
     "design": (8, 1221),
     "devices": (9, 2209),
@@ -490,13 +490,13 @@ SIZES = {
     "light": (6, 1672),
     "optics": (7, 1751),
     "planner": (6, 1627),
-    "reconstruct": (16, 5540),
+    "reconstruct": (16, 5546),
     "report": (6, 1906),
-    "scene": (5, 1359),
+    "scene": (5, 1353),
     "sensor": (4, 1105),
     "sessions": (4, 888),
-    "studies": (24, 5387),
-    "top level": (5, 528),
+    "studies": (24, 5384),
+    "top level": (5, 514),
     "transport": (15, 3982),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from

@@ -21,7 +21,7 @@ from mitsim.acquire.spectral import MosaicLight, SpectralBench, excess_behind_fi
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import names, present
 from mitsim.bench.layout import obstacles
-from mitsim.bench.request import FEWEST_PASSES, REFERENCE, Request, Task, check_samples
+from mitsim.bench.request import FEWEST_PASSES, REFERENCE, Request, Task, Working, check_samples
 from mitsim.core import colour_files, manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Drawn, takes
@@ -69,16 +69,14 @@ _NEGLIGIBLE = 0.1
 class Light(SampledLight):
     """Sampled light of one scene, ready to be exposed."""
 
-    @takes(Request, without="patterns")
-    def expose(
-        self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
-    ) -> Capture:
+    @takes(Working, Request, without="patterns resume")
+    def expose(self, patterns: str = "dots:7", output: Path | str | None = None, **request: Any) -> Capture:
         """Expose one noisy frame for each shot of the family ``patterns``; ``output`` None keeps them in memory.
 
         Raises MitsimError for patterns that do not fit, an output that cannot be written, or a field that needs other
         light.
         """
-        return expose(self, patterns, Task.of(output, job=job), **Request(**request).given)
+        return expose(self, patterns, Task.taken(output, request), **Request(**request).given)
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
@@ -526,8 +524,7 @@ def show_pattern(bench: Apparatus, pattern: FloatArray) -> Iterator[None]:
         parameters.update()
 
 
-def render(bench: Apparatus, estimator: str, spp: int | None, asked: Request, job: Job | None = None) -> Rendered:
-    job, seed = job or Job(), asked.seed
+def render(bench: Apparatus, estimator: str, spp: int | None, asked: Request, job: Job) -> Rendered:
     check_samples(estimator, spp)
     if spp is None:
         spp = bench.loaded.samples or _SAMPLES
@@ -542,7 +539,7 @@ def render(bench: Apparatus, estimator: str, spp: int | None, asked: Request, jo
             absent = names(lambda effect: effect.in_frames and not effect.in_reference) - {"black-level"}
             left_out = ", ".join(name for name in present(bench) if name in absent)
             notes += (f"the reference leaves out {left_out}; --estimator factored does not",) if left_out else ()
-        mean, error = reference(bench.loaded, spp, seed, job)
+        mean, error = reference(bench.loaded, spp, asked.seed, job)
         warnings = (bench.loaded.unfit.caustics,) if bench.loaded.unfit.caustics else ()
         sampler = bench.loaded.camera.sampler().class_name()
         if sampler not in _SAMPLERS:
@@ -560,12 +557,12 @@ def render(bench: Apparatus, estimator: str, spp: int | None, asked: Request, jo
     else:
         uniform = Lighting.uniform(bench.n)
         with job.planning(str(bench.loaded.path), first_shadow(bench, asked.effects)):
-            plan = make_plan(bench, uniform, asked.accuracy, seed, asked.effects)
+            plan = make_plan(bench, uniform, asked.accuracy, asked.seed, asked.effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
         with job.clock.stage("transport"):
-            light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
+            light = trace_light(bench, plan, uniform, asked.seed, Sampling(by_pixel=False), job.progress)
         warnings = (*light.warnings, *light.unreached)
-        frame = next(iter(light.frames(uniform, seed)))
+        frame = next(iter(light.frames(uniform, asked.seed)))
         bound = bound_of(frame.by_group * frame.irradiance.size, float(np.square(frame.irradiance).sum()))
         mean = frame.irradiance[..., None]
         error = np.full_like(mean, math.sqrt(frame.variance))
@@ -576,7 +573,7 @@ def render(bench: Apparatus, estimator: str, spp: int | None, asked: Request, jo
         "spp": spp if estimator == REFERENCE else None,
         "seconds": time.perf_counter() - started,
         "variant": bench.variant,
-        "seed": seed,
+        "seed": asked.seed,
         "notes": notes,
         "mc_error_bound": bound,
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from itertools import islice
 from typing import Any, Literal, TypeVar
@@ -359,8 +359,9 @@ def warmer(sensor: SensorModel, kelvin: float) -> SensorModel:
 class DriftedExposer(Exposer):
     """A camera that has drifted: frames are exposed in its true state and interpreted in its known one."""
 
-    drift: Drift = field(default_factory=Drift)
-    family: PatternFamily | None = None
+    _: KW_ONLY
+    drift: Drift
+    family: PatternFamily
     ambient: FloatArray | float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
@@ -398,7 +399,6 @@ class DriftedExposer(Exposer):
 
     @cached_property
     def levels(self) -> dict[tuple[str | int, ...], tuple[float, float]]:
-        assert self.family is not None
         shots, drift = self.family.shots, self.drift
         power = (1 + drift.power) * levels(self.seed, "power", len(shots), drift.power_ramp, drift.power_flicker)
         lamp = (1 + drift.lamp) * levels(self.seed, "lamp", len(shots), flicker=drift.lamp_flicker)
@@ -407,5 +407,4 @@ class DriftedExposer(Exposer):
 
     @cached_property
     def ambient_levels(self) -> FloatArray:
-        assert self.family is not None
         return levels(self.seed, "ambient", ambient_shots(self.family), flicker=self.drift.lamp_flicker)

@@ -8,16 +8,14 @@ from __future__ import annotations
 import hashlib
 import tempfile
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.apparatus import Apparatus, open_apparatus, reopen
-from mitsim.bench.request import PredictRequest, Request, SessionRequest, Task
+from mitsim.bench.request import Planned, PredictRequest, Request, SessionRequest, Task, Working
 from mitsim.core.configuration import takes
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, check_arguments, is_masked
-from mitsim.core.job import Job
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:
@@ -139,22 +137,20 @@ class Bench(Apparatus):
 
         return plan_request(self, Request(patterns=patterns, **request))
 
-    @takes(Request, without="patterns")
-    def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Any) -> Light:
+    @takes(Working, Request, without="patterns resume")
+    def light(self, patterns: Plan | str = "dots:7", **request: Any) -> Light:
         """Trace the light of the scene by projector pixel, once, so that any family can be exposed in it.
 
         Parameters
         ----------
         patterns
             Family whose frames are to have the accuracy, or a plan of this bench.
-        job
-            Clock, progress and limits.
         """
         from mitsim.acquire.capture import check_plan, request_of, trace_request
         from mitsim.acquire.spectral import SpectralBench, plan_request
         from mitsim.light.cost_model import first_shadow
 
-        job, asked = job or Job(), request_of(patterns, request)
+        job, asked = Task.taken(None, request).job, request_of(patterns, request)
         if isinstance(patterns, str):
             with job.planning(patterns, first_shadow(self, asked.effects)):
                 patterns = plan_request(self, asked)
@@ -164,16 +160,14 @@ class Bench(Apparatus):
 
     transport = light
 
-    @takes(PredictRequest, without="patterns")
-    def predict(self, patterns: str = "dots:7", job: Job | None = None, **request: Any) -> Prediction:
+    @takes(Working, PredictRequest, without="patterns resume")
+    def predict(self, patterns: str = "dots:7", **request: Any) -> Prediction:
         """Predict the PSNR of an image, and its errors by cause, without forming frames or solving them.
 
         Parameters
         ----------
         patterns
             Name of a family.
-        job
-            Clock and progress.
 
         Raises
         ------
@@ -182,19 +176,13 @@ class Bench(Apparatus):
         """
         from mitsim.design.predict import predict
 
+        job = Task.taken(None, request).job
         return predict(self, PredictRequest(patterns=patterns, **request), job)
 
     # ---- Captures ----
 
-    @takes(Request)
-    def capture(
-        self,
-        plan: Plan | str = "dots:7",
-        output: Path | str | None = None,
-        resume: bool = False,
-        job: Job | None = None,
-        **request: Any,
-    ) -> Capture:
+    @takes(Working, Request)
+    def capture(self, plan: Plan | str = "dots:7", output: Path | str | None = None, **request: Any) -> Capture:
         """Take one noisy frame for each shot of a pattern family.
 
         Parameters
@@ -203,10 +191,6 @@ class Bench(Apparatus):
             Plan of this bench, or name of a family.
         output
             Folder that the frames are written to as they are made; None keeps them in memory.
-        resume
-            True to resume an interrupted capture of the same request in ``output``, bit-equal to an uninterrupted one.
-        job
-            Clock, progress and limits.
 
         Raises
         ------
@@ -214,21 +198,16 @@ class Bench(Apparatus):
             for a request that cannot be served, an output that cannot be written or holds something else, or more
             memory, disk or time than the job's limits allow.
         """
-        with Task.of(output, resume, job).importing() as task:
+        with Task.taken(output, request).importing() as task:
             from mitsim.acquire.capture import capture, request_of
             from mitsim.acquire.spectral import SpectralBench
         return capture(SpectralBench(self), request_of(plan, request), task, plan).runs[0]
 
     # ---- Spectral lines and colour filters ----
 
-    @takes(Request, without="patterns")
+    @takes(Working, Request, without="patterns")
     def capture_lines(
-        self,
-        patterns: Plan | str = "dots:7",
-        output: Path | str | None = None,
-        resume: bool = False,
-        job: Job | None = None,
-        **request: Any,
+        self, patterns: Plan | str = "dots:7", output: Path | str | None = None, **request: Any
     ) -> dict[str, Capture]:
         """Take a capture for each spectral line of the projector, by the line's name, as ``638nm``.
 
@@ -241,8 +220,6 @@ class Bench(Apparatus):
             Name of the family, or a plan of all lines.
         output
             Folder of a run's folder for each line, and colour.json; None keeps the runs in memory.
-        resume, job
-            As for :meth:`capture`.
 
         Raises
         ------
@@ -250,7 +227,7 @@ class Bench(Apparatus):
             as :meth:`capture`; for another variant, a projector of more than four lines, and lamps where the camera's
             efficiency is not known.
         """
-        with Task.of(output, resume, job).importing() as task:
+        with Task.taken(output, request).importing() as task:
             from mitsim.acquire.capture import capture_lines, request_of
         return capture_lines(self, request_of(patterns, request), task, patterns)
 
@@ -282,16 +259,12 @@ class Bench(Apparatus):
         """
         return reopen(self, variant)
 
-    @takes(SessionRequest)
-    def calibrate_lines(
-        self, output: Path | str | None = None, resume: bool = False, job: Job | None = None, **request: Any
-    ) -> dict[str, Factors]:
+    @takes(Working, SessionRequest)
+    def calibrate_lines(self, output: Path | str | None = None, **request: Any) -> dict[str, Factors]:
         """Estimate the camera's factors at each spectral line of the projector, by the line's name.
 
         Parameters
         ----------
-        resume, job
-            As for :meth:`calibrate`.
         output
             Folder of a calibration's folder for each line, and colour.json; None keeps the factors in memory.
 
@@ -300,18 +273,13 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`calibrate`, for a variant that is not spectral, and a projector of more than four lines.
         """
-        with Task.of(output, resume, job).importing() as task:
+        with Task.taken(output, request).importing() as task:
             from mitsim.calibrate.calibrate import calibrate_lines
         return calibrate_lines(self, SessionRequest(**request), task)
 
-    @takes(Request, without="patterns")
+    @takes(Working, Request, without="patterns")
     def capture_mosaic(
-        self,
-        patterns: Plan | str = "dots:7",
-        output: Path | str | None = None,
-        resume: bool = False,
-        job: Job | None = None,
-        **request: Any,
+        self, patterns: Plan | str = "dots:7", output: Path | str | None = None, **request: Any
     ) -> MosaicCapture:
         """Take frames of all lines at once by a camera under a mosaic of colour filters: one frame for each shot.
 
@@ -323,8 +291,6 @@ class Bench(Apparatus):
             Name of the family, or a plan of this bench.
         output
             RUN folder, which also holds the lines' truths and colour.json; None keeps all in memory.
-        resume, job
-            As for :meth:`capture`.
 
         Raises
         ------
@@ -332,14 +298,12 @@ class Bench(Apparatus):
             as :meth:`capture_lines`, for a camera without a mosaic, lines that its curves do not hold, a sensor of an
             odd number of pixels, and a projector with speckle, which is not simulated behind filters.
         """
-        with Task.of(output, resume, job).importing() as task:
+        with Task.taken(output, request).importing() as task:
             from mitsim.acquire.capture import capture_mosaic, request_of
         return capture_mosaic(self, request_of(patterns, request), task, patterns)
 
-    @takes(SessionRequest)
-    def calibrate_mosaic(
-        self, output: Path | str | None = None, resume: bool = False, job: Job | None = None, **request: Any
-    ) -> dict[str, Factors]:
+    @takes(Working, SessionRequest)
+    def calibrate_mosaic(self, output: Path | str | None = None, **request: Any) -> dict[str, Factors]:
         """Estimate the factors of a camera under colour filters by spectral line of the projector.
 
         Each line has a session of its own, by the shipped recipe with four shots of each pattern if none is given. Each
@@ -348,7 +312,7 @@ class Bench(Apparatus):
 
         Parameters
         ----------
-        output, resume, job
+        output
             As for :meth:`calibrate_lines`.
 
         Raises
@@ -356,57 +320,46 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`calibrate_lines` and :meth:`capture_mosaic`, and for a filter that passes nothing of a line.
         """
-        with Task.of(output, resume, job).importing() as task:
+        with Task.taken(output, request).importing() as task:
             from mitsim.calibrate.calibrate import calibrate_lines
         return calibrate_lines(self, SessionRequest(**request), task, mosaic=True)
 
     # ---- Calibration sessions ----
 
-    @takes(SessionRequest)
-    def calibrate(
-        self, output: Path | str | None = None, resume: bool = False, job: Job | None = None, **request: Any
-    ) -> Factors:
+    @takes(Working, SessionRequest)
+    def calibrate(self, output: Path | str | None = None, **request: Any) -> Factors:
         """Estimate the camera's two factors from a rendered Hadamard session on a white board.
 
         Parameters
         ----------
         output
             CAL folder to write, with its unfinished parts meanwhile; None keeps the factors in memory.
-        resume
-            True to resume an interrupted session in ``output``.
-        job
-            Clock, progress and limits.
 
         Raises
         ------
         MitsimError
             as :meth:`capture`.
         """
-        with Task.of(output, resume, job).importing() as task:
+        with Task.taken(output, request).importing() as task:
             from mitsim.calibrate.calibrate import calibrate
         return calibrate(self, SessionRequest(**request), task)
 
-    @takes(SessionRequest)
-    def calibrate_depths(
-        self, output: Path | str | None = None, resume: bool = False, job: Job | None = None, **request: Any
-    ) -> dict[float, Factors]:
+    @takes(Working, SessionRequest)
+    def calibrate_depths(self, output: Path | str | None = None, **request: Any) -> dict[float, Factors]:
         """Estimate the camera's two factors at each of a recipe's depths, by depth [mm].
 
         Parameters
         ----------
-        resume, job
-            As for :meth:`calibrate`.
         output
             Folder of a CAL folder for each depth, named by its millimetres; None keeps the factors in memory.
         """
         from mitsim.calibrate.calibrate import calibrate_depths
 
-        return calibrate_depths(self, SessionRequest(**request), Task.of(output, resume, job))
+        task = Task.taken(output, request)
+        return calibrate_depths(self, SessionRequest(**request), task)
 
-    @takes(SessionRequest)
-    def write_session(
-        self, frames: Path | str, output: Path | str | None = None, job: Job | None = None, **request: Any
-    ) -> Factors:
+    @takes(Working, SessionRequest, without="resume")
+    def write_session(self, frames: Path | str, output: Path | str | None = None, **request: Any) -> Factors:
         """Calibrate as :meth:`calibrate` does, and write the session's frames.
 
         The frames are written as a user of a real camera has them, so that :func:`mitsim.calibrate_frames` makes the
@@ -416,12 +369,13 @@ class Bench(Apparatus):
         ----------
         frames
             New or empty folder for the frames.
-        output, job
+        output
             As for :meth:`calibrate`.
         """
         from mitsim.calibrate.calibrate import calibrate
 
-        return calibrate(self, SessionRequest(**request), Task.of(output, job=job), frames)
+        task = Task.taken(output, request)
+        return calibrate(self, SessionRequest(**request), task, frames)
 
     # ---- The bench to look at, renderings, and the same devices before a board ----
 
@@ -434,15 +388,9 @@ class Bench(Apparatus):
 
         return view(self)
 
-    @check_arguments
+    @takes(Working, Planned, without="resume patterns seconds")
     def render(
-        self,
-        estimator: Literal["reference", "factored"] = "reference",
-        spp: int | None = None,
-        accuracy: float = 1e-3,
-        seed: int = 0,
-        effects: Mapping[str, bool] | None = None,
-        job: Job | None = None,
+        self, estimator: Literal["reference", "factored"] = "reference", spp: int | None = None, **request: Any
     ) -> Rendered:
         """Estimate the expected irradiance under the scene's own light.
 
@@ -452,12 +400,6 @@ class Bench(Apparatus):
             ``reference``: the scene's own integrator, path by path; ``factored``: the estimator of captures.
         spp
             Samples a pixel of the reference; None: the ``sample_count`` of the scene's sampler, or 64 without.
-        accuracy, effects
-            Relative error of the factored estimator, and effects that are switched on or off, by name.
-        seed
-            Root of every random stream.
-        job
-            Clock, progress and limits.
 
         Raises
         ------
@@ -466,7 +408,8 @@ class Bench(Apparatus):
         """
         from mitsim.acquire.capture import render
 
-        return render(self, estimator, spp, Request(accuracy=accuracy, seed=seed, effects=effects or {}), job)
+        job = Task.taken(None, request).job
+        return render(self, estimator, spp, Request(**request), job)
 
     @check_arguments
     def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Self:

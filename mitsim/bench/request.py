@@ -29,7 +29,7 @@ from mitsim.core.configuration import (
     validated_by,
 )
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
-from mitsim.core.errors import ArgumentError, MitsimError, short_text
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, short_text
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
 from mitsim.core.seeds import check_root
@@ -77,6 +77,7 @@ class Task:
     job: Job = field(default_factory=Job)
 
     @classmethod
+    @check_arguments
     def of(cls, output: Path | str | None = None, resume: bool = False, job: Job | None = None) -> Task:
         """Return the value that the arguments of a Python function describe.
 
@@ -86,6 +87,11 @@ class Task:
             as the attributes.
         """
         return cls(None if output is None else Path(output), resume, job or Job())
+
+    @classmethod
+    def taken(cls, output: Path | str | None, options: dict[str, Any]) -> Task:
+        """Return the task of an ``output`` and of the options of :class:`Working`, which are taken out."""
+        return cls.of(output, **{name: options.pop(name) for name in Working.model_fields if name in options})
 
     @contextmanager
     def importing(self) -> Iterator[Task]:
@@ -123,6 +129,13 @@ class Exposure:
 
         wavelength = devices.projector.effective_wavelength_nm
         return exposure_for_peak(peak_irradiance, self.fraction, devices.sensor, wavelength)
+
+
+class Working(Options):
+    """How the verbs of a bench work, without influence on their results."""
+
+    resume: bool = option(False, "True to resume interrupted work of the same request in ``output``, bit-equal")
+    job: Job | None = option(None, "clock, progress and limits")
 
 
 def _check_range(name: str, value: float, least: float, most: float, rule: str) -> float:

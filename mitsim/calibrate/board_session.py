@@ -86,11 +86,6 @@ class Session:
             return replace(self.bench, loaded=self.whole.board.loaded)
         return before_board(self.bench, self.recipe.board_reflectance, self.recipe.board, self.depth)
 
-    @property
-    def centre(self) -> bool:
-        """Return True if row and column means are subtracted from every response, as for a FlatCam mask."""
-        return self.bench.geometry.centred
-
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         shape, found = self.recipe.board, list[str]()
@@ -155,7 +150,7 @@ class Session:
         )
         down, across = (tuple(range(0, size, max(size // (places or size), 1))) for size in geometry.frame_shape)
         terms = shadow_terms(geometry, rows, columns, self.distance, spectrum, (down, across))
-        return centre_terms(terms) if self.centre else terms
+        return centre_terms(terms) if geometry.centred else terms
 
     @cached_property
     def signs(self) -> FloatArray:

@@ -274,7 +274,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
             signed_capture=session.recipe.signed_capture,
             repeats=session.recipe.repeats,
             digital=digital,
-            centre=session.centre,
+            centre=bench.geometry.centred,
             board_reflectance=session.recipe.board_reflectance,
             frames=tuple(session.files.values()),
         )
@@ -327,10 +327,8 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
     return factors
 
 
-def estimate(
-    lit: LitSession, job: Job, noise_free: bool = False, checkpoint: Checkpoint | None = None
-) -> tuple[Estimate, int]:
-    (found,), saturated, _ = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
+def estimate(lit: LitSession, job: Job, noise_free: bool = False) -> tuple[Estimate, int]:
+    (found,), saturated, _ = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,))
     return found, saturated
 
 
@@ -396,7 +394,7 @@ def session_sums(
             uniform = zip(kinds, *(respond(side, 0, lit.white) for side in SIDES), strict=True)
             for kind, one, other in uniform:
                 lights = one.light, other.light
-                found[kind] = stripe_sums(one.rate, other.rate, count, session.centre, lights=lights)
+                found[kind] = stripe_sums(one.rate, other.rate, count, session.bench.geometry.centred, lights=lights)
                 saturated += one.saturated + other.saturated
     saved = time.monotonic()
     for side, sums in zip(SIDES, zip(*found.values(), strict=True), strict=True):

@@ -16,11 +16,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.request import SessionRequest
+from mitsim.bench.request import SessionRequest, Task, Working
 from mitsim.calibrate.board_session import LitSession, Session, manifest_of
 from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import takes
 from mitsim.core.environment import versions
-from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.errors import MitsimError
 from mitsim.core.files import output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, FactorNoise, FittedNumber, ModelledFactors
@@ -28,7 +29,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.framelist import SessionFrames, load_frames
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.sensor import digital_of
-from mitsim.devices.session import SIDES, UNITS, Model, Modelling, SessionRecipe, Side, frames_of, load_recipe
+from mitsim.devices.session import SIDES, UNITS, Model, Modelling, Side, frames_of, load_recipe
 from mitsim.optics.shadow import SeparableTerms
 from mitsim.optics.terms import ModelledCamera, Placement, best_term
 from mitsim.reconstruct.captured_session import chosen_responses
@@ -42,15 +43,13 @@ _SIGNIFICANT = 3.0
 # -------- Factors of the fitted model
 
 
-@check_arguments
+@takes(SessionRequest, Working, without="accuracy resume")
 def calibrate_model(
     bench: Apparatus,
     modelling: Modelling,
     frames: Path | str | SessionFrames | None = None,
-    recipe: SessionRecipe | None = None,
-    seed: int = 0,
     output: Path | str | None = None,
-    job: Job | None = None,
+    **request: Any,
 ) -> Factors:
     """Estimate the camera's factors by a fitted model.
 
@@ -62,14 +61,8 @@ def calibrate_model(
         Model, number of frames, and free parameters.
     frames
         Folder or list of a real session's frames; None simulates a session of the bench.
-    recipe
-        Recipe of a simulated session; None for the shipped one.
-    seed
-        Root of a simulated session's random streams.
     output
         CAL folder; None keeps the factors in memory.
-    job
-        Clock and progress.
 
     Returns
     -------
@@ -82,7 +75,7 @@ def calibrate_model(
         For numbers that these frames cannot distinguish, frames of another size, an output that cannot be written, and
         as :meth:`mitsim.api.bench.Bench.calibrate`.
     """
-    job, request = job or Job(), SessionRequest(seed=seed, accuracy=modelling.accuracy, recipe=recipe)
+    job, asked = Task.taken(None, request).job, SessionRequest(accuracy=modelling.accuracy, **request)
     with nullcontext() if output is None else output_folder(output) as place:
         camera = model_of(bench, modelling.model)
         if frames is not None:
@@ -105,14 +98,14 @@ def calibrate_model(
             shown, digital = _shown(signs, chosen, rates, listed.centre), listed.digital
             reflectance, configuration = listed.board_reflectance, dict[str, Any](frames=str(session.folder))
         else:
-            recipe = (request.recipe or load_recipe()).of_one_depth()
-            board = Session(bench, recipe, request.seed)
-            plan = board.plan(request.accuracy, job)
+            recipe = (asked.recipe or load_recipe()).of_one_depth()
+            board = Session(bench, recipe, asked.seed)
+            plan = board.plan(asked.accuracy, job)
             lit = LitSession.of(board, board.trace(plan, job)[0], job)
             with job.clock.stage("sensor"):
                 shown, used = simulate_responses(lit, modelling)
             digital, reflectance = digital_of(bench.sensor, lit.exposure_s), recipe.board_reflectance
-            configuration = {"seed": request.seed, "recipe": recipe.model_dump(exclude_defaults=True)}
+            configuration = {"seed": asked.seed, "recipe": recipe.model_dump(exclude_defaults=True)}
         job.progress("fit", 0.5)
         with job.clock.stage("fit"):
             fitted = fit_placement(camera, shown, modelling.free)
@@ -147,7 +140,7 @@ def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Show
             frames = lit.light.frames(Lighting(labels, (1 + signs.T[own]) / 2), session.seed)
             formed |= {(side, index): frame for index, frame in zip(own, frames, strict=True)}
     rates = [(lit.noisy(side, index, formed[side, index]).rate, lit.response_noise) for side, index in chosen]
-    return _shown(signs, chosen, rates, session.centre), frames_of(chosen, pairs, repeats)
+    return _shown(signs, chosen, rates, session.bench.geometry.centred), frames_of(chosen, pairs, repeats)
 
 
 def _changes(signs: FloatArray) -> list[int]:

@@ -23,12 +23,11 @@ from mitsim.acquire.capture import capture
 from mitsim.acquire.exposure import Exposer
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.request import Exposure, Request, check_psnr
+from mitsim.bench.request import Exposure, Request, SessionRequest, Task, Working, check_psnr
 from mitsim.calibrate.board_session import LitSession, Session, manifest_of, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import check_arguments
-from mitsim.core.job import Job
+from mitsim.core.configuration import takes
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_FRACTION, digital_of
@@ -157,17 +156,11 @@ class CalibrationPlan:
         ]
 
 
-@check_arguments
-def plan_calibration(
-    bench: Apparatus,
-    psnr: float,
-    patterns: str = "dots:7",
-    recipe: SessionRecipe | None = None,
-    accuracy: float = 1e-3,
-    seed: int = 0,
-    job: Job | None = None,
-) -> CalibrationPlan:
+@takes(Working, SessionRequest, without="resume")
+def plan_calibration(bench: Apparatus, psnr: float, patterns: str = "dots:7", **request: Any) -> CalibrationPlan:
     """Find the least exposure, or fewest repeats, with which the image of a capture reaches a PSNR.
+
+    The recipe's exposure fraction is the largest; its repeats are found.
 
     Parameters
     ----------
@@ -177,12 +170,6 @@ def plan_calibration(
         Wanted PSNR [dB].
     patterns
         Patterns of the capture, which is exposed as `mitsim capture` does by default.
-    recipe
-        Recipe of the session; None for the shipped one. Its exposure fraction is the largest; its repeats are found.
-    accuracy, seed
-        Accuracy of the light, and root of every random stream.
-    job
-        Clock, progress and limits.
 
     Returns
     -------
@@ -195,18 +182,19 @@ def plan_calibration(
         For a PSNR outside 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.api.bench.Bench.capture`.
     """
     check_psnr(psnr)
-    largest, job = (recipe or load_recipe()).of_one_depth(), job or Job()
+    job, asked = Task.taken(None, request).job, SessionRequest(**request)
+    largest = (asked.recipe or load_recipe()).of_one_depth()
     Exposure(None, largest.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
-    session = Session(bench, largest, seed)
+    session = Session(bench, largest, asked.seed)
     session.check_mask(job)
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
-        request = Request.of(patterns=patterns, seed=seed, accuracy=accuracy)
-        shots = capture(SpectralBench(bench), request).runs[0]
+        light = Request(patterns=patterns, seed=asked.seed, accuracy=asked.accuracy)
+        shots = capture(SpectralBench(bench), light).runs[0]
     job.progress("session", 0.0)
     with job.clock.stage("session"), single_threaded_blas():
         own = job.apart("session ")
-        plan = session.plan(accuracy, own)
+        plan = session.plan(asked.accuracy, own)
         whole = LitSession.of(session, session.trace(plan, own)[0], own)
         sums = session_sums(whole, own, (NOISE_FREE,))[0][NOISE_FREE]
     truth = truth_for(shots, largest.board_reflectance)
@@ -250,7 +238,7 @@ def plan_calibration(
     if lit.speckle:
         flags.append(f"speckle of contrast {lit.speckle:g}: it is in every frame, and not in the plan's calibration")
     # Half of the projector's pixels are lit in every frame but the uniform ones.
-    electrons = float(Exposer(bench.devices, lit.exposure_s, seed).electrons(lit.white).mean()) / 2
+    electrons = float(Exposer(bench.devices, lit.exposure_s, asked.seed).electrons(lit.white).mean()) / 2
     return CalibrationPlan(
         psnr_asked=psnr,
         patterns=patterns,

@@ -508,7 +508,8 @@ def render(asked: Rendering) -> int:
         )
         check_apart(output, bench.loaded.files)
         with output_file(output, overwrite=True) as place:
-            frame = bench.render(method, asked.spp, asked.accuracy, asked.seed, asked.effects, job)
+            light = {"accuracy": asked.accuracy, "seed": asked.seed, "effects": asked.effects}
+            frame = bench.render(method, asked.spp, job=job, **light)
             payload = {**frame.summary(), "output": str(frame.save(place))}
     payload["notes"] = [*payload["notes"], *ignored]
     bound = payload["mc_error_bound"]
@@ -545,7 +546,7 @@ def transport(asked: Tracing) -> int:
     with asked.job() as job, output_file(asked.output, asked.overwrite) as output:
         bench = open_as(asked.scene, asked, job)
         check_apart(output, (*bench.loaded.files, *asked.models, *filter(None, [asked.plan])))
-        light = bench.light(known or patterns, job, **{name: given[name] for name in given if name != "patterns"})
+        light = bench.light(known or patterns, job=job, **{name: given[name] for name in given if name != "patterns"})
         with job.clock.stage("write"):
             light.save(output)
     size = output.stat().st_size

@@ -103,7 +103,7 @@ def _simulated(asked: Calibrating, folder: Path) -> int:
         bench = open_as(str(asked.scene), asked, job, colour)
         held = memory_from_here()
         if kept is not None:
-            found: Mapping[str, Factors] = {"": bench.write_session(kept, folder, job, **session.given)}
+            found: Mapping[str, Factors] = {"": bench.write_session(kept, folder, job=job, **session.given)}
         else:
             found = calibrate_in(bench, colour, session, Task(folder, asked.resume, job))
     return _finish(found, folder, asked, memory_since(held))
@@ -172,7 +172,8 @@ def _plan(asked: Calibrating, _: Path) -> int:
         from mitsim.calibrate.session_plan import plan_calibration
 
         with nullcontext() if output is None else output_file(output, asked.overwrite):
-            found = plan_calibration(bench, psnr, patterns, recipe, seed=asked.seed, accuracy=asked.accuracy, job=job)
+            light = {"seed": asked.seed, "accuracy": asked.accuracy}
+            found = plan_calibration(bench, psnr, patterns, recipe=recipe, job=job, **light)
             lines = found.lines()
             if output is not None:
                 write_text(output, recipe_text(found.recipe))
@@ -196,7 +197,7 @@ def _fit(asked: Calibrating, folder: Path) -> int:
         bench = open_as(asked.scene, asked, job)
         from mitsim.calibrate.model import calibrate_model
 
-        factors = calibrate_model(bench, modelling, frames, recipe, asked.seed, folder, job)
+        factors = calibrate_model(bench, modelling, frames, folder, recipe=recipe, seed=asked.seed, job=job)
     result = factors.manifest.result
     numbers = [
         f"{name.replace('_', ' ')} {number['value']:.6g} +-{number['standard_error']:.2g} {number['unit']}"

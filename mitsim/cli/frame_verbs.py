@@ -456,8 +456,8 @@ def train(asked: Learning) -> int:
     Training(method=asked.method, **schedule)  # refused before anything is imported for it
     advise(RESUME)
     with asked.job() as job:
-        where = asked.pairs, output, asked.calibration, asked.resume, job, asked.overwrite
-        made = train_model(asked.method, *where, **schedule)
+        where = asked.pairs, output, asked.calibration, asked.overwrite
+        made = train_model(asked.method, *where, resume=asked.resume, job=job, **schedule)
         payload = {**made.summary(), "seconds": job.clock.seconds()}
     lines = [
         f"{payload['model']}: {payload['weights']} weights, {made.curve[-1][0]} of {asked.steps} steps in "

@@ -131,10 +131,12 @@ class Check:
 
 
 def doctor(variant: str = DEFAULT_VARIANT) -> list[Check]:
-    """Check Python, LLVM, packages, memory, and a rendering in a ``variant``, in about 5 s.
+    """Check this machine in about five seconds; each check has ``ok``, a finding, and the command that mends it.
 
-    Imports and renderings can crash or hang, so that they run in child processes.
+    Imports, and the rendering of a test image in the ``variant`` of Mitsuba, can crash or hang, so that they run in
+    child processes.
     """
+    check_variant(variant)
     from mitsim.core.job import free_memory, size_text
 
     def child(name: str, program: str, package: str, success: Callable[[], str]) -> Check:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, Generic, TypeVar
@@ -109,7 +110,7 @@ class Behind(Generic[Item]):
 
     def __init__(self, function: Callable[[Item], Any]) -> None:
         self._function, self._pool = function, ThreadPoolExecutor(workers())
-        self._begun: list[Future[Any]] = []
+        self._begun: Iterable[Any] = ()
 
     def __enter__(self) -> Behind[Item]:
         return self
@@ -120,9 +121,7 @@ class Behind(Generic[Item]):
     def give(self, items: Iterable[Item]) -> None:
         """Wait for the earlier items, and begin these ``items``."""
         self.wait()
-        self._begun = [self._pool.submit(self._function, item) for item in items]
+        self._begun = self._pool.map(self._function, items)
 
     def wait(self) -> None:
-        for future in self._begun:
-            future.result()
-        self._begun = []
+        deque(self._begun, maxlen=0)

@@ -489,7 +489,11 @@ _FOCUS = "for a scene of other depths use `--focus auto` or `--focus map`, "
 
 
 class Cause(Enum):
-    NOISE = "the frames' noise", "check gain, read noise and black level of the camera file, and that numbers are raw"
+    NOISE = (
+        "the frames' noise",
+        "check gain, read noise and black level of the camera file, and that numbers are raw; print finer than a "
+        "projector pixel looks alike",
+    )
     READING = "another reading of the frames", "see which of the readings is true, and import the frames so"
     FRAMES = "frames that do not fit the others", "capture these frames again"
     PIXELS = "a part of the sensor or of the session", "look at the map of the misfit, and capture again"
@@ -552,7 +556,7 @@ class Misfit:
         elif self.cause is Cause.PIXELS and self.places:
             words = f"the misfit is in {self.places[0].words}"
         elif self.cause is Cause.NOISE and self.noise:
-            words = f"the frames' noise has {self.noise.ratio:.3g} times the variance that the camera file states"
+            words = f"neighbouring pixels differ by {self.noise.ratio:.3g} times the variance of stated noise"
             if self.gain and self.noise.gain_error < 0.1 * self.noise.gain:
                 measured, error = self.gain * self.noise.gain, self.gain * self.noise.gain_error
                 words += f"; stated gain {self.gain:.4g} DN per electron, measured {measured:.3g} +- {error:.1g}"
@@ -589,7 +593,7 @@ class Misfit:
             return status
         times = f", {chi_square_text(self.chi_square)} times what its noise makes" if self.stated else ""
         head = f"Misfit: {self.unexplained:.1%} of the measurements fit no image{times}; "
-        head = {Cause.NOISE: "Noise is not as stated: ", Cause.FRAMES: "Faulty frames: "}.get(self.cause, head)
+        head = {Cause.NOISE: "Unlike the stated noise: ", Cause.FRAMES: "Faulty frames: "}.get(self.cause, head)
         sentence, remedy = head + self.reason, self.cause.value[1]
         remedy = remedy.removeprefix(_FOCUS) if focused else remedy
         if self.predicted:

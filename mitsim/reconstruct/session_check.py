@@ -136,7 +136,7 @@ _FOREIGN = 0.5, 15.0, 15.0
 _TURNED = 0.7
 _LINE = 0.15
 """Limit of a line's squared deviation over the mean square: good cameras of 32 lines reach 0.003."""
-_DARK, _LIT = (0.02, 0.3), 0.1
+_LIT = 0.1
 _NAMED = 12
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
 _EVEN = "responses hold even light that changes from pattern to pattern; darken the room, and mount the mask straight"
@@ -527,7 +527,10 @@ class _Check:
             self._refuse(own, index, f"they show light that no {own.side} stripes cast")
         light = np.square(own.vectors).sum(axis=1)
         lower, upper = np.sort([np.roll(light, 1), np.roll(light, -1)], axis=0)
-        strange = (light < _DARK[own.sums.centre] * lower) & (lower > _LIT * np.median(light)) | (_LIT * light > upper)
+        dark = light < (0.3 * lower if own.sums.centre else 3 * own.noise * self.count / len(light))
+        # Light of lines alternates from pattern to pattern, and that of a hot pixel does not.
+        hot = (_LIT * light > upper) & (np.square(own.vectors.mean(axis=1)) * self.count > 0.2 * light)
+        strange = dark & (lower > _LIT * np.median(light)) | hot
         where = f"sensor {('row', 'column')[own.axis]} {np.argmax(strange)}"
         words = f"{where} shows no light, or too much; check the sensor"
         own.add(words, float(np.maximum(light, lower)[strange].sum()))

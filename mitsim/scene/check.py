@@ -333,11 +333,11 @@ class CheckedScene:
     @property
     def own(self) -> dict[str, str]:
         """Return the parameters by which a user names files, by the path of the file."""
-        return {str(path): name for path, name in self.outline.files.own.items() if name in PREPARED}
+        return {str(path): name for path, name in self.outline.own.items() if name in PREPARED}
 
     @property
     def files(self) -> tuple[Path, ...]:
-        return tuple(self.outline.files.used)
+        return tuple(self.outline.used)
 
 
 def check_file(
@@ -485,7 +485,7 @@ def _check_resource(checked: CheckedScene, node: mi.parser.SceneNode) -> None:
     if name is None:
         got = "no text" if "filename" in node.props else "nothing"
         raise tag.refusal("filename", got, f"a {plugin} reads one file")
-    path = checked.outline.files.find(tag, name)
+    path = checked.outline.find(tag, name)
     if str(path) in checked.own:
         return  # mitsim reads it itself, and makes a file of it that is as Mitsuba needs it
     try:

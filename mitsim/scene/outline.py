@@ -59,19 +59,20 @@ class Tag:
 class Outline:
     """Positions of all tags in a scene file and its includes.
 
-    ``defines`` precede the values of ``<default>``; files become absolute paths. ``files`` records includes.
-    ``projected`` are files that objects inside the projectors name.
+    ``defines`` precede the values of ``<default>``; files become absolute paths. ``used`` are the files that the scene
+    reads, the scene first, and ``own`` the parameters by which the user names some; all are in the scene's folder
+    unless ``outside``. ``projected`` are files that objects inside the projectors name.
 
     Raises MitsimError if the XML is not well formed, too large or nested too deep, names files that are not allowed, or
     has parameters that are missing, unknown or not plain.
     """
 
     def __init__(self, path: Path, defines: Mapping[str, str], outside: bool = False) -> None:
-        self.files = SceneFiles(path, outside)
-        self._values, self._given = dict(defines), defines
-        self.defines = dict(defines)
+        self.path, self.outside = path, outside
+        self.own: dict[Path, str] = {}
+        self.used: dict[Path, None] = {}
+        self._values, self._given, self.defines = dict(defines), defines, dict(defines)
         self._defaults: set[str] = set()
-        self.path = path
         self._tags: dict[tuple[int, int, str], Tag] = {}
         self._places: dict[tuple[str, str, str], Tag] = {}
         self.projected: list[Path] = []
@@ -81,7 +82,7 @@ class Outline:
                 raise MitsimError(f"parameter {cut(name)}={cut(value)!r}: give one without $, backslash or line breaks")
         if not path.is_file():
             raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
-        self.files.used[path] = None
+        self.used[path] = None
         # Mitsuba searches the folder "plugins" beside the scene and in the working folder before its own.
         for folder in (path.parent, Path()):
             _check_native(path, folder)
@@ -147,7 +148,7 @@ class Outline:
             tag = Tag(path, parser.CurrentLineNumber, name, attributes)
             own = attributes.get("value", "")
             if (name, attributes.get("name")) == ("string", "filename") and own[:1] == "$" and own[1:] in self._given:
-                path_of_own = str(self.files.find_named(own[1:], self._given[own[1:]]))
+                path_of_own = str(self.find_named(own[1:], self._given[own[1:]]))
                 self.defines[own[1:]] = self._values[own[1:]] = path_of_own
             texts = {key: self._with_parameters(tag, text) for key, text in attributes.items()}
             if texts.get("name") == "" and name != "default":
@@ -177,7 +178,7 @@ class Outline:
                 self._defaults.add(parameter)
                 self._values.setdefault(parameter, value)
             elif name == "include":
-                inner = self.files.find(tag, texts.get("filename", ""), path.parent)
+                inner = self.find(tag, texts.get("filename", ""), path.parent)
                 open_files = *above, path.resolve()
                 _check_native(path, inner.parent)
                 if inner.resolve() in open_files:
@@ -188,14 +189,14 @@ class Outline:
                 self._read(inner, path.parent, open_files)
             elif name == "spectrum" and "filename" in texts:
                 name = texts["filename"]
-                if self.files.find(tag, name, beside).stat().st_size > _MOST_SPECTRUM:
+                if self.find(tag, name, beside).stat().st_size > _MOST_SPECTRUM:
                     raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
             elif name in _NUMBERS:
                 _check_numbers(tag, texts)
             elif (name, texts.get("name")) == ("string", "filename"):
                 outer = (self._tags[file, at, ""].attributes for at in open_tags[:-1])
                 if any(attributes.get("type") == "projector" for attributes in outer):
-                    self.projected.append(self.files.folder / texts.get("value", ""))
+                    self.projected.append(self.path.parent / texts.get("value", ""))
 
         parser.XmlDeclHandler = declare
         parser.StartDoctypeDeclHandler = lambda *_: refuse("a scene has no DTDs and entities; remove <!DOCTYPE ...>")
@@ -223,6 +224,46 @@ class Outline:
             return self._values[match[1]]
 
         return text if tag.name == "default" else _PARAMETER.sub(value, text)
+
+    def find_named(self, parameter: str, name: str) -> Path:
+        """Return the path of the file that a user names for a scene ``parameter``.
+
+        A ``name`` is relative to the working folder if it starts with a dot, and to the scene's folder if only that has
+        it. Raises MitsimError if the file is missing, or both folders have one of that name.
+        """
+        own, here = self.path.parent / name, Path(name)
+        places = [here] if name.startswith(".") or here.is_absolute() else [own, here]
+        found = {place.resolve(): place for place in places if os.path.isfile(place)}  # also of a name too long
+        if not found:
+            folders = " or ".join(str(folder) for folder in dict.fromkeys((Path.cwd(), self.path.parent)))
+            raise MitsimError(f"parameter {cut(parameter)}={cut(name)}: no such file in {folders}; mend the name")
+        if len(found) > 1:
+            problem = f"parameter {cut(parameter)}={cut(name)}: the scene's folder and the working folder have"
+            raise MitsimError(f"{problem} a file of that name; give ./{cut(name)} or {own}")
+        path = next(iter(found.values()))
+        path = self.path.parent.absolute() / name if path == own else path.absolute()
+        self.own[path] = parameter
+        return path
+
+    def find(self, tag: Tag, name: str, folder: Path | None = None) -> Path:
+        """Return the file ``name``, relative to a ``folder`` (None: the scene's).
+
+        Raises MitsimError if it lies outside the scene's folder, or is no plain file of at most 512 MiB.
+        """
+        folder = folder or self.path.parent
+        path = folder / name
+        try:
+            status = path.stat()
+            inside = path.resolve().is_relative_to(self.path.parent.resolve())
+        except (OSError, ValueError, RuntimeError):
+            raise tag.refusal("filename", repr(name), f"no such file in {folder}; mend the name") from None
+        if not (inside or self.outside or path in self.own):
+            rule = f"files lie in the scene's folder {self.path.parent}; copy it there, or use --allow-outside-files"
+            raise tag.refusal("filename", repr(name), rule)
+        if not stat.S_ISREG(status.st_mode) or not 0 < status.st_size <= _MOST_FILE:
+            raise tag.refusal("filename", repr(name), f"a plain file of 1 byte to {_MOST_FILE >> 20} MiB is needed")
+        self.used[path] = None
+        return path
 
 
 def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
@@ -253,59 +294,6 @@ _MOST_FILE = 512 << 20
 """Room for the largest environment map, 400 MiB."""
 _MOST_SPECTRUM = 1 << 20
 """Some 50 000 lines; measured spectra have 1000."""
-
-
-class SceneFiles:
-    """Files that one scene may read: ``used`` ones, the scene first, and the parameters of the user's ``own``.
-
-    All are in the scene's folder unless ``outside``.
-    """
-
-    def __init__(self, scene: Path, outside: bool = False) -> None:
-        self.folder = scene.parent
-        self.outside = outside
-        self.own: dict[Path, str] = {}
-        self.used: dict[Path, None] = {}
-
-    def find_named(self, parameter: str, name: str) -> Path:
-        """Return the path of the file that a user names for a scene ``parameter``.
-
-        A ``name`` is relative to the working folder if it starts with a dot, and to the scene's folder if only that has
-        it. Raises MitsimError if the file is missing, or both folders have one of that name.
-        """
-        own, here = self.folder / name, Path(name)
-        places = [here] if name.startswith(".") or here.is_absolute() else [own, here]
-        found = {place.resolve(): place for place in places if os.path.isfile(place)}  # also of a name too long
-        if not found:
-            folders = " or ".join(str(folder) for folder in dict.fromkeys((Path.cwd(), self.folder)))
-            raise MitsimError(f"parameter {cut(parameter)}={cut(name)}: no such file in {folders}; mend the name")
-        if len(found) > 1:
-            problem = f"parameter {cut(parameter)}={cut(name)}: the scene's folder and the working folder have"
-            raise MitsimError(f"{problem} a file of that name; give ./{cut(name)} or {own}")
-        path = next(iter(found.values()))
-        path = self.folder.absolute() / name if path == own else path.absolute()
-        self.own[path] = parameter
-        return path
-
-    def find(self, tag: Tag, name: str, folder: Path | None = None) -> Path:
-        """Return the file ``name``, relative to a ``folder`` (None: the scene's).
-
-        Raises MitsimError if it lies outside the scene's folder, or is no plain file of at most 512 MiB.
-        """
-        folder = folder or self.folder
-        path = folder / name
-        try:
-            status = path.stat()
-            inside = path.resolve().is_relative_to(self.folder.resolve())
-        except (OSError, ValueError, RuntimeError):
-            raise tag.refusal("filename", repr(name), f"no such file in {folder}; mend the name") from None
-        if not (inside or self.outside or path in self.own):
-            rule = f"files lie in the scene's folder {self.folder}; copy it there, or use --allow-outside-files"
-            raise tag.refusal("filename", repr(name), rule)
-        if not stat.S_ISREG(status.st_mode) or not 0 < status.st_size <= _MOST_FILE:
-            raise tag.refusal("filename", repr(name), f"a plain file of 1 byte to {_MOST_FILE >> 20} MiB is needed")
-        self.used[path] = None
-        return path
 
 
 def _check_native(scene: Path, folder: Path) -> None:

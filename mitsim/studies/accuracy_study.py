@@ -136,12 +136,12 @@ def measure_reference(judge: Judge) -> list[dict[str, Value]]:
     answer, _ = stack_frames(light.frames(family.lighting.shots([index]), judge.seed + 1))
     with show_pattern(bench, family.light(shots[index])):
         started = time.perf_counter()
-        render(bench, REFERENCE, SAMPLES[0], Request(seed=judge.seed))  # compiles kernels
+        render(bench, REFERENCE, SAMPLES[0], Request(seed=judge.seed), Job())  # compiles kernels
         predicted_s = time.perf_counter() - started
         for spp in SAMPLES:
             if predicted_s > LONGEST_S:
                 break
-            rendered = render(bench, REFERENCE, spp, Request(seed=judge.seed))
+            rendered = render(bench, REFERENCE, spp, Request(seed=judge.seed), Job())
             one = float(rendered.facts["seconds"])
             predicted_s = 5 * one  # four times the samples, and some more
             error = relative_error(rendered.mean.mean(axis=2), answer[0])

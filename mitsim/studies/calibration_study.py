@@ -20,13 +20,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.bench.request import Exposure
-from mitsim.calibrate.board_session import LitSession, Session
+from mitsim.calibrate.board_session import LitSession, Session, manifest_of
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.manifests import SIDES as FACTORS
-from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import digital_of
@@ -244,11 +243,9 @@ def _measure(studio: Studio, point: Point) -> Found:
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), seed)
     lit = LitSession.of(session, session.trace(session.plan(accuracy, job), job)[0], job)
     (noisy, clean), _, _ = estimates(lit, job, (NOISY, NOISE_FREE))
-    manifest = CalibrationManifest(
-        camera=bench.identity(), centre=session.centre, board_reflectance=recipe.board_reflectance,
-        digital=digital_of(bench.sensor, lit.exposure_s), parallax=bench.parallax,
-    )  # fmt: skip
-    scene = LitScene(bench.light(point["patterns"], job, accuracy=accuracy, seed=seed))
+    digital, depth = digital_of(bench.sensor, lit.exposure_s), bench.geometry.scene_distance
+    manifest = manifest_of(bench, digital, recipe.board_reflectance, depth)
+    scene = LitScene(bench.light(point["patterns"], job=job, accuracy=accuracy, seed=seed))
     stand = DriftStand(scene, Factors.of(noisy, manifest), recipe, family, seed)
     *lost, rest = losses(stand, lit, Factors.of(clean, manifest))
     left, right = IdealCamera(bench, bench.geometry.mask).calibrated(scene.board_flux)

@@ -100,7 +100,7 @@ class DriftStand:
         expected, base = scene.expected_frames(RENDERED, self.family, bench=mask), self._frames.exposer(self.exposure_s)
         ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
         shot = base.exposure_s, base.seed, base.speckle
-        exposer = exposure.DriftedExposer(bench.devices, *shot, drift, self.family, ambient)
+        exposer = exposure.DriftedExposer(bench.devices, *shot, drift=drift, family=self.family, ambient=ambient)
         (sums,) = accumulate(exposer, self.family, expected, [model])
         image = model.solve(sums, self.before.lam).image
         still, predicted = (self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))

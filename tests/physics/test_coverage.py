@@ -67,7 +67,7 @@ def sessions(bench: Bench, patterns: str, seeds: range) -> Iterator[tuple[float,
     session, recipe = Session(bench, load_recipe(), 0), load_recipe()
     board = LitSession.of(session, session.trace(session.plan(2e-4, Job()), Job())[0], Job())
     manifest = CalibrationManifest(
-        camera=bench.identity(), centre=session.centre, board_reflectance=recipe.board_reflectance
+        camera=bench.identity(), centre=bench.geometry.centred, board_reflectance=recipe.board_reflectance
     )
     for seed in seeds:
         shots = light.expose(patterns, seed=seed, exposure_fraction=0.1)

@@ -43,7 +43,7 @@ for path in map(Path, sys.argv[4:]):
     found[f"{path.stem} total"] = tracer.trace(0, 0, 64).value.sum()
     forced = {"diffraction": False, "black-level": False, "interreflection": path.stem == "walls"}
     for name in ("reference", "factored"):
-        result = bench.render(name, 64, 3e-3, seed, forced if name == "factored" else None)
+        result = bench.render(name, 64, accuracy=3e-3, seed=seed, effects=forced if name == "factored" else {})
         found[f"{path.stem} {name}"], found[f"{path.stem} {name} error"] = result.mean, result.mc_error
 np.savez(target, **found)
 """

@@ -504,9 +504,9 @@ def test_drawing_the_first_shadow_is_held_against_limits_before_anything_is_look
         (Limits(1e-4), r" s; allowed are 0\.0001"),
     ):
         with pytest.raises(MitsimError, match=f"^dots:2: would take about .*{sentence}"):
-            bench.light("dots:2", Job(limits=limits))
+            bench.light("dots:2", job=Job(limits=limits))
     with pytest.raises(AssertionError, match="planned"):
-        bench.light("dots:2", Job(limits=Limits(memory_bytes=1e6)), effects="-diffraction")
+        bench.light("dots:2", job=Job(limits=Limits(memory_bytes=1e6)), effects="-diffraction")
 
 
 @pytest.mark.parametrize("drawing", ["random", "ring", "turned", "bar", "cross"])

@@ -41,7 +41,7 @@ FRAMES = [Frame(AMBIENT + 0.02 * RNG.random((PIXELS, PIXELS)), 0.0, 0.0, 0.0) fo
 
 
 def exposer(**drift: float) -> DriftedExposer:
-    return DriftedExposer(DEVICES, SECONDS, SEED, 0.0, Drift(**drift), FAMILY, AMBIENT)
+    return DriftedExposer(DEVICES, SECONDS, SEED, drift=Drift(**drift), family=FAMILY, ambient=AMBIENT)
 
 
 def frames(camera: Exposer) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_without_drift_frames_are_the_same_bit_for_bit() -> None:
 
 def test_power_scales_the_projectors_light_and_lamps_that_of_lamps() -> None:
     """Without lamps all light is the projector's. (Planted: the lamps' light scaled with the projector's.)"""
-    dark = DriftedExposer(DEVICES, SECONDS, SEED, 0.0, Drift(power=0.1), FAMILY)
+    dark = DriftedExposer(DEVICES, SECONDS, SEED, drift=Drift(power=0.1), family=FAMILY)
     assert np.allclose(dark.shot_electrons(FRAMES[0], *FAMILY.shots[0].names), 1.1 * dark.electrons(FRAMES[0]))
     for camera, power, lamp in ((exposer(power=0.1), 1.1, 1.0), (exposer(lamp=0.3), 1.0, 1.3)):
         for shot, frame in zip(FAMILY.shots, FRAMES, strict=True):

@@ -130,7 +130,7 @@ def test_a_session_behind_filters_repeats_its_frames_by_default(bench: Bench, mo
     """Four times, where no recipe is given; each line's light passes by its filter, and all of it without filters.
     (Seen: TypeError, because the request is no dataclass.)"""
     asked, seen, about = list[Any](), coloured(bench), SimpleNamespace(wavelengths_nm=(500.0, 600.0))
-    monkeypatch.setattr(calibrate, "_run_sessions", lambda lines, request, *_: asked.append(request) or lines)
+    monkeypatch.setattr(calibrate, "_run_sessions", lambda lines, *_: asked.extend(lines) or lines)
     for own, whole in ((seen, without_filters(seen)), (bench, bench)):
         lines = SimpleNamespace(manifest=about, names=("a", "b"), benches=(bench, bench), whole=whole)
         monkeypatch.setattr(calibrate, "SpectralBench", SimpleNamespace(of=lambda *_, lines=lines: lines))

@@ -282,8 +282,8 @@ def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: py
     assert estimate(lit, Job())[1] == lit.session.shots == 34
     kept.left = 3
     with pytest.raises(KeyboardInterrupt):
-        estimate(lit, Job(), checkpoint=kept)
-    assert estimate(lit, Job(), checkpoint=kept)[1] == 34
+        estimates(lit, Job(), (NOISY,), kept)
+    assert estimates(lit, Job(), (NOISY,), kept)[1] == 34
 
 
 # ---- differences -----------------------------------------------------------------------------------------------------

@@ -58,7 +58,7 @@ def test_frames_against_a_uniform_one_lose_what_dark_frames_show(tmp_path: Path)
         write_image(folder / f"dark_{number}.png", session.frame(np.zeros((4, 4)), offset=40.0))
     good = calibrate_frames(folder)
     assert good.ok and good.manifest.result["dark_frames"] == 4, good.warnings
-    assert max(error(good, session)) < 0.02 and any("ambient light" in words for words in bad.warnings)
+    assert max(error(good, session)) < 0.02 and any("even light" in words for words in bad.warnings)
     assert max(good.estimate.predicted_error) < max(error(bad, session)) < max(bad.estimate.predicted_error)
     assert good.manifest.result["response_noise"] == pytest.approx(good.estimate.noise, rel=0.1)
 

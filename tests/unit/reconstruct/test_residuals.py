@@ -199,10 +199,12 @@ def test_measured_noise_scatters_as_it_says() -> None:
 
 def test_noise_is_off_where_energy_and_differences_agree() -> None:
     """Half of the energy is too little noise if differences lie below 0.85, or within three errors of it, and twice as
-    much is too much above 1.15 and three errors. (Planted: three over the error.)"""
-    noise = SimpleNamespace(stated=True, light=np.ones(100), chance=lambda size: 0.0)
+    much is too much above 1.15 and three errors. (Planted: three over the error; the bound of rendering taken off.)"""
+    noise = SimpleNamespace(stated=True, light=np.ones(100), chance=lambda size: 0.0, rendering=0.0)
     for ratio, whole, off in ((0.87, 0.5, True), (0.89, 0.5, False), (1.45, 2.0, True), (1.17, 1.7, False)):
         assert NoiseTest(ratio, 0.01, 1.0, 0.01).off(noise, whole, 1.0, 0.0) == off  # type: ignore[arg-type]
+    noise.rendering = 0.3
+    assert not NoiseTest(0.87, 0.01, 1.0, 0.01).off(noise, 1.0, 1.0, 0.3)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("above", "flagged"), [(0.9, False), (1.1, True)])

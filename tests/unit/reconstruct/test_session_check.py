@@ -407,6 +407,17 @@ def test_photon_noise_of_peaked_light_is_no_changing_light() -> None:
         assert np.linalg.norm(one - other) / np.linalg.norm(other) == pytest.approx(stated, rel=0.15)
 
 
+@pytest.mark.parametrize(("feature", "gap"), [(0.11, 0.8), (0.12, 1.0)])
+def test_a_line_behind_closed_features_is_not_dead(feature: float, gap: float) -> None:
+    """It has little light, but more than noise. (Planted: a fiftieth of its neighbours' energy is a dead row.)"""
+    edges = centred_edges(48, 5.0 / 48), centred_edges(N, 120 / N)
+    exact, rng = [scene_factor(mls_mask().terms[0][1], feature, *edges, gap, 400.0)] * 2, np.random.default_rng(3)
+    shown = {half: light(half, exact) for half in ORDER}
+    top = max(frame.max() for frame in shown.values())
+    noisy = {half: each / top + 1e-3 * rng.standard_normal(each.shape) for half, each in shown.items()}
+    assert not checked(noisy).doubts
+
+
 def test_a_sign_is_turned_without_pairs() -> None:
     half, clean = ("vertical", 20, 1), error(checked(frames(), pairs=False))[0]
     found = checked({**frames(), half: light(("vertical", 20, -1))}, pairs=False)
