@@ -490,7 +490,7 @@ def design(
     from mitsim.design.goal import Goal, load_goal
 
     checked = goal if isinstance(goal, Goal) else load_goal(goal)
-    Opening(camera=checked.camera).check(checked.scene, checked.patterns[0])
+    Opening(camera=checked.camera).check(checked.scene, checked.families[0])
     from mitsim.studies.mask_design import design as run_design  # only now: it takes seconds to import
 
     return run_design(checked, output, job, asked.resume, asked.overwrite)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,7 +21,7 @@ class Goal(Configuration):
     camera: str | None = None
     """Camera file or name; none: the scene's. Its mask is replaced."""
     patterns: tuple[str, ...] = Field(default=("dots:7",), strict=False, min_length=1)
-    """Pattern families to choose from."""
+    """Pattern families to choose from. For cyclic:P, the best 0/1 code of period P is found, which shifts as dots:P."""
     exposure_total_s: Positive
     """Seconds of all frames of a capture together; frames of a family share them evenly."""
     exposures: Literal["time", "light", "peak"] = "time"
@@ -55,6 +56,11 @@ class Goal(Configuration):
     accuracy: float = Field(default=1e-4, ge=1e-6, le=0.1)
     """Accuracy of the frames of the proof."""
 
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Pattern families with which the search begins: dots:P for cyclic:P."""
+        return tuple(dict.fromkeys(re.sub("^cyclic:", "dots:", name) for name in self.patterns))
+
     @model_validator(mode="after")
     def _can_be_compared(self) -> Goal:
         if self.exposures == "peak":
@@ -65,6 +71,9 @@ class Goal(Configuration):
         low, high = self.open_part
         if not 0 <= low <= high <= 1:
             raise ValueError(f"open_part: got {low:g} to {high:g}; give two parts from 0 to 1, the smaller one first")
+        for name in self.patterns:
+            if name.startswith("cyclic:") and not re.fullmatch(r"cyclic:[0-9]+", name):
+                raise ValueError(f"patterns: got {name!r}; give cyclic:P with one period P for rows and columns")
         return self
 
 

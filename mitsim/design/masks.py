@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,14 @@ from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.design.goal import Goal
-from mitsim.design.objective import CodedSide, Light, Objective, Prior
+from mitsim.design.objective import CodedSide, Light, Objective, Prior, cyclic_patterns
 from mitsim.design.predict import Stand, TracedLight
 from mitsim.design.search import Found, Search
+from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.session import load_recipe
 from mitsim.optics.shadow import Directions
 
-STATE = "search.json"
+STATE, PATTERNS, FOR_DOTS = "search.json", "patterns.toml", "mask for dots"
 _FULL = 0.8
 """Part of the full well that the brightest pixel of a frame may reach, as in a capture by default."""
 _ALIKE = 1e-3
@@ -46,10 +48,23 @@ class Choice:
     feature_mm: float
     distance_mm: float
     patterns: str
+    lit: str = ""
+    """Code of cyclic patterns, of characters 0 and 1."""
+
+    @property
+    def shown(self) -> str:
+        """Name of the patterns, with the code of cyclic ones."""
+        return f"{self.patterns} {self.lit}".strip()
 
     @property
     def words(self) -> str:
-        return f"features of {self.feature_mm * 1e3:g} um, {self.distance_mm:g} mm from the sensor, {self.patterns}"
+        return f"features of {self.feature_mm * 1e3:g} um, {self.distance_mm:g} mm from the sensor, {self.shown}"
+
+    def family(self, bench: Apparatus) -> PatternFamily:
+        if not self.lit:
+            return bench.family(self.patterns)
+        factor = cyclic_patterns(self.lit, bench.n).astype(np.int8)
+        return PatternFamily(self.shown, factor, factor)
 
 
 @dataclass(frozen=True)
@@ -73,7 +88,7 @@ class Candidate:
             "name": self.name,
             "feature_um": self.choice.feature_mm * 1e3,
             "mask_distance_mm": self.choice.distance_mm,
-            "patterns": self.choice.patterns,
+            "patterns": self.choice.shown,
             "origin": self.found.origin,
             "code": _text(self.found.code),
             "evaluations": self.found.evaluations,
@@ -103,7 +118,7 @@ def stand_of(bench: Apparatus, seed: int) -> tuple[Stand, float]:
 def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> list[Objective]:
     """Return the objectives of a ``choice``, one for each dose and distance."""
     bench, sensor = stand.bench, stand.bench.sensor
-    family, prior = bench.family(choice.patterns), prior_of(stand, goal)
+    family, prior = choice.family(bench), prior_of(stand, goal)
     update: dict[str, Any] = {"mask_feature": choice.feature_mm, "mask_distance": choice.distance_mm}
     update |= {"mask": "separable", "mask_plate": None}
     depths = goal.scene_distances_mm or (bench.geometry.scene_distance,)
@@ -147,19 +162,15 @@ def prior_of(stand: Stand, goal: Goal) -> Prior:
     return Prior(float(truth.mean()), variance**0.5, float(np.clip(np.mean(neighbours) / variance, 0.0, 0.999)))
 
 
-def searches(stand: Stand, goal: Goal, session_s: float) -> Iterator[tuple[Choice, Search]]:
-    """Yield each choice of feature size, distance and family with its search."""
-    distances = goal.mask_distance_mm or (stand.bench.geometry.mask_distance,)
-    for feature, distance, patterns in itertools.product(goal.feature_um, distances, goal.patterns):
-        choice = Choice(feature * 1e-3, distance, patterns)
-        own = objectives(stand, goal, choice, session_s)
-        yield choice, Search(own, goal.open_part, goal.judge == "worst", goal.seed)
+def search_of(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> Search:
+    return Search(objectives(stand, goal, choice, session_s), goal.open_part, goal.judge == "worst", goal.seed)
 
 
 def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: float) -> tuple[list[Candidate], bool]:
     """Return the best masks: the found one, then simple ones; and whether all starts were made.
 
-    Starts that are done are in ``search.json``, from which a search that was stopped goes on.
+    Starts that are done are in ``search.json``, from which a search that was stopped goes on. For cyclic patterns,
+    masks for dots are searched first. Masks for the code that is best with the best of them follow, until codes repeat.
     """
     path = folder / STATE
     done: dict[str, Any] = read_json(path) if path.is_file() else {}
@@ -169,11 +180,16 @@ def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: floa
         if found is not None and (name not in best or found.score < best[name][1].score):
             best[name] = choice, found, search
 
-    every = list(searches(stand, goal, session_s))
-    for number, (choice, search) in enumerate(every):
+    distances = goal.mask_distance_mm or (stand.bench.geometry.mask_distance,)
+    options = itertools.product(goal.feature_um, distances, goal.families)
+    order = [Choice(feature * 1e-3, distance, patterns) for feature, distance, patterns in options]
+    every = {choice: search_of(stand, goal, choice, session_s) for choice in order}
+    known_masks = dict[Choice, list[tuple[str, FloatArray]]]()
+    for number, choice in enumerate(order):  # to which cyclic patterns are added
+        search, masks, spent = every[choice], list[Found](), 0
         own: list[dict[str, Any]] = done.setdefault(choice.words, [])
-        spent = 0
-        for index, (origin, start) in enumerate(itertools.islice(search.starts(), goal.starts)):
+        starts = itertools.chain(known_masks.get(choice, ()), search.starts())
+        for index, (origin, start) in enumerate(itertools.islice(starts, goal.starts)):
             if index == len(own):
                 if goal.time_limit_s is not None and time.monotonic() - began > goal.time_limit_s:
                     complete = False
@@ -185,15 +201,30 @@ def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: floa
             code = _code(known["code"])
             found = Found(known["origin"], code, search.score(code).score, known["evaluations"])
             spent += found.evaluations
+            masks.append(found)
             keep("design", choice, found, search)
-            job.progress("search", (number + (index + 1) / goal.starts) / len(every))
+            job.progress("search", (number + (index + 1) / goal.starts) / len(order))
+        cyclic = re.sub("^dots:", "cyclic:", choice.patterns)
+        if masks and cyclic in goal.patterns:
+            mask = min(masks, key=lambda each: each.score)
+            if not choice.lit:
+                keep(FOR_DOTS, choice, mask, search)
+            lit = search.best_patterns(mask.code, int(cyclic.partition(":")[2]))
+            changed = replace(choice, patterns=cyclic, lit=lit)
+            if lit.count("1") > 1 and changed not in every:  # a single 1 is dots
+                order.append(changed)
+                every[changed] = search_of(stand, goal, changed, session_s)
+                known_masks[changed] = [(f"the mask for {choice.shown}", mask.code)]
+                keep("design", changed, replace(mask, score=every[changed].score(mask.code).score), every[changed])
         keep("random", choice, search.best_random(spent), search)
         keep("pinholes", choice, search.best_pinholes(), search)
         keep("maximum length sequence", choice, search.maximum_length(), search)
+    if FOR_DOTS in best and best[FOR_DOTS][1] is best["design"][1]:
+        del best[FOR_DOTS]
     candidates = []
     for name, (choice, found, search) in best.items():
         seconds = search.objectives[0].frame_s((found.code, found.code)) / goal.doses[0]
-        frames = len(stand.bench.family(choice.patterns).shots)
+        frames = len(choice.family(stand.bench).shots)
         candidates.append(Candidate(name, choice, found, frames * seconds))
     return candidates, complete
 
@@ -210,7 +241,10 @@ def _code(text: str) -> FloatArray:
 
 
 def write_camera(folder: Path, bench: Apparatus, candidate: Candidate) -> Path:
-    """Write a camera file with the mask as a drawing, its PNG, and an SVG in millimetres; return the camera file."""
+    """Write a camera file with the mask as a drawing, its PNG, an SVG in millimetres, and a file of 0/1 patterns.
+
+    Return the camera file.
+    """
     code, feature = candidate.found.code > 0.5, candidate.choice.feature_mm
     folder.mkdir(exist_ok=True)
     write_numbers(folder / "mask.png", (255 * np.outer(code, code)).astype(np.uint8))
@@ -227,6 +261,10 @@ def write_camera(folder: Path, bench: Apparatus, candidate: Candidate) -> Path:
     sensor = bench.counting.model_dump(mode="json", exclude_defaults=True)
     mask = {"kind": "drawing", "feature_mm": feature, "file": "mask.png", "distance_mm": candidate.choice.distance_mm}
     write_text(folder / "camera.toml", tomli_w.dumps({**sensor, "mask": mask}))
+    family = candidate.choice.family(bench)
+    if family.grey is None and not family.signed:
+        left, right = (side.T.tolist() for side in (family.left, family.right))
+        write_text(folder / PATTERNS, f"left = {left}\nright = {right}\n")
     return folder / "camera.toml"
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -115,10 +116,19 @@ class CodedSide:
 
         self._means = means(0.0)
         self._moved = (means(_STEP) - means(-_STEP)) / (2 * _STEP)
+        self._show(patterns)
+        self.used = np.flatnonzero(np.abs(lines[:-1] + camera.mask_feature / 2) < reach + camera.mask_feature / 2)
+
+    def _show(self, patterns: FloatArray) -> None:
         self.patterns = patterns
         self.gram = patterns @ patterns.T
         self.squared = self.gram @ self.gram
-        self.used = np.flatnonzero(np.abs(lines[:-1] + camera.mask_feature / 2) < reach + camera.mask_feature / 2)
+
+    def lit_by(self, lit: str) -> CodedSide:
+        """Return the side under the cyclic patterns of a code."""
+        other = copy(self)
+        other._show(cyclic_patterns(lit, self.shape[1]))
+        return other
 
     def __call__(self, code: FloatArray) -> Factor:
         fields = [(weight, matrix, matrix @ code) for weight, matrix in self._waves]
@@ -142,6 +152,12 @@ class Factor:
     values: FloatArray
     moved: FloatArray
     back: Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def cyclic_patterns(lit: str, n: int) -> FloatArray:
+    """Return patterns (n, P) of 0 and 1: a code of P characters that repeats along n pixels, shifted by 0 to P - 1."""
+    places = (np.arange(n)[:, None] - np.arange(len(lit))) % len(lit)
+    return np.asarray(np.array([float(each) for each in lit])[places])
 
 
 def _step_fields(x: FloatArray, product: float, cell: float) -> ComplexArray:
@@ -218,6 +234,16 @@ class Objective:
         """Return the objective for exposures with as much light as a mask of these codes has."""
         scale = replace(self, light=replace(self.light, signal_e=1.0)).frame_s(codes)
         return replace(self, light=replace(self.light, signal_e=self.light.frame_s / scale))
+
+    def lit_by(self, lit: str) -> Objective:
+        """Return the objective for cyclic patterns of a code, as many as the patterns before, in the same time."""
+        rows = self.sides[0].lit_by(lit)
+        sides = rows, (rows if self.sides[0] is self.sides[1] else self.sides[1].lit_by(lit))
+        signal_e = self.light.signal_e
+        if signal_e is not None:  # that of the mask by which light is equal
+            for new, old in zip(sides, self.sides, strict=True):
+                signal_e *= new.patterns.mean() / old.patterns.mean()
+        return replace(self, sides=sides, light=replace(self.light, signal_e=signal_e))
 
     def __call__(self, codes: Sequence[FloatArray], lam: float | None = None, slopes: bool = False) -> Value:
         light, prior, sides = self.light, self.prior, self.sides

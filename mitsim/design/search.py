@@ -8,9 +8,10 @@ resumed after any number of starts ends as one without a stop.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -20,6 +21,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.design.objective import Objective
 from mitsim.devices.mask import mls_code
+from mitsim.devices.patterns import is_prime
 
 _RELAXED = 40
 """Steps of relaxation: later ones gain less than flips do."""
@@ -30,6 +32,10 @@ _WIDEST = 4
 """Features of the widest pinholes."""
 _SHARPNESS = 20.0
 """Exponent of the mean that stands for the largest error, which decides where errors differ by 1 dB."""
+_EVERY_CODE = 12
+"""Longest period of which all 223 codes are tried, in some seconds."""
+_DIGITS = 9
+"""Digits of an error's logarithm by which codes are equal."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +150,14 @@ class Search:
                 best = Found(f"random, open part {code[self.used].mean():.2f}", code, score, 0)
         return Found(best.origin, best.code, best.score, self.evaluations - begun)
 
+    def lit_by(self, lit: str) -> Search:
+        """Return the search for cyclic patterns of a code."""
+        return replace(self, objectives=[each.lit_by(lit) for each in self.objectives])
+
+    def best_patterns(self, code: FloatArray, period: int) -> str:
+        """Return the code of a ``period`` whose cyclic patterns have the least error with a mask."""
+        return min(cyclic_codes(period), key=lambda lit: round(math.log(self.lit_by(lit).score(code).score), _DIGITS))
+
     def best_pinholes(self) -> Found | None:
         """Return the best array of equal pinholes, None if no array is within the bounds."""
         found, begun = [], self.evaluations
@@ -215,3 +229,24 @@ class Scored:
 def pinholes(count: int, period: int, width: int) -> FloatArray:
     """Return a code (count,) of openings of ``width`` features, a ``period`` apart, about its middle."""
     return ((np.arange(count) - count // 2 + width // 2) % period < width).astype(np.float64)
+
+
+def cyclic_codes(period: int) -> list[str]:
+    """Return texts of 0 and 1 of a ``period``, without rotations and mirror images of others; that of dots is first.
+
+    Mirror images have the same noise but for the order of pixels. Beyond a period of 12, codes are as many 1 as one
+    likes, side by side or spread evenly, and difference sets with their complements: squares modulo a prime, and
+    maximum length sequences.
+    """
+    places = range(period)
+    if period <= _EVERY_CODE:
+        codes = [*itertools.product((0, 1), repeat=period)][1:]
+    else:
+        codes = [tuple(int(i * step % period < fill) for i in places) for fill in places[1:] for step in (1, fill)]
+        sets = [{i * i % period for i in places[1:]}] if is_prime(period) else []
+        if (period + 1).bit_count() == 1:
+            sets.append(set(np.flatnonzero(mls_code(period.bit_length()))))
+        codes += [tuple(int((i in chosen) == inside) for i in places) for chosen in sets for inside in (True, False)]
+    texts = ("".join(map(str, code)) for code in codes)
+    alike = ((each[i:] + each[:i] for each in (text, text[::-1]) for i in places) for text in texts)
+    return list(dict.fromkeys(map(max, alike)))

@@ -16,7 +16,17 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import output_folder, write_json, write_text
 from mitsim.core.job import Job
 from mitsim.design.goal import Goal, load_goal
-from mitsim.design.masks import STATE, Candidate, run_search, searches, seconds_for, sensitivity, stand_of, write_camera
+from mitsim.design.masks import (
+    PATTERNS,
+    STATE,
+    Candidate,
+    run_search,
+    search_of,
+    seconds_for,
+    sensitivity,
+    stand_of,
+    write_camera,
+)
 from mitsim.metrics import psnr, truth_for
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.report.pages import Mean, page_figure
@@ -55,11 +65,12 @@ class Design:
     @property
     def table(self) -> Part:
         """Return predicted and rendered PSNR of all masks."""
-        head = ("mask", "predicted [dB]", "rendered [dB]", "scatter of seeds [dB]", "open part a side",
+        head = ("mask", "patterns", "predicted [dB]", "rendered [dB]", "scatter of seeds [dB]", "open part a side",
                 "exposure [s]", "session [s a frame]", "codes tried")  # fmt: skip
         rows = tuple(
             (
                 each.name,
+                each.choice.shown,
                 f"{each.predicted:.2f}",
                 f"{each.rendered:.2f}",
                 f"{each.scatter:.2f}",
@@ -80,7 +91,8 @@ class Design:
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        return [self.headline, *self.table.lines(), f"Camera file: {self.output}/design/camera.toml"]
+        patterns = [f"Patterns: {self.output}/design/{PATTERNS}"] if self.candidates[0].choice.lit else []
+        return [self.headline, *self.table.lines(), f"Camera file: {self.output}/design/camera.toml", *patterns]
 
     @property
     def headline(self) -> str:
@@ -93,9 +105,13 @@ class Design:
 # -------- Proof
 
 
-def prove(goal: Goal, candidate: Candidate, bench: Bench, job: Job) -> Candidate:
-    """Predict, capture, calibrate and reconstruct with the camera of a ``candidate``, once for each seed."""
-    patterns, frames = candidate.choice.patterns, len(bench.family(candidate.choice.patterns).shots)
+def prove(goal: Goal, candidate: Candidate, camera: Path, job: Job) -> Candidate:
+    """Predict, capture, calibrate and reconstruct with the ``camera`` of a candidate, once for each seed."""
+    from mitsim.api.bench import open_bench
+
+    bench = open_bench(goal.scene, camera=str(camera))
+    patterns = str(camera.parent / PATTERNS) if candidate.choice.lit else candidate.choice.patterns
+    frames = len(bench.family(patterns).shots)
     predicted = bench.predict(patterns, exposure_total=candidate.exposure_total_s, job=job)
     factors = bench.calibrate(accuracy=goal.accuracy, seed=goal.seed, job=job)
     found, warnings = [], list(predicted.warnings)
@@ -148,9 +164,9 @@ def design(
             job.progress("proof", number / len(candidates))
             file = write_camera(folder / each.name.replace(" ", "_"), bench, each)
             with job.clock.stage("proof"):
-                proved.append(prove(asked, each, open_bench(asked.scene, camera=str(file)), job.apart(f"{each.name} ")))
+                proved.append(prove(asked, each, file, job.apart(f"{each.name} ")))
         best, *simple = proved
-        own = next(search for choice, search in searches(stand, asked, session_s) if choice == best.choice)
+        own = search_of(stand, asked, best.choice, session_s)
         texts = dict.fromkeys(text for each in proved for text in each.warnings)
         warnings = [f"{', '.join(each.name for each in proved if text in each.warnings)}: {text}" for text in texts]
         if best.rendered < best.predicted - _SHORT_DB:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
+from mitsim.core.files import read_json, write_json
 from mitsim.core.job import Job
 from mitsim.design.goal import Goal, load_goal
-from mitsim.design.masks import Candidate, Choice, objectives, run_search, stand_of, write_camera
+from mitsim.design.masks import STATE, Candidate, Choice, objectives, run_search, stand_of, write_camera
 from mitsim.design.predict import Stand
 from mitsim.design.search import Found, Search
 from mitsim.optics.terms import ModelledCamera
@@ -39,6 +41,7 @@ def stand() -> Stand:
         ("open_part = [0.5, 0.2]", "open_part: got 0.5 to 0.2"),
         ("exposure_total_s = -1", "exposure_total_s"),
         ("patterns = []", "patterns"),
+        ('patterns = ["cyclic:3x5"]', "one period P"),
         ("feature = 60", "feature_um"),
         ('judge = "best"', "judge"),
     ],
@@ -54,21 +57,32 @@ def test_a_goal_names_what_it_cannot_have(tmp_path: Path, line: str, words: str)
 
 
 def test_patterns_and_scenes_that_do_not_exist_are_refused_before_the_search(tmp_path: Path) -> None:
-    for change in ({"scene": "nosuch"}, {"patterns": ("dots:0",)}, {"camera": "nosuch"}):
+    for change in ({"scene": "nosuch"}, {"patterns": ("dots:0",)}, {"patterns": ("cyclic:0",)}, {"camera": "nosuch"}):
         with pytest.raises(MitsimError):
             ms.design(Goal(**(GOAL | change)), tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
 
 def test_a_resumed_search_ends_as_one_without_a_stop(stand: Stand, tmp_path: Path) -> None:
-    (tmp_path / "whole").mkdir()
-    whole, _ = run_search(stand, Goal(**GOAL, starts=2, patterns=("dots:3",)), tmp_path / "whole", Job(), 0.01)
-    for starts in (1, 2):
-        found, complete = run_search(stand, Goal(**GOAL, starts=starts, patterns=("dots:3",)), tmp_path, Job(), 0.01)
-    assert complete
+    """Cyclic patterns begin with dots, and are in a file by which a capture shows them."""
+    coarse = GOAL | {"exposure_total_s": 0.4, "feature_um": (240.0,)}
+    goal = Goal(**coarse, starts=2, patterns=("cyclic:3",))
+    whole, complete = run_search(stand, goal, tmp_path, Job(), 0.01)
+    state = read_json(tmp_path / STATE)
+    first = next(iter(state))
+    write_json(tmp_path / STATE, {first: state[first][:1]})
+    found, _ = run_search(stand, goal, tmp_path, Job(), 0.01)
+    assert complete and len(state) == 2
     for one, other in zip(whole, found, strict=True):
-        assert one.name == other.name and one.found.score == other.found.score
+        assert one.name == other.name and one.found.score == other.found.score and one.choice == other.choice
         assert np.array_equal(one.found.code, other.found.code)
+    best, dots = found[:2]
+    assert (best.choice.shown, dots.choice.shown, dots.name) == ("cyclic:3 110", "dots:3", "mask for dots")
+    assert best.found.score < dots.found.score and best.exposure_total_s <= dots.exposure_total_s == 0.4
+    shown = stand.bench.family(str(write_camera(tmp_path / "mask", stand.bench, best).with_name("patterns.toml")))
+    lit = np.arange(stand.bench.n)[:, None] % 3 != np.arange(3)
+    for side in (shown.left, shown.right):
+        assert {*map(tuple, side.T)} == {*map(tuple, lit.T)}
 
 
 def test_the_drawn_mask_casts_the_shadow_of_the_code(stand: Stand, tmp_path: Path) -> None:
@@ -98,6 +112,9 @@ def test_equal_light_exposes_a_darker_mask_for_longer(stand: Stand) -> None:
         signals.append(objective.frame_s((code, code)) * (factor.mean(axis=0) @ pattern.mean(axis=1)) ** 2)
     assert signals[0] == pytest.approx(signals[1], rel=1e-6)
     assert objective.frame_s((full, full)) == pytest.approx(0.4 / 9, rel=1e-12)
+    choice = replace(CHOICE, patterns="cyclic:3", lit="110")
+    (lit,) = objectives(stand, Goal(**(GOAL | {"exposure_total_s": 0.4}), exposures="light"), choice, 0.01)
+    assert objective.lit_by("110")((half, half)).total == pytest.approx(lit((half, half)).total, rel=1e-3)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.design.objective import CodedSide, Light, Objective, Prior
-from mitsim.design.search import Search, pinholes
+from mitsim.design.search import Search, cyclic_codes, pinholes
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Plate
 from mitsim.devices.projector import Spectrum
@@ -105,6 +105,33 @@ def test_the_worst_of_two_exposures_counts(objective: Objective) -> None:
     alone = [Search([each]).score(CODE).score for each in (objective, dim)]
     assert mean == pytest.approx(np.sqrt(alone[0] * alone[1]), rel=1e-9)
     assert 0.9 * max(alone) < worst <= max(alone)
+
+
+@pytest.mark.parametrize(("read_noise_e", "lit_pixels"), [(3.0, 1), (300.0, 2)])
+def test_the_best_cyclic_patterns_are_those_of_all_codes(
+    objective: Objective, read_noise_e: float, lit_pixels: int
+) -> None:
+    """Each of 31 codes of period 5 with patterns of its own; mirror images, which are not tried, differ by 1e-3."""
+    light, patterns = replace(LIGHT, read_noise_e=read_noise_e), list[FloatArray]()
+    for number in range(1, 32):
+        bits = np.array([number >> place & 1 for place in range(5)], dtype=np.float64)
+        patterns.append(np.stack([np.roll(np.tile(bits, 4), shift)[:N] for shift in range(5)], axis=1))
+    every = [Objective((one, one), light, Prior())((CODE, CODE)).total for one in (side(LINES, c) for c in patterns)]
+    search = Search([replace(objective, light=light)])
+    lit = search.best_patterns(CODE, 5)
+    found = search.lit_by(lit).score(CODE).score
+    assert found < (1 + 1e-3) * min(every) and found <= search.lit_by("10000").score(CODE).score
+    assert any(found == pytest.approx(each, rel=1e-9) for each in every)
+    assert lit.count("1") == lit_pixels
+
+
+@pytest.mark.parametrize(("period", "count", "code"), [(7, 17, "1101000"), (19, 36, "1111010100001101100")])
+def test_codes_have_difference_sets(period: int, count: int, code: str) -> None:
+    """17 necklaces of 7 beads that may be turned over are not all dark; of 19, two sets and runs and even spreads."""
+    codes = cyclic_codes(period)
+    same = {each[i:] + each[:i] for each in (code, code[::-1]) for i in range(period)}
+    assert codes[0] == "1" + "0" * (period - 1) and len(same & set(codes)) == 1
+    assert len(codes) == count
 
 
 def test_pinholes_are_equal_and_centred() -> None:
